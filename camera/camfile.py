@@ -1,0 +1,203 @@
+"""Reading and writing ``.cam`` files (``SmRadialDistortedCamera``).
+
+The grammar is the data set's, read generously: any white space, commas or none, keys in any order,
+``#`` comments. Keys that mean nothing here are kept and written back.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+
+from camera.errors import CameraError
+from camera.model import Camera, Pose
+from storage import write_whole
+
+CLASS_NAME = "SmRadialDistortedCamera"
+_LARGEST_FILE_BYTES = 1 << 20
+_LARGEST_EXCERPT = 40
+
+_TOKEN = re.compile(r"[{}\[\]:]|[^\s,{}\[\]:#]+")
+
+# A key's value: its tokens, each with its line.
+_Entries = dict[str, list[tuple[str, int]]]
+
+
+def read_camera(path: str | os.PathLike[str]) -> Camera:
+    """Read a ``.cam`` file.
+
+    Parameters
+    ----------
+    path : path
+        The file.
+
+    Returns
+    -------
+    Camera
+        The calibrated camera.
+
+    Raises
+    ------
+    CameraError
+        If the file cannot be read or does not describe a possible camera; the message names the
+        file and, where it is one line's fault, the line.
+    """
+    path = Path(path)
+    try:
+        if path.stat().st_size > _LARGEST_FILE_BYTES:
+            raise CameraError(f"{path}: larger than {_LARGEST_FILE_BYTES} bytes: not a .cam file")
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise CameraError(f"{path}: no such calibration file") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise CameraError(f"{path}: cannot be read as a .cam file: {error}") from None
+    return parse_camera(text, name=str(path))
+
+
+def parse_camera(text: str, name: str = "<text>") -> Camera:
+    """Make a camera of the text of a ``.cam`` file; `name` stands for the file in errors."""
+    entries = _split(text, name)
+
+    def numbers(key: str, count: int) -> list[float]:
+        if key not in entries:
+            raise CameraError(f"{name}: lacks {key}")
+        return _numbers(entries.pop(key), key, count, name)
+
+    def whole(key: str) -> int:
+        value = numbers(key, 1)[0]
+        if value != int(value):
+            raise CameraError(f"{name}: {key} is {value}: expected a whole number")
+        return int(value)
+
+    pose = _rows(numbers("sensor2World", 12))
+    tcp = _rows(numbers("sensor2Tcp", 12)) if "sensor2Tcp" in entries else None
+    mount_index = whole("mountIndex") if "mountIndex" in entries else 0
+    width, height = whole("width"), whole("height")
+    scale_x, scale_y = numbers("scaleX", 1)[0], numbers("scaleY", 1)[0]
+    offset_x, offset_y = numbers("offsetX", 1)[0], numbers("offsetY", 1)[0]
+    a2, a3, b1, b2, b3 = numbers("coef", 5)
+    unknown = tuple((key, " ".join(token for token, _ in value)) for key, value in entries.items())
+    try:
+        return Camera(
+            width=width,
+            height=height,
+            scale_x=scale_x,
+            scale_y=scale_y,
+            offset_x=offset_x,
+            offset_y=offset_y,
+            coef=(a2, a3, b1, b2, b3),
+            robot_from_camera=pose,
+            sensor_to_tcp=tcp,
+            mount_index=mount_index,
+            unknown=unknown,
+        )
+    except CameraError as error:
+        raise CameraError(f"{name}: {error}") from None
+
+
+def format_camera(camera: Camera) -> str:
+    """The text of a ``.cam`` file, laid out as the data set's; `parse_camera` gives it back."""
+    lines = [f"{{ {CLASS_NAME}"]
+    if camera.sensor_to_tcp is not None:
+        lines += _pose_lines("sensor2Tcp", camera.sensor_to_tcp)
+    lines += _pose_lines("sensor2World", camera.robot_from_camera)
+    lines.append(f"mountIndex: {camera.mount_index}")
+    lines.append(
+        f"width: {camera.width} height: {camera.height} "
+        f"scaleX: {_shortest(camera.scale_x)} scaleY: {_shortest(camera.scale_y)} "
+        f"offsetX: {_shortest(camera.offset_x)} offsetY: {_shortest(camera.offset_y)}"
+    )
+    lines.append(f"coef: {{ {' '.join(_shortest(c) for c in camera.coef)} }}")
+    lines += [f"{key}: {text}" for key, text in camera.unknown]
+    return "\n".join([*lines, "}", ""])
+
+
+def write_camera(camera: Camera, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
+    """Write a ``.cam`` file, whole or not at all; an existing one only with `overwrite`."""
+    with write_whole(path, overwrite=overwrite) as stream:
+        stream.write(format_camera(camera).encode())
+
+
+def _split(text: str, name: str) -> _Entries:
+    """Split the text into keys and the tokens of their values, checking braces and brackets."""
+    tokens = [
+        (match.group(), number)
+        for number, line in enumerate(text.splitlines(), start=1)
+        for match in _TOKEN.finditer(line.partition("#")[0])
+    ]
+    words = [token for token, _ in tokens]
+    if words[:2] != ["{", CLASS_NAME]:
+        found = _excerpt(" ".join(words[:2])) if words else "nothing"
+        raise CameraError(f"{name}: begins with {found}: expected {{ {CLASS_NAME}")
+    entries: _Entries = {}
+    closing = {"{": "}", "[": "]"}
+    open_until: list[str] = []
+    key = ""
+    position = 2
+    while position < len(tokens):
+        token, line = tokens[position]
+        is_key = not open_until and position + 1 < len(tokens) and words[position + 1] == ":"
+        if is_key and token not in "{}[]:":
+            if token in entries:
+                raise CameraError(f"{name}:{line}: {_excerpt(token)} is given twice")
+            key = token
+            entries[key] = []
+            position += 2
+            continue
+        if token == "}" and not open_until:
+            if position + 1 != len(tokens):
+                following = tokens[position + 1][1]
+                raise CameraError(f"{name}:{following}: text after the closing brace")
+            return entries
+        if token == ":" or not key:
+            raise CameraError(f"{name}:{line}: unexpected {_excerpt(token)}: expected 'key: value'")
+        if token in closing:
+            open_until.append(closing[token])
+        elif token in closing.values():
+            if not open_until or open_until.pop() != token:
+                raise CameraError(f"{name}:{line}: unexpected {token}")
+        entries[key].append((token, line))
+        position += 1
+    raise CameraError(f"{name}: ends before its closing brace")
+
+
+def _numbers(value: list[tuple[str, int]], key: str, count: int, name: str) -> list[float]:
+    numbers: list[float] = []
+    for token, line in value:
+        if token in "{}[]":
+            continue
+        try:
+            numbers.append(float(token))
+        except ValueError:
+            raise CameraError(
+                f"{name}:{line}: {key} has {_excerpt(token)}: expected a number"
+            ) from None
+        if not abs(numbers[-1]) < float("inf"):
+            raise CameraError(f"{name}:{line}: {key} has {token}: expected a finite number")
+    if len(numbers) != count:
+        where = f":{value[0][1]}" if value else ""
+        raise CameraError(f"{name}{where}: {key} has {len(numbers)} numbers: expected {count}")
+    return numbers
+
+
+def _rows(numbers: list[float]) -> Pose:
+    return tuple(
+        (numbers[k], numbers[k + 1], numbers[k + 2], numbers[k + 3]) for k in range(0, 12, 4)
+    )
+
+
+def _pose_lines(key: str, pose: Pose) -> list[str]:
+    rows = [f"[ {', '.join(_shortest(x) for x in row)} ]" for row in pose]
+    return [f"{key}: {rows[0]}", *rows[1:]]
+
+
+def _shortest(number: float) -> str:
+    """The shortest text that reads back as the same float."""
+    text = repr(float(number))
+    return text.removesuffix(".0")
+
+
+def _excerpt(text: str) -> str:
+    shown = ascii(text[:_LARGEST_EXCERPT])
+    return shown if len(text) <= _LARGEST_EXCERPT else f"{shown}..."

@@ -1,0 +1,396 @@
+"""What a pixel sees: the calibrated camera, from points to pixels and back.
+
+Frames and conventions
+----------------------
+pixel
+    (u, v), u right, v down, (0, 0) the *centre* of the top-left pixel.
+camera
+    x right, y down, z forward; metres.
+robot
+    origin on the floor at the robot's centre, X left, Y backward, Z up; metres.
+    The file calls the transform camera -> robot ``sensor2World``; here it is `robot_from_camera`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from camera.distortion import (
+    Coef,
+    fold_radius,
+    largest_distorted_radius,
+    radial_factor,
+    radial_factor_derivative,
+    undistorted_radius,
+)
+from camera.errors import CameraError
+
+FloatArray = NDArray[np.float64]
+Pose = tuple[tuple[float, float, float, float], ...]
+
+#: The published step of the central differences by which the data set's covariances were made.
+PUBLISHED_STEP_PX = 0.1
+
+_ROTATION_TOLERANCE = 1e-3
+_LARGEST_SIDE_PX = 65536
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A calibrated camera with rational radial distortion, mounted on a robot. A value.
+
+    Two cameras are equal, and hash alike, when all that they were made of is equal.
+
+    Parameters
+    ----------
+    width, height : int
+        Image size in pixels.
+    scale_x, scale_y : float
+        Focal lengths in pixels along u and v (different for single fields of interlaced frames).
+    offset_x, offset_y : float
+        Principal point in pixels.
+    coef : 5 floats
+        a2, a3, b1, b2, b3 of the distortion (see `camera.distortion`).
+    robot_from_camera : 3 rows of 4 floats
+        Rotation and translation camera -> robot (``sensor2World``), metres.
+    sensor_to_tcp : 3 rows of 4 floats, optional
+        The file's second transform, kept as it is.
+    mount_index : int
+        The file's ``mountIndex``.
+    unknown : tuple of (key, text)
+        Entries of a ``.cam`` file that mean nothing here; they survive reading and writing.
+
+    Raises
+    ------
+    CameraError
+        If a number is not finite, a size or scale not positive, the rotation not a rotation, or the
+        distortion folds inside the image.
+
+    References
+    ----------
+    DLR Spatial Cognition data set report, camera calibration.
+    """
+
+    width: int
+    height: int
+    scale_x: float
+    scale_y: float
+    offset_x: float
+    offset_y: float
+    coef: Coef
+    robot_from_camera: Pose
+    sensor_to_tcp: Pose | None = None
+    mount_index: int = 0
+    unknown: tuple[tuple[str, str], ...] = field(default=())
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "coef", tuple(float(c) for c in self.coef))
+        object.__setattr__(self, "robot_from_camera", _pose("sensor2World", self.robot_from_camera))
+        if self.sensor_to_tcp is not None:
+            object.__setattr__(self, "sensor_to_tcp", _pose("sensor2Tcp", self.sensor_to_tcp))
+        self._check()
+
+    def _check(self) -> None:
+        for name, side in (("width", self.width), ("height", self.height)):
+            if not 1 <= side <= _LARGEST_SIDE_PX:
+                raise CameraError(f"{name} is {side}: expected 1 to {_LARGEST_SIDE_PX} pixels")
+        if len(self.coef) != 5:
+            raise CameraError(f"coef has {len(self.coef)} numbers: expected 5 (a2 a3 b1 b2 b3)")
+        for name, value in (
+            ("scaleX", self.scale_x),
+            ("scaleY", self.scale_y),
+            ("offsetX", self.offset_x),
+            ("offsetY", self.offset_y),
+            *((f"coef {symbol}", c) for symbol, c in zip("a2 a3 b1 b2 b3".split(), self.coef)),
+        ):
+            if not math.isfinite(value):
+                raise CameraError(f"{name} is {value}: expected a finite number")
+        for name, value in (("scaleX", self.scale_x), ("scaleY", self.scale_y)):
+            if value <= 0.0:
+                raise CameraError(f"{name} is {value}: expected a positive number of pixels")
+        corner = self._farthest_corner()
+        seen = largest_distorted_radius(self.coef)
+        if not corner < seen:
+            raise CameraError(
+                f"the distortion folds inside the image: it grows only up to r = "
+                f"{fold_radius(self.coef):.6g}, seen at {seen:.6g}, while the image's corner lies "
+                f"at {corner:.6g}"
+            )
+
+    def _farthest_corner(self) -> float:
+        x = max(abs(self.offset_x), abs(self.width - 1 - self.offset_x)) / self.scale_x
+        y = max(abs(self.offset_y), abs(self.height - 1 - self.offset_y)) / self.scale_y
+        return math.hypot(x, y)
+
+    # -- the camera as arrays ---------------------------------------------------------------
+
+    @cached_property
+    def rotation(self) -> FloatArray:
+        """(3, 3) rotation camera -> robot; its columns are the camera's axes in the robot frame."""
+        return _read_only(np.array(self.robot_from_camera)[:, :3])
+
+    @cached_property
+    def centre(self) -> FloatArray:
+        """(3,) position of the camera's centre in the robot frame, metres."""
+        return _read_only(np.array(self.robot_from_camera)[:, 3])
+
+    @cached_property
+    def r_max(self) -> float:
+        """Undistorted radius up to which the projection is defined."""
+        return fold_radius(self.coef)
+
+    @cached_property
+    def content_hash(self) -> str:
+        """Hexadecimal digest of all that decides what a pixel sees; the key of cached tables."""
+        numbers = (
+            self.width, self.height, self.scale_x, self.scale_y, self.offset_x, self.offset_y,
+            *self.coef, *(x for row in self.robot_from_camera for x in row),
+        )  # fmt: skip
+        return hashlib.sha256(" ".join(float(n).hex() for n in numbers).encode()).hexdigest()
+
+    def __str__(self) -> str:
+        pitch_deg = math.degrees(math.asin(max(-1.0, min(1.0, -float(self.rotation[2, 2])))))
+        return (
+            f"{self.width}x{self.height} px, scale {self.scale_x:g} x {self.scale_y:g} px, "
+            f"centre {self.offset_x:g} {self.offset_y:g}, "
+            f"{self.centre[2]:.3f} m above the floor, looking {pitch_deg:.1f} deg down"
+        )
+
+    # -- camera frame <-> pixels ------------------------------------------------------------
+
+    def distort(self, normalised: ArrayLike) -> FloatArray:
+        """Pixels of undistorted normalised coordinates.
+
+        Parameters
+        ----------
+        normalised : (..., 2) array
+            x = px/pz, y = py/pz.
+
+        Returns
+        -------
+        (..., 2) array
+            u, v; both NaN past the distortion's fold.
+        """
+        xy = np.asarray(normalised, dtype=np.float64)
+        radius = np.hypot(xy[..., 0], xy[..., 1])
+        defined = radius <= self.r_max
+        factor = np.where(defined, radial_factor(np.where(defined, radius, 0.0), self.coef), np.nan)
+        return np.stack(
+            [
+                self.scale_x * xy[..., 0] * factor + self.offset_x,
+                self.scale_y * xy[..., 1] * factor + self.offset_y,
+            ],
+            axis=-1,
+        )
+
+    def undistort(self, pixels: ArrayLike) -> FloatArray:
+        """Undistorted normalised coordinates of pixels; the inverse of `distort`.
+
+        Parameters
+        ----------
+        pixels : (..., 2) array
+            u, v in pixels; need not be integers nor inside the image.
+
+        Returns
+        -------
+        (..., 2) array
+            x, y; both NaN where the pixel sees nothing (past the fold).
+        """
+        uv = np.asarray(pixels, dtype=np.float64)
+        x = (uv[..., 0] - self.offset_x) / self.scale_x
+        y = (uv[..., 1] - self.offset_y) / self.scale_y
+        factor = radial_factor(undistorted_radius(np.hypot(x, y), self.coef), self.coef)
+        return np.stack([x / factor, y / factor], axis=-1)
+
+    def project(self, points_camera: ArrayLike) -> FloatArray:
+        """Pixels of points in the camera frame.
+
+        Parameters
+        ----------
+        points_camera : (..., 3) array
+            Points in the camera frame, metres.
+
+        Returns
+        -------
+        (..., 2) array
+            u, v; both NaN for points not in front of the camera or past the distortion's fold.
+        """
+        p = np.asarray(points_camera, dtype=np.float64)
+        depth = np.where(p[..., 2] > 0.0, p[..., 2], np.nan)
+        return self.distort(p[..., :2] / depth[..., None])
+
+    def unproject(self, pixels: ArrayLike) -> FloatArray:
+        """Directions (x, y, 1) in the camera frame that pixels see.
+
+        Parameters
+        ----------
+        pixels : (..., 2) array
+            u, v in pixels.
+
+        Returns
+        -------
+        (..., 3) array
+            Directions with z = 1; all NaN past the fold.
+        """
+        xy = self.undistort(pixels)
+        ones = np.where(np.isnan(xy[..., :1]), np.nan, 1.0)
+        return np.concatenate([xy, ones], axis=-1)
+
+    # -- robot frame and floor --------------------------------------------------------------
+
+    def robot_to_camera(self, points_robot: ArrayLike) -> FloatArray:
+        """(..., 3) points of the robot frame in the camera frame, metres."""
+        return (np.asarray(points_robot, dtype=np.float64) - self.centre) @ self.rotation
+
+    def project_robot(self, points_robot: ArrayLike) -> FloatArray:
+        """(..., 2) pixels of (..., 3) points in the robot frame; NaN as in `project`."""
+        return self.project(self.robot_to_camera(points_robot))
+
+    def project_floor(self, floor_xy: ArrayLike) -> FloatArray:
+        """(..., 2) pixels of (..., 2) points on the floor (robot X, Y in metres)."""
+        xy = np.asarray(floor_xy, dtype=np.float64)
+        return self.project_robot(np.concatenate([xy, np.zeros_like(xy[..., :1])], axis=-1))
+
+    def directions_robot(self, pixels: ArrayLike) -> FloatArray:
+        """(..., 3) directions, in the robot frame and not normalised, that (..., 2) pixels see."""
+        return self.unproject(pixels) @ self.rotation.T
+
+    def floor_from_pixel(self, pixels: ArrayLike) -> FloatArray:
+        """Where the rays of pixels meet the floor.
+
+        Parameters
+        ----------
+        pixels : (..., 2) array
+            u, v in pixels.
+
+        Returns
+        -------
+        (..., 2) array
+            X, Y in the robot frame, metres; NaN where the ray does not come down to the floor.
+        """
+        direction = self.directions_robot(pixels)
+        down = np.where(direction[..., 2] * self.centre[2] < 0.0, direction[..., 2], np.nan)
+        along = -self.centre[2] / down
+        return np.asarray(self.centre[:2] + along[..., None] * direction[..., :2])
+
+    # -- Jacobians --------------------------------------------------------------------------
+
+    def distort_jacobian(self, normalised: ArrayLike) -> FloatArray:
+        """d(u, v) / d(x, y) of `distort`, analytic.
+
+        Parameters
+        ----------
+        normalised : (..., 2) array
+            Undistorted normalised coordinates.
+
+        Returns
+        -------
+        (..., 2, 2) array
+            Rows u, v; columns x, y; NaN past the fold.
+        """
+        xy = np.asarray(normalised, dtype=np.float64)
+        radius = np.hypot(xy[..., 0], xy[..., 1])
+        inside = np.where(radius <= self.r_max, radius, np.nan)
+        factor = radial_factor(inside, self.coef)
+        slope = radial_factor_derivative(inside, self.coef)
+        # d(x f)/dx = f + f' x^2 / r; at r = 0 the second term vanishes.
+        unit = xy / np.where(radius > 0.0, radius, 1.0)[..., None]
+        outer = slope[..., None, None] * xy[..., :, None] * unit[..., None, :]
+        jacobian = factor[..., None, None] * np.eye(2) + outer
+        return np.asarray(jacobian * np.array([[self.scale_x], [self.scale_y]]))
+
+    def project_jacobian(self, points_camera: ArrayLike) -> FloatArray:
+        """d(u, v) / d(point) of `project`, analytic.
+
+        Parameters
+        ----------
+        points_camera : (..., 3) array
+            Points in the camera frame, metres.
+
+        Returns
+        -------
+        (..., 2, 3) array
+            Pixels per metre; NaN where the projection is undefined.
+        """
+        p = np.asarray(points_camera, dtype=np.float64)
+        depth = np.where(p[..., 2] > 0.0, p[..., 2], np.nan)
+        xy = p[..., :2] / depth[..., None]
+        perspective = np.zeros((*p.shape[:-1], 2, 3))
+        perspective[..., 0, 0] = perspective[..., 1, 1] = 1.0
+        perspective[..., :, 2] = -xy
+        perspective /= depth[..., None, None]
+        return np.asarray(self.distort_jacobian(xy) @ perspective)
+
+    def floor_jacobian(self, pixels: ArrayLike) -> FloatArray:
+        """d(floor X, Y) / d(u, v) at pixels, analytic.
+
+        Parameters
+        ----------
+        pixels : (..., 2) array
+            u, v in pixels.
+
+        Returns
+        -------
+        (..., 2, 2) array
+            Metres per pixel, rows X, Y, columns u, v; NaN where the pixel does not see the floor.
+        """
+        floor_xy = self.floor_from_pixel(pixels)
+        point = np.concatenate([floor_xy, np.zeros_like(floor_xy[..., :1])], axis=-1)
+        pixels_per_metre = (
+            self.project_jacobian(self.robot_to_camera(point)) @ self.rotation.T[:, :2]
+        )
+        return _inverse_2x2(pixels_per_metre)
+
+    def floor_jacobian_published(self, pixels: ArrayLike) -> FloatArray:
+        """d(floor X, Y) / d(u, v) by central differences over +-0.1 px, as the data set has it.
+
+        Shapes as in `floor_jacobian`.
+        """
+        uv = np.asarray(pixels, dtype=np.float64)
+        step_u, step_v = np.array([PUBLISHED_STEP_PX, 0.0]), np.array([0.0, PUBLISHED_STEP_PX])
+        along_u = self.floor_from_pixel(uv + step_u) - self.floor_from_pixel(uv - step_u)
+        along_v = self.floor_from_pixel(uv + step_v) - self.floor_from_pixel(uv - step_v)
+        return np.asarray(np.stack([along_u, along_v], axis=-1) / (2.0 * PUBLISHED_STEP_PX))
+
+
+def _pose(name: str, rows: ArrayLike) -> Pose:
+    """Check a 3x4 rigid transform and return it as tuples."""
+    array = np.asarray(rows, dtype=np.float64)
+    if array.shape != (3, 4):
+        raise CameraError(f"{name} has shape {array.shape}: expected 3 rows of 4 numbers")
+    if not np.all(np.isfinite(array)):
+        raise CameraError(f"{name} has a number that is not finite")
+    rotation = array[:, :3]
+    deviation = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+    if deviation > _ROTATION_TOLERANCE:
+        raise CameraError(
+            f"{name} is not a rotation: R R^T differs from the identity by {deviation:.3g} "
+            f"(at most {_ROTATION_TOLERANCE:g})"
+        )
+    if np.linalg.det(rotation) < 0.0:
+        raise CameraError(f"{name} is not a rotation but a reflection: its determinant is -1")
+    return tuple((float(a), float(b), float(c), float(d)) for a, b, c, d in array)
+
+
+def _read_only(array: FloatArray) -> FloatArray:
+    array.setflags(write=False)
+    return array
+
+
+def _inverse_2x2(m: FloatArray) -> FloatArray:
+    """Inverse over the last two axes; NaN passes through (np.linalg.inv may raise on it)."""
+    determinant = m[..., 0, 0] * m[..., 1, 1] - m[..., 0, 1] * m[..., 1, 0]
+    adjugate = np.stack(
+        [
+            np.stack([m[..., 1, 1], -m[..., 0, 1]], axis=-1),
+            np.stack([-m[..., 1, 0], m[..., 0, 0]], axis=-1),
+        ],
+        axis=-2,
+    )
+    return np.asarray(adjugate / determinant[..., None, None])
