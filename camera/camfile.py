@@ -154,9 +154,8 @@ def _split(text: str, name: str) -> _Entries:
             raise CameraError(f"{name}:{line}: unexpected {_excerpt(token)}: expected 'key: value'")
         if token in closing:
             open_until.append(closing[token])
-        elif token in closing.values():
-            if not open_until or open_until.pop() != token:
-                raise CameraError(f"{name}:{line}: unexpected {token}")
+        elif token in closing.values() and (not open_until or open_until.pop() != token):
+            raise CameraError(f"{name}:{line}: unexpected {token}")
         entries[key].append((token, line))
         position += 1
     raise CameraError(f"{name}: ends before its closing brace")

@@ -107,7 +107,10 @@ class Camera:
             ("scaleY", self.scale_y),
             ("offsetX", self.offset_x),
             ("offsetY", self.offset_y),
-            *((f"coef {symbol}", c) for symbol, c in zip("a2 a3 b1 b2 b3".split(), self.coef)),
+            *(
+                (f"coef {symbol}", c)
+                for symbol, c in zip(["a2", "a3", "b1", "b2", "b3"], self.coef)
+            ),
         ):
             if not math.isfinite(value):
                 raise CameraError(f"{name} is {value}: expected a finite number")
