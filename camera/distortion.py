@@ -104,7 +104,7 @@ def _inverse_table(coef: Coef) -> tuple[NDArray[np.float64], NDArray[np.float64]
 
 
 def largest_distorted_radius(coef: Coef) -> float:
-    """Largest g, at the fold (or at `RADIUS_LIMIT`): no ray is seen at a larger distorted radius."""
+    """Largest distorted radius at which a ray is seen: g at the fold or at `RADIUS_LIMIT`."""
     return float(_inverse_table(coef)[0][-1])
 
 

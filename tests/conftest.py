@@ -1,0 +1,60 @@
+"""Options and data shared by all tests."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from camera import Camera, parse_camera
+
+ROOT = Path(__file__).resolve().parent.parent
+
+PUBLISHED_CAM = """\
+{ SmRadialDistortedCamera
+sensor2Tcp: [ 0.99992, -0.00994383, -0.00778315, -0.0820676 ]
+[ 0.00718218, -0.0591054, 0.998226, 0.142944 ]
+[ -0.0103862, -0.998202, -0.0590291, 0.0522051 ]
+sensor2World: [ -0.99992, 0.00994383, 0.00778315, 0.0179777 ]
+[ -0.00211987, 0.475426, -0.879753, -0.0808609 ]
+[ -0.0124484, -0.879699, -0.475367, 1.50354 ]
+mountIndex: 0
+width: 768 height: 288 scaleX: 464.762 scaleY: 232.381 offsetX: 384 offsetY: 144
+coef: { -0.0620672 -0.324903 0.314764 1.52524 -0.480806 }
+}
+"""
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption(
+        "--run",
+        action="append",
+        default=[],
+        metavar="DIR",
+        help="also re-detect this run folder and compare with its shipped rows (repeatable)",
+    )
+
+
+@pytest.fixture(scope="session")
+def published_cam_text() -> str:
+    """The calibration of run e as the report prints it."""
+    return PUBLISHED_CAM
+
+
+@pytest.fixture(scope="session")
+def published_camera() -> Camera:
+    return parse_camera(PUBLISHED_CAM)
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """Folder of photographs and numbers with truth that is not part of the project."""
+    folder = ROOT.parent / "shared" / "data"
+    if not folder.is_dir():
+        pytest.skip("the evaluation data (../shared/data) is not on this machine")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def project_root() -> Path:
+    return ROOT
