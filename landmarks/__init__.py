@@ -1,0 +1,54 @@
+"""Landmark records, their files, and the association of records.
+
+>>> from landmarks import read_frames
+>>> for frame in read_frames("images/e/map.circles"):          # doctest: +SKIP
+...     print(frame.step.prefix, [circle.ids for circle in frame.circles])
+"""
+
+from landmarks.arrays import CircleArrays, circle_arrays, circle_landmarks, is_positive_definite
+from landmarks.errors import LandmarkError, LandmarkFileError
+from landmarks.reading import (
+    frames_of_rows,
+    parse_record,
+    parse_rows,
+    read_frames,
+    read_rows,
+    read_steps,
+)
+from landmarks.records import (
+    CircleLandmark,
+    DetectorSettings,
+    Frame,
+    Landmark,
+    LineLandmark,
+    Record,
+    Row,
+    Step,
+)
+from landmarks.writing import format_record, write_frames, write_rows
+
+__all__ = [
+    "CircleArrays",
+    "CircleLandmark",
+    "DetectorSettings",
+    "Frame",
+    "Landmark",
+    "LandmarkError",
+    "LandmarkFileError",
+    "LineLandmark",
+    "Record",
+    "Row",
+    "Step",
+    "circle_arrays",
+    "circle_landmarks",
+    "format_record",
+    "frames_of_rows",
+    "is_positive_definite",
+    "parse_record",
+    "parse_rows",
+    "read_frames",
+    "read_rows",
+    "read_steps",
+    "write_frames",
+    "write_rows",
+]

@@ -1,0 +1,250 @@
+"""Reading landmark files: ``.circles``, ``.lines`` and the STEP rows of ``<run>.txt``.
+
+A file is read row by row as it is asked for, so that its size does not matter. Line ends may be
+LF or CRLF. ``#`` at the start of a word begins a comment. A trailing backslash continues a row, but
+not a comment: that would swallow the row after it.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+from landmarks.errors import LandmarkError, LandmarkFileError, excerpt
+from landmarks.records import (
+    CIRCLE_NUMBERS,
+    LINE_NUMBERS,
+    STEP_NUMBERS,
+    CircleLandmark,
+    DetectorSettings,
+    Frame,
+    Landmark,
+    LineLandmark,
+    Record,
+    Row,
+    Step,
+)
+
+_LONGEST_ROW_BYTES = 1 << 16
+_LONGEST_ID_DIGITS = 20
+_BYTE_ORDER_MARK = b"\xef\xbb\xbf"
+
+# Narrower than `float`, which also takes nan, infinity and 1_000.
+_NUMBER = re.compile(rb"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
+_WHOLE_NUMBER = re.compile(rb"[+-]?[0-9]+")
+
+
+def read_rows(path: str | os.PathLike[str]) -> Iterator[Row]:
+    """Read a landmark file row by row, comments and blank lines included.
+
+    Written back with `write_rows`, unchanged rows are byte-identical.
+
+    Parameters
+    ----------
+    path : path
+        The file. It is opened when the first row is asked for.
+
+    Yields
+    ------
+    Row
+        Each row with its record (None for comments and blank lines) and its text.
+
+    Raises
+    ------
+    LandmarkFileError
+        If the file cannot be opened, a row is malformed, or a landmark stands before any STEP; the
+        message names the file, the line and what was expected.
+    """
+    try:
+        with Path(path).open("rb") as stream:
+            yield from parse_rows(stream, name=os.fspath(path))
+    except FileNotFoundError:
+        raise LandmarkFileError(path, None, "no such landmark file") from None
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise LandmarkFileError(
+            path, None, f"cannot be read as a landmark file: {reason}"
+        ) from None
+
+
+def read_frames(path: str | os.PathLike[str]) -> Iterator[Frame]:
+    """Read a landmark file frame by frame: each STEP with the landmarks after it.
+
+    Parameters, errors and laziness are those of `read_rows`.
+    """
+    return frames_of_rows(read_rows(path))
+
+
+def read_steps(path: str | os.PathLike[str]) -> list[Step]:
+    """Read a run's odometry: the STEP rows of a ``.txt``, ``.circles`` or ``.lines`` file.
+
+    Parameters
+    ----------
+    path : path
+        The file.
+
+    Returns
+    -------
+    list of Step
+        In the file's order; landmarks are checked and left out.
+
+    Raises
+    ------
+    LandmarkFileError
+        As `read_rows`.
+    """
+    return [row.record for row in read_rows(path) if isinstance(row.record, Step)]
+
+
+def frames_of_rows(rows: Iterable[Row]) -> Iterator[Frame]:
+    """Gather rows to frames; comments and detector settings are left out."""
+    step: Step | None = None
+    landmarks: list[Landmark] = []
+    for row in rows:
+        if isinstance(row.record, Step):
+            if step is not None:
+                yield Frame(step, tuple(landmarks))
+            step = row.record
+            landmarks = []
+        elif isinstance(row.record, Landmark):
+            landmarks.append(row.record)
+    if step is not None:
+        yield Frame(step, tuple(landmarks))
+
+
+def parse_rows(stream: BinaryIO, name: str = "<stream>") -> Iterator[Row]:
+    """Read rows from a binary stream; `name` stands for the file in errors (see `read_rows`)."""
+    seen_step = False
+    for line, source, text in _logical_lines(stream, name):
+        try:
+            record = _parse(text)
+        except LandmarkError as error:
+            raise LandmarkFileError(name, line, str(error)) from None
+        if isinstance(record, Step):
+            seen_step = True
+        elif isinstance(record, Landmark) and not seen_step:
+            raise LandmarkFileError(name, line, "landmark before any STEP: expected a STEP first")
+        yield Row(record, source, line)
+
+
+def parse_record(text: str) -> Record | None:
+    """Make a record of one row's text; None for a comment or a blank line.
+
+    Raises
+    ------
+    LandmarkError
+        If the row is malformed; the message says what was expected.
+    """
+    return _parse(text.encode("utf-8", "surrogateescape"))
+
+
+def _logical_lines(stream: BinaryIO, name: str) -> Iterator[tuple[int, bytes, bytes]]:
+    """Yield each row's first line number, its text in the file, and the same joined to one line."""
+    number = 0
+
+    def next_line(length_so_far: int) -> bytes:
+        line = stream.readline(_LONGEST_ROW_BYTES + 1)
+        if length_so_far + len(line) > _LONGEST_ROW_BYTES:
+            raise LandmarkFileError(
+                name, number + 1, f"longer than {_LONGEST_ROW_BYTES} bytes: expected a row of text"
+            )
+        return line
+
+    while source := next_line(0):
+        number += 1
+        first = number
+        text = source.rstrip(b"\r\n")
+        if first == 1:
+            text = text.removeprefix(_BYTE_ORDER_MARK)
+        if text.lstrip().startswith(b"#"):
+            text = b""
+        while text.endswith(b"\\"):
+            following = next_line(len(source))
+            if not following:
+                raise LandmarkFileError(name, number, "ends with \\: expected a line to follow")
+            number += 1
+            source += following
+            text = text[:-1] + following.rstrip(b"\r\n")
+        yield first, source, text
+
+
+def _parse(text: bytes) -> Record | None:
+    words = text.split()
+    if b"#" in text:
+        comment = next((i for i, word in enumerate(words) if word.startswith(b"#")), len(words))
+        words = words[:comment]
+    if not words:
+        return None
+    keyword = words[0]
+    parse = _PARSERS.get(keyword)
+    if parse is not None:
+        return parse(words)
+    if keyword.endswith(b"DETECTOR"):
+        return DetectorSettings(_decode(keyword), tuple(map(_decode, words[1:])))
+    raise LandmarkError(
+        f"row starts with {excerpt(keyword)}: expected STEP, LANDMARK_C, LANDMARK_L or a # comment"
+    )
+
+
+def _parse_step(words: list[bytes]) -> Step:
+    if len(words) != 2 + len(STEP_NUMBERS):
+        raise LandmarkError(
+            f"STEP with {len(words) - 1} values: expected {1 + len(STEP_NUMBERS)}: "
+            f"prefix {' '.join(STEP_NUMBERS)}"
+        )
+    return Step(_decode(words[1]), *_numbers(words[2:], STEP_NUMBERS))
+
+
+def _parse_circle(words: list[bytes]) -> CircleLandmark:
+    numbers, ids = _numbers_and_ids(words, CIRCLE_NUMBERS)
+    px, py, quality, cxx, cxy, cyy = numbers
+    return CircleLandmark(px, py, quality, cxx, cxy, cyy, ids)
+
+
+def _parse_line(words: list[bytes]) -> LineLandmark:
+    numbers, ids = _numbers_and_ids(words, LINE_NUMBERS)
+    xtop, ytop, xbottom, ybottom, alpha, beta, quality, sigma = numbers
+    return LineLandmark(xtop, ytop, xbottom, ybottom, alpha, beta, quality, sigma, ids)
+
+
+_PARSERS: dict[bytes, Callable[[list[bytes]], Record]] = {
+    b"STEP": _parse_step,
+    b"LANDMARK_C": _parse_circle,
+    # What the comments at the head of the data set's files of circles call the row.
+    b"LANDMARK": _parse_circle,
+    b"LANDMARK_L": _parse_line,
+}
+
+
+def _numbers_and_ids(
+    words: list[bytes], names: tuple[str, ...]
+) -> tuple[list[float], tuple[int, ...]]:
+    if len(words) < 1 + len(names):
+        raise LandmarkError(
+            f"{_decode(words[0])} with {len(words) - 1} values: expected at least {len(names)}: "
+            f"{' '.join(names)} and any IDs"
+        )
+    numbers = _numbers(words[1 : 1 + len(names)], names)
+    return numbers, tuple(map(_identifier, words[1 + len(names) :]))
+
+
+def _numbers(words: list[bytes], names: tuple[str, ...]) -> list[float]:
+    numbers = []
+    for word, name in zip(words, names):
+        if not _NUMBER.fullmatch(word):
+            raise LandmarkError(f"{name} is {excerpt(word)}: expected a finite number")
+        numbers.append(float(word))
+    return numbers
+
+
+def _identifier(word: bytes) -> int:
+    if not _WHOLE_NUMBER.fullmatch(word) or len(word) > _LONGEST_ID_DIGITS:
+        raise LandmarkError(f"ID is {excerpt(word)}: expected a whole number, -1 if unknown")
+    return int(word)
+
+
+def _decode(word: bytes) -> str:
+    return word.decode("utf-8", "surrogateescape")

@@ -1,0 +1,242 @@
+"""The rows of landmark files as values.
+
+Robot frame: X left, Y backward (forward is -Y), origin on the floor below the robot's centre;
+metres and radians. The field names are the format's own.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from math import isfinite
+
+from landmarks.errors import LandmarkError, excerpt
+
+STEP_NUMBERS = ("dx", "dy", "dphi", "cxx", "cxy", "cyy", "cxphi", "cyphi", "cphiphi")
+CIRCLE_NUMBERS = ("px", "py", "quality", "cxx", "cxy", "cyy")
+LINE_NUMBERS = ("xtop", "ytop", "xbottom", "ybottom", "alpha", "beta", "quality", "sigma")
+
+_LARGEST_ID = 2**63 - 1
+_BLANK = re.compile(r"[ \t\n\r\v\f]")
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """A movement of the robot and the image taken after it.
+
+    Attributes
+    ----------
+    prefix : str
+        The image's name, usually without extension. Bytes of the file that are no UTF-8 are kept
+        as surrogates, as in Python's file names.
+    dx, dy, dphi : float
+        Pose after the movement in the robot frame before it (m, m, rad).
+    cxx, cxy, cyy, cxphi, cyphi, cphiphi : float
+        Covariance of (dx, dy, dphi) (m^2, m rad, rad^2).
+
+    Raises
+    ------
+    LandmarkError
+        If a number is not finite, or the prefix could not be read back from a file.
+    """
+
+    prefix: str
+    dx: float
+    dy: float
+    dphi: float
+    cxx: float
+    cxy: float
+    cyy: float
+    cxphi: float
+    cyphi: float
+    cphiphi: float
+
+    def __post_init__(self) -> None:
+        _demand_finite(self, STEP_NUMBERS)
+        _demand_word(self.prefix, "image prefix")
+
+
+@dataclass(frozen=True, slots=True)
+class CircleLandmark:
+    """A disc on the floor as seen in one image.
+
+    Attributes
+    ----------
+    px, py : float
+        The disc's centre in the robot frame (m).
+    quality : float
+        The detector's confidence, 0 (bad) to 1 (good).
+    cxx, cxy, cyy : float
+        Covariance of (px, py) (m^2).
+    ids : tuple of int
+        The disc's identifiers: usually one, -1 where it is unknown, empty where the row has none.
+
+    Raises
+    ------
+    LandmarkError
+        If a number is not finite or an identifier does not fit in 64 bits.
+    """
+
+    px: float
+    py: float
+    quality: float
+    cxx: float
+    cxy: float
+    cyy: float
+    ids: tuple[int, ...] = ()
+
+    def __post_init__(self) -> None:
+        _demand_finite(self, CIRCLE_NUMBERS)
+        _demand_ids(self.ids)
+
+    @property
+    def identified(self) -> bool:
+        """Whether the row says which disc this is."""
+        return _identified(self.ids)
+
+
+@dataclass(frozen=True, slots=True)
+class LineLandmark:
+    """A vertical line of the building as seen in one image.
+
+    Attributes
+    ----------
+    xtop, ytop, xbottom, ybottom : float
+        The line's ends in undistorted normalised image coordinates.
+    alpha : float
+        Bearing of the line, 0 forward and positive to the left (rad).
+    beta : float
+        Inclination of the plane through the camera's centre and the line (rad).
+    quality : float
+        The detector's confidence; always 0 in the data set's own files.
+    sigma : float
+        Standard deviation of `alpha` (rad).
+    ids : tuple of int
+        The line's identifiers, as in `CircleLandmark`.
+
+    Raises
+    ------
+    LandmarkError
+        If a number is not finite or an identifier does not fit in 64 bits.
+    """
+
+    xtop: float
+    ytop: float
+    xbottom: float
+    ybottom: float
+    alpha: float
+    beta: float
+    quality: float
+    sigma: float
+    ids: tuple[int, ...] = ()
+
+    def __post_init__(self) -> None:
+        _demand_finite(self, LINE_NUMBERS)
+        _demand_ids(self.ids)
+
+    @property
+    def identified(self) -> bool:
+        """Whether the row says which line this is."""
+        return _identified(self.ids)
+
+
+@dataclass(frozen=True, slots=True)
+class DetectorSettings:
+    """How a detector was set, as the data set's files may say at their head.
+
+    The data set knows ``CIRCLEMARKDETECTOR <camfile> nohalf|half <radius> <threshold>``.
+
+    Attributes
+    ----------
+    keyword : str
+        The row's first word, ending in DETECTOR.
+    words : tuple of str
+        The others, as they are.
+
+    Raises
+    ------
+    LandmarkError
+        If the row could not be read back from a file.
+    """
+
+    keyword: str
+    words: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        for word in (self.keyword, *self.words):
+            _demand_word(word, "word of detector settings")
+        if not self.keyword.endswith("DETECTOR"):
+            shown = excerpt(self.keyword.encode("utf-8", "surrogatepass"))
+            raise LandmarkError(f"keyword is {shown}: expected one that ends in DETECTOR")
+
+
+Landmark = CircleLandmark | LineLandmark
+Record = Step | Landmark | DetectorSettings
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """A step and what was seen in the image taken after it."""
+
+    step: Step
+    landmarks: tuple[Landmark, ...] = ()
+
+    @property
+    def circles(self) -> tuple[CircleLandmark, ...]:
+        """The discs among the landmarks, in the file's order."""
+        return tuple(row for row in self.landmarks if isinstance(row, CircleLandmark))
+
+    @property
+    def lines(self) -> tuple[LineLandmark, ...]:
+        """The lines among the landmarks, in the file's order."""
+        return tuple(row for row in self.landmarks if isinstance(row, LineLandmark))
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """A row of a landmark file together with the text it was read from.
+
+    Attributes
+    ----------
+    record : Record or None
+        What the row says; None for comments and blank lines.
+    source : bytes or None
+        The row's text in the file, continuation lines and line end included; None for a row that
+        was not read from a file, or was changed since.
+    line : int
+        The number of the row's first line in its file, counted from 1; 0 without a file.
+    """
+
+    record: Record | None
+    source: bytes | None = None
+    line: int = 0
+
+    def with_record(self, record: Record) -> Row:
+        """Return the row saying `record`; its text is kept only if that says the same already."""
+        return self if record == self.record else Row(record, line=self.line)
+
+
+def _demand_finite(record: object, names: tuple[str, ...]) -> None:
+    for name in names:
+        value = getattr(record, name)
+        if not isfinite(value):
+            raise LandmarkError(f"{name} is {value}: expected a finite number")
+
+
+def _demand_word(word: str, name: str) -> None:
+    """Refuse what a file would not give back as one word."""
+    if not word or word.startswith("#") or word.endswith("\\") or _BLANK.search(word):
+        shown = excerpt(word.encode("utf-8", "surrogatepass"))
+        raise LandmarkError(
+            f"{name} is {shown}: expected one word that starts with no # and ends with no backslash"
+        )
+
+
+def _demand_ids(ids: tuple[int, ...]) -> None:
+    for identifier in ids:
+        if not -_LARGEST_ID <= identifier <= _LARGEST_ID:
+            raise LandmarkError(f"ID is {identifier:.6g}: expected at most 64 bits")
+
+
+def _identified(ids: tuple[int, ...]) -> bool:
+    return any(identifier >= 0 for identifier in ids)

@@ -1,0 +1,128 @@
+"""Writing landmark files, laid out as the data set's own."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from typing import Literal
+
+from landmarks.records import (
+    CircleLandmark,
+    DetectorSettings,
+    Frame,
+    Record,
+    Row,
+    Step,
+)
+from storage import write_whole
+
+LineEnd = Literal["\n", "\r\n"]
+
+
+def format_record(record: Record) -> str:
+    """Lay a record out as a row of a file, without line end.
+
+    Poses of steps have 5 decimals and their covariances 12, as C's ``%8.5f`` and ``%.12f``;
+    landmarks have 6 significant digits, as C's ``%g``.
+    """
+    if isinstance(record, Step):
+        return (
+            f"STEP {record.prefix} {record.dx:8.5f} {record.dy:8.5f} {record.dphi:8.5f} "
+            f"{record.cxx:.12f} {record.cxy:.12f} {record.cyy:.12f} "
+            f"{record.cxphi:.12f} {record.cyphi:.12f} {record.cphiphi:.12f}"
+        )
+    if isinstance(record, DetectorSettings):
+        return " ".join([record.keyword, *record.words])
+    if isinstance(record, CircleLandmark):
+        text = (
+            f"LANDMARK_C {record.px:g} {record.py:g} {record.quality:g} "
+            f"{record.cxx:g} {record.cxy:g} {record.cyy:g}"
+        )
+    else:
+        text = (
+            f"LANDMARK_L {record.xtop:g} {record.ytop:g} {record.xbottom:g} {record.ybottom:g} "
+            f"{record.alpha:g} {record.beta:g} {record.quality:g} {record.sigma:g}"
+        )
+    return " ".join([text, *(f"{identifier:d}" for identifier in record.ids)])
+
+
+def write_frames(
+    path: str | os.PathLike[str],
+    frames: Iterable[Frame],
+    *,
+    head: str = "",
+    line_end: LineEnd = "\n",
+    overwrite: bool = False,
+) -> None:
+    """Write frames to a landmark file, whole or not at all.
+
+    Parameters
+    ----------
+    path : path
+        Where the file will be.
+    frames : iterable of Frame
+        Written as they come: they need not be in memory at once.
+    head : str
+        Text that stands above them, each of its lines as a comment.
+    line_end : str
+        LF, or CRLF as in the data set's own files.
+    overwrite : bool
+        Whether an existing file may be replaced.
+
+    Raises
+    ------
+    storage.OutputExistsError
+        If `path` exists and `overwrite` is false.
+    OSError
+        If the folder cannot be written to.
+    """
+    with write_whole(path, overwrite=overwrite) as stream:
+        for line in head.split("\n") if head else []:
+            stream.write(_encode(f"# {line}".rstrip() + line_end))
+        for frame in frames:
+            for record in (frame.step, *frame.landmarks):
+                stream.write(_encode(format_record(record) + line_end))
+
+
+def write_rows(
+    path: str | os.PathLike[str], rows: Iterable[Row], *, overwrite: bool = False
+) -> None:
+    """Write rows to a landmark file, whole or not at all; unchanged ones byte by byte.
+
+    Parameters
+    ----------
+    path : path
+        Where the file will be; may be the one that the rows are being read from.
+    rows : iterable of Row
+        Rows that have their text are copied; the others are laid out by `format_record` and end
+        like the row before them.
+    overwrite : bool
+        Whether an existing file may be replaced.
+
+    Raises
+    ------
+    storage.OutputExistsError
+        If `path` exists and `overwrite` is false.
+    OSError
+        If the folder cannot be written to.
+    """
+    line_end = b"\n"
+    unfinished = False
+    with write_whole(path, overwrite=overwrite) as stream:
+        for row in rows:
+            if unfinished:  # what was the file's last line, without a line end, no longer is
+                stream.write(line_end)
+            if row.source is not None:
+                text = row.source
+            elif row.record is not None:
+                text = _encode(format_record(row.record)) + line_end
+            else:
+                text = line_end
+            unfinished = not text.endswith(b"\n")
+            if not unfinished:
+                line_end = b"\r\n" if text.endswith(b"\r\n") else b"\n"
+            stream.write(text)
+
+
+def _encode(text: str) -> bytes:
+    return text.encode("utf-8", "surrogateescape")
