@@ -6,6 +6,15 @@
 """
 
 from landmarks.arrays import CircleArrays, circle_arrays, circle_landmarks, is_positive_definite
+from landmarks.association import (
+    Association,
+    associate,
+    associate_bearings,
+    associate_positions,
+    associate_within_covariance,
+    squared_mahalanobis,
+    wrap_angle,
+)
 from landmarks.errors import LandmarkError, LandmarkFileError
 from landmarks.reading import (
     frames_of_rows,
@@ -28,6 +37,7 @@ from landmarks.records import (
 from landmarks.writing import format_record, write_frames, write_rows
 
 __all__ = [
+    "Association",
     "CircleArrays",
     "CircleLandmark",
     "DetectorSettings",
@@ -39,6 +49,10 @@ __all__ = [
     "Record",
     "Row",
     "Step",
+    "associate",
+    "associate_bearings",
+    "associate_positions",
+    "associate_within_covariance",
     "circle_arrays",
     "circle_landmarks",
     "format_record",
@@ -49,6 +63,8 @@ __all__ = [
     "read_frames",
     "read_rows",
     "read_steps",
+    "squared_mahalanobis",
+    "wrap_angle",
     "write_frames",
     "write_rows",
 ]

@@ -1,0 +1,205 @@
+"""Which row of one set is which row of another: gated, one to one, optimal."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+FloatArray = NDArray[np.float64]
+IndexArray = NDArray[np.intp]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Association:
+    """Pairs of rows of two sets; no row is in two pairs.
+
+    Attributes
+    ----------
+    first, second : (M,) intp
+        The pairs: row `first[k]` of the first set belongs to row `second[k]` of the second. `first`
+        ascends.
+    first_alone, second_alone : intp
+        The rows of each set that are in no pair, ascending.
+    """
+
+    first: IndexArray
+    second: IndexArray
+    first_alone: IndexArray
+    second_alone: IndexArray
+
+
+def associate(costs: ArrayLike, allowed: ArrayLike) -> Association:
+    """Pair the rows of two sets: as many pairs as possible, and of those the least total cost.
+
+    The pairs that are allowed fall apart into small groups of rows that compete; each is solved on
+    its own as a linear assignment problem. Deterministic; where several solutions have the same
+    number of pairs and the same cost, which one comes out may depend on the order of the rows.
+
+    Parameters
+    ----------
+    costs : (N, M) array_like
+        Cost of pairing row n of the first set with row m of the second, at least 0. Whatever stands
+        where a pair is not allowed is not looked at.
+    allowed : (N, M) array_like of bool
+        The gate.
+
+    Returns
+    -------
+    Association
+        The pairs and what is left over.
+
+    Raises
+    ------
+    ValueError
+        If the shapes differ or an allowed cost is negative or not finite.
+    """
+    from scipy.optimize import linear_sum_assignment
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    cost = np.asarray(costs, dtype=np.float64)
+    gate = np.asarray(allowed, dtype=np.bool_)
+    if cost.ndim != 2 or cost.shape != gate.shape:
+        raise ValueError(f"costs {cost.shape}, allowed {gate.shape}: expected both (N, M)")
+    rows, columns = np.nonzero(gate)
+    if not (np.isfinite(cost[gate]) & (cost[gate] >= 0)).all():
+        raise ValueError("a cost is negative or not finite where a pair is allowed")
+
+    n_first, n_second = cost.shape
+    edges = coo_array(
+        (np.ones(len(rows)), (rows, n_first + columns)), shape=(n_first + n_second,) * 2
+    )
+    _, group = connected_components(edges, directed=False)
+    partner = np.full(n_first, -1, dtype=np.intp)
+    for label in np.unique(group[rows]):
+        some_first = np.flatnonzero(group[:n_first] == label)
+        some_second = np.flatnonzero(group[n_first:] == label)
+        block = np.ix_(some_first, some_second)
+        # One forbidden pair costs more than all allowed ones together: no more are taken than must.
+        scale = cost[block][gate[block]].max() or 1.0
+        forbidden = 1.0 + min(gate[block].shape)
+        solved = linear_sum_assignment(np.where(gate[block], cost[block] / scale, forbidden))
+        for i, j in zip(some_first[solved[0]], some_second[solved[1]]):
+            if gate[i, j]:
+                partner[i] = j
+
+    first = np.flatnonzero(partner >= 0)
+    second = partner[first]
+    return Association(
+        first=first,
+        second=second,
+        first_alone=np.flatnonzero(partner < 0),
+        second_alone=np.setdiff1d(np.arange(n_second), second),
+    )
+
+
+def associate_positions(first: ArrayLike, second: ArrayLike, *, gate_m: float) -> Association:
+    """Pair positions that lie within `gate_m` of each other, with least squared distances.
+
+    Parameters
+    ----------
+    first, second : (N, 2), (M, 2) array_like
+        Positions in one frame (m).
+    gate_m : float
+        Largest distance of a pair (m), at least 0.
+
+    Returns
+    -------
+    Association
+        See `associate`.
+    """
+    distance = np.linalg.norm(_differences(first, second), axis=-1)
+    return associate(distance**2, distance <= gate_m)
+
+
+def associate_within_covariance(
+    first: ArrayLike, second: ArrayLike, covariance: ArrayLike, *, gate_sigma: float
+) -> Association:
+    """Pair positions by their Mahalanobis distance.
+
+    Parameters
+    ----------
+    first, second : (N, 2), (M, 2) array_like
+        Positions in one frame (m).
+    covariance : (N, 2, 2) or (N, M, 2, 2) array_like
+        Positive definite covariance of each position of the first set, or of each difference (m^2).
+    gate_sigma : float
+        Largest Mahalanobis distance of a pair (standard deviations), at least 0.
+
+    Returns
+    -------
+    Association
+        See `associate`.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If a covariance is singular.
+    ValueError
+        If one makes a squared distance negative.
+    """
+    offset = _differences(first, second)
+    spread = np.asarray(covariance, dtype=np.float64)
+    if spread.ndim == 3:
+        spread = spread[:, np.newaxis]
+    squared = squared_mahalanobis(offset, spread)
+    return associate(squared, squared <= gate_sigma**2)
+
+
+def associate_bearings(first: ArrayLike, second: ArrayLike, *, gate_rad: float) -> Association:
+    """Pair bearings that lie within `gate_rad` of each other round the circle.
+
+    Parameters
+    ----------
+    first, second : (N,), (M,) array_like
+        Bearings (rad), of any turn.
+    gate_rad : float
+        Largest difference of a pair (rad), at least 0.
+
+    Returns
+    -------
+    Association
+        See `associate`; squared differences are least.
+    """
+    bearings = np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64)
+    difference = wrap_angle(bearings[0][:, np.newaxis] - bearings[1])
+    return associate(difference**2, np.abs(difference) <= gate_rad)
+
+
+def squared_mahalanobis(offset: ArrayLike, covariance: ArrayLike) -> FloatArray:
+    """Square of the Mahalanobis distance, ``offset' covariance^-1 offset``.
+
+    Parameters
+    ----------
+    offset : (..., n) array_like
+        Differences.
+    covariance : (..., n, n) array_like
+        Their positive definite covariances; broadcast against `offset`.
+
+    Returns
+    -------
+    (...) float64
+        Squared distances in standard deviations.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If a covariance is singular.
+    """
+    difference = np.asarray(offset, dtype=np.float64)
+    solved = np.linalg.solve(np.asarray(covariance, dtype=np.float64), difference[..., np.newaxis])
+    return np.asarray(np.einsum("...i,...i->...", difference, solved[..., 0]), dtype=np.float64)
+
+
+def wrap_angle(angle_rad: ArrayLike) -> FloatArray:
+    """Bring angles into [-pi, pi) (rad)."""
+    angle = np.asarray(angle_rad, dtype=np.float64)
+    return np.asarray((angle + np.pi) % (2 * np.pi) - np.pi, dtype=np.float64)
+
+
+def _differences(first: ArrayLike, second: ArrayLike) -> FloatArray:
+    """All (N, M, 2) differences between two sets of positions."""
+    positions = [np.asarray(xy, dtype=np.float64).reshape(-1, 2) for xy in (first, second)]
+    return np.asarray(positions[0][:, np.newaxis] - positions[1], dtype=np.float64)
