@@ -1,0 +1,302 @@
+"""Detected discs held against reference rows of the same run.
+
+Frames are matched by the names of their images; in each, detected rows are paired with reference
+rows one to one within a gate. What is left over on either side is missed or extra.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import accumulate, pairwise
+from math import inf, isfinite
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from detect.compare_result import (
+    CompareError,
+    CompareOptions,
+    Comparison,
+    DistanceBin,
+    ErrorCovariance,
+    FrameScore,
+    NormalisedError,
+)
+from landmarks import (
+    Association,
+    CircleLandmark,
+    Frame,
+    associate_positions,
+    associate_within_covariance,
+    circle_arrays,
+    is_positive_definite,
+    read_frames,
+    squared_mahalanobis,
+)
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+# The forward distances for which the data set's own qualities are known.
+DISTANCE_EDGES_M = (0.8, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0)
+_IMAGE_EXTENSIONS = (".jpg", ".jpeg", ".png", ".pgm", ".ppm", ".bmp", ".tif", ".tiff")
+_LONGEST_SHOWN_NAME = 80
+_BAND = (0.025, 0.975)
+
+
+def compare_runs(
+    run: str | os.PathLike[str],
+    *,
+    reference: str | os.PathLike[str] | None = None,
+    detected: str | os.PathLike[str] | None = None,
+    options: CompareOptions | None = None,
+) -> Comparison:
+    """Compare a run's detected discs with its reference rows.
+
+    Parameters
+    ----------
+    run : path
+        The run's folder.
+    reference, detected : path, optional
+        By default ``map.circles`` and ``detected.circles`` in that folder.
+    options : CompareOptions, optional
+        What counts as the same disc, and which rows count.
+
+    Returns
+    -------
+    Comparison
+        The figures.
+
+    Raises
+    ------
+    landmarks.LandmarkFileError
+        If a file cannot be read.
+    CompareError
+        If a frame occurs twice in a file, or the gate needs a reference row's covariance and that
+        is not positive definite.
+    """
+    reference = Path(run) / "map.circles" if reference is None else reference
+    detected = Path(run) / "detected.circles" if detected is None else detected
+    return compare_frames(
+        read_frames(reference),
+        read_frames(detected),
+        options or CompareOptions(),
+        reference_name=os.fspath(reference),
+        detected_name=os.fspath(detected),
+    )
+
+
+def compare_frames(
+    reference: Iterable[Frame],
+    detected: Iterable[Frame],
+    options: CompareOptions,
+    *,
+    reference_name: str = "reference",
+    detected_name: str = "detected",
+) -> Comparison:
+    """Compare the discs of two sets of frames; the names stand for them in errors and reports.
+
+    See `compare_runs`.
+    """
+    reference_rows = _rows_by_image(reference, reference_name)
+    detected_rows = _rows_by_image(detected, detected_name)
+    only_in_reference = tuple(name for name in reference_rows if name not in detected_rows)
+    only_in_detected = tuple(name for name in detected_rows if name not in reference_rows)
+    if options.all_frames:
+        names = [*reference_rows, *only_in_detected]
+    else:
+        names = [name for name in reference_rows if name in detected_rows]
+    matches = [
+        _match_frame(name, reference_rows.get(name, ()), detected_rows.get(name, ()), options)
+        for name in names
+    ]
+    wanted = _pool([(match.reference, match.pairs.first) for match in matches])
+    found = _pool([(match.detected, match.pairs.second) for match in matches])
+    offset_xy = found.xy[found.paired] - wanted.xy[wanted.paired]
+    error_m = np.asarray(np.linalg.norm(offset_xy, axis=1), dtype=np.float64)
+    return Comparison(
+        reference_name=reference_name,
+        detected_name=detected_name,
+        options=options,
+        reference=len(wanted.xy),
+        detected=len(found.xy),
+        matched=len(error_m),
+        set_aside=sum(match.set_aside for match in matches),
+        recall=_mean(wanted.is_paired),
+        precision=_mean(found.is_paired),
+        error_median_m=_quantile(error_m, 0.5),
+        error_95_m=_quantile(error_m, 0.95),
+        normalised_error=_normalised_error(
+            offset_xy, _error_covariance(wanted, found, options.error_covariance)
+        ),
+        reference_quality_matched=_quantile(wanted.quality[wanted.is_paired], 0.5),
+        reference_quality_missed=_quantile(wanted.quality[~wanted.is_paired], 0.5),
+        detected_quality_matched=_quantile(found.quality[found.is_paired], 0.5),
+        detected_quality_extra=_quantile(found.quality[~found.is_paired], 0.5),
+        bins=tuple(
+            _distance_bin(from_m, to_m, wanted, found, error_m)
+            for from_m, to_m in pairwise((-inf, *DISTANCE_EDGES_M, inf))
+        ),
+        frames=_frame_scores(matches, error_m),
+        frames_only_in_reference=only_in_reference,
+        frames_only_in_detected=only_in_detected,
+    )
+
+
+def image_name(prefix: str) -> str:
+    """Name of an image without directories (of either system) and image extension."""
+    name = prefix.replace("\\", "/").rpartition("/")[2]
+    # Not just any suffix: the data set's prefixes end in a number, as in e.0067.
+    stem, dot, extension = name.rpartition(".")
+    return stem if stem and (dot + extension).lower() in _IMAGE_EXTENSIONS else name
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _FrameMatch:
+    """One frame's rows that count, and which of them belong together."""
+
+    name: str
+    reference: Sequence[CircleLandmark]
+    detected: Sequence[CircleLandmark]
+    pairs: Association
+    set_aside: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Pool:
+    """All rows of one side that count; `paired` are those in pairs, in the order of the pairs."""
+
+    xy: FloatArray
+    quality: FloatArray
+    covariance: FloatArray
+    paired: NDArray[np.intp]
+    is_paired: BoolArray
+
+
+def _rows_by_image(frames: Iterable[Frame], name: str) -> dict[str, tuple[CircleLandmark, ...]]:
+    rows: dict[str, tuple[CircleLandmark, ...]] = {}
+    for frame in frames:
+        image = image_name(frame.step.prefix)
+        if image in rows:
+            raise CompareError(f"{name}: two frames of image {_shown(image)}: expected one")
+        rows[image] = frame.circles
+    return rows
+
+
+def _match_frame(
+    name: str,
+    reference: Sequence[CircleLandmark],
+    detected: Sequence[CircleLandmark],
+    options: CompareOptions,
+) -> _FrameMatch:
+    measurable = is_positive_definite(circle_arrays(reference).covariance)
+    if options.sigma is not None and not measurable.all():
+        raise CompareError(
+            f"frame {_shown(name)}: a reference row's covariance is not positive definite: "
+            "expected one to measure sigmas in; a gate in metres needs none"
+        )
+    counted = [row for row in reference if row.identified or not options.only_identified]
+    uncounted = [row for row in reference if not row.identified and options.only_identified]
+    pairs = _pair_up(counted, detected, options)
+    set_aside = 0
+    if uncounted:
+        alone = [detected[i] for i in pairs.second_alone]
+        aside = _pair_up(uncounted, alone, options)
+        set_aside = len(aside.second)
+        kept = sorted([*pairs.second, *pairs.second_alone[aside.second_alone]])
+        detected = [detected[i] for i in kept]
+        pairs = _pair_up(counted, detected, options)
+    return _FrameMatch(name, counted, detected, pairs, set_aside)
+
+
+def _pair_up(
+    reference: Sequence[CircleLandmark], detected: Sequence[CircleLandmark], options: CompareOptions
+) -> Association:
+    first, second = circle_arrays(reference), circle_arrays(detected)
+    if options.sigma is None:
+        return associate_positions(first.xy, second.xy, gate_m=options.gate_m)
+    return associate_within_covariance(
+        first.xy, second.xy, first.covariance, gate_sigma=options.sigma
+    )
+
+
+def _pool(frames: Sequence[tuple[Sequence[CircleLandmark], NDArray[np.intp]]]) -> _Pool:
+    arrays = circle_arrays([row for rows, _ in frames for row in rows])
+    starts = accumulate((len(rows) for rows, _ in frames), initial=0)
+    paired = np.array(
+        [start + i for start, (_, indices) in zip(starts, frames) for i in indices], dtype=np.intp
+    )
+    is_paired = np.zeros(len(arrays.xy), dtype=np.bool_)
+    is_paired[paired] = True
+    return _Pool(arrays.xy, arrays.quality, arrays.covariance, paired, is_paired)
+
+
+def _error_covariance(wanted: _Pool, found: _Pool, source: ErrorCovariance) -> FloatArray:
+    if source == "detected":
+        return found.covariance[found.paired]
+    if source == "reference":
+        return wanted.covariance[wanted.paired]
+    return wanted.covariance[wanted.paired] + found.covariance[found.paired]
+
+
+def _normalised_error(offset_xy: FloatArray, covariance: FloatArray) -> NormalisedError:
+    from scipy.stats import chi2
+
+    usable = is_positive_definite(covariance)
+    dof = 2 * int(usable.sum())
+    left_out = len(usable) - int(usable.sum())
+    if dof == 0:
+        return NormalisedError(per_dof=None, dof=0, band=None, left_out=left_out)
+    squared = squared_mahalanobis(offset_xy[usable], covariance[usable])
+    low, high = (float(chi2.ppf(p, dof)) / dof for p in _BAND)
+    return NormalisedError(float(squared.sum()) / dof, dof, (low, high), left_out)
+
+
+def _distance_bin(
+    from_m: float, to_m: float, wanted: _Pool, found: _Pool, error_m: FloatArray
+) -> DistanceBin:
+    wanted_here, found_here = (
+        (from_m <= -pool.xy[:, 1]) & (-pool.xy[:, 1] < to_m) for pool in (wanted, found)
+    )
+    return DistanceBin(
+        from_m=from_m if isfinite(from_m) else None,
+        to_m=to_m if isfinite(to_m) else None,
+        reference=int(wanted_here.sum()),
+        missed=int((wanted_here & ~wanted.is_paired).sum()),
+        detected=int(found_here.sum()),
+        extra=int((found_here & ~found.is_paired).sum()),
+        recall=_mean(wanted.is_paired[wanted_here]),
+        precision=_mean(found.is_paired[found_here]),
+        reference_quality_median=_quantile(wanted.quality[wanted_here], 0.5),
+        detected_quality_median=_quantile(found.quality[found_here], 0.5),
+        error_median_m=_quantile(error_m[wanted_here[wanted.paired]], 0.5),
+    )
+
+
+def _frame_scores(matches: Sequence[_FrameMatch], error_m: FloatArray) -> tuple[FrameScore, ...]:
+    ends = list(accumulate(len(match.pairs.first) for match in matches))
+    return tuple(
+        FrameScore(
+            name=match.name,
+            matched=len(match.pairs.first),
+            missed=len(match.pairs.first_alone),
+            extra=len(match.pairs.second_alone),
+            largest_error_m=_quantile(error_m[end - len(match.pairs.first) : end], 1.0),
+        )
+        for match, end in zip(matches, ends)
+    )
+
+
+def _shown(image: str) -> str:
+    return repr(image[:_LONGEST_SHOWN_NAME])
+
+
+def _mean(mask: BoolArray) -> float | None:
+    return float(mask.mean()) if len(mask) else None
+
+
+def _quantile(values: FloatArray, q: float) -> float | None:
+    return float(np.quantile(values, q)) if len(values) else None

@@ -1,0 +1,182 @@
+"""What a comparison of two runs is asked for, and what it answers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from math import isfinite
+from typing import Literal
+
+ErrorCovariance = Literal["detected", "reference", "sum"]
+
+
+class CompareError(ValueError):
+    """Two runs that cannot be compared; the message says which file or frame and why."""
+
+
+@dataclass(frozen=True, slots=True)
+class CompareOptions:
+    """What counts as the same disc, and which rows count.
+
+    Attributes
+    ----------
+    gate_m : float
+        Largest distance between a detected and a reference row of the same disc (m).
+    sigma : float or None
+        If given, used instead: the largest Mahalanobis distance under the reference row's
+        covariance (standard deviations).
+    only_identified : bool
+        Count only reference rows that have an ID. Detected rows that fit a reference row without
+        one are then neither right nor wrong: they are set aside.
+    all_frames : bool
+        Count frames that only one file has, too: all their rows are missed, or extra.
+    error_covariance : {"detected", "reference", "sum"}
+        Which covariance position errors are measured in: the detected row's, the reference row's,
+        or, where both err independently, their sum.
+    """
+
+    gate_m: float = 0.10
+    sigma: float | None = None
+    only_identified: bool = False
+    all_frames: bool = False
+    error_covariance: ErrorCovariance = "detected"
+
+    def __post_init__(self) -> None:
+        for name, gate in (("gate_m", self.gate_m), ("sigma", self.sigma)):
+            if gate is not None and not (isfinite(gate) and gate > 0):
+                raise CompareError(f"{name} is {gate}: expected a positive number")
+
+
+@dataclass(frozen=True, slots=True)
+class FrameScore:
+    """What became of one frame's rows."""
+
+    name: str
+    matched: int
+    missed: int
+    extra: int
+    largest_error_m: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class DistanceBin:
+    """Rows at a range of forward distances; reference and detected rows each by their own.
+
+    Figures are None where there are no rows to compute them from.
+    """
+
+    from_m: float | None
+    to_m: float | None
+    reference: int
+    missed: int
+    detected: int
+    extra: int
+    recall: float | None
+    precision: float | None
+    reference_quality_median: float | None
+    detected_quality_median: float | None
+    error_median_m: float | None
+
+    @property
+    def quality_difference(self) -> float | None:
+        """Detected minus reference quality (of the medians)."""
+        if self.reference_quality_median is None or self.detected_quality_median is None:
+            return None
+        return self.detected_quality_median - self.reference_quality_median
+
+
+@dataclass(frozen=True, slots=True)
+class NormalisedError:
+    """Squared position errors in units of their covariance.
+
+    Attributes
+    ----------
+    per_dof : float or None
+        Mean per degree of freedom: 1 if the covariance is right, more if it promises too much.
+    dof : int
+        Degrees of freedom: two for each matched row.
+    band : (float, float) or None
+        Where `per_dof` lies with 95 % probability if errors are normal, independent and have that
+        covariance.
+    left_out : int
+        Matched rows whose covariance is not positive definite.
+    """
+
+    per_dof: float | None
+    dof: int
+    band: tuple[float, float] | None
+    left_out: int
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """How a run's detected discs compare with reference rows.
+
+    Figures are None where there are no rows to compute them from. Qualities are medians.
+    """
+
+    reference_name: str
+    detected_name: str
+    options: CompareOptions
+    reference: int
+    detected: int
+    matched: int
+    set_aside: int
+    recall: float | None
+    precision: float | None
+    error_median_m: float | None
+    error_95_m: float | None
+    normalised_error: NormalisedError
+    reference_quality_matched: float | None
+    reference_quality_missed: float | None
+    detected_quality_matched: float | None
+    detected_quality_extra: float | None
+    bins: tuple[DistanceBin, ...]
+    frames: tuple[FrameScore, ...] = field(repr=False)
+    frames_only_in_reference: tuple[str, ...] = field(repr=False)
+    frames_only_in_detected: tuple[str, ...] = field(repr=False)
+
+    @property
+    def missed(self) -> int:
+        """Reference rows that no detected row fits."""
+        return self.reference - self.matched
+
+    @property
+    def extra(self) -> int:
+        """Detected rows that fit no reference row."""
+        return self.detected - self.matched
+
+    def worst_frames(self, count: int) -> tuple[FrameScore, ...]:
+        """The frames with most missed and extra rows; of equals, with the largest error first."""
+        ranked = sorted(
+            self.frames,
+            key=lambda f: (-(f.missed + f.extra), -(f.largest_error_m or 0.0), f.name),
+        )
+        return tuple(ranked[:count])
+
+
+def unmet_demands(
+    comparison: Comparison, *, min_recall: float | None = None, min_precision: float | None = None
+) -> tuple[str, ...]:
+    """Say which demands a comparison fails: a command that made them exits 1 if there are any.
+
+    Parameters
+    ----------
+    comparison : Comparison
+        The figures.
+    min_recall, min_precision : float, optional
+        Least values. A figure that there are no rows for fails its demand.
+
+    Returns
+    -------
+    tuple of str
+        One sentence for each demand that fails.
+    """
+    demands = (
+        ("recall", comparison.recall, min_recall),
+        ("precision", comparison.precision, min_precision),
+    )
+    return tuple(
+        f"{name} is {'unknown' if value is None else f'{value:.4f}'}: at least {least:g} demanded"
+        for name, value, least in demands
+        if least is not None and (value is None or value < least)
+    )
