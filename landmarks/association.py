@@ -110,8 +110,10 @@ def associate_positions(first: ArrayLike, second: ArrayLike, *, gate_m: float) -
     Association
         See `associate`.
     """
-    distance = np.linalg.norm(_differences(first, second), axis=-1)
-    return associate(distance**2, distance <= gate_m)
+    with np.errstate(over="ignore"):  # what is too far apart for a number is beyond any gate
+        distance = np.linalg.norm(_differences(first, second), axis=-1)
+        squared = distance**2
+    return associate(squared, distance <= gate_m)
 
 
 def associate_within_covariance(
@@ -140,11 +142,11 @@ def associate_within_covariance(
     ValueError
         If one makes a squared distance negative.
     """
-    offset = _differences(first, second)
     spread = np.asarray(covariance, dtype=np.float64)
     if spread.ndim == 3:
         spread = spread[:, np.newaxis]
-    squared = squared_mahalanobis(offset, spread)
+    with np.errstate(over="ignore", invalid="ignore"):  # as in associate_positions
+        squared = squared_mahalanobis(_differences(first, second), spread)
     return associate(squared, squared <= gate_sigma**2)
 
 

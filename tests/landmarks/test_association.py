@@ -133,6 +133,16 @@ def test_positions_pair_within_the_gate_and_not_beyond() -> None:
     assert len(associate_positions([[0, 0]], [[0, 0.26]], gate_m=0.25).first) == 0
 
 
+def test_distances_past_the_largest_number_are_beyond_any_gate() -> None:
+    far, near = [[1e308, 0.0], [1.0, 0.0]], [[-1e308, 0.0], [1.0, 0.0]]
+    covariance = np.tile(np.eye(2), (2, 1, 1))
+    for found in (
+        associate_positions(far, near, gate_m=1.0),
+        associate_within_covariance(far, near, covariance, gate_sigma=1.0),
+    ):
+        assert list(zip(found.first, found.second)) == [(1, 1)]
+
+
 def test_crowded_positions_give_way_to_each_other() -> None:
     # The nearest pair (0.1 apart) must not be taken: it would leave two rows alone.
     found = associate_positions([[0.0, 0.0], [0.3, 0.0]], [[0.2, 0.0], [0.55, 0.0]], gate_m=0.3)
