@@ -110,6 +110,14 @@ def test_more_pairs_come_before_less_cost() -> None:
     assert list(zip(found.first, found.second)) == [(0, 1), (1, 0)]
 
 
+def test_rows_that_compete_for_too_few_partners_stay_alone() -> None:
+    # Rows 0 and 1 want only column 0, and only row 2 wants columns 1 and 2: two pairs, not three.
+    allowed = [[True, False, False], [True, False, False], [True, True, True]]
+    found = associate([[2.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 4.0, 3.0]], allowed)
+    assert list(zip(found.first, found.second)) == [(1, 0), (2, 2)]
+    assert (found.first_alone.tolist(), found.second_alone.tolist()) == ([0], [1])
+
+
 def test_forbidden_costs_are_not_looked_at() -> None:
     found = associate([[np.nan, 1.0], [-5.0, np.inf]], [[False, True], [False, False]])
     assert list(zip(found.first, found.second)) == [(0, 1)]
