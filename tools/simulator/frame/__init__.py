@@ -1,0 +1,1 @@
+"""One frame: rays through all pixels of the full, interlaced image."""

@@ -1,0 +1,1 @@
+"""How light spreads in the building before the first frame."""

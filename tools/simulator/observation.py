@@ -1,0 +1,277 @@
+"""What is truly in view: discs and vertical edges, from the world's geometry."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from camera import Camera
+from landmarks import CircleLandmark, LineLandmark
+from tools.simulator.construction import UprightEdge
+from tools.simulator.poses import world_from_robot, world_to_robot
+from tools.simulator.quality import disc_quality
+from tools.simulator.renderer import camera_in_world
+from tools.simulator.scene import FloatArray, Scene
+
+#: A row's centre lies at least so many pixels inside the image, as in the data set.
+BORDER_PX = 12
+#: And the floor moves at most so far from one pixel to the next (m), as in the data set.
+FAR_LIMIT_M = 0.05
+#: A row's disc has at least this share of its area in view.
+LEAST_SHARE = 0.8
+
+_DISC_POINTS = 60
+_EDGE_POINTS = 48
+_EDGE_REACH_M = 12.0
+_SLACK_M = 0.02
+_EDGE_CONTRAST_ROWS = 20
+_EDGE_CONTRAST_GREY = 12.0
+_POSITION_SIGMA_M = 0.04
+
+
+@dataclass(frozen=True)
+class SeenDisc:
+    """A disc that is at least partly in view.
+
+    `robot_xy` is its true place in the level robot frame (m), `pixel` where the true camera sees
+    its centre, `share` the part of its area that is in the image and not hidden.
+    """
+
+    disc_id: int
+    robot_xy: FloatArray
+    pixel: FloatArray
+    share: float
+    occluded: bool
+    cut: bool
+    listed: bool
+
+
+@dataclass(frozen=True)
+class SeenEdge:
+    """A vertical edge, the longest stretch of it that is in view.
+
+    `ends` are pixels of its top and bottom, `normalised` the same undistorted; `bearing_rad` is its
+    true bearing from the camera's centre in the level robot frame; `contrast` the median step in
+    grey values across it.
+    """
+
+    edge_id: int
+    ends: FloatArray
+    normalised: FloatArray
+    bearing_rad: float
+    contrast: float
+    rows: int
+
+    @property
+    def listed(self) -> bool:
+        """Whether it is long and clear enough for a row of its own."""
+        return self.rows >= _EDGE_CONTRAST_ROWS and abs(self.contrast) >= _EDGE_CONTRAST_GREY
+
+
+def see_discs(
+    scene: Scene,
+    nominal: Camera,
+    true: Camera,
+    pose: FloatArray,
+    disc_ids: NDArray[np.int64],
+    disc_xy: FloatArray,
+    radius_m: float,
+) -> list[SeenDisc]:
+    """Which discs are in view from a pose.
+
+    Parameters
+    ----------
+    scene : Scene
+        The world.
+    nominal : Camera
+        The camera as calibrated; it decides the far limit of rows.
+    true : Camera
+        The camera as it is mounted at that moment, tilt included.
+    pose : (3,) array
+        x, y (m), heading (rad) of the robot.
+    disc_ids, disc_xy : (M,), (M, 2) arrays
+        The discs' numbers and places in the world (m).
+    radius_m : float
+        Their radius.
+
+    Returns
+    -------
+    list of SeenDisc
+        In scan order of the image.
+    """
+    from tools.simulator.tracing.kernels import points_visible
+
+    robot_xy = world_to_robot(pose, disc_xy)
+    pixels = true.project_floor(robot_xy)
+    inside = (
+        (pixels[:, 0] >= -0.5) & (pixels[:, 0] < true.width - 0.5)
+        & (pixels[:, 1] >= -0.5) & (pixels[:, 1] < true.height - 0.5)
+    )  # fmt: skip
+    eye = camera_in_world(true, pose)[:, 3]
+    spots = _sunflower(_DISC_POINTS) * radius_m
+    seen: list[SeenDisc] = []
+    for k in np.flatnonzero(inside):
+        world = np.column_stack([disc_xy[k] + spots, np.full(len(spots), 1e-3)])
+        free = points_visible(scene, eye, world, _SLACK_M)
+        uv = true.project_floor(robot_xy[k] + _rotated(spots, -pose[2]))
+        within = (
+            (uv[:, 0] >= -0.5) & (uv[:, 0] < true.width - 0.5)
+            & (uv[:, 1] >= -0.5) & (uv[:, 1] < true.height - 0.5)
+        )  # fmt: skip
+        share = float((free & within).mean())
+        if share <= 0.0:
+            continue
+        seen.append(
+            SeenDisc(
+                disc_id=int(disc_ids[k]), robot_xy=robot_xy[k], pixel=pixels[k], share=share,
+                occluded=not bool(free.all()), cut=not bool(within.all()),
+                listed=share >= LEAST_SHARE and _within_limits(nominal, pixels[k]),
+            )
+        )  # fmt: skip
+    return sorted(seen, key=lambda d: (round(float(d.pixel[1])), round(float(d.pixel[0]))))
+
+
+def circle_row(
+    disc: SeenDisc, nominal: Camera, grey: NDArray[np.uint8] | None, disc_id: int
+) -> CircleLandmark:
+    """Row of a disc: its true place, the published covariance, and the image's quality there."""
+    pixel = np.rint(disc.pixel)
+    covariance = published_covariance(nominal, pixel)
+    quality = 1.0 if grey is None else disc_quality(grey, nominal, pixel)
+    return CircleLandmark(
+        float(disc.robot_xy[0]), float(disc.robot_xy[1]), quality,
+        float(covariance[0, 0]), float(covariance[0, 1]), float(covariance[1, 1]), (disc_id,),
+    )  # fmt: skip
+
+
+def published_covariance(camera: Camera, pixel: FloatArray) -> FloatArray:
+    """(2, 2) covariance of a disc seen at a pixel: (0.04 m)^2 I + 2 px^2 J J^T."""
+    jacobian = camera.floor_jacobian_published(pixel)
+    return np.asarray(_POSITION_SIGMA_M**2 * np.eye(2) + 2.0 * jacobian @ jacobian.T)
+
+
+def see_edges(
+    scene: Scene,
+    true: Camera,
+    pose: FloatArray,
+    edges: list[UprightEdge],
+    grey: NDArray[np.uint8],
+) -> list[SeenEdge]:
+    """Which vertical edges are in view from a pose; parameters as in `see_discs`."""
+    from tools.simulator.tracing.kernels import points_visible
+
+    eye = camera_in_world(true, pose)[:, 3]
+    place = np.array([[e.x, e.y] for e in edges]).reshape(-1, 2)
+    heights = np.array([[e.z0, e.z1] for e in edges]).reshape(-1, 2)
+    off = place - eye[:2]
+    ahead = np.array([np.sin(pose[2]), -np.cos(pose[2])])
+    near = np.flatnonzero((np.hypot(off[:, 0], off[:, 1]) < _EDGE_REACH_M) & (off @ ahead > 0.05))
+    world_to_level = np.linalg.inv(world_from_robot(pose))
+    share = np.linspace(1.0, 0.0, _EDGE_POINTS)
+    seen: list[SeenEdge] = []
+    for k in near:
+        z = heights[k, 0] + share * (heights[k, 1] - heights[k, 0])
+        world = np.column_stack([np.tile(place[k], (_EDGE_POINTS, 1)), z])
+        level = world @ world_to_level[:3, :3].T + world_to_level[:3, 3]
+        uv = true.project_robot(level)
+        within = (
+            (uv[:, 0] >= 3.0) & (uv[:, 0] < true.width - 3.0)
+            & (uv[:, 1] >= 0.0) & (uv[:, 1] <= true.height - 1.0)
+        )  # fmt: skip
+        if within.sum() < 2:
+            continue
+        visible = within.copy()
+        visible[within] = points_visible(scene, eye, world[within], _SLACK_M)
+        first, last = _longest_run(visible)
+        if last - first < 1:
+            continue
+        contrast, rows = _contrast_along(grey, uv[first : last + 1])
+        ends = uv[[first, last]]
+        level_ends = level[[first, last]] - true.centre
+        seen.append(
+            SeenEdge(
+                edge_id=int(k), ends=ends, normalised=true.undistort(ends),
+                bearing_rad=float(np.arctan2(level_ends[0, 0], -level_ends[0, 1])),
+                contrast=contrast, rows=rows,
+            )
+        )  # fmt: skip
+    return seen
+
+
+def line_row(edge: SeenEdge, nominal: Camera) -> LineLandmark:
+    """Row of an edge: true bearing; inclination as the nominal camera measures it; one pixel."""
+    rays = np.column_stack([edge.normalised, np.ones(2)])
+    normal = nominal.rotation @ np.cross(rays[0], rays[1])
+    normal /= np.linalg.norm(normal)
+    # The sign is the one that makes the plane's bearing point forward.
+    if np.cross(normal, [0.0, 0.0, 1.0]) @ [0.0, -1.0, 0.0] < 0.0:
+        normal = -normal
+    middle = edge.ends.mean(axis=0)
+    aside = nominal.directions_robot(middle + np.array([[-0.5, 0.0], [0.5, 0.0]]))
+    bearing = np.arctan2(aside[:, 0], -aside[:, 1])
+    top, bottom = edge.normalised
+    return LineLandmark(
+        float(top[0]),
+        float(top[1]),
+        float(bottom[0]),
+        float(bottom[1]),
+        alpha=edge.bearing_rad, beta=float(np.arcsin(np.clip(normal[2], -1.0, 1.0))),
+        quality=0.0, sigma=float(abs(bearing[0] - bearing[1])), ids=(edge.edge_id,),
+    )  # fmt: skip
+
+
+def _within_limits(nominal: Camera, pixel: FloatArray) -> bool:
+    u, v = np.rint(pixel)
+    if not (
+        BORDER_PX <= u <= nominal.width - 1 - BORDER_PX
+        and BORDER_PX <= v <= nominal.height - 1 - BORDER_PX
+    ):
+        return False
+    jacobian = nominal.floor_jacobian_published(np.array([u, v]))
+    if np.isnan(jacobian).any():
+        return False
+    return bool(np.linalg.norm(jacobian, 2) <= FAR_LIMIT_M)
+
+
+def _sunflower(count: int) -> FloatArray:
+    """(count, 2) points spread evenly over the unit disc."""
+    k = np.arange(count)
+    radius = np.sqrt((k + 0.5) / count)
+    angle = k * np.pi * (3.0 - np.sqrt(5.0))
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=-1)
+
+
+def _rotated(points: FloatArray, angle: float) -> FloatArray:
+    c, s = np.cos(angle), np.sin(angle)
+    return np.asarray(points @ np.array([[c, s], [-s, c]]))
+
+
+def _longest_run(flags: NDArray[np.bool_]) -> tuple[int, int]:
+    """First and last index of the longest run of true values; (0, -1) if there is none."""
+    padded = np.concatenate([[False], flags, [False]]).astype(np.int8)
+    steps = np.diff(padded)
+    begin, end = np.flatnonzero(steps == 1), np.flatnonzero(steps == -1) - 1
+    if not len(begin):
+        return 0, -1
+    best = int(np.argmax(end - begin))
+    return int(begin[best]), int(end[best])
+
+
+def _contrast_along(grey: NDArray[np.uint8], uv: FloatArray) -> tuple[float, int]:
+    """Median step in grey values across an edge, right minus left, and how many rows show it."""
+    top, bottom = int(np.ceil(uv[:, 1].min())), int(np.floor(uv[:, 1].max()))
+    if bottom < top:
+        return 0.0, 0
+    rows = np.arange(top, bottom + 1)
+    order = np.argsort(uv[:, 1])
+    u = np.interp(rows, uv[order, 1], uv[order, 0])
+    offsets = np.array([2.0, 3.0])
+    columns = np.clip(np.rint(u[:, None] + offsets).astype(int), 0, grey.shape[1] - 1)
+    right = grey[rows[:, None], columns].astype(np.float64).mean(axis=1)
+    columns = np.clip(np.rint(u[:, None] - offsets).astype(int), 0, grey.shape[1] - 1)
+    left = grey[rows[:, None], columns].astype(np.float64).mean(axis=1)
+    step = right - left
+    typical = float(np.median(step))
+    return typical, int(np.sum(step * np.sign(typical) >= 0.5 * _EDGE_CONTRAST_GREY))

@@ -1,0 +1,356 @@
+"""A simulated run as a folder of the data set's layout."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from camera import write_camera
+from landmarks import CircleLandmark, Frame, Landmark, LineLandmark, write_frames
+from storage import write_whole
+from tools.simulator.observation import (
+    SeenDisc,
+    SeenEdge,
+    circle_row,
+    line_row,
+    see_discs,
+    see_edges,
+)
+from tools.simulator.odometry import step_record
+from tools.simulator.plan import RunPlan, RunSettings, plan_run, random_for, random_for_frame
+from tools.simulator.renderer import render_light, smeared
+from tools.simulator.sensor import encode_jpeg, grey_values
+
+SIMULATED = """\
+SIMULATED, rendered by tools/simulator ({what}): no real robot drove here.
+The real data set (runs c, d, e and g of the DLR Spatial Cognition data set, with images) is
+published on the page DlrSpatialCognitionDataSet of the University of Bremen's group AG EBV; its run
+folders have the same layout and take the place of this one unchanged.
+"""
+
+_STEP_FORMAT = """\
+The robot coordinate system is located in the robot's center with -Y pointing forward and X pointing
+left.
+STEP <image> <dX> <dY> <dPhi> <cXX> <cXY> <cYY> <cXPhi> <cYPhi> <cPhiPhi>
+A movement by odometry; the image was taken after it. Metres and radians."""
+
+_CIRCLE_FORMAT = """\
+LANDMARK_C <pX> <pY> <quality> <cXX> <cXY> <cYY> <ID>
+A disc that is truly in view, at its true place in the level robot frame. The covariance is the
+published detector's for that place in the image, the quality the published one there.
+ID -1: unknown."""
+
+_NOISY_CIRCLE_FORMAT = """\
+LANDMARK_C <pX> <pY> <quality> <cXX> <cXY> <cYY> <ID>
+A disc that is in view, at its true place in the level robot frame plus an error drawn from the
+covariance. Quality is always 1: there are no images. ID -1: unknown."""
+
+_LINE_FORMAT = """\
+LANDMARK_L <xtop> <ytop> <xbottom> <ybottom> <alpha> <beta> <quality> <sigma> <ID>
+A vertical edge that is truly in view: its ends in undistorted normalised image coordinates, its
+true bearing, its inclination as the (level) calibration measures it, one pixel as standard
+deviation."""
+
+
+@dataclass(frozen=True)
+class FrameTruth:
+    """What is truly in view in one frame, and the image's bytes if there is one."""
+
+    frame: int
+    jpeg: bytes | None
+    circles: tuple[CircleLandmark, ...]
+    lines: tuple[LineLandmark, ...]
+    discs: tuple[SeenDisc, ...]
+    edges: tuple[SeenEdge, ...]
+
+
+def render_frame(plan: RunPlan, frame: int) -> FrameTruth:
+    """Render one frame of a run and say what is in it; does not depend on other frames."""
+    import cv2
+
+    rng = random_for_frame(plan.settings.seed, frame)
+    camera = plan.true_camera(frame)
+    pose = plan.poses[frame + 1]
+    light = render_light(plan.scene, camera, pose)
+    # The robot goes on as it came; half of the exposure lies after its middle.
+    onward = pose + 0.5 * plan.settings.sensor.exposure * (pose - plan.poses[frame])
+    radiance = smeared(light, camera, pose, onward)
+    grey = grey_values(radiance, plan.settings.sensor, rng)
+    jpeg = encode_jpeg(grey, plan.settings.sensor.jpeg_quality)
+    decoded = cv2.imdecode(np.frombuffer(jpeg, dtype=np.uint8), cv2.IMREAD_GRAYSCALE)
+    return _truth(plan, frame, jpeg, np.asarray(decoded, dtype=np.uint8))
+
+
+def _truth(
+    plan: RunPlan, frame: int, jpeg: bytes | None, grey: NDArray[np.uint8] | None
+) -> FrameTruth:
+    camera, pose = plan.true_camera(frame), plan.poses[frame + 1]
+    discs = see_discs(
+        plan.scene, plan.camera, camera, pose, plan.disc_ids, plan.disc_xy, plan.disc_radius_m
+    )
+    edges = [] if grey is None else see_edges(plan.scene, camera, pose, plan.edges, grey)
+    unknown = {int(disc) for disc in plan.disc_ids[plan.unlabelled[frame]]}
+    return FrameTruth(
+        frame=frame,
+        jpeg=jpeg,
+        circles=tuple(
+            circle_row(d, plan.camera, grey, -1 if d.disc_id in unknown else d.disc_id)
+            for d in discs
+            if d.listed
+        ),
+        lines=tuple(line_row(e, plan.camera) for e in edges if e.listed),
+        discs=tuple(discs),
+        edges=tuple(edges),
+    )
+
+
+def write_run(
+    settings: RunSettings,
+    folder: Path,
+    *,
+    jobs: int = 1,
+    overwrite: bool = False,
+    on_frame: Callable[[int], None] | None = None,
+) -> int:
+    """Render a run and write its folder.
+
+    Parameters
+    ----------
+    settings : RunSettings
+        The run; its name should be the folder's.
+    folder : Path
+        Where it goes; made if missing.
+    jobs : int
+        Processes that render frames.
+    overwrite : bool
+        Whether existing files may be replaced.
+    on_frame : callable, optional
+        Called with the number of each frame that is done.
+
+    Returns
+    -------
+    int
+        Number of disc rows.
+
+    Raises
+    ------
+    storage.OutputExistsError
+        If a file exists and `overwrite` is false.
+    """
+    plan = plan_run(settings)
+    name = settings.name
+    images = folder / "images"
+    images.mkdir(parents=True, exist_ok=True)
+    what = f"run {name}, seed {settings.seed}, {settings.frames} frames"
+    if settings.skip:
+        what += f" after {settings.skip} skipped"
+    write_camera(plan.camera, folder / f"{name}.cam", overwrite=overwrite)
+    truths: list[FrameTruth] = []
+    for truth in _rendered(plan, jobs):
+        if truth.jpeg is not None:
+            with write_whole(
+                images / f"{plan.prefix(truth.frame)}.jpg", overwrite=overwrite
+            ) as out:
+                out.write(truth.jpeg)
+        # The bytes of all images need not be kept.
+        truths.append(
+            FrameTruth(truth.frame, None, truth.circles, truth.lines, truth.discs, truth.edges)
+        )
+        if on_frame is not None:
+            on_frame(truth.frame)
+    _write_steps(plan, folder, what, overwrite)
+    _write_landmarks(plan, folder / "map.circles", what, _CIRCLE_FORMAT,
+                     [t.circles for t in truths], overwrite)  # fmt: skip
+    _write_landmarks(plan, folder / "map.lines", what, _LINE_FORMAT, [t.lines for t in truths],
+                     overwrite)  # fmt: skip
+    with write_whole(folder / "truth.json", overwrite=overwrite) as out:
+        out.write(_truth_json(plan, truths, what).encode())
+    return sum(len(t.circles) for t in truths)
+
+
+def write_rows(
+    settings: RunSettings,
+    folder: Path,
+    *,
+    noisy: bool = True,
+    miss: float = 0.0,
+    overwrite: bool = False,
+) -> int:
+    """Write a run without images: odometry, and disc rows with or without measurement noise.
+
+    Parameters
+    ----------
+    settings : RunSettings
+        The run.
+    folder : Path
+        Where it goes; made if missing.
+    noisy : bool
+        Whether each row gets an error drawn from its covariance.
+    miss : float
+        Probability that a row is left out.
+    overwrite : bool
+        Whether existing files may be replaced.
+
+    Returns
+    -------
+    int
+        Number of disc rows.
+    """
+    plan = plan_run(settings, lit=False)
+    rng = random_for(settings.seed, "rows")
+    truths = [_truth(plan, frame, None, None) for frame in range(settings.frames)]
+    rows: list[tuple[CircleLandmark, ...]] = []
+    for truth in truths:
+        kept = [row for row in truth.circles if rng.random() >= miss]
+        rows.append(tuple(_disturbed(row, rng) for row in kept) if noisy else tuple(kept))
+    folder.mkdir(parents=True, exist_ok=True)
+    what = f"run {settings.name}, seed {settings.seed}, {settings.frames} steps, no images"
+    write_camera(plan.camera, folder / f"{settings.name}.cam", overwrite=overwrite)
+    _write_steps(plan, folder, what, overwrite)
+    text = _NOISY_CIRCLE_FORMAT if noisy else _CIRCLE_FORMAT
+    _write_landmarks(plan, folder / "map.circles", what, text, rows, overwrite)
+    with write_whole(folder / "truth.json", overwrite=overwrite) as out:
+        out.write(_truth_json(plan, truths, what).encode())
+    return sum(len(r) for r in rows)
+
+
+def _disturbed(row: CircleLandmark, rng: np.random.Generator) -> CircleLandmark:
+    covariance = np.array([[row.cxx, row.cxy], [row.cxy, row.cyy]])
+    dx, dy = np.linalg.cholesky(covariance) @ rng.standard_normal(2)
+    return CircleLandmark(
+        row.px + float(dx), row.py + float(dy), row.quality, row.cxx, row.cxy, row.cyy, row.ids
+    )
+
+
+# -- processes ------------------------------------------------------------------------------
+
+_plan_of_worker: RunPlan | None = None
+
+
+def _rendered(plan: RunPlan, jobs: int) -> Iterator[FrameTruth]:
+    """Frames in order."""
+    frames = range(plan.settings.frames)
+    if jobs <= 1:
+        yield from (render_frame(plan, frame) for frame in frames)
+        return
+    import multiprocessing
+
+    context = multiprocessing.get_context("spawn")
+    with context.Pool(jobs, _start_worker, (plan.settings,)) as pool:
+        yield from pool.imap(_render_in_worker, frames)
+
+
+def _start_worker(settings: RunSettings) -> None:
+    """Make the plan anew: that is quicker than to send it, and comes out the same."""
+    global _plan_of_worker
+    import cv2
+
+    cv2.setNumThreads(1)
+    _plan_of_worker = plan_run(settings)
+
+
+def _render_in_worker(frame: int) -> FrameTruth:
+    if _plan_of_worker is None:
+        raise RuntimeError("the worker has no plan: it was not started by _start_worker")
+    return render_frame(_plan_of_worker, frame)
+
+
+# -- files ----------------------------------------------------------------------------------
+
+
+def _write_steps(plan: RunPlan, folder: Path, what: str, overwrite: bool) -> None:
+    _write_landmarks(plan, folder / f"{plan.settings.name}.txt", what, "",
+                     [() for _ in range(plan.settings.frames)], overwrite)  # fmt: skip
+
+
+def _write_landmarks(
+    plan: RunPlan,
+    path: Path,
+    what: str,
+    row_format: str,
+    rows: Iterable[tuple[Landmark, ...]],
+    overwrite: bool,
+) -> None:
+    head = "\n".join(
+        part for part in (SIMULATED.format(what=what).rstrip(), "", _STEP_FORMAT, row_format)
+    ).rstrip()
+    frames = (
+        Frame(step_record(plan.prefix(k), plan.steps[k]), landmarks)
+        for k, landmarks in enumerate(rows)
+    )
+    write_frames(path, frames, head=head, overwrite=overwrite)
+
+
+def _truth_json(plan: RunPlan, truths: list[FrameTruth], what: str) -> str:
+    """All that is known about the run, one line per frame and object."""
+    head: dict[str, Any] = {
+        "note": SIMULATED.format(what=what).split("\n"),
+        "conventions": {
+            "world": "metres; floor plan x, y; z up; the floor is z = 0",
+            "pose": "x, y (m), heading (rad) of the robot after the frame's step; a robot at "
+            "heading h looks along (sin h, -cos h)",
+            "tilt": "(p, q) rad: a point r of the robot frame is really at exp([p, q, 0]x) r in "
+            "the level robot frame; the .cam file stays level",
+            "disc": "robot_xy: true place in the level robot frame (m); pixel: of its centre; "
+            "share: of its area in the image and not hidden; listed: has a row in map.circles",
+            "edge": "alpha: true bearing (rad); ends: pixels u, v of top and bottom of the "
+            "longest visible stretch; contrast: grey values right minus left; rows: how many "
+            "image rows show it; listed: has a row in map.lines",
+            "picture": "x0, y0, x1, y1, z0, z1 of posters: edges inside them are not listed",
+        },
+        "settings": asdict(plan.settings),
+        "disc_radius_m": plan.disc_radius_m,
+        "start": _rounded(plan.poses[0], 9),
+    }
+    used = sorted({e.edge_id for t in truths for e in t.edges})
+    lists: dict[str, list[Any]] = {
+        "discs": [
+            {"id": int(i), "xy": _rounded(xy, 6)} for i, xy in zip(plan.disc_ids, plan.disc_xy)
+        ],
+        "lookalikes": [
+            {"kind": kind, "xy": _rounded([x, y], 6)} for kind, x, y in plan.lookalikes
+        ],
+        "pictures": [_rounded(picture, 4) for picture in plan.pictures],
+        "edges": [
+            {"id": k, "xy": _rounded([plan.edges[k].x, plan.edges[k].y], 6),
+             "z": _rounded([plan.edges[k].z0, plan.edges[k].z1], 4), "kind": plan.edges[k].label}
+            for k in used
+        ],
+        "frames": [_frame_json(plan, truth) for truth in truths],
+    }  # fmt: skip
+    text = json.dumps(head, indent=1)[:-2]
+    for key, items in lists.items():
+        body = ",\n".join(json.dumps(item, separators=(",", ":")) for item in items)
+        text += f',\n "{key}": [\n{body}\n ]'
+    return text + "\n}\n"
+
+
+def _frame_json(plan: RunPlan, truth: FrameTruth) -> dict[str, Any]:
+    frame = truth.frame
+    return {
+        "prefix": plan.prefix(frame),
+        "pose": _rounded(plan.poses[frame + 1], 9),
+        "tilt": _rounded(plan.tilts_rad[frame], 9),
+        "wrong_odometry": bool(plan.wrong_odometry[frame]),
+        "discs": [
+            {"id": d.disc_id, "robot_xy": _rounded(d.robot_xy, 6), "pixel": _rounded(d.pixel, 3),
+             "share": round(d.share, 3), "occluded": d.occluded, "cut": d.cut, "listed": d.listed}
+            for d in truth.discs
+        ],
+        "edges": [
+            {"id": e.edge_id, "alpha": round(e.bearing_rad, 6),
+             "ends": _rounded(e.ends.ravel(), 2), "contrast": round(e.contrast, 1),
+             "rows": e.rows, "listed": e.listed}
+            for e in truth.edges
+        ],
+    }  # fmt: skip
+
+
+def _rounded(values: Any, digits: int) -> list[float]:
+    return [round(float(v), digits) for v in values]
