@@ -6,14 +6,14 @@ from tools.simulator.drive import DriveStyle
 from tools.simulator.plan import RunSettings
 from tools.simulator.sensor import Sensor
 
-#: 80 frames from a corridor into a room and round a corner.
+#: 80 frames: along a corridor, into a room with sunlit windows, back and on along the corridor.
 DEMO = RunSettings(
     name="e",
     frames=80,
-    seed=5,
-    discs=60,
-    lookalikes=18,
+    seed=8,
+    discs=32,
+    lookalikes=16,
     visits=0.8,
-    style=DriveStyle(step_m=0.25),
-    sensor=Sensor(jpeg_quality=88),
+    style=DriveStyle(step_m=0.25, tilt_deg=0.5),
+    sensor=Sensor(jpeg_quality=85),
 )

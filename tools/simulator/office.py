@@ -30,12 +30,12 @@ from tools.simulator.walls import (
     add_wall,
 )
 
-WIDTH_M, DEPTH_M = 46.0, 27.0
-EXTENT = (-4.0, -4.0, 60.0, 31.0)
+WIDTH_M, DEPTH_M = 66.0, 27.0
+EXTENT = (-4.0, -4.0, 80.0, 31.0)
 LONG_CORRIDORS_Y = (6.5, 20.5)
-SHORT_CORRIDORS_X = (7.0, 23.0, 39.0)
+SHORT_CORRIDORS_X = (7.0, 33.0, 59.0)
 CORRIDOR_M = 2.4
-YARD_X = 51.0
+YARD_X = 71.0
 
 _HALF = 0.5 * CORRIDOR_M
 _DOOR_M = 0.96
@@ -447,7 +447,7 @@ def _add_fire_doors(building: Construction, rng: np.random.Generator) -> None:
     """Portals across the long corridors."""
     look = Look(albedo=float(rng.choice([0.3, 0.75])))
     for y in LONG_CORRIDORS_Y:
-        for x in (10.5, 19.5, 27.5, 35.5):
+        for x in (10.5, 18.0, 29.5, 36.5, 46.0, 55.5):
             if rng.random() < 0.5:
                 continue
             for side in (-1.0, 1.0):
@@ -484,7 +484,7 @@ def _add_yard(building: Construction, rng: np.random.Generator) -> None:
         building.box(np.array([YARD_X + 2.2, float(y)]), 0.12, 0.12, 0.0, 4.0,
                      Look(Texture.METAL, 0.3), "post")  # fmt: skip
     for y in (9.6, 12.6, 17.0):
-        centre = np.array([47.6, y])
+        centre = np.array([WIDTH_M + 1.6, y])
         building.box(centre, 1.7, 2.2, 0.25, 0.95, Look(Texture.METAL, 0.25), "")
         building.box(centre, 1.4, 1.3, 0.95, 1.45, Look(Texture.METAL, 0.12), "")
-    building.box(np.array([58.0, 13.5]), 3.0, 30.0, 0.0, 6.0, Look(Texture.FACADE, 0.4), "wall")
+    building.box(np.array([YARD_X + 7.0, 13.5]), 3.0, 30.0, 0.0, 6.0, Look(Texture.FACADE, 0.4), "wall")

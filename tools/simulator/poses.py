@@ -25,8 +25,8 @@ def level_from_tilted(tilt_rad: ArrayLike) -> FloatArray:
     ----------
     tilt_rad : (2,) array
         (p, q): the rotation is exp([p, q, 0]x), about the axis (p, q, 0) of the robot frame by the
-        angle |(p, q)|. p > 0 lowers the robot's rear (it leans backward and its camera looks
-        higher), q > 0 lowers its left side.
+        angle |(p, q)|. p > 0 raises the robot's rear (its camera looks lower), q > 0 lowers its
+        left side.
 
     Returns
     -------

@@ -10,7 +10,7 @@ from tools.simulator.scene import FloatArray
 
 _LOW, _HIGH = LONG_CORRIDORS_Y
 _WEST, _MIDDLE, _EAST = SHORT_CORRIDORS_X
-_YARD = 48.9
+_YARD = WIDTH_M + 2.9
 
 #: Two blocks one after the other, then the whole building by the yard: three loops.
 FULL_ROUTE = (
