@@ -7,14 +7,16 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, TypeVar
 
 import tyro
 
 from storage import OutputExistsError
 from tools.simulator.drive import DriveStyle
-from tools.simulator.plan import RunSettings
+from tools.simulator.plan import PUBLISHED_CAMERA, RunSettings
 from tools.simulator.sensor import Sensor
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -49,6 +51,8 @@ class Run:
     """Steps of the drive that go by before the first frame."""
     unlabelled: float = 0.03
     """Share of rows whose ID is not known (-1)."""
+    camera: Path | None = None
+    """Calibration (.cam); the published one by default."""
     jobs: int = 1
     """Processes that render."""
     force: bool = False
@@ -73,6 +77,8 @@ class Rows:
     """Probability that a room with an open door is visited in passing."""
     unlabelled: float = 0.03
     """Share of rows whose ID is not known (-1)."""
+    camera: Path | None = None
+    """Calibration (.cam); the published one by default."""
     exact: bool = False
     """Leave the rows without measurement noise."""
     miss: float = 0.0
@@ -82,12 +88,63 @@ class Rows:
     style: DriveStyle = field(default_factory=DriveStyle)
 
 
+@dataclass(frozen=True)
+class Reenact:
+    """Render what the camera of a recorded run would have seen.
+
+    Prints the discs' quality by distance, shipped and rendered.
+    """
+
+    landmarks: Annotated[Path, tyro.conf.Positional]
+    """The recorded run's .circles file."""
+    output: Annotated[Path, tyro.conf.Positional]
+    """Folder of the run; its name is the run's."""
+    camera: Path
+    """The calibration (.cam) that belongs to it."""
+    world: Path
+    """Path, discs and true mounting: what `python -m tools.reenactment prepare` wrote."""
+    every: int = 5
+    """Render every so many frames."""
+    seed: int = 1
+    """Of noise and light."""
+    jobs: int = 1
+    """Processes that render."""
+    force: bool = False
+    """Replace files that exist."""
+
+
+@dataclass(frozen=True)
+class Discs:
+    """Render single discs all over the image, with exact truth, as one .npz."""
+
+    output: Annotated[Path, tyro.conf.Positional]
+    """The file: grey_0000, ... (crops), u0_v0, floor_xy, pixel."""
+    camera: Path | None = None
+    """Calibration (.cam); the published one by default."""
+    count: int = 200
+    """Discs to render."""
+    seed: int = 1
+    """Of places and noise."""
+    radius_m: float = 0.10
+    """Radius (m)."""
+    blur_px: float = 0.8
+    """Blur along u, standard deviation (pixels); half of it along v."""
+    noise_grey: float = 2.0
+    """Standard deviation of the noise (grey values)."""
+    row_aperture: float = 1.0
+    """Height of a pixel's sensitive area (rows)."""
+    force: bool = False
+    """Replace a file that exists."""
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; 0 if all went well."""
     command = tyro.cli(
         Annotated[Demo, tyro.conf.subcommand("demo")]
         | Annotated[Run, tyro.conf.subcommand("run")]
-        | Annotated[Rows, tyro.conf.subcommand("rows")],
+        | Annotated[Rows, tyro.conf.subcommand("rows")]
+        | Annotated[Reenact, tyro.conf.subcommand("reenact")]
+        | Annotated[Discs, tyro.conf.subcommand("discs")],
         prog="python -m tools.simulator",
         description="Rendered runs with known truth.",
         args=arguments,
@@ -99,47 +156,96 @@ def main(arguments: list[str] | None = None) -> int:
         return 1
 
 
-def _perform(command: Demo | Run | Rows) -> int:
-    from tools.simulator.demo import DEMO
-    from tools.simulator.run_folder import write_rows, write_run
-
+def _perform(command: Demo | Run | Rows | Reenact | Discs) -> int:
     begin = time.perf_counter()
-    if isinstance(command, Rows):
-        settings = RunSettings(
-            name=command.output.resolve().name, frames=command.frames, seed=command.seed,
-            discs=command.discs, lookalikes=0, visits=command.visits,
-            unlabelled=command.unlabelled, style=command.style,
-        )  # fmt: skip
-        rows = write_rows(
-            settings, command.output, noisy=not command.exact, miss=command.miss,
-            overwrite=command.force,
-        )  # fmt: skip
+    if isinstance(command, Discs):
+        what = _discs(command)
+    elif isinstance(command, Reenact):
+        what = _reenact(command)
+    elif isinstance(command, Rows):
+        what = _rows(command)
     else:
-        settings = DEMO
-        if isinstance(command, Run):
-            settings = RunSettings(
-                name=command.output.resolve().name, frames=command.frames, seed=command.seed,
-                discs=command.discs, lookalikes=command.lookalikes, visits=command.visits,
-                skip=command.skip, unlabelled=command.unlabelled, style=command.style,
-                sensor=command.sensor,
-            )  # fmt: skip
-        rows = _with_progress(
-            settings.frames,
-            lambda tick: write_run(
-                settings, command.output, jobs=command.jobs, overwrite=command.force, on_frame=tick
-            ),
-        )
-    seconds = time.perf_counter() - begin
-    print(
-        f"{command.output}: {settings.frames} steps, {rows} disc rows, {seconds:.0f} s "
-        f"({1000.0 * seconds / settings.frames:.0f} ms per step)"
-    )
+        what = _run(command)
+    print(f"{command.output}: {what}, {time.perf_counter() - begin:.0f} s")
     return 0
 
 
-def _with_progress(frames: int, work: Callable[[Callable[[int], None]], int]) -> int:
+def _run(command: Demo | Run) -> str:
+    from tools.simulator.demo import DEMO
+    from tools.simulator.run_folder import write_run
+
+    settings = DEMO
+    if isinstance(command, Run):
+        settings = RunSettings(
+            name=command.output.resolve().name, frames=command.frames, seed=command.seed,
+            discs=command.discs, lookalikes=command.lookalikes, visits=command.visits,
+            skip=command.skip, unlabelled=command.unlabelled, style=command.style,
+            camera_text=_camera_text(command.camera), sensor=command.sensor,
+        )  # fmt: skip
+    rows = _with_progress(
+        settings.frames,
+        1,
+        lambda tick: write_run(
+            settings, command.output, jobs=command.jobs, overwrite=command.force, on_frame=tick
+        ),
+    )
+    return f"{settings.frames} frames, {rows} disc rows"
+
+
+def _rows(command: Rows) -> str:
+    from tools.simulator.run_folder import write_rows
+
+    settings = RunSettings(
+        name=command.output.resolve().name, frames=command.frames, seed=command.seed,
+        discs=command.discs, lookalikes=0, visits=command.visits, unlabelled=command.unlabelled,
+        camera_text=_camera_text(command.camera), style=command.style,
+    )  # fmt: skip
+    rows = write_rows(
+        settings, command.output, noisy=not command.exact, miss=command.miss,
+        overwrite=command.force,
+    )  # fmt: skip
+    return f"{settings.frames} steps, {rows} disc rows"
+
+
+def _camera_text(path: Path | None) -> str:
+    from camera import format_camera, read_camera
+
+    return PUBLISHED_CAMERA if path is None else format_camera(read_camera(path))
+
+
+def _reenact(command: Reenact) -> str:
+    from tools.simulator.reenact import prepare, quality_table, write_reenactment
+
+    run = prepare(command.landmarks, command.camera, command.world, command.seed)
+    rendered = len(range(0, len(run.frames), command.every))
+    qualities = _with_progress(
+        rendered,
+        command.every,
+        lambda tick: write_reenactment(
+            run, command.output, command.every, jobs=command.jobs, overwrite=command.force,
+            on_frame=tick,
+        ),
+    )  # fmt: skip
+    for line in quality_table(qualities):
+        print(line)
+    return f"{rendered} frames"
+
+
+def _discs(command: Discs) -> str:
+    from tools.simulator.disc_set import write_discs
+
+    write_discs(
+        command.output, command.camera, count=command.count, seed=command.seed,
+        radius_m=command.radius_m, blur_px=(command.blur_px, 0.5 * command.blur_px),
+        noise_sigma=command.noise_grey, row_aperture=command.row_aperture,
+        overwrite=command.force,
+    )  # fmt: skip
+    return f"{command.count} discs"
+
+
+def _with_progress(frames: int, every: int, work: Callable[[Callable[[int], None]], T]) -> T:
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
 
     with Progress(BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()) as progress:
         task = progress.add_task("", total=frames)
-        return work(lambda frame: progress.update(task, completed=frame + 1))
+        return work(lambda frame: progress.update(task, completed=frame // every + 1))

@@ -89,7 +89,9 @@ class Construction:
 
     def quad(self, origin: FloatArray, a: FloatArray, b: FloatArray, look: Look) -> None:
         """Add the rectangle with a corner `origin` and the edges `a` and `b` (m)."""
-        normal = np.cross(a, b)
+        normal = np.array(
+            [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+        )
         normal = normal / np.linalg.norm(normal)
         s, t = a / (a @ a), b / (b @ b)
         self.quads.append([*normal, normal @ origin, *s, s @ origin, *t, t @ origin])
@@ -138,7 +140,8 @@ class Construction:
         ring = [centre - a - b, centre + a - b, centre + a + b, centre - a + b]
         for k in range(4):
             self.upright(ring[k], ring[(k + 1) % 4], z0, z1, look)
-            self.edges.append(UprightEdge(float(ring[k][0]), float(ring[k][1]), z0, z1, label))
+            x, y = float(ring[k][0]), float(ring[k][1])
+            self.edges.append(UprightEdge(x, y, z0, z1, label or "other"))
         if z1 < CEILING_M:
             self.level(ring[0], width * e, depth * n, z1, look)
         if z0 > 0.0:

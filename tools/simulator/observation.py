@@ -23,17 +23,21 @@ FAR_LIMIT_M = 0.05
 LEAST_SHARE = 0.8
 
 _DISC_POINTS = 60
+_DISC_REACH_M = 8.0
 _EDGE_POINTS = 48
 _EDGE_REACH_M = 12.0
 _SLACK_M = 0.02
 _EDGE_CONTRAST_ROWS = 20
 _EDGE_CONTRAST_GREY = 12.0
+_EDGE_PEAK_PX = 1.0
+_PROFILE_PX = np.arange(-6.0, 6.01, 0.5)
+_SLOPE = np.array([1.0, 1.0, 0.0, -1.0, -1.0]) / 3.0
 _POSITION_SIGMA_M = 0.04
 
 
 @dataclass(frozen=True)
 class SeenDisc:
-    """A disc that is at least partly in view.
+    """A disc within 8 m that is at least partly in view.
 
     `robot_xy` is its true place in the level robot frame (m), `pixel` where the true camera sees
     its centre, `share` the part of its area that is in the image and not hidden.
@@ -54,7 +58,8 @@ class SeenEdge:
 
     `ends` are pixels of its top and bottom, `normalised` the same undistorted; `bearing_rad` is its
     true bearing from the camera's centre in the level robot frame; `contrast` the median step in
-    grey values across it.
+    grey values across it, `rows` the number of image rows that show it, `peak_px` its distance from
+    the nearest peak of the image's gradient.
     """
 
     edge_id: int
@@ -63,11 +68,16 @@ class SeenEdge:
     bearing_rad: float
     contrast: float
     rows: int
+    peak_px: float
 
     @property
     def listed(self) -> bool:
         """Whether it is long and clear enough for a row of its own."""
-        return self.rows >= _EDGE_CONTRAST_ROWS and abs(self.contrast) >= _EDGE_CONTRAST_GREY
+        return (
+            self.rows >= _EDGE_CONTRAST_ROWS
+            and abs(self.contrast) >= _EDGE_CONTRAST_GREY
+            and self.peak_px <= _EDGE_PEAK_PX
+        )
 
 
 def see_discs(
@@ -112,7 +122,8 @@ def see_discs(
     eye = camera_in_world(true, pose)[:, 3]
     spots = _sunflower(_DISC_POINTS) * radius_m
     seen: list[SeenDisc] = []
-    for k in np.flatnonzero(inside):
+    near = np.hypot(robot_xy[:, 0], robot_xy[:, 1]) < _DISC_REACH_M
+    for k in np.flatnonzero(inside & near):
         world = np.column_stack([disc_xy[k] + spots, np.full(len(spots), 1e-3)])
         free = points_visible(scene, eye, world, _SLACK_M)
         uv = true.project_floor(robot_xy[k] + _rotated(spots, -pose[2]))
@@ -187,14 +198,14 @@ def see_edges(
         first, last = _longest_run(visible)
         if last - first < 1:
             continue
-        contrast, rows = _contrast_along(grey, uv[first : last + 1])
+        contrast, rows, peak_px = _appearance(grey, uv[first : last + 1])
         ends = uv[[first, last]]
         level_ends = level[[first, last]] - true.centre
         seen.append(
             SeenEdge(
                 edge_id=int(k), ends=ends, normalised=true.undistort(ends),
                 bearing_rad=float(np.arctan2(level_ends[0, 0], -level_ends[0, 1])),
-                contrast=contrast, rows=rows,
+                contrast=contrast, rows=rows, peak_px=peak_px,
             )
         )  # fmt: skip
     return seen
@@ -259,19 +270,30 @@ def _longest_run(flags: NDArray[np.bool_]) -> tuple[int, int]:
     return int(begin[best]), int(end[best])
 
 
-def _contrast_along(grey: NDArray[np.uint8], uv: FloatArray) -> tuple[float, int]:
-    """Median step in grey values across an edge, right minus left, and how many rows show it."""
+def _appearance(grey: NDArray[np.uint8], uv: FloatArray) -> tuple[float, int, float]:
+    """How an edge shows in the image along its points (u, v).
+
+    Returns the median step in grey values across it (right minus left), how many rows show it, and
+    the distance (px) to the nearest peak of the gradient (infinite if there is none near).
+    """
     top, bottom = int(np.ceil(uv[:, 1].min())), int(np.floor(uv[:, 1].max()))
     if bottom < top:
-        return 0.0, 0
+        return 0.0, 0, float("inf")
     rows = np.arange(top, bottom + 1)
     order = np.argsort(uv[:, 1])
     u = np.interp(rows, uv[order, 1], uv[order, 0])
-    offsets = np.array([2.0, 3.0])
-    columns = np.clip(np.rint(u[:, None] + offsets).astype(int), 0, grey.shape[1] - 1)
-    right = grey[rows[:, None], columns].astype(np.float64).mean(axis=1)
-    columns = np.clip(np.rint(u[:, None] - offsets).astype(int), 0, grey.shape[1] - 1)
-    left = grey[rows[:, None], columns].astype(np.float64).mean(axis=1)
-    step = right - left
+    # Grey values at equal distances from the edge, row by row.
+    at = np.clip(u[:, None] + _PROFILE_PX, 0.0, grey.shape[1] - 1.001)
+    left = at.astype(int)
+    share = at - left
+    values = grey[rows[:, None], left] * (1.0 - share) + grey[rows[:, None], left + 1] * share
+    beside = (np.abs(_PROFILE_PX) >= 2.0) & (np.abs(_PROFILE_PX) <= 3.0)
+    step = values[:, beside & (_PROFILE_PX > 0.0)].mean(axis=1)
+    step -= values[:, beside & (_PROFILE_PX < 0.0)].mean(axis=1)
     typical = float(np.median(step))
-    return typical, int(np.sum(step * np.sign(typical) >= 0.5 * _EDGE_CONTRAST_GREY))
+    shown = int(np.sum(step * np.sign(typical) >= 0.5 * _EDGE_CONTRAST_GREY))
+    slope = np.abs(np.convolve(values.mean(axis=0), _SLOPE, mode="valid"))
+    middle = slope[1:-1]
+    peaks = (middle >= slope[:-2]) & (middle >= slope[2:]) & (middle >= 0.25 * slope.max())
+    offsets = _PROFILE_PX[len(_SLOPE) // 2 + 1 : -(len(_SLOPE) // 2) - 1][peaks]
+    return typical, shown, float(np.min(np.abs(offsets), initial=np.inf))

@@ -108,3 +108,50 @@ def step_record(prefix: str, step: FloatArray) -> Step:
         prefix, dx, dy, dphi, float(c[0, 0]), float(c[0, 1]), float(c[1, 1]), float(c[0, 2]),
         float(c[1, 2]), float(c[2, 2]),
     )  # fmt: skip
+
+
+def joined_steps(steps: list[Step], kept: list[int]) -> list[Step]:
+    """Odometry of a run of which only some frames are kept.
+
+    Parameters
+    ----------
+    steps : list of Step
+        All steps.
+    kept : list of int
+        Indices of the kept frames, ascending.
+
+    Returns
+    -------
+    list of Step
+        For each kept frame the movement since the one before it, covariances propagated to first
+        order, under the kept frame's prefix.
+    """
+    joined: list[Step] = []
+    first = 0
+    for last in kept:
+        pose, covariance = np.zeros(3), np.zeros((3, 3))
+        for step in steps[first : last + 1]:
+            move = np.array([step.dx, step.dy, step.dphi])
+            c, s = np.cos(pose[2]), np.sin(pose[2])
+            turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+            lever = np.eye(3)
+            lever[:2, 2] = [-s * move[0] - c * move[1], c * move[0] - s * move[1]]
+            own = np.array(
+                [
+                    [step.cxx, step.cxy, step.cxphi],
+                    [step.cxy, step.cyy, step.cyphi],
+                    [step.cxphi, step.cyphi, step.cphiphi],
+                ]
+            )
+            covariance = lever @ covariance @ lever.T + turn @ own @ turn.T
+            pose = pose + turn @ move
+        a = covariance
+        joined.append(
+            Step(
+                steps[last].prefix, float(pose[0]), float(pose[1]), float(pose[2]),
+                float(a[0, 0]), float(a[0, 1]), float(a[1, 1]), float(a[0, 2]), float(a[1, 2]),
+                float(a[2, 2]),
+            )
+        )  # fmt: skip
+        first = last + 1
+    return joined

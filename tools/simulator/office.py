@@ -487,4 +487,6 @@ def _add_yard(building: Construction, rng: np.random.Generator) -> None:
         centre = np.array([WIDTH_M + 1.6, y])
         building.box(centre, 1.7, 2.2, 0.25, 0.95, Look(Texture.METAL, 0.25), "")
         building.box(centre, 1.4, 1.3, 0.95, 1.45, Look(Texture.METAL, 0.12), "")
-    building.box(np.array([YARD_X + 7.0, 13.5]), 3.0, 30.0, 0.0, 6.0, Look(Texture.FACADE, 0.4), "wall")
+    building.box(
+        np.array([YARD_X + 7.0, 13.5]), 3.0, 30.0, 0.0, 6.0, Look(Texture.FACADE, 0.4), "wall"
+    )

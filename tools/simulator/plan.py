@@ -53,6 +53,8 @@ class RunSettings:
     """Steps of the drive that go by before the first frame."""
     unlabelled: float = 0.03
     """Share of rows whose ID is not known (-1)."""
+    camera_text: str = PUBLISHED_CAMERA
+    """Text of the calibration (.cam) through which the run is seen."""
     style: DriveStyle = field(default_factory=DriveStyle)
     sensor: Sensor = field(default_factory=Sensor)
 
@@ -126,7 +128,7 @@ def plan_run(settings: RunSettings, *, lit: bool = True) -> RunPlan:
         If the route is shorter than the run, or there is no room for so many discs.
     """
     seed, frames = settings.seed, settings.frames
-    camera = parse_camera(PUBLISHED_CAMERA, "the published calibration")
+    camera = parse_camera(settings.camera_text, "the calibration")
     office = build_office(random_for(seed, "building"))
     corners = office_route(office, random_for(seed, "route"), settings.visits)
     driven = drive(corners, settings.skip + frames, settings.style, random_for(seed, "drive"))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -42,30 +41,22 @@ class Optics:
     coef: FloatArray
 
 
-@lru_cache(maxsize=8)
-def _optics(numbers: tuple[float, ...], reach: float, camera: Camera) -> Optics:
-    squared = np.linspace(0.0, reach * reach, _INVERSE_NODES)
-    radius = np.sqrt(squared)
-    pixels = np.stack(
-        [camera.offset_x + camera.scale_x * radius, np.full_like(radius, camera.offset_y)], axis=-1
-    )
-    undistorted = camera.undistort(pixels)[:, 0]
-    ratio = np.ones_like(radius)
-    ratio[1:] = undistorted[1:] / radius[1:]
-    per_unit = (_INVERSE_NODES - 1) / (reach * reach)
-    return Optics(np.array([*numbers, per_unit]), ratio, np.array(camera.coef))
-
-
 def optics_of(camera: Camera) -> Optics:
-    """Tabulate the inverse of a camera's distortion over its image.
-
-    The result does not depend on where the camera is mounted.
-    """
-    numbers = (camera.scale_x, camera.scale_y, camera.offset_x, camera.offset_y)
+    """Tabulate the inverse of a camera's distortion over its image."""
     u = np.array([-1.0, camera.width]) - camera.offset_x
     v = np.array([-1.0, camera.height + 0.5]) - camera.offset_y
     reach = np.hypot(np.abs(u).max() / camera.scale_x, np.abs(v).max() / camera.scale_y)
-    return _optics(numbers, float(reach), camera)
+    radius = np.sqrt(np.linspace(0.0, reach * reach, _INVERSE_NODES))
+    pixels = np.stack(
+        [camera.offset_x + camera.scale_x * radius, np.full_like(radius, camera.offset_y)], axis=-1
+    )
+    ratio = np.ones_like(radius)
+    ratio[1:] = camera.undistort(pixels)[1:, 0] / radius[1:]
+    if np.isnan(ratio).any():
+        raise ValueError("the camera's image reaches past the fold of its distortion")
+    numbers = (camera.scale_x, camera.scale_y, camera.offset_x, camera.offset_y)
+    per_unit = (_INVERSE_NODES - 1) / (reach * reach)
+    return Optics(np.array([*numbers, per_unit]), ratio, np.array(camera.coef))
 
 
 def camera_in_world(camera: Camera, pose: FloatArray) -> FloatArray:

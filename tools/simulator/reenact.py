@@ -1,0 +1,352 @@
+"""Re-enactment: a recorded run driven again, its discs rendered as the camera would have seen them.
+
+What is taken from the recording: the path, the discs, how the camera was really mounted and tilted
+(`tools.reenactment` fits them to the shipped rows). What is made up: a plain floor, far-off walls,
+and the photometry, tuned so that the discs' quality falls with distance as that of the
+shipped rows.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from camera import Camera, read_camera, write_camera
+from landmarks import Frame, read_frames, write_frames
+from storage import write_whole
+from tools.reenactment.world import World, read_world
+from tools.simulator.construction import (
+    CEILING_M,
+    Construction,
+    FloorMark,
+    Look,
+    flooring,
+    make_scene,
+    raster_shape,
+)
+from tools.simulator.observation import SeenDisc, see_discs
+from tools.simulator.odometry import joined_steps
+from tools.simulator.poses import with_mounting
+from tools.simulator.quality import DISTANCE_BORDERS_M, best_quality_near
+from tools.simulator.renderer import render_light, smeared
+from tools.simulator.run_folder import SIMULATED
+from tools.simulator.scene import FloatArray, Flooring, Mark, Scene, Texture
+from tools.simulator.sensor import Sensor, encode_jpeg, grey_values
+
+#: Tuned on the shipped rows' median quality by distance (see `quality_table`): no other figure than
+#: the blur makes quality fall with distance as it does, and this one fits all distances at once.
+REENACTED_SENSOR = Sensor(
+    blur_px=6.3,
+    video_blur_px=0.5,
+    glare=0.03,
+    noise_grey=4.0,
+    shot_noise_grey=2.0,
+    exposure=0.03,
+    jpeg_quality=85,
+)
+
+_DISC_RADIUS_M = 0.10
+_MARGIN_M = 15.0
+_WALLS_BEYOND_M = 12.0
+_FLOOR_ALBEDO = 0.30
+_DISC_ALBEDO = 0.80
+_LIGHT_SPREAD = 0.15
+_REMEMBERED_FRAMES = 30
+
+
+@dataclass(frozen=True)
+class Reenactment:
+    """A recorded run that needs only be rendered."""
+
+    camera: Camera
+    """As calibrated: what detectors are given."""
+    world: World
+    frames: tuple[Frame, ...]
+    """The shipped rows, one frame per pose."""
+    scene: Scene
+    """The floor with all discs."""
+    seed: int
+
+
+@dataclass(frozen=True)
+class ReenactedFrame:
+    """A rendered frame, what is truly in view, and the quality at each shipped row."""
+
+    index: int
+    grey: NDArray[np.uint8]
+    discs: tuple[SeenDisc, ...]
+    qualities: tuple[tuple[float, float, float], ...]
+    """Forward distance (m), shipped quality and rendered quality of shipped rows with an ID."""
+
+
+def prepare(landmarks: Path, camera: Path, world: Path, seed: int) -> Reenactment:
+    """Read a recorded run and the world it happened in.
+
+    Parameters
+    ----------
+    landmarks : Path
+        The shipped landmark file.
+    camera : Path
+        The calibration that belongs to it.
+    world : Path
+        What ``python -m tools.reenactment prepare`` wrote.
+    seed : int
+        Of the noise and the light.
+
+    Raises
+    ------
+    ValueError
+        If the world does not belong to the landmark file.
+    """
+    found = read_world(world)
+    frames = tuple(read_frames(landmarks))
+    if [f.step.prefix for f in frames] != [str(p) for p in found.prefixes]:
+        raise ValueError(f"{world}: its image prefixes are not those of {landmarks}")
+    return Reenactment(read_camera(camera), found, frames, _scene(found, seed), seed)
+
+
+def reenacted_frame(run: Reenactment, index: int, sensor: Sensor) -> ReenactedFrame:
+    """Render what the camera saw after a step."""
+    rng = np.random.default_rng(np.random.SeedSequence([run.seed, 1, index]))
+    shown = _remembered(run, index)
+    camera = true_camera(run, index)
+    pose = run.world.poses[index]
+    light = render_light(_showing(run.scene, shown), camera, pose)
+    before = run.world.poses[max(index - 1, 0)]
+    onward = pose + 0.5 * sensor.exposure * _motion(before, pose)
+    grey = grey_values(smeared(light, camera, pose, onward), sensor, rng)
+    ids, xy = run.world.disc_ids[shown], run.world.disc_xy[shown]
+    discs = see_discs(run.scene, run.camera, camera, pose, ids, xy, _DISC_RADIUS_M)
+    return ReenactedFrame(index, grey, tuple(discs), _qualities(run, index, grey, discs))
+
+
+def true_camera(run: Reenactment, index: int) -> Camera:
+    """The camera as it was mounted and tilted after a step: turned about its own centre."""
+    from scipy.spatial.transform import Rotation
+
+    mounting = run.world.robot_from_camera
+    p, q = run.world.tilt[index]
+    turn = Rotation.from_rotvec([p, q, 0.0]).as_matrix()
+    return with_mounting(run.camera, np.column_stack([turn @ mounting[:, :3], mounting[:, 3]]))
+
+
+def write_reenactment(
+    run: Reenactment,
+    folder: Path,
+    every: int,
+    *,
+    jobs: int = 1,
+    sensor: Sensor = REENACTED_SENSOR,
+    overwrite: bool = False,
+    on_frame: Callable[[int], None] | None = None,
+) -> FloatArray:
+    """Render every `every`-th frame of a recorded run and write a run folder.
+
+    Its ``map.circles`` holds the shipped rows of the rendered frames, so that what is detected
+    again can be compared with them; odometry between them is joined.
+
+    Parameters
+    ----------
+    run : Reenactment
+        What `prepare` read.
+    folder : Path
+        Where the run folder goes; made if missing. Its name is the run's.
+    every : int
+        Frames are rendered at this distance, from the first.
+    jobs : int
+        Processes that render.
+    sensor : Sensor
+        Photometry.
+    overwrite : bool
+        Whether existing files may be replaced.
+    on_frame : callable, optional
+        Called with the index of each frame that is done.
+
+    Returns
+    -------
+    (K, 3) array
+        Forward distance (m), shipped and rendered quality of every shipped row with an ID.
+    """
+    name = folder.resolve().name
+    images = folder / "images"
+    images.mkdir(parents=True, exist_ok=True)
+    write_camera(run.camera, folder / f"{name}.cam", overwrite=overwrite)
+    indices = range(0, len(run.frames), every)
+    truth: list[str] = []
+    qualities: list[tuple[float, float, float]] = []
+    for frame in _rendered(run, indices, sensor, jobs):
+        index = frame.index
+        prefix = run.frames[index].step.prefix
+        with write_whole(images / f"{prefix}.jpg", overwrite=overwrite) as out:
+            out.write(encode_jpeg(frame.grey, sensor.jpeg_quality))
+        qualities += frame.qualities
+        truth.append(_truth_json(run, frame))
+        if on_frame is not None:
+            on_frame(index)
+    steps = joined_steps([f.step for f in run.frames], list(indices))
+    kept = [Frame(step, run.frames[index].landmarks) for step, index in zip(steps, indices)]
+    what = f"re-enactment, every {every}th frame, seed {run.seed}"
+    head = SIMULATED.format(what=what).rstrip()
+    rows_head = (
+        f"{head}\n\nThe images are simulated; the LANDMARK rows below are the recorded run's own."
+    )
+    write_frames(folder / "map.circles", kept, head=rows_head, overwrite=overwrite)
+    write_frames(
+        folder / f"{name}.txt", [Frame(f.step) for f in kept], head=head, overwrite=overwrite
+    )
+    with write_whole(folder / "truth.json", overwrite=overwrite) as out:
+        out.write(('{"frames": [\n' + ",\n".join(truth) + "\n]}\n").encode())
+    return np.array(qualities).reshape(-1, 3)
+
+
+def quality_table(qualities: FloatArray) -> Iterator[str]:
+    """Lines of a table: median quality of shipped and rendered rows by forward distance.
+
+    Parameters
+    ----------
+    qualities : (K, 3) array
+        Forward distance (m), shipped quality, rendered quality.
+    """
+    yield f"{'distance / m':>14}{'rows':>8}{'shipped':>10}{'rendered':>10}{'difference':>12}"
+    borders = DISTANCE_BORDERS_M
+    for low, high in pairwise(borders):
+        rows = qualities[(qualities[:, 0] >= low) & (qualities[:, 0] < high)]
+        if not len(rows):
+            yield f"{low:7.1f} - {high:4.1f}{0:8d}"
+            continue
+        shipped, rendered = np.median(rows[:, 1]), np.median(rows[:, 2])
+        yield (
+            f"{low:7.1f} - {high:4.1f}{len(rows):8d}{shipped:10.3f}{rendered:10.3f}"
+            f"{rendered - shipped:+12.3f}"
+        )
+
+
+_worker: tuple[Reenactment, Sensor] | None = None
+
+
+def _rendered(
+    run: Reenactment, indices: range, sensor: Sensor, jobs: int
+) -> Iterator[ReenactedFrame]:
+    """Frames in order."""
+    if jobs <= 1:
+        yield from (reenacted_frame(run, index, sensor) for index in indices)
+        return
+    import multiprocessing
+
+    context = multiprocessing.get_context("spawn")
+    with context.Pool(jobs, _start_worker, (run, sensor)) as pool:
+        yield from pool.imap(_render_in_worker, indices)
+
+
+def _start_worker(run: Reenactment, sensor: Sensor) -> None:
+    global _worker
+    import cv2
+
+    cv2.setNumThreads(1)
+    _worker = run, sensor
+
+
+def _render_in_worker(index: int) -> ReenactedFrame:
+    if _worker is None:
+        raise RuntimeError("the worker has no run: it was not started by _start_worker")
+    run, sensor = _worker
+    return reenacted_frame(run, index, sensor)
+
+
+def _scene(world: World, seed: int) -> Scene:
+    """A plain floor with the discs, and walls far from all of them."""
+    from scipy.ndimage import gaussian_filter
+
+    building = Construction()
+    for disc_id, (x, y) in zip(world.disc_ids, world.disc_xy):
+        building.marks.append(
+            FloorMark(
+                Mark.DISC, float(x), float(y), _DISC_RADIUS_M, _DISC_ALBEDO, disc_id=int(disc_id)
+            )
+        )
+    places = np.concatenate([world.disc_xy, world.poses[:, :2]])
+    low, high = places.min(axis=0) - _MARGIN_M, places.max(axis=0) + _MARGIN_M
+    extent = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
+    a = places.min(axis=0) - _WALLS_BEYOND_M
+    b = places.max(axis=0) + _WALLS_BEYOND_M
+    ring = [a, np.array([b[0], a[1]]), b, np.array([a[0], b[1]])]
+    for k in range(4):
+        building.upright(ring[k], ring[(k + 1) % 4], 0.0, CEILING_M, Look(Texture.WALL, 0.6, 0.2))
+    shape = raster_shape(extent)
+    scene = make_scene(
+        building, extent, np.zeros(shape, dtype=np.int8),
+        np.array([flooring(Flooring.LINOLEUM, _FLOOR_ALBEDO, 0.08, 0.0)]),
+        np.ones(shape, dtype=np.uint8), lit=False,
+    )  # fmt: skip
+    # Light that changes slowly from place to place, as below lamps.
+    rng = np.random.default_rng(np.random.SeedSequence([seed, 0]))
+    uneven = gaussian_filter(rng.standard_normal(shape), 10.0)
+    light = 1.0 + _LIGHT_SPREAD * uneven / uneven.std()
+    side = np.zeros((*shape, 3))
+    side[..., 0] = light
+    return scene._replace(floor_light=light, side_light=side)
+
+
+def _remembered(run: Reenactment, index: int) -> NDArray[np.bool_]:
+    """Discs that are reported some frames before or after: what walls hide is not shown."""
+    near = run.frames[max(index - _REMEMBERED_FRAMES, 0) : index + _REMEMBERED_FRAMES + 1]
+    ids = {i for frame in near for row in frame.circles for i in row.ids}
+    return np.isin(run.world.disc_ids, list(ids))
+
+
+def _showing(scene: Scene, shown: NDArray[np.bool_]) -> Scene:
+    """The same floor with some of its discs."""
+    keep = shown[scene.mark_items]
+    counted = np.concatenate([[0], np.cumsum(keep)])
+    return scene._replace(
+        mark_items=scene.mark_items[keep], mark_start=counted[scene.mark_start].astype(np.int64)
+    )
+
+
+def _motion(before: FloatArray, after: FloatArray) -> FloatArray:
+    motion = after - before
+    motion[2] = np.pi - np.mod(np.pi - motion[2], 2.0 * np.pi)
+    return np.asarray(motion)
+
+
+def _qualities(
+    run: Reenactment, index: int, grey: NDArray[np.uint8], discs: list[SeenDisc]
+) -> tuple[tuple[float, float, float], ...]:
+    """Distance, shipped and rendered quality of shipped rows whose disc is in view."""
+    found = []
+    for row in run.frames[index].circles:
+        ids = {i for i in row.ids if i >= 0}
+        candidates = [d for d in discs if d.disc_id in ids]
+        if not candidates:
+            continue
+        place = run.camera.project_floor(np.array([row.px, row.py]))
+        disc = min(candidates, key=lambda d: float(np.hypot(*(d.pixel - place))))
+        rendered, _ = best_quality_near(grey, run.camera, disc.pixel)
+        found.append((-row.py, row.quality, rendered))
+    return tuple(found)
+
+
+def _truth_json(run: Reenactment, frame: ReenactedFrame) -> str:
+    return json.dumps(
+        {
+            "prefix": run.frames[frame.index].step.prefix,
+            "pose": [round(float(v), 9) for v in run.world.poses[frame.index]],
+            "tilt": [round(float(v), 9) for v in run.world.tilt[frame.index]],
+            "discs": [
+                {
+                    "id": d.disc_id,
+                    "robot_xy": [round(float(v), 6) for v in d.robot_xy],
+                    "pixel": [round(float(v), 3) for v in d.pixel],
+                    "cut": d.cut,
+                }
+                for d in frame.discs
+            ],
+        },
+        separators=(",", ":"),
+    )
