@@ -13,7 +13,8 @@ from tools.simulator.construction import UprightEdge, make_scene
 from tools.simulator.drive import DriveStyle, drive, robot_tilt
 from tools.simulator.floor_marks import DISC_RADIUS_M, lay_discs
 from tools.simulator.odometry import measured_steps
-from tools.simulator.office import EXTENT, build_office
+from tools.simulator.office import build_office
+from tools.simulator.office_plan import EXTENT
 from tools.simulator.poses import tilted_camera
 from tools.simulator.route import is_outside, office_route
 from tools.simulator.scene import FloatArray, Scene

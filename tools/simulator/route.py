@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from tools.simulator.office import LONG_CORRIDORS_Y, SHORT_CORRIDORS_X, WIDTH_M, Office, Room
+from tools.simulator.office_plan import LONG_CORRIDORS_Y, SHORT_CORRIDORS_X, WIDTH_M, Office, Room
 from tools.simulator.scene import FloatArray
 
 _LOW, _HIGH = LONG_CORRIDORS_Y
