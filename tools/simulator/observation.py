@@ -24,7 +24,7 @@ LEAST_SHARE = 0.8
 
 _DISC_POINTS = 60
 _DISC_REACH_M = 8.0
-_EDGE_POINTS = 48
+_EDGE_POINTS = 80
 _EDGE_REACH_M = 12.0
 _SLACK_M = 0.02
 _EDGE_CONTRAST_ROWS = 20
@@ -179,33 +179,31 @@ def see_edges(
     off = place - eye[:2]
     ahead = np.array([np.sin(pose[2]), -np.cos(pose[2])])
     near = np.flatnonzero((np.hypot(off[:, 0], off[:, 1]) < _EDGE_REACH_M) & (off @ ahead > 0.05))
-    world_to_level = np.linalg.inv(world_from_robot(pose))
+    world = np.empty((len(near), _EDGE_POINTS, 3))
+    world[..., :2] = place[near, None]
     share = np.linspace(1.0, 0.0, _EDGE_POINTS)
+    world[..., 2] = heights[near, :1] + share * (heights[near, 1:] - heights[near, :1])
+    world_to_level = np.linalg.inv(world_from_robot(pose))
+    level = world @ world_to_level[:3, :3].T + world_to_level[:3, 3]
+    uv = true.project_robot(level)
+    visible = (
+        (uv[..., 0] >= 3.0) & (uv[..., 0] < true.width - 3.0)
+        & (uv[..., 1] >= 0.0) & (uv[..., 1] <= true.height - 1.0)
+    )  # fmt: skip
+    visible[visible] = points_visible(scene, eye, world[visible], _SLACK_M)
     seen: list[SeenEdge] = []
-    for k in near:
-        z = heights[k, 0] + share * (heights[k, 1] - heights[k, 0])
-        world = np.column_stack([np.tile(place[k], (_EDGE_POINTS, 1)), z])
-        level = world @ world_to_level[:3, :3].T + world_to_level[:3, 3]
-        uv = true.project_robot(level)
-        within = (
-            (uv[:, 0] >= 3.0) & (uv[:, 0] < true.width - 3.0)
-            & (uv[:, 1] >= 0.0) & (uv[:, 1] <= true.height - 1.0)
-        )  # fmt: skip
-        if within.sum() < 2:
-            continue
-        visible = within.copy()
-        visible[within] = points_visible(scene, eye, world[within], _SLACK_M)
-        first, last = _longest_run(visible)
+    for k in np.flatnonzero(visible.sum(axis=1) >= 2):
+        first, last = _longest_run(visible[k])
         if last - first < 1:
             continue
-        contrast, rows, peak_px = _appearance(grey, uv[first : last + 1])
-        ends = uv[[first, last]]
-        level_ends = level[[first, last]] - true.centre
+        contrast, rows, peak_px = _appearance(grey, uv[k, first : last + 1])
+        ends = uv[k, [first, last]]
+        top = level[k, first] - true.centre
         seen.append(
             SeenEdge(
-                edge_id=int(k), ends=ends, normalised=true.undistort(ends),
-                bearing_rad=float(np.arctan2(level_ends[0, 0], -level_ends[0, 1])),
-                contrast=contrast, rows=rows, peak_px=peak_px,
+                edge_id=int(near[k]), ends=ends, normalised=true.undistort(ends),
+                bearing_rad=float(np.arctan2(top[0], -top[1])), contrast=contrast, rows=rows,
+                peak_px=peak_px,
             )
         )  # fmt: skip
     return seen
