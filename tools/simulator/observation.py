@@ -147,7 +147,19 @@ def see_discs(
 def circle_row(
     disc: SeenDisc, nominal: Camera, grey: NDArray[np.uint8] | None, disc_id: int
 ) -> CircleLandmark:
-    """Row of a disc: its true place, the published covariance, and the image's quality there."""
+    """Row of a disc: its true place, the published covariance, and the image's quality there.
+
+    Parameters
+    ----------
+    disc : SeenDisc
+        The disc.
+    nominal : Camera
+        The camera as calibrated.
+    grey : (H, W) uint8, optional
+        The image; without it the quality is 1.
+    disc_id : int
+        The ID that the row gets, -1 for unknown.
+    """
     pixel = np.rint(disc.pixel)
     covariance = published_covariance(nominal, pixel)
     quality = 1.0 if grey is None else disc_quality(grey, nominal, pixel)
@@ -170,7 +182,22 @@ def see_edges(
     edges: list[UprightEdge],
     grey: NDArray[np.uint8],
 ) -> list[SeenEdge]:
-    """Which vertical edges are in view from a pose; parameters as in `see_discs`."""
+    """Which vertical edges within 12 m are in view from a pose.
+
+    Parameters
+    ----------
+    scene, true, pose
+        As in `see_discs`.
+    edges : list of UprightEdge
+        All edges of the world.
+    grey : (H, W) uint8
+        The image, by which their contrast is measured.
+
+    Returns
+    -------
+    list of SeenEdge
+        In the order of `edges`.
+    """
     from tools.simulator.tracing.kernels import points_visible
 
     eye = camera_in_world(true, pose)[:, 3]
@@ -210,7 +237,11 @@ def see_edges(
 
 
 def line_row(edge: SeenEdge, nominal: Camera) -> LineLandmark:
-    """Row of an edge: true bearing; inclination as the nominal camera measures it; one pixel."""
+    """Row of an edge: its true bearing, with one pixel as standard deviation.
+
+    The inclination beta is what the nominal (level) camera measures, as in the data set's rows:
+    asin(n_z), n the unit normal of the plane through the camera's centre and the edge.
+    """
     rays = np.column_stack([edge.normalised, np.ones(2)])
     normal = nominal.rotation @ np.cross(rays[0], rays[1])
     normal /= np.linalg.norm(normal)

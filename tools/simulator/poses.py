@@ -41,7 +41,18 @@ def level_from_tilted(tilt_rad: ArrayLike) -> FloatArray:
 
 
 def relative_pose(before: ArrayLike, after: ArrayLike) -> FloatArray:
-    """(..., 3) poses `after` in the robot frames of the poses `before`; headings in (-pi, pi]."""
+    """Poses in the robot frames of other poses: what odometry measures.
+
+    Parameters
+    ----------
+    before, after : (..., 3) arrays
+        x, y (m) and heading (rad).
+
+    Returns
+    -------
+    (..., 3) array
+        dx, dy (m), dphi (rad) in (-pi, pi].
+    """
     a, b = np.asarray(before, dtype=np.float64), np.asarray(after, dtype=np.float64)
     c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
     dx, dy = b[..., 0] - a[..., 0], b[..., 1] - a[..., 1]
@@ -51,7 +62,20 @@ def relative_pose(before: ArrayLike, after: ArrayLike) -> FloatArray:
 
 
 def world_to_robot(pose: ArrayLike, world_xy: ArrayLike) -> FloatArray:
-    """(..., 2) points of the world's floor in the frame of a level robot at `pose`."""
+    """Points of the world's floor in the frame of a level robot.
+
+    Parameters
+    ----------
+    pose : (3,) array
+        x, y (m) and heading (rad) of the robot in the world.
+    world_xy : (..., 2) array
+        Points (m).
+
+    Returns
+    -------
+    (..., 2) array
+        Robot X (left), Y (backward), metres.
+    """
     x, y, heading = np.asarray(pose, dtype=np.float64)
     c, s = np.cos(heading), np.sin(heading)
     off = np.asarray(world_xy, dtype=np.float64) - (x, y)

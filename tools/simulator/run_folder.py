@@ -71,7 +71,15 @@ class FrameTruth:
 
 
 def render_frame(plan: RunPlan, frame: int) -> FrameTruth:
-    """Render one frame of a run and say what is in it; does not depend on other frames."""
+    """Render one frame of a run and say what is in it.
+
+    Parameters
+    ----------
+    plan : RunPlan
+        The run.
+    frame : int
+        The frame's number. The result depends on no other frame.
+    """
     import cv2
 
     rng = random_for_frame(plan.settings.seed, frame)
