@@ -169,6 +169,7 @@ def test_rows_are_the_truth_plus_noise_of_their_covariance(
     assert 0 < unlabelled < 0.12 * count
 
 
+@pytest.mark.long
 def test_exact_rows_and_missed_rows(tmp_path: Path, rows_plan: RunPlan) -> None:
     every = write_rows(SETTINGS, tmp_path / "exact", noisy=False)
     some = write_rows(SETTINGS, tmp_path / "some", noisy=False, miss=0.3)
@@ -179,6 +180,7 @@ def test_exact_rows_and_missed_rows(tmp_path: Path, rows_plan: RunPlan) -> None:
             assert np.abs(truth - [row.px, row.py]).max(axis=1).min() < 1e-5
 
 
+@pytest.mark.long
 def test_same_seed_same_bytes_other_seed_other_run(tmp_path: Path) -> None:
     from dataclasses import replace
 
