@@ -1,0 +1,59 @@
+"""The camera's projection for single points, compiled, for tables that need millions of them.
+
+`camera.model` is the definition; a test holds the two together.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from camera.model import Camera
+
+#: Length of the vector that `camera_numbers` returns.
+NUMBERS = 22
+
+
+def camera_numbers(camera: Camera) -> NDArray[np.float64]:
+    """All that a projection needs, as one vector, the form in which kernels take a camera.
+
+    Order: scale x, y; offset x, y; a2, a3, b1, b2, b3; r_max; the 9 entries of the rotation
+    camera -> robot row by row; the camera's centre in the robot frame.
+    """
+    return np.array(
+        [
+            camera.scale_x,
+            camera.scale_y,
+            camera.offset_x,
+            camera.offset_y,
+            *camera.coef,
+            camera.r_max,
+            *camera.rotation.ravel(),
+            *camera.centre,
+        ]
+    )
+
+
+@njit(cache=True, error_model="numpy")
+def project_floor_point(
+    numbers: NDArray[np.float64], x_robot: float, y_robot: float
+) -> tuple[float, float]:
+    """Pixel (u, v) of a floor point; both NaN where the projection is undefined."""
+    dx = x_robot - numbers[19]
+    dy = y_robot - numbers[20]
+    dz = -numbers[21]
+    z = numbers[12] * dx + numbers[15] * dy + numbers[18] * dz
+    if not z > 0.0:
+        return math.nan, math.nan
+    x = (numbers[10] * dx + numbers[13] * dy + numbers[16] * dz) / z
+    y = (numbers[11] * dx + numbers[14] * dy + numbers[17] * dz) / z
+    r = math.sqrt(x * x + y * y)
+    if not r <= numbers[9]:
+        return math.nan, math.nan
+    factor = 1.0 + r * (numbers[4] + r * numbers[5]) / (
+        1.0 + r * (numbers[6] + r * (numbers[7] + r * numbers[8]))
+    )
+    return numbers[0] * x * factor + numbers[2], numbers[1] * y * factor + numbers[3]

@@ -1,0 +1,291 @@
+"""The disc detector: one image in, discs on the floor out.
+
+The way of one image, top to bottom, is `detect_circles`. The published detector (DLR Spatial
+Cognition data set report, circle detection) is its first half: quality of every centre, local
+maxima above a threshold, a covariance of one pixel and some centimetres. The second half makes one
+disc one row: it fits a disc through the camera at each maximum, weighs the evidence, suppresses
+neighbours in the floor plane and refines the position.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from camera import Camera
+from detect.circle_kernels import local_maxima, quality_map, suppress_neighbours
+from detect.disc_fit import disc_evidence, estimate_noise, fit_discs
+from detect.errors import FrameError
+from detect.settings import CircleSettings
+from lut import DiscShape, DiscTable
+
+FloatArray = NDArray[np.float64]
+
+#: The published covariance: this deviation in every direction, and two pixels squared.
+PUBLISHED_FLOOR_M = 0.04
+PUBLISHED_PIXEL_VARIANCE = 2.0
+
+#: Candidates whose first look is this much below the required evidence are not fitted in full.
+_FIRST_LOOK_SLACK = 6.0
+
+
+@dataclass(frozen=True)
+class CircleDetections:
+    """The discs found in one image, in scan order of their pixels.
+
+    Attributes
+    ----------
+    pixels : (N, 2) int64
+        Pixel (u, v) of each local maximum of the quality.
+    floor_xy : (N, 2) float64
+        Position in the robot frame, metres.
+    covariance : (N, 2, 2) float64
+        Of the position, square metres.
+    quality : (N,) float64
+        Otsu's quality at the pixel, 0 to 1.
+    evidence : (N,) float64
+        Log-odds that it is a disc; NaN if that was not looked at.
+    """
+
+    pixels: NDArray[np.int64]
+    floor_xy: FloatArray
+    covariance: FloatArray
+    quality: FloatArray
+    evidence: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.quality)
+
+
+def detect_circles(
+    image: NDArray[np.uint8], camera: Camera, table: DiscTable, settings: CircleSettings
+) -> CircleDetections:
+    """Find the discs in one image.
+
+    Parameters
+    ----------
+    image : (H, W) uint8
+        Grey image of the camera's size.
+    camera : Camera
+        The calibrated camera.
+    table : DiscTable
+        The camera's table for `disc_shape` of the settings (see `lut.cached_disc_table`).
+    settings : CircleSettings
+        What to look for.
+
+    Returns
+    -------
+    CircleDetections
+
+    Raises
+    ------
+    FrameError
+        If the image has not the camera's size.
+    """
+    if image.shape != (camera.height, camera.width):
+        raise FrameError(
+            f"the image is {image.shape[1]}x{image.shape[0]} px: "
+            f"the calibration is for {camera.width}x{camera.height}"
+        )
+    quality, contrast = quality_of_centres(image, table)
+    if settings.polarity != "any":
+        wanted = 1.0 if settings.polarity == "light" else -1.0
+        quality[contrast * wanted <= 0.0] = 0.0
+    columns, rows = local_maxima(quality, settings.threshold)
+
+    noise = estimate_noise(image)
+    strong = np.abs(contrast[rows, columns]) >= settings.noise_floor * noise
+    columns, rows = columns[strong], rows[strong]
+    pixels = np.stack([columns, rows], axis=-1)
+    found_quality = quality[rows, columns]
+    floor_xy = camera.floor_from_pixel(pixels.astype(np.float64))
+    evidence = np.full(len(pixels), np.nan)
+
+    if not (settings.verify or settings.refine):
+        keep = _alone(floor_xy, found_quality, settings.separation_m)
+        return CircleDetections(
+            pixels=pixels[keep],
+            floor_xy=floor_xy[keep],
+            covariance=published_covariance(camera, pixels[keep]),
+            quality=found_quality[keep],
+            evidence=evidence[keep],
+        )
+
+    # A first look at every maximum, then the full fit of those that may be discs, about their
+    # centres.
+    keep = _alone(floor_xy, found_quality, 0.5 * settings.separation_m)
+    pixels, found_quality, floor_xy = pixels[keep], found_quality[keep], floor_xy[keep]
+    first = fit_discs(image, table.floor_xy, pixels, settings.radius_m, noise, first_look=True)
+    likely = first.fitted
+    if settings.verify:
+        promise = disc_evidence(first, found_quality, settings.radius_m)
+        likely &= promise >= settings.evidence - _FIRST_LOOK_SLACK
+    pixels, found_quality, floor_xy = pixels[likely], found_quality[likely], floor_xy[likely]
+    centres = _nearest_pixels(camera, first.floor_xy[likely])
+    fits = fit_discs(image, table.floor_xy, centres, settings.radius_m, noise)
+    evidence = disc_evidence(fits, found_quality, settings.radius_m)
+    # A fit that wandered off, or turned the disc's contrast round, is about something else.
+    stayed = np.hypot(*(fits.floor_xy - floor_xy).T) < settings.radius_m
+    same_sign = fits.contrast * contrast[pixels[:, 1], pixels[:, 0]] > 0.0
+    sound = fits.fitted & stayed & same_sign
+    if settings.verify:
+        sound &= evidence >= settings.evidence
+    position = fits.floor_xy if settings.refine else floor_xy
+    score = np.where(np.isfinite(evidence), evidence, -1e9 + found_quality)
+    index = np.flatnonzero(sound)
+    index = index[_alone(position[index], score[index], settings.separation_m)]
+    covariance = (
+        refined_covariance(camera, fits.floor_xy[index], fits.covariance[index], settings)
+        if settings.refine
+        else published_covariance(camera, pixels[index])
+    )
+    return CircleDetections(
+        pixels=pixels[index],
+        floor_xy=position[index],
+        covariance=covariance,
+        quality=found_quality[index],
+        evidence=evidence[index],
+    )
+
+
+def disc_shape(settings: CircleSettings) -> DiscShape:
+    """What the table needs to know of the settings."""
+    return DiscShape(
+        inner_radius_m=settings.inner_radius_m,
+        outer_radius_m=settings.outer_radius_m,
+        samples=settings.samples,
+        border_px=settings.border_px,
+        far_limit_m_per_px=settings.far_limit_m_per_px,
+    )
+
+
+def quality_of_centres(
+    image: NDArray[np.uint8], table: DiscTable
+) -> tuple[FloatArray, NDArray[np.float32]]:
+    """Otsu's quality, and the contrast, of the outlines around every pixel.
+
+    Parameters
+    ----------
+    image : (H, W) uint8
+        Grey image.
+    table : DiscTable
+        The camera's table.
+
+    Returns
+    -------
+    quality : (H, W) float64
+        Between-class variance / total variance of the outlines' grey values, 0 to 1; 0 where the
+        table has no usable centre.
+    contrast : (H, W) float32
+        Mean grey value of the inner outline minus that of the outer.
+    """
+    padded = np.pad(image, table.margin_px)
+    quality = np.zeros(image.shape)
+    contrast = np.zeros(image.shape, np.float32)
+    quality_map(
+        padded,
+        table.margin_px,
+        table.samples,
+        table.row_begin,
+        table.row_end,
+        table.usable,
+        table.run_bounds,
+        table.run_start,
+        table.run_du,
+        table.run_dv,
+        table.votes_inner,
+        table.votes_outer,
+        quality,
+        contrast,
+    )
+    return quality, contrast
+
+
+def published_covariance(camera: Camera, pixels: NDArray[np.int64]) -> FloatArray:
+    """The data set's covariance of positions that are pixels: (0.04 m)^2 I + 2 px^2 J J^T.
+
+    Parameters
+    ----------
+    camera : Camera
+        The calibrated camera.
+    pixels : (N, 2) int64
+        Pixels (u, v).
+
+    Returns
+    -------
+    (N, 2, 2) float64
+        Square metres.
+    """
+    jacobian = camera.floor_jacobian_published(pixels.astype(np.float64))
+    spread = jacobian @ jacobian.swapaxes(-1, -2)
+    return np.asarray(PUBLISHED_FLOOR_M**2 * np.eye(2) + PUBLISHED_PIXEL_VARIANCE * spread)
+
+
+def refined_covariance(
+    camera: Camera, floor_xy: FloatArray, fitted: FloatArray, settings: CircleSettings
+) -> FloatArray:
+    """Covariance of refined positions: the fit's, the systematic floor, the camera's tilt.
+
+    Parameters
+    ----------
+    camera : Camera
+        The calibrated camera.
+    floor_xy : (N, 2) float64
+        Refined positions, metres.
+    fitted : (N, 2, 2) float64
+        Covariances of the fits.
+    settings : CircleSettings
+        `systematic_px` and `tilt_sigma_deg`.
+
+    Returns
+    -------
+    (N, 2, 2) float64
+        Square metres.
+    """
+    jacobian = camera.floor_jacobian(camera.project_floor(floor_xy))
+    spread = jacobian @ jacobian.swapaxes(-1, -2)
+    tilt = tilt_jacobian(camera, floor_xy)
+    tilt_spread = tilt @ tilt.swapaxes(-1, -2)
+    return np.asarray(
+        fitted
+        + settings.systematic_px**2 * spread
+        + np.radians(settings.tilt_sigma_deg) ** 2 * tilt_spread
+    )
+
+
+def tilt_jacobian(camera: Camera, floor_xy: FloatArray) -> FloatArray:
+    """How far positions move when the camera turns about the robot's X and Y axes.
+
+    Parameters
+    ----------
+    camera : Camera
+        The calibrated camera.
+    floor_xy : (N, 2) float64
+        Positions, metres.
+
+    Returns
+    -------
+    (N, 2, 2) float64
+        d(X, Y) / d(rotation about X, about Y), metres per radian.
+    """
+    x, y = floor_xy[:, 0] - camera.centre[0], floor_xy[:, 1] - camera.centre[1]
+    h = camera.centre[2]
+    # A ray d = (x, y, -h) turned by w becomes d + w x d and meets the floor where its height is -h.
+    about_x = np.stack([x * y / h, h + y * y / h], axis=-1)
+    about_y = np.stack([-h - x * x / h, -x * y / h], axis=-1)
+    return np.stack([about_x, about_y], axis=-1)
+
+
+def _nearest_pixels(camera: Camera, floor_xy: FloatArray) -> NDArray[np.int64]:
+    """(N, 2) pixels of the image nearest to where (N, 2) floor positions are seen."""
+    last = np.array([camera.width - 1, camera.height - 1])
+    seen = np.nan_to_num(camera.project_floor(floor_xy), nan=0.0)
+    return np.asarray(np.clip(np.rint(seen), 0, last).astype(np.int64))
+
+
+def _alone(floor_xy: FloatArray, score: FloatArray, separation_m: float) -> NDArray[np.bool_]:
+    if separation_m == 0.0:
+        return np.ones(len(score), bool)
+    return np.asarray(suppress_neighbours(floor_xy, score, separation_m))

@@ -1,0 +1,269 @@
+"""The command ``detect``.
+
+Only what `--help` needs is imported at once; everything heavy waits for the command that uses it.
+
+Exit codes: 0 all went well; 1 the command could not be carried out, or a demand of `compare` was
+not met; 2 the command line was wrong; 3 some frames could not be worked on (the others were).
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+from tyro.conf import OmitArgPrefixes, Positional, arg, subcommand
+
+from detect.compare_result import CompareOptions
+from detect.settings import PUBLISHED, CircleSettings
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from camera import Camera
+    from detect.circles import CircleDetections
+    from detect.circles_run import FrameSink
+    from detect.run import RunFrame
+
+Preset = Literal["default", "published"]
+
+EXIT_ERROR = 1
+EXIT_FRAMES_FAILED = 3
+
+_PRESETS = {"default": CircleSettings(), "published": PUBLISHED}
+_SHOWN_FAILURES = 10
+
+
+@dataclass(frozen=True)
+class Circles:
+    """Detect the discs of a run and write them to a .circles file.
+
+    Example: detect circles images/e --draw /tmp/discs
+
+    Parameters
+    ----------
+    run : Path
+        Run folder of the data set's layout, or a folder of images with a .cam in it.
+    preset : str
+        Values that the other flags start from: `published` is the report's detector to the letter.
+    camera : Path
+        Calibration, if it is not the one in the run folder.
+    output : Path
+        The file to write; by default detected.circles in the run folder.
+    force : bool
+        Replace existing files.
+    draw : Path
+        Folder for images with the outlines and qualities drawn in.
+    json : Path
+        Write the rows with their pixels and evidence as JSON as well.
+    """
+
+    run: Positional[Path]
+    preset: Preset = "default"
+    camera: Path | None = None
+    output: Annotated[Path | None, arg(aliases=["-o"])] = None
+    force: bool = False
+    draw: Path | None = None
+    json: Path | None = None
+    settings: OmitArgPrefixes[CircleSettings] = field(default_factory=CircleSettings)
+
+
+@dataclass(frozen=True)
+class Compare:
+    """Compare detected discs with reference rows: matched, missed, extra, errors.
+
+    Example: detect compare images/e --min-recall 0.9
+
+    Parameters
+    ----------
+    run : Path
+        Run folder.
+    reference : Path
+        Reference rows; by default map.circles in the run folder.
+    detected : Path
+        Detected rows; by default detected.circles in the run folder.
+    min_recall : float
+        Exit with 1 if the recall is lower.
+    min_precision : float
+        Exit with 1 if the precision is lower.
+    json : Path
+        Write the result as JSON.
+    force : bool
+        Replace an existing JSON file.
+    """
+
+    run: Positional[Path]
+    reference: Path | None = None
+    detected: Path | None = None
+    min_recall: float | None = None
+    min_precision: float | None = None
+    json: Path | None = None
+    force: bool = False
+    options: OmitArgPrefixes[CompareOptions] = field(default_factory=CompareOptions)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command line; returns the exit code."""
+    given = sys.argv[1:] if arguments is None else arguments
+    settings = _PRESETS.get(_preset(given), CircleSettings())
+    command = tyro.cli(
+        Annotated[
+            Annotated[
+                Circles,
+                subcommand("circles", default=Circles(run=tyro.MISSING, settings=settings)),
+            ]
+            | Annotated[Compare, subcommand("compare")],
+            arg(name=""),
+        ],
+        prog="detect",
+        description="Landmarks with covariances out of a calibrated camera's images.",
+        args=given,
+    )
+    try:
+        return _circles(command) if isinstance(command, Circles) else _compare(command)
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return 130
+    except (ValueError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return EXIT_ERROR
+
+
+def _preset(arguments: list[str]) -> str:
+    """The preset that a command line names: it decides the other flags' defaults."""
+    for position, argument in enumerate(arguments):
+        if argument == "--preset" and position + 1 < len(arguments):
+            return arguments[position + 1]
+        if argument.startswith("--preset="):
+            return argument.partition("=")[2]
+    return "default"
+
+
+def _circles(command: Circles) -> int:
+    from rich.console import Console
+
+    from detect import __version__
+    from detect.circles_run import detect_circles_run
+    from detect.run import open_run
+    from storage import OutputExistsError
+
+    run = open_run(command.run, command.camera)
+    output = command.output if command.output is not None else command.run / "detected.circles"
+    for path in (output, command.json):
+        if path is not None and path.exists() and not command.force:
+            raise OutputExistsError(path)
+    draw: FrameSink | None = None
+    if command.draw is not None:
+        draw = _drawing_sink(command.draw, run.camera, command.settings, command.force)
+
+    console = Console(stderr=True)
+    with _progress(console) as progress:
+        task = progress.add_task("discs", total=len(run.frames), rate="")
+
+        def advance() -> None:
+            progress.advance(task)
+            speed = progress.tasks[0].finished_speed or progress.tasks[0].speed
+            progress.update(task, rate=f"{speed:.1f} images/s" if speed else "")
+
+        summary = detect_circles_run(
+            run,
+            command.settings,
+            output,
+            version=__version__,
+            overwrite=command.force,
+            json_output=command.json,
+            on_frame=draw,
+            on_progress=advance,
+        )
+    print(f"{output}: {summary.discs} discs in {summary.frames} frames")
+    if summary.images_without_step:
+        print(f"{summary.images_without_step} images are not named by a STEP row: left out")
+    _print_failures(summary.failures)
+    return EXIT_FRAMES_FAILED if summary.failures else 0
+
+
+def _drawing_sink(
+    folder: Path, camera: Camera, settings: CircleSettings, overwrite: bool
+) -> FrameSink:
+    """What draws each frame's detections into a PNG."""
+    import cv2
+
+    from detect.drawing import draw_circles
+    from storage import write_whole
+
+    folder.mkdir(parents=True, exist_ok=True)
+
+    def draw(frame: RunFrame, image: NDArray[np.uint8], found: CircleDetections) -> None:
+        picture = draw_circles(image, camera, found, settings)
+        _, encoded = cv2.imencode(".png", picture)
+        name = f"{Path(frame.step.prefix).name}.png"
+        with write_whole(folder / name, overwrite=overwrite) as stream:
+            stream.write(encoded.tobytes())
+
+    return draw
+
+
+def _compare(command: Compare) -> int:
+    from rich.console import Console
+
+    from detect.compare import compare_runs
+    from detect.compare_report import comparison_tables, format_json
+    from detect.compare_result import unmet_demands
+    from storage import write_whole
+
+    result = compare_runs(
+        command.run,
+        reference=command.reference,
+        detected=command.detected,
+        options=command.options,
+    )
+    Console().print(comparison_tables(result))
+    if command.json is not None:
+        with write_whole(command.json, overwrite=command.force) as stream:
+            stream.write(format_json(result).encode())
+    unmet = unmet_demands(
+        result, min_recall=command.min_recall, min_precision=command.min_precision
+    )
+    for sentence in unmet:
+        print(sentence, file=sys.stderr)
+    return EXIT_ERROR if unmet else 0
+
+
+def _progress(console: Console) -> Progress:
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[rate]}", justify="right"),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+        console=console,
+    )
+
+
+def _print_failures(failures: list[str]) -> None:
+    if not failures:
+        return
+    print(f"{len(failures)} frames could not be worked on:", file=sys.stderr)
+    for line in failures[:_SHOWN_FAILURES]:
+        print(f"  {line}", file=sys.stderr)
+    if len(failures) > _SHOWN_FAILURES:
+        print(f"  and {len(failures) - _SHOWN_FAILURES} more", file=sys.stderr)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

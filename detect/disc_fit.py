@@ -1,0 +1,219 @@
+"""Is it a disc, and where exactly: the fit of a disc through the camera to the grey values.
+
+Around each candidate a blurred disc on an unevenly lit background is fitted (Levenberg-Marquardt,
+all pixels, through the camera's exact geometry). The fit gives the position with its covariance,
+and the evidence that there is a disc at all.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from detect import disc_fit_kernels as kernels
+from detect.disc_profile import T_LIMIT, Z_LIMIT, disc_profile
+
+FloatArray = NDArray[np.float64]
+
+#: Pixels used for a first look, and for the final fit.
+_FIRST_LOOK_PIXELS = 700
+_ALL_PIXELS = 40_000
+#: Nodes of the quadrature across flat discs, likewise.
+_FIRST_LOOK_NODES = 5
+_ALL_NODES = 15
+
+#: Pixels within this many radii of the centre are fitted, and those this near to the edge.
+_REACH_RADII = 1.7
+_REACH_PX = 3.0
+#: Standard deviation of the radius about the nominal one (relative), of the log of the blur; and
+#: the blur in pixels about which it lies.
+_RADIUS_SIGMA = 0.08
+_BLUR_SIGMA = 0.7
+_BLUR_PX = 0.6
+#: Grey values are rounded: noise is never below this.
+_LEAST_NOISE = 0.3
+
+#: What no disc's fit violates: radius relative to the nominal one, explained variance, and the
+#: share of the outline that has a step of the right sign.
+_RADIUS_RANGE = (0.75, 1.28)
+_LEAST_EXPLAINED = 0.35
+_LEAST_SECTORS = 0.75
+
+
+@dataclass(frozen=True)
+class DiscFits:
+    """Discs fitted at N candidates.
+
+    Attributes
+    ----------
+    fitted : (N,) bool
+        Whether the fit came to a result; the other arrays mean nothing where it did not.
+    floor_xy : (N, 2) float64
+        Centres on the floor (robot X, Y), metres.
+    covariance : (N, 2, 2) float64
+        Of the centres, from the fit: noise and, where the model does not fit, the correlated
+        residuals.
+    radius_m, blur_px, contrast : (N,) float64
+        The disc's radius, the standard deviation of the blur, and grey level inside minus outside.
+    explained : (N,) float64
+        Share of the variance about the background that the disc explains.
+    sectors_good : (N,) float64
+        Share of 16 sectors whose step at the edge has the sign, and 0.4 of the size, of the disc's.
+    outline_deviation : (N,) float64
+        Root mean square over the sectors of how far the edge is from the circle, in radii.
+    relative_blur : (N,) float64
+        Width of the blur across the edge, in radii.
+    """
+
+    fitted: NDArray[np.bool_]
+    floor_xy: FloatArray
+    covariance: FloatArray
+    radius_m: FloatArray
+    blur_px: FloatArray
+    contrast: FloatArray
+    explained: FloatArray
+    sectors_good: FloatArray
+    outline_deviation: FloatArray
+    relative_blur: FloatArray
+
+
+def fit_discs(
+    image: NDArray[np.uint8],
+    floor_xy: NDArray[np.float32],
+    pixels: NDArray[np.int64],
+    radius_m: float,
+    noise: float,
+    *,
+    first_look: bool = False,
+) -> DiscFits:
+    """Fit a disc at each candidate.
+
+    Parameters
+    ----------
+    image : (H, W) uint8
+        The image.
+    floor_xy : (H, W, 2) float32
+        Floor position of each pixel (`DiscTable.floor_xy`), metres.
+    pixels : (N, 2) int64
+        The candidates' pixels (u, v).
+    radius_m : float
+        Nominal radius, metres.
+    noise : float
+        Standard deviation of the image's noise, grey levels.
+    first_look : bool
+        Use a part of the pixels of large discs and a coarse quadrature: several times faster, good
+        enough to tell what is no disc.
+
+    Returns
+    -------
+    DiscFits
+    """
+    count = _FIRST_LOOK_NODES if first_look else _ALL_NODES
+    nodes, weights = np.polynomial.hermite_e.hermegauss(count)
+    settings = np.array(
+        [
+            max(noise, _LEAST_NOISE),
+            _REACH_RADII,
+            _REACH_PX,
+            _RADIUS_SIGMA,
+            _BLUR_PX,
+            _BLUR_SIGMA,
+        ]
+    )
+    results, fitted = kernels.fit_discs(
+        image,
+        floor_xy,
+        np.ascontiguousarray(pixels[:, 0]),
+        np.ascontiguousarray(pixels[:, 1]),
+        radius_m,
+        disc_profile(),
+        Z_LIMIT,
+        T_LIMIT,
+        nodes,
+        weights / weights.sum(),
+        settings,
+        _FIRST_LOOK_PIXELS if first_look else _ALL_PIXELS,
+    )
+    xx, xy, yy = (results[:, k] for k in (kernels.COV_XX, kernels.COV_XY, kernels.COV_YY))
+    return DiscFits(
+        fitted=fitted,
+        floor_xy=results[:, [kernels.X, kernels.Y]],
+        covariance=np.stack([xx, xy, xy, yy], axis=-1).reshape(-1, 2, 2),
+        radius_m=results[:, kernels.RADIUS],
+        blur_px=results[:, kernels.BLUR],
+        contrast=results[:, kernels.CONTRAST],
+        explained=results[:, kernels.EXPLAINED],
+        sectors_good=results[:, kernels.SECTORS_GOOD],
+        outline_deviation=results[:, kernels.OUTLINE_DEVIATION],
+        relative_blur=results[:, kernels.RELATIVE_BLUR],
+    )
+
+
+def disc_evidence(fits: DiscFits, quality: FloatArray, radius_m: float) -> FloatArray:
+    """How much speaks for a disc: a log-odds score, minus infinity where it cannot be one.
+
+    What speaks for a disc: that it explains the grey values of the patch and of the outlines, has
+    the right radius, a circular outline, and a sharp edge. No single one must: glare or texture
+    leave much unexplained about a sharp circle of the right size, defocus blurs the edge of a disc
+    that explains everything. So they are weighed by a logistic regression. Its weights were fitted
+    to some 17,000 discs, and to what else the outlines' quality suggests, in photographs and
+    renders: as they are, and with glare, shade, defocus, motion blur, noise and low contrast added.
+
+    Parameters
+    ----------
+    fits : DiscFits
+        The fits.
+    quality : (N,) float64
+        Otsu's quality of the outlines, 0 to 1.
+    radius_m : float
+        Nominal radius, metres.
+
+    Returns
+    -------
+    (N,) float64
+    """
+    relative_radius = np.where(fits.radius_m > 0.0, fits.radius_m / radius_m, 1.0)
+    score = (
+        2.8 * _log_odds(fits.explained)
+        + 1.15 * _log_odds(quality)
+        - 13.8 * np.abs(np.log(relative_radius))
+        - 1.0 * np.log(np.clip(fits.outline_deviation, 0.002, 1.0))
+        - 4.8 * np.log(np.clip(fits.relative_blur, 0.02, 2.5))
+        - 15.7
+    )
+    possible = (
+        fits.fitted
+        & (relative_radius > _RADIUS_RANGE[0])
+        & (relative_radius < _RADIUS_RANGE[1])
+        & (fits.explained >= _LEAST_EXPLAINED)
+        & (fits.sectors_good > _LEAST_SECTORS)
+    )
+    return np.asarray(np.where(possible, score, -np.inf))
+
+
+def _log_odds(share: FloatArray) -> FloatArray:
+    bounded = np.clip(share, 0.003, 0.997)
+    return np.asarray(np.log(bounded / (1.0 - bounded)))
+
+
+def estimate_noise(image: NDArray[np.uint8]) -> float:
+    """Standard deviation of an image's noise, grey levels.
+
+    The median absolute response to the second difference in both directions, which sees neither
+    planes nor straight edges (after Immerkaer, "Fast noise variance estimation", 1996); black and
+    saturated pixels do not count.
+    """
+    inner = image[1:-1, 1:-1]
+    countable = (inner > 2) & (inner < 253)
+    grey = image.astype(np.int16)
+    rows = grey[:-2] - 2 * grey[1:-1] + grey[2:]
+    response = np.abs(rows[:, :-2] - 2 * rows[:, 1:-1] + rows[:, 2:])
+    values = response[countable]
+    if values.size < 100:
+        values = response.ravel()
+    if not values.size:
+        return 0.0
+    # The mask's coefficients have a sum of squares of 36; 0.6745 makes a median a deviation.
+    return float(np.median(values) / 0.6745 / 6.0)

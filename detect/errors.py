@@ -1,0 +1,14 @@
+"""What can go wrong with a detection."""
+
+from __future__ import annotations
+
+
+class DetectError(ValueError):
+    """A run or setting that cannot be worked on.
+
+    The message names the file or the setting, its value and what was expected.
+    """
+
+
+class FrameError(ValueError):
+    """One image that cannot be worked on; it costs its frame only."""

@@ -1,0 +1,192 @@
+"""A run on disk: its camera, its frames, its odometry.
+
+Either a run folder of the data set (``images/``, ``<run>.cam``, ``<run>.txt``, ``map.circles``),
+or any folder of images with a ``.cam`` in it. A frame is a STEP row with its image; without
+odometry, an image with a STEP row of zeros.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from camera import Camera, read_camera
+from detect.errors import DetectError, FrameError
+from landmarks import Step, read_steps
+
+IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".pgm", ".ppm", ".tif", ".tiff", ".bmp"})
+
+_JPEG_BEGIN, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
+
+
+@dataclass(frozen=True)
+class RunFrame:
+    """One frame of a run: its STEP row, and the image taken after it (None where there is none)."""
+
+    step: Step
+    image: Path | None
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run folder that was looked through.
+
+    Attributes
+    ----------
+    folder : path
+    camera : Camera
+    frames : tuple of RunFrame
+        In the order of the odometry, or of the images' names.
+    odometry : path or None
+        Where the STEP rows come from.
+    images_without_step : tuple of path
+        Images that the odometry does not name: they are not part of the run.
+    """
+
+    folder: Path
+    camera: Camera
+    frames: tuple[RunFrame, ...]
+    odometry: Path | None
+    images_without_step: tuple[Path, ...]
+
+    @property
+    def name(self) -> str:
+        """The folder's own name."""
+        return self.folder.resolve().name
+
+
+def open_run(folder: Path, camera_path: Path | None = None) -> Run:
+    """Look through a run folder.
+
+    Parameters
+    ----------
+    folder : path
+        A run folder of the data set's layout, or a folder of images.
+    camera_path : path, optional
+        The calibration; by default the one ``.cam`` in the folder (``<run>.cam`` if there are
+        several).
+
+    Returns
+    -------
+    Run
+
+    Raises
+    ------
+    DetectError
+        If there is no such folder, no image, no calibration, or more than one to choose from.
+    camera.CameraError, landmarks.LandmarkFileError
+        If the calibration or the odometry cannot be read.
+    """
+    if not folder.is_dir():
+        raise DetectError(f"{folder}: no such folder: expected a run folder or a folder of images")
+    camera = read_camera(camera_path if camera_path is not None else _only_camera(folder))
+    images = _images(folder)
+    if not images:
+        kinds = " ".join(sorted(IMAGE_SUFFIXES))
+        raise DetectError(f"{folder}: no images: expected {kinds} in it or in {folder / 'images'}")
+    odometry = _odometry(folder)
+    if odometry is None:
+        frames = tuple(RunFrame(_standing_still(path.stem), path) for path in images)
+        return Run(folder, camera, frames, None, ())
+    by_name: dict[str, Path] = {}
+    for path in images:
+        by_name.setdefault(path.stem, path)
+        by_name.setdefault(path.name, path)
+    frames = tuple(
+        RunFrame(step, by_name.get(_base_name(step.prefix))) for step in read_steps(odometry)
+    )
+    named = {frame.image for frame in frames}
+    without = tuple(path for path in images if path not in named)
+    return Run(folder, camera, frames, odometry, without)
+
+
+def read_image(frame: RunFrame, camera: Camera) -> NDArray[np.uint8]:
+    """The grey image of a frame.
+
+    Colour images are converted, 16-bit images brought to 8 bits.
+
+    Parameters
+    ----------
+    frame : RunFrame
+    camera : Camera
+        Whose size the image must have.
+
+    Returns
+    -------
+    (H, W) uint8 array
+
+    Raises
+    ------
+    FrameError
+        If there is no image, it cannot be read, or has another size than the calibration.
+    """
+    import cv2
+
+    if frame.image is None:
+        raise FrameError(f"{frame.step.prefix}: no image of that name in the run")
+    try:
+        content = frame.image.read_bytes()
+    except OSError as error:
+        raise FrameError(f"{frame.image}: cannot be read: {error.strerror}") from None
+    if not content:
+        raise FrameError(f"{frame.image}: is empty: expected an image")
+    if content.startswith(_JPEG_BEGIN) and _JPEG_END not in content[-64:]:
+        raise FrameError(f"{frame.image}: the JPEG is cut off: its end is missing")
+    image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_GRAYSCALE)
+    if image is None:
+        raise FrameError(f"{frame.image}: cannot be decoded: expected an image")
+    if image.shape != (camera.height, camera.width):
+        raise FrameError(
+            f"{frame.image}: is {image.shape[1]}x{image.shape[0]} px: "
+            f"expected {camera.width}x{camera.height}, the calibration's size"
+        )
+    return np.asarray(image, dtype=np.uint8)
+
+
+def _only_camera(folder: Path) -> Path:
+    cameras = sorted(folder.glob("*.cam"))
+    if not cameras:
+        raise DetectError(
+            f"{folder}: no calibration: expected a .cam file in it, or one named by --camera"
+        )
+    own = folder / f"{folder.resolve().name}.cam"
+    if own in cameras:
+        return own
+    if len(cameras) > 1:
+        names = ", ".join(path.name for path in cameras[:4])
+        raise DetectError(f"{folder}: several calibrations ({names}): name one by --camera")
+    return cameras[0]
+
+
+def _images(folder: Path) -> list[Path]:
+    """Images in ``images/`` or, failing that, in the folder; by name, numbers by value."""
+    for place in (folder / "images", folder):
+        if place.is_dir():
+            found = [path for path in place.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES]
+            if found:
+                return sorted(found, key=_natural_order)
+    return []
+
+
+def _natural_order(path: Path) -> tuple[list[tuple[int, str]], str]:
+    parts = re.findall(r"\d+|\D+", path.name)
+    return [(int(p), "") if p.isdigit() and p.isascii() else (-1, p) for p in parts], path.name
+
+
+def _odometry(folder: Path) -> Path | None:
+    for candidate in (folder / f"{folder.resolve().name}.txt", folder / "map.circles"):
+        if candidate.is_file():
+            return candidate
+    return None
+
+
+def _base_name(prefix: str) -> str:
+    return prefix.strip('"').replace("\\", "/").rsplit("/", 1)[-1]
+
+
+def _standing_still(prefix: str) -> Step:
+    return Step(re.sub(r"\s", "_", prefix), *[0.0] * 9)

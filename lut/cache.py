@@ -1,0 +1,105 @@
+"""Tables on disk, so that they are computed once per calibration.
+
+A cached table is a file named by the hash of everything that decides its content. It begins with
+the hash of the bytes that follow, so damage of any kind is noticed, and the table computed again.
+Files appear whole or not at all, so any number of processes may share a cache. A cache that cannot
+be written to is no error: the next run just computes again.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import io
+import os
+from pathlib import Path
+from zipfile import BadZipFile
+
+import numpy as np
+
+from camera import Camera
+from lut.outlines import DiscShape, DiscTable, build_disc_table
+from storage import write_whole
+
+#: Raised with every change of what tables hold or how they are computed.
+TABLE_VERSION = 1
+
+_DIGEST_BYTES = hashlib.sha256().digest_size
+
+
+def cache_folder() -> Path:
+    """Where tables are kept: ``$REDETECT_CACHE``, else ``redetect`` in the user's cache folder."""
+    chosen = os.environ.get("REDETECT_CACHE")
+    if chosen:
+        return Path(chosen)
+    base = os.environ.get("XDG_CACHE_HOME")
+    return (Path(base) if base else Path.home() / ".cache") / "redetect"
+
+
+def cached_disc_table(camera: Camera, shape: DiscShape, folder: Path | None = None) -> DiscTable:
+    """The disc table of a camera, from the cache if it is there and sound, else computed and kept.
+
+    Parameters
+    ----------
+    camera : Camera
+        The calibrated camera.
+    shape : DiscShape
+        Outlines and limits.
+    folder : path, optional
+        The cache; by default `cache_folder`.
+
+    Returns
+    -------
+    DiscTable
+        Equal to that of `lut.build_disc_table`.
+
+    Raises
+    ------
+    TableError
+        As `lut.build_disc_table`.
+    """
+    folder = cache_folder() if folder is None else folder
+    path = folder / f"discs-{_key(camera, shape)}.table"
+    table = _read(path)
+    if table is None:
+        table = build_disc_table(camera, shape)
+        _keep(path, table)
+    return table
+
+
+def _key(camera: Camera, shape: DiscShape) -> str:
+    numbers = [float(value).hex() for value in dataclasses.astuple(shape)]
+    parts = ["discs", str(TABLE_VERSION), camera.content_hash, *numbers]
+    return hashlib.sha256(" ".join(parts).encode()).hexdigest()[:32]
+
+
+def _read(path: Path) -> DiscTable | None:
+    """The table in a file; None if there is none or it is damaged."""
+    try:
+        content = path.read_bytes()
+    except OSError:
+        return None
+    digest, payload = content[:_DIGEST_BYTES], content[_DIGEST_BYTES:]
+    if hashlib.sha256(payload).digest() != digest:
+        return None
+    try:
+        with np.load(io.BytesIO(payload), allow_pickle=False) as arrays:
+            fields = {name: arrays[name] for name in arrays.files}
+        samples, margin_px = int(fields.pop("samples")), int(fields.pop("margin_px"))
+        return DiscTable(samples=samples, margin_px=margin_px, **fields)
+    except (ValueError, KeyError, TypeError, EOFError, OSError, BadZipFile):
+        return None
+
+
+def _keep(path: Path, table: DiscTable) -> None:
+    buffer = io.BytesIO()
+    fields = {f.name: getattr(table, f.name) for f in dataclasses.fields(table)}
+    np.savez(buffer, allow_pickle=False, **fields)
+    payload = buffer.getvalue()
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with write_whole(path, overwrite=True) as stream:
+            stream.write(hashlib.sha256(payload).digest())
+            stream.write(payload)
+    except OSError:
+        pass

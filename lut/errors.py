@@ -1,0 +1,7 @@
+"""What can be wrong with a table."""
+
+from __future__ import annotations
+
+
+class TableError(ValueError):
+    """A table that cannot be made; the message names the quantity and what was expected."""
