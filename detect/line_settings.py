@@ -1,0 +1,132 @@
+"""What the detector of verticals can be told."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from detect.tilt import ConsensusSettings
+
+BearingConvention = Literal["level", "published"]
+
+
+@dataclass(frozen=True)
+class LineSettings:
+    """Parameters of the detector of verticals. The defaults are the all-round preset.
+
+    Lengths along a line are given in widths of a pixel, so that they mean the same for full frames
+    and for single fields, whose rows are twice as high; what belongs to the filter is in rows.
+
+    Parameters
+    ----------
+    sigma_across_px, sigma_along_rows : float
+        Gaussian window of the filter, across and along the line.
+    regulariser : float
+        Added to the variance in the window, grey values squared: steps much smaller than its root
+        give no response.
+    threshold : float
+        Least response of a point, 0 to 1; an ideal step has 2/pi.
+    border_rows : int
+        Rows at the upper and lower border that are left out.
+    start_band_rows, start_spacing_rows : int
+        Tracks start on the horizon and on every so manieth row up to so far from it.
+    gap_rows : int
+        Rows without a point that a track bridges.
+    guided : bool
+        Whether tracks are followed a second time, along the verticals of the estimated tilt.
+    guided_pull, guided_reach_px : float
+        In the second time, part of a point's offset that the track yields to, and largest offset.
+    refine_scales_px : tuple of float
+        Widths of the Gaussian with which lines are refined on the grey values; none for the
+        eigen-decomposition of the tracked points alone.
+    coarse_scale_px : float
+        Width with which the last refinement's contrast is compared.
+    least_rows : int
+        Least number of points of a line.
+    least_length_px : float
+        The same as a length.
+    least_evidence : float
+        Least sum of the points' responses, per pixel's width of length, weakened for soft edges.
+    largest_horizon_gap_px : float
+        How far a line may end from the horizon.
+    largest_scatter_px : float
+        Largest root-mean-square distance of the points from the line.
+    largest_shift_px : float
+        Farthest that the refinement may take a line.
+    largest_noise_px : float
+        Largest standard deviation of a line's place at the horizon due to noise.
+    bend_px : float
+        What real edges and calibrations bend, in the uncertainty of a line's inclination.
+    consensus : ConsensusSettings
+        How tilt is estimated and what is vertical.
+    weight_limit : float
+        Votes of a line in the consensus grow with its evidence up to this.
+    same_edge_px : float
+        Of two lines of equal polarity closer than this at the horizon only the stronger is kept.
+    join_px : float
+        Lines closer than this at the horizon are joined to one row.
+    join_share : float
+        Lines with less than this part of a closer one's evidence are dropped instead.
+    sigma_px : float
+        Standard deviation of an edge about the line of the building that it stands for.
+    alpha : "level" or "published"
+        Bearings compensated for the tilt, or with the sign that the data set's own rows have.
+    """
+
+    sigma_across_px: float = 0.8
+    sigma_along_rows: float = 2.0
+    regulariser: float = 40.0
+    threshold: float = 0.12
+    border_rows: int = 2
+    start_band_rows: int = 20
+    start_spacing_rows: int = 4
+    gap_rows: int = 6
+    guided: bool = True
+    guided_pull: float = 0.05
+    guided_reach_px: float = 0.75
+    refine_scales_px: tuple[float, ...] = (1.2, 0.8, 0.8)
+    coarse_scale_px: float = 1.6
+    least_rows: int = 14
+    least_length_px: float = 26.0
+    least_evidence: float = 8.5
+    largest_horizon_gap_px: float = 11.0
+    largest_scatter_px: float = 1.0
+    largest_shift_px: float = 1.0
+    largest_noise_px: float = 0.3
+    bend_px: float = 0.5
+    consensus: ConsensusSettings = field(default_factory=ConsensusSettings)
+    weight_limit: float = 3.0
+    same_edge_px: float = 2.0
+    join_px: float = 3.0
+    join_share: float = 0.5
+    sigma_px: float = 0.8
+    alpha: BearingConvention = "level"
+
+
+#: The report's parameters to the letter; what it does not say is set to change nothing.
+PUBLISHED = LineSettings(
+    sigma_across_px=2.5,
+    sigma_along_rows=7.0,
+    regulariser=9.0,
+    threshold=0.4,
+    border_rows=22,
+    start_band_rows=0,
+    start_spacing_rows=1,
+    guided=False,
+    refine_scales_px=(),
+    least_rows=30,
+    least_length_px=0.0,
+    least_evidence=0.0,
+    largest_horizon_gap_px=np.inf,
+    largest_shift_px=np.inf,
+    largest_noise_px=np.inf,
+    join_share=0.0,
+    sigma_px=1.0,
+    alpha="published",
+)
+
+DEFAULT = LineSettings()
+
+PRESETS = {"default": DEFAULT, "published": PUBLISHED}

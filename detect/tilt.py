@@ -1,0 +1,149 @@
+"""The camera's tilt from the verticals that it sees.
+
+A calibration knows how the camera is mounted on the robot, not how the robot stands: it pitches and
+rolls on its springs, and the mounting itself drifts. Real verticals tell. The plane through the
+camera's centre and a vertical line contains the vertical, so its normal n, turned by the tilt, is
+level:
+
+    (R n)_z = 0,    R = exp([pitch, roll, 0]x)    (robot frame: X left, Y backward, Z up)
+
+R takes directions measured with the calibrated mounting to level ones. (DLR Spatial Cognition data set
+report, line detection; the data set's own rows apply the inverse of this rotation.)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+FloatArray = NDArray[np.float64]
+
+_REFINEMENTS = 4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TiltEstimate:
+    """Pitch and roll of one frame.
+
+    Attributes
+    ----------
+    pitch_rad, roll_rad : float
+        Rotation vector (pitch, roll, 0) about the robot's X and Y that turns measured directions
+        level.
+    covariance : (2, 2) float64
+        Of (pitch, roll) (rad^2).
+    lines : int
+        How many verticals agree with it.
+    """
+
+    pitch_rad: float
+    roll_rad: float
+    covariance: FloatArray
+    lines: int
+
+
+@dataclass(frozen=True, slots=True)
+class ConsensusSettings:
+    """How the tilt that most verticals agree with is found.
+
+    Parameters
+    ----------
+    largest_rad : float
+        Largest absolute pitch and roll.
+    prior_rad : float
+        Standard deviation of the tilt; decides only between tilts that the lines support alike.
+    tolerance_rad : float
+        How far a real vertical may be from vertical.
+    tolerance_sigmas : float
+        What its own uncertainty adds to that, standard deviations.
+    building_rad : float
+        Standard deviation of real verticals about the vertical.
+    proposers : int
+        The tilt is looked for among those that pairs of this many lines, the strongest, agree with.
+    least_lines : int
+        With fewer lines that agree there is no estimate.
+    """
+
+    largest_rad: float = np.radians(5.0)
+    prior_rad: float = np.radians(2.0)
+    tolerance_rad: float = np.radians(0.6)
+    tolerance_sigmas: float = 3.0
+    building_rad: float = np.radians(0.1)
+    proposers: int = 24
+    least_lines: int = 3
+
+
+def consensus(
+    normal: FloatArray,
+    inclination_variance: FloatArray,
+    weight: FloatArray,
+    settings: ConsensusSettings,
+) -> tuple[TiltEstimate | None, NDArray[np.bool_]]:
+    """Estimate the tilt from the largest consistent set of lines, and tell which belong to it.
+
+    Parameters
+    ----------
+    normal : (N, 3) float64
+        Unit normals, in the calibrated robot frame, of the planes through the camera and each line.
+    inclination_variance : (N,) float64
+        Variance of the normals' inclinations (rad^2).
+    weight : (N,) float64
+        Votes of each line, at least 0.
+    settings : ConsensusSettings
+        Limits and tolerances.
+
+    Returns
+    -------
+    tilt : TiltEstimate or None
+        None where too few lines agree.
+    consistent : (N,) bool
+        Lines that are vertical under that tilt; without an estimate, under no tilt.
+    """
+    from detect.line_kernels import vote_for_tilt
+
+    tolerance = np.hypot(
+        settings.tolerance_rad, settings.tolerance_sigmas * np.sqrt(inclination_variance)
+    )
+    strongest = np.argsort(-weight, kind="stable")[: settings.proposers]
+    tilt = np.array(
+        vote_for_tilt(
+            normal, tolerance, weight, strongest, settings.largest_rad, settings.prior_rad
+        )
+    )
+    precision = 1.0 / (settings.building_rad**2 + inclination_variance)
+    covariance = np.zeros((2, 2))
+    consistent = np.abs(_inclination(normal, tilt)) <= tolerance
+    for _ in range(_REFINEMENTS):
+        design = np.stack([normal[:, 1], -normal[:, 0]], axis=-1)[consistent]
+        weighted = design * precision[consistent, None]
+        information = weighted.T @ design + np.eye(2) / settings.prior_rad**2
+        covariance = np.linalg.inv(information)
+        tilt = -covariance @ (weighted.T @ normal[consistent, 2])
+        now = np.abs(_inclination(normal, tilt)) <= tolerance
+        if np.array_equal(now, consistent):
+            break
+        consistent = now
+    lines = int(consistent.sum())
+    if lines < settings.least_lines or np.any(np.abs(tilt) > settings.largest_rad):
+        return None, np.abs(normal[:, 2]) <= tolerance
+    return TiltEstimate(float(tilt[0]), float(tilt[1]), covariance, lines), consistent
+
+
+def level_rotation(pitch_rad: float, roll_rad: float) -> FloatArray:
+    """(3, 3) rotation exp([pitch, roll, 0]x) that turns measured directions level."""
+    from scipy.spatial.transform import Rotation
+
+    return np.asarray(Rotation.from_rotvec([pitch_rad, roll_rad, 0.0]).as_matrix())
+
+
+def lean(bearing_rad: ArrayLike, pitch_rad: float, roll_rad: float) -> FloatArray:
+    """How a vertical at a bearing leans to the left in the chart of a tilted camera (dX / dZ)."""
+    bearing = np.asarray(bearing_rad, dtype=np.float64)
+    return np.asarray(pitch_rad * np.sin(bearing) - roll_rad * np.cos(bearing))
+
+
+def _inclination(normal: FloatArray, tilt: FloatArray) -> FloatArray:
+    """Z of the turned normals, to first order in the tilt: the refinement undoes the rest."""
+    return np.asarray(normal[:, 2] + tilt[0] * normal[:, 1] - tilt[1] * normal[:, 0])

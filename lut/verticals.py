@@ -1,0 +1,237 @@
+"""Where the building's vertical lines appear: the horizon and the verticals through it.
+
+A vertical plane through the camera's centre is seen as one curve in the image. All points on it share
+their bearing, so the curve is named by the one pixel at which it crosses the horizon: for each image
+column the table holds the row of the horizon and the vertical through that point, as a column for
+each row, through the distortion (DLR Spatial Cognition data set report, line detection).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from camera import Camera
+
+#: Verticals farther than this from the image's vertical are not followed: du/dv of 45 deg.
+STEEPEST_SLOPE = 1.0
+
+_ELEVATIONS = 361
+_NEWTON_STEPS = 6
+_NEWTON_TOLERANCE_PX = 1e-7
+
+
+@dataclass(frozen=True)
+class VerticalTable:
+    """The horizon and the verticals of a calibration.
+
+    Attributes
+    ----------
+    horizon_row : (W,) float64
+        Row at which the horizon crosses each column; NaN where it does so outside the image or not
+        at all.
+    bearing_rad : (W,) float64
+        Bearing of that point, 0 forward, positive to the left; NaN as above.
+    first_row, last_row : (W,) int32
+        Rows over which the vertical through it is seen without a break, inside the image and within
+        45 deg of the image's vertical; ``first_row > last_row`` where there are none.
+    column : (H, W) float32
+        Column at which the vertical named by its second index crosses each row; NaN outside those
+        rows.
+    elevation_tan : (H, W) float32
+        Tangent of the elevation above the horizon at which it does so; NaN as `column`.
+    robot_from_camera : (3, 3) float64
+        Rotation camera -> robot.
+    row_aspect : float
+        Height of a row in widths of a column (2 for single fields of interlaced frames).
+    """
+
+    horizon_row: NDArray[np.float64]
+    bearing_rad: NDArray[np.float64]
+    first_row: NDArray[np.int32]
+    last_row: NDArray[np.int32]
+    column: NDArray[np.float32]
+    elevation_tan: NDArray[np.float32]
+    robot_from_camera: NDArray[np.float64]
+    row_aspect: float
+
+    @property
+    def usable(self) -> NDArray[np.bool_]:
+        """(W,) bool, the columns that have a vertical."""
+        return self.first_row <= self.last_row
+
+
+def build_vertical_table(camera: Camera) -> VerticalTable:
+    """Compute the horizon and the verticals through it.
+
+    Parameters
+    ----------
+    camera : Camera
+        The calibrated camera, in any pose.
+
+    Returns
+    -------
+    VerticalTable
+        Columns whose horizon lies outside the image have no vertical; a camera that does not see
+        the horizon gets a table without verticals.
+    """
+    height, width = camera.height, camera.width
+    v, u = np.mgrid[0:height, 0:width].astype(np.float64)
+    normalised = camera.undistort(np.stack([u, v], axis=-1))
+    row = horizon_rows(camera, normalised)
+    on_horizon = camera.directions_robot(np.stack([np.arange(width, dtype=np.float64), row], -1))
+    bearing = np.arctan2(on_horizon[:, 0], -on_horizon[:, 1])
+    column, elevation = vertical_columns(camera, bearing)
+    first, last, seen = _unbroken(column, row)
+    return VerticalTable(
+        horizon_row=row,
+        bearing_rad=bearing,
+        first_row=first,
+        last_row=last,
+        column=np.where(seen, column, np.nan).astype(np.float32),
+        elevation_tan=np.where(seen, np.tan(elevation), np.nan).astype(np.float32),
+        robot_from_camera=camera.rotation,
+        row_aspect=camera.scale_x / camera.scale_y,
+    )
+
+
+def horizon_rows(camera: Camera, normalised: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Row at which the horizon crosses each column.
+
+    Parameters
+    ----------
+    camera : Camera
+        The calibrated camera.
+    normalised : (H, W, 2) float64
+        `camera.undistort` of all pixels.
+
+    Returns
+    -------
+    (W,) float64
+        NaN where the horizon does not cross the column inside the image; where it does so more than
+        once (a camera rolled far over), the crossing nearest to the image's middle row.
+    """
+    height, width = camera.height, camera.width
+    toward_up = camera.rotation[2]
+    rise = normalised @ toward_up[:2] + toward_up[2]
+    row = np.full(width, np.nan)
+    if height > 1:
+        crosses = (rise[:-1] > 0.0) != (rise[1:] > 0.0)
+        crosses &= np.isfinite(rise[:-1]) & np.isfinite(rise[1:])
+        distance = np.abs(np.arange(height - 1) + 0.5 - 0.5 * (height - 1))
+        above = np.where(crosses, distance[:, None], np.inf).argmin(axis=0)
+        some = np.flatnonzero(crosses.any(axis=0))
+        low = above[some].astype(np.float64)
+        high = low + 1.0
+        sign = np.where(rise[above[some], some] > 0.0, 1.0, -1.0)
+        # Bisection needs no derivative through the distortion; 44 halvings reach 1e-13 px.
+        for _ in range(44):
+            middle = 0.5 * (low + high)
+            at = camera.undistort(np.stack([some.astype(np.float64), middle], axis=-1))
+            before = sign * (at @ toward_up[:2] + toward_up[2]) > 0.0
+            low = np.where(before, middle, low)
+            high = np.where(before, high, middle)
+        row[some] = 0.5 * (low + high)
+    return row
+
+
+def vertical_columns(
+    camera: Camera, bearing_rad: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Columns at which verticals of given bearings cross the image's rows.
+
+    Parameters
+    ----------
+    camera : Camera
+        The calibrated camera.
+    bearing_rad : (N,) float64
+        Bearings of the verticals; NaN for none.
+
+    Returns
+    -------
+    column : (H, N) float64
+        Column of each vertical at rows 0 ... H-1, inside the image or not; NaN where the row does not
+        show the vertical.
+    elevation_rad : (H, N) float64
+        Elevation above the horizon of that point; NaN as above.
+    """
+    height = camera.height
+    columns = np.full((height, len(bearing_rad)), np.nan)
+    elevations = np.full_like(columns, np.nan)
+    some = np.flatnonzero(np.isfinite(bearing_rad))
+    if not len(some):
+        return columns, elevations
+    bearing = bearing_rad[some]
+    level = np.stack([np.sin(bearing), -np.cos(bearing), np.zeros(len(some))], axis=-1)
+    up = np.array([0.0, 0.0, 1.0])
+    elevation = np.linspace(-0.5 * np.pi, 0.5 * np.pi, _ELEVATIONS + 2)[1:-1]
+    coarse = camera.project(
+        (np.cos(elevation)[:, None, None] * level + np.sin(elevation)[:, None, None] * up)
+        @ camera.rotation
+    )[..., 1]
+    rows = np.arange(height, dtype=np.float64)
+    angle = np.full((height, len(some)), np.nan)
+    for k in range(len(some)):
+        angle[:, k] = _angle_at_rows(elevation, coarse[:, k], rows)
+
+    pixels = np.full((height, len(some), 2), np.nan)
+    for _ in range(_NEWTON_STEPS):
+        sine, cosine = np.sin(angle)[..., None], np.cos(angle)[..., None]
+        direction = (cosine * level + sine * up) @ camera.rotation
+        change = (cosine * up - sine * level) @ camera.rotation
+        pixels = camera.project(direction)
+        slope = (camera.project_jacobian(direction) @ change[..., None])[..., 1, 0]
+        step = (rows[:, None] - pixels[..., 1]) / slope
+        angle = angle + step
+        if not np.any(np.abs(rows[:, None] - pixels[..., 1]) > _NEWTON_TOLERANCE_PX):
+            break
+    converged = np.abs(rows[:, None] - pixels[..., 1]) < 1e-3
+    columns[:, some] = np.where(converged, pixels[..., 0], np.nan)
+    elevations[:, some] = np.where(converged, angle, np.nan)
+    return columns, elevations
+
+
+def _angle_at_rows(
+    elevation: NDArray[np.float64], seen_row: NDArray[np.float64], rows: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Elevations at which one vertical crosses rows, to start Newton's method; NaN where never."""
+    level = len(elevation) // 2
+    if not np.isfinite(seen_row[level]):
+        return np.full(len(rows), np.nan)
+    direction = 1.0 if seen_row[level - 1] > seen_row[level + 1] else -1.0
+    descending = np.diff(direction * seen_row) < 0.0  # False next to NaN
+    before = np.flatnonzero(~descending[:level])
+    after = np.flatnonzero(~descending[level:])
+    first = int(before[-1]) + 1 if len(before) else 0
+    last = level + int(after[0]) if len(after) else len(elevation) - 1
+    part = slice(first, last + 1)
+    row, angle = seen_row[part], elevation[part]
+    if direction > 0.0:
+        row, angle = row[::-1], angle[::-1]
+    return np.interp(rows, row, angle, left=np.nan, right=np.nan)
+
+
+def _unbroken(
+    column: NDArray[np.float64], horizon_row: NDArray[np.float64]
+) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.bool_]]:
+    """First and last of the rows round the horizon over which verticals are seen; those rows."""
+    height, width = column.shape
+    with np.errstate(invalid="ignore"):
+        seen = (column >= 0.0) & (column <= width - 1.0)
+        slope = np.gradient(column, axis=0) if height > 1 else np.zeros_like(column)
+        seen &= ~(np.abs(slope) > STEEPEST_SLOPE)
+    first = np.ones(width, np.int32)
+    last = np.zeros(width, np.int32)
+    kept = np.zeros(column.shape, np.bool_)
+    for c in np.flatnonzero(np.isfinite(horizon_row)):
+        start = round(float(horizon_row[c]))
+        if not seen[start, c]:
+            continue
+        above = np.flatnonzero(~seen[:start, c])
+        below = np.flatnonzero(~seen[start:, c])
+        first[c] = above[-1] + 1 if len(above) else 0
+        last[c] = start + below[0] - 1 if len(below) else height - 1
+        kept[first[c] : last[c] + 1, c] = True
+    return first, last, kept
