@@ -120,12 +120,12 @@ def detect_circles(
     first = fit_discs(image, table.floor_xy, pixels, settings.radius_m, noise, first_look=True)
     likely = first.fitted
     if settings.verify:
-        promise = disc_evidence(first, found_quality, settings.radius_m)
+        promise = disc_evidence(first, settings.radius_m)
         likely &= promise >= settings.evidence - _FIRST_LOOK_SLACK
     pixels, found_quality, floor_xy = pixels[likely], found_quality[likely], floor_xy[likely]
     centres = _nearest_pixels(camera, first.floor_xy[likely])
     fits = fit_discs(image, table.floor_xy, centres, settings.radius_m, noise)
-    evidence = disc_evidence(fits, found_quality, settings.radius_m)
+    evidence = disc_evidence(fits, settings.radius_m)
     # A fit that wandered off, or turned the disc's contrast round, is about something else.
     stayed = np.hypot(*(fits.floor_xy - floor_xy).T) < settings.radius_m
     same_sign = fits.contrast * contrast[pixels[:, 1], pixels[:, 0]] > 0.0

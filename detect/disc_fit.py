@@ -151,22 +151,20 @@ def fit_discs(
     )
 
 
-def disc_evidence(fits: DiscFits, quality: FloatArray, radius_m: float) -> FloatArray:
+def disc_evidence(fits: DiscFits, radius_m: float) -> FloatArray:
     """How much speaks for a disc: a log-odds score, minus infinity where it cannot be one.
 
-    What speaks for a disc: that it explains the grey values of the patch and of the outlines, has
-    the right radius, a circular outline, and a sharp edge. No single one must: glare or texture
-    leave much unexplained about a sharp circle of the right size, defocus blurs the edge of a disc
-    that explains everything. So they are weighed by a logistic regression. Its weights were fitted
-    to some 17,000 discs, and to what else the outlines' quality suggests, in photographs and
-    renders: as they are, and with glare, shade, defocus, motion blur, noise and low contrast added.
+    What speaks for a disc: that it explains the grey values, has the right radius, an even outline
+    and a sharp edge. No single one must: glare or texture leave much unexplained about a sharp
+    circle of the right size, defocus blurs the edge of a disc that explains everything. So they
+    are weighed by a logistic regression. Its weights were fitted to some 18,000 discs, and to what
+    else has a high quality, in photographs and renders: as they are, and with glare, shade,
+    defocus, motion blur, noise and low contrast added.
 
     Parameters
     ----------
     fits : DiscFits
         The fits.
-    quality : (N,) float64
-        Otsu's quality of the outlines, 0 to 1.
     radius_m : float
         Nominal radius, metres.
 
@@ -174,14 +172,18 @@ def disc_evidence(fits: DiscFits, quality: FloatArray, radius_m: float) -> Float
     -------
     (N,) float64
     """
+    explained = np.clip(fits.explained, 0.003, 0.997)
     relative_radius = np.where(fits.radius_m > 0.0, fits.radius_m / radius_m, 1.0)
+    blur = np.clip(fits.relative_blur, 0.02, 2.5)
+    # What is seen sharply must fit closely; a blurred outline may seem larger, smaller or uneven.
+    off_radius = np.abs(np.log(relative_radius)) / (0.03 + 0.3 * blur)
+    uneven = fits.outline_deviation / (0.03 + 0.2 * blur)
     score = (
-        2.8 * _log_odds(fits.explained)
-        + 1.15 * _log_odds(quality)
-        - 13.8 * np.abs(np.log(relative_radius))
-        - 1.0 * np.log(np.clip(fits.outline_deviation, 0.002, 1.0))
-        - 4.8 * np.log(np.clip(fits.relative_blur, 0.02, 2.5))
-        - 15.7
+        2.8 * np.log(explained / (1.0 - explained))
+        - 1.8 * off_radius
+        - 2.2 * uneven
+        - 5.7 * np.log(blur)
+        - 11.1
     )
     possible = (
         fits.fitted
@@ -191,11 +193,6 @@ def disc_evidence(fits: DiscFits, quality: FloatArray, radius_m: float) -> Float
         & (fits.sectors_good > _LEAST_SECTORS)
     )
     return np.asarray(np.where(possible, score, -np.inf))
-
-
-def _log_odds(share: FloatArray) -> FloatArray:
-    bounded = np.clip(share, 0.003, 0.997)
-    return np.asarray(np.log(bounded / (1.0 - bounded)))
 
 
 def estimate_noise(image: NDArray[np.uint8]) -> float:

@@ -66,7 +66,7 @@ class CircleSettings:
     noise_floor: float = 2.0
     separation_m: float = 0.14
     verify: bool = True
-    evidence: float = 2.0
+    evidence: float = 1.0
     refine: bool = True
     systematic_px: float = 0.005
     tilt_sigma_deg: float = 0.0
