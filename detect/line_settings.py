@@ -49,6 +49,8 @@ class LineSettings:
         The same as a length.
     least_evidence : float
         Least sum of the points' responses, per pixel's width of length, weakened for soft edges.
+    least_sharpness : float
+        Least sharpness of a line's edge relative to the image's median: softer ones are shadows.
     largest_horizon_gap_px : float
         How far a line may end from the horizon.
     largest_scatter_px : float
@@ -90,18 +92,21 @@ class LineSettings:
     coarse_scale_px: float = 1.6
     least_rows: int = 14
     least_length_px: float = 26.0
-    least_evidence: float = 8.5
+    least_evidence: float = 7.0
+    least_sharpness: float = 0.87
     largest_horizon_gap_px: float = 11.0
     largest_scatter_px: float = 1.0
     largest_shift_px: float = 1.0
     largest_noise_px: float = 0.3
-    bend_px: float = 0.5
+    bend_px: float = 0.15
     consensus: ConsensusSettings = field(default_factory=ConsensusSettings)
     weight_limit: float = 3.0
     same_edge_px: float = 2.0
-    join_px: float = 3.0
+    join_px: float = 2.8
     join_share: float = 0.5
-    sigma_px: float = 0.8
+    shoulder_px: float = 5.0
+    shoulder_share: float = 0.5
+    sigma_px: float = 0.9
     alpha: BearingConvention = "level"
 
 
@@ -119,6 +124,7 @@ PUBLISHED = LineSettings(
     least_rows=30,
     least_length_px=0.0,
     least_evidence=0.0,
+    least_sharpness=0.0,
     largest_horizon_gap_px=np.inf,
     largest_shift_px=np.inf,
     largest_noise_px=np.inf,

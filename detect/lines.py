@@ -38,6 +38,7 @@ from lut.verticals import VerticalTable
 
 FloatArray = NDArray[np.float64]
 
+QQ = 0.25
 ACCEPTED = "accepted"
 JOINED = "joined"
 
@@ -204,6 +205,12 @@ def judge_lines(
         for t in np.flatnonzero(~passed):
             if fate[t] == ACCEPTED:
                 fate[t] = reason
+    accepted = np.flatnonzero([f == ACCEPTED for f in fate])
+    if len(accepted):
+        # How sharp an edge can be depends on the image's focus and motion.
+        typical = np.quantile(fits.sharpness[accepted], QQ)
+        for t in accepted[fits.sharpness[accepted] < settings.least_sharpness * typical]:
+            fate[t] = "soft"
     return fate
 
 
@@ -266,7 +273,10 @@ def group_lines(
         weaker = evidence[t] < settings.join_share * evidence[kept]
         if np.any(same & (near < settings.same_edge_px)):
             fate[t] = "same edge"
-        elif np.any(weaker & (near < settings.join_px)):
+        elif np.any(weaker & (near < settings.join_px)) or np.any(
+            (near < settings.shoulder_px)
+            & (fits.contrast[t] < settings.shoulder_share * fits.contrast[kept])
+        ):
             fate[t] = "beside a stronger edge"
         else:
             kept.append(int(t))

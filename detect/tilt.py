@@ -20,7 +20,8 @@ from numpy.typing import ArrayLike, NDArray
 
 FloatArray = NDArray[np.float64]
 
-_REFINEMENTS = 4
+_REFINEMENTS = 6
+_SOFTENING = 2.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,9 +69,9 @@ class ConsensusSettings:
 
     largest_rad: float = np.radians(5.0)
     prior_rad: float = np.radians(2.0)
-    tolerance_rad: float = np.radians(0.6)
-    tolerance_sigmas: float = 3.0
-    building_rad: float = np.radians(0.1)
+    tolerance_rad: float = np.radians(0.7)
+    tolerance_sigmas: float = 10.0
+    building_rad: float = np.radians(0.03)
     proposers: int = 24
     least_lines: int = 3
 
@@ -112,19 +113,21 @@ def consensus(
             normal, tolerance, weight, strongest, settings.largest_rad, settings.prior_rad
         )
     )
-    precision = 1.0 / (settings.building_rad**2 + inclination_variance)
-    covariance = np.zeros((2, 2))
-    consistent = np.abs(_inclination(normal, tilt)) <= tolerance
+    deviation = np.sqrt(settings.building_rad**2 + inclination_variance)
+    prior = np.eye(2) / settings.prior_rad**2
+    covariance = np.linalg.inv(prior)
+    consistent = np.zeros(len(normal), np.bool_)
     for _ in range(_REFINEMENTS):
-        design = np.stack([normal[:, 1], -normal[:, 0]], axis=-1)[consistent]
-        weighted = design * precision[consistent, None]
-        information = weighted.T @ design + np.eye(2) / settings.prior_rad**2
+        off = _inclination(normal, tilt)
+        consistent = np.abs(off) <= tolerance
+        # Cauchy's weights: a line of furniture or a shadow among few lines must not pull.
+        softened = deviation * np.sqrt(1.0 + (off / (_SOFTENING * deviation)) ** 2)
+        design = np.stack([normal[:, 1], -normal[:, 0]], axis=-1) / softened[:, None]
+        seen = -normal[:, 2] / softened
+        information = design[consistent].T @ design[consistent] + prior
         covariance = np.linalg.inv(information)
-        tilt = -covariance @ (weighted.T @ normal[consistent, 2])
-        now = np.abs(_inclination(normal, tilt)) <= tolerance
-        if np.array_equal(now, consistent):
-            break
-        consistent = now
+        tilt = covariance @ (design[consistent].T @ seen[consistent])
+    consistent = np.abs(_inclination(normal, tilt)) <= tolerance
     lines = int(consistent.sum())
     if lines < settings.least_lines or np.any(np.abs(tilt) > settings.largest_rad):
         return None, np.abs(normal[:, 2]) <= tolerance
