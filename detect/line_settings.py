@@ -50,7 +50,8 @@ class LineSettings:
     least_evidence : float
         Least sum of the points' responses, per pixel's width of length, weakened for soft edges.
     least_sharpness : float
-        Least sharpness of a line's edge relative to the image's median: softer ones are shadows.
+        Edges fainter than the image's median must have this part of the sharpness that a quarter of
+        its lines stay below: fainter and softer ones are shadows and glare.
     largest_horizon_gap_px : float
         How far a line may end from the horizon.
     largest_scatter_px : float
@@ -70,7 +71,10 @@ class LineSettings:
     join_px : float
         Lines closer than this at the horizon are joined to one row.
     join_share : float
-        Lines with less than this part of a closer one's evidence are dropped instead.
+        Lines with less than this part of the other's evidence are dropped instead.
+    shoulder_px, shoulder_share : float
+        Lines closer than this to one with so much more contrast (the part that theirs is of it) are
+        dropped: they are what light does beside an edge.
     sigma_px : float
         Standard deviation of an edge about the line of the building that it stands for.
     alpha : "level" or "published"
@@ -86,13 +90,13 @@ class LineSettings:
     start_spacing_rows: int = 4
     gap_rows: int = 6
     guided: bool = True
-    guided_pull: float = 0.05
+    guided_pull: float = 0.07
     guided_reach_px: float = 0.75
     refine_scales_px: tuple[float, ...] = (1.2, 0.8, 0.8)
     coarse_scale_px: float = 1.6
     least_rows: int = 14
-    least_length_px: float = 26.0
-    least_evidence: float = 7.0
+    least_length_px: float = 24.0
+    least_evidence: float = 6.8
     least_sharpness: float = 0.87
     largest_horizon_gap_px: float = 11.0
     largest_scatter_px: float = 1.0

@@ -38,7 +38,6 @@ from lut.verticals import VerticalTable
 
 FloatArray = NDArray[np.float64]
 
-QQ = 0.25
 ACCEPTED = "accepted"
 JOINED = "joined"
 
@@ -208,8 +207,10 @@ def judge_lines(
     accepted = np.flatnonzero([f == ACCEPTED for f in fate])
     if len(accepted):
         # How sharp an edge can be depends on the image's focus and motion.
-        typical = np.quantile(fits.sharpness[accepted], QQ)
-        for t in accepted[fits.sharpness[accepted] < settings.least_sharpness * typical]:
+        sharpness, contrast = fits.sharpness[accepted], fits.contrast[accepted]
+        soft = sharpness < settings.least_sharpness * np.quantile(sharpness, 0.25)
+        faint = contrast < np.median(contrast)
+        for t in accepted[soft & faint]:
             fate[t] = "soft"
     return fate
 
