@@ -22,7 +22,7 @@ _FIRST_LOOK_PIXELS = 700
 _ALL_PIXELS = 40_000
 #: Nodes of the quadrature across flat discs, likewise.
 _FIRST_LOOK_NODES = 5
-_ALL_NODES = 15
+_ALL_NODES = 31
 
 #: Pixels within this many radii of the centre are fitted, and those this near to the edge.
 _REACH_RADII = 1.7

@@ -389,7 +389,8 @@ def _correlated_area(edge: NDArray[np.float64], n: int) -> float:
         square += edge[i, 2] * edge[i, 2]
     if not square > 0.0:
         return 1.0
-    correlation = min(max(product / square, 0.0), 0.8)
+    # By chance alone the correlation of n residuals scatters by 1 / sqrt(n).
+    correlation = min(max(product / square - 1.5 / math.sqrt(n), 0.0), 0.8)
     return ((1.0 + correlation) / (1.0 - correlation)) ** 2
 
 

@@ -68,7 +68,7 @@ class CircleSettings:
     verify: bool = True
     evidence: float = 1.0
     refine: bool = True
-    systematic_px: float = 0.005
+    systematic_px: float = 0.003
     tilt_sigma_deg: float = 0.0
 
     def __post_init__(self) -> None:

@@ -1,0 +1,81 @@
+"""The demo run, and any run given by ``--run``, re-detected and held against its shipped rows."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from detect.circles_run import detect_circles_run
+from detect.compare import compare_runs
+from detect.compare_result import CompareOptions, Comparison
+from detect.run import open_run
+from detect.settings import PUBLISHED, CircleSettings
+
+#: What the shipped rows were detected with, apart from what makes one disc one row.
+LIKE_SHIPPED = replace(
+    CircleSettings(), polarity="light", far_limit_m_per_px=PUBLISHED.far_limit_m_per_px
+)
+
+
+def redetected(run: Path, settings: CircleSettings, folder: Path) -> Comparison:
+    output = folder / "detected.circles"
+    summary = detect_circles_run(open_run(run), settings, output, version="test")
+    assert summary.failures == []
+    return compare_runs(run, detected=output, options=CompareOptions(sigma=4.0))
+
+
+@pytest.mark.long
+def test_demo_run_is_found_again(project_root: Path, tmp_path: Path) -> None:
+    result = redetected(project_root / "images" / "e", LIKE_SHIPPED, tmp_path)
+    assert result.matched + result.missed >= 250
+    assert result.recall is not None
+    assert result.recall >= 0.97
+    assert result.precision is not None
+    assert result.precision >= 0.80
+
+
+@pytest.mark.long
+def test_published_detector_finds_the_demo_run(project_root: Path, tmp_path: Path) -> None:
+    result = redetected(project_root / "images" / "e", PUBLISHED, tmp_path)
+    assert result.recall is not None
+    assert result.recall >= 0.98
+
+
+def test_demo_run_is_complete(project_root: Path) -> None:
+    run = open_run(project_root / "images" / "e")
+    assert 60 <= len(run.frames) <= 100
+    assert all(frame.image is not None for frame in run.frames)
+    assert run.images_without_step == ()
+    size = sum(path.stat().st_size for path in run.folder.rglob("*") if path.is_file())
+    assert size <= 4_000_000
+
+
+@pytest.mark.long
+def test_given_runs_are_found_again(request: pytest.FixtureRequest, tmp_path: Path) -> None:
+    runs = [Path(given) for given in request.config.getoption("--run")]
+    if not runs:
+        pytest.skip("no run folder was given by --run")
+    for number, run in enumerate(runs):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        result = redetected(run, LIKE_SHIPPED, folder)
+        assert result.recall is not None
+        assert result.recall >= 0.90, f"{run}: recall {result.recall:.3f}"
+
+
+def test_same_run_gives_the_same_bytes(project_root: Path, tmp_path: Path) -> None:
+    short = tmp_path / "e"
+    (short / "images").mkdir(parents=True)
+    source = project_root / "images" / "e"
+    shutil.copy(source / "e.cam", short)
+    for number in range(3):
+        shutil.copy(source / "images" / f"e.{number:04d}.jpg", short / "images")
+    written = []
+    for name in ("first", "second"):
+        output = tmp_path / f"{name}.circles"
+        detect_circles_run(open_run(short), CircleSettings(), output, version="test")
+        written.append(output.read_bytes())
+    assert written[0] == written[1]

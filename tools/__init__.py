@@ -1,0 +1,1 @@
+"""Scripts that make, fetch, measure or time things."""

@@ -1,0 +1,128 @@
+"""Accuracy of the disc fit on rendered discs whose truth is exact.
+
+Discs are drawn at random over all pixels that the detector's table covers, at random sub-pixel
+places, rendered by exact supersampling (`tools.simulator.single_disc`, which knows nothing of the
+fit), and fitted. Errors are held against the covariance that the fit predicts.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from camera import Camera
+from detect.circles import disc_shape, refined_covariance
+from detect.disc_fit import estimate_noise, fit_discs
+from detect.settings import CircleSettings
+from lut import DiscTable, cached_disc_table
+from tools.simulator.single_disc import render_disc
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """Errors of N fitted discs.
+
+    Attributes
+    ----------
+    distance_m : (N,) float64
+        Of the discs from the robot.
+    error_px : (N, 2) float64
+        Fitted minus true centre in the image, pixels.
+    normalised_error : (N,) float64
+        Squared error over the predicted covariance, per degree of freedom.
+    failed : int
+        Discs that the fit gave up.
+    """
+
+    distance_m: NDArray[np.float64]
+    error_px: NDArray[np.float64]
+    normalised_error: NDArray[np.float64]
+    failed: int
+
+    @property
+    def rms_px(self) -> float:
+        """Root mean square of the errors of either coordinate, pixels."""
+        return float(np.sqrt(np.mean(self.error_px**2)))
+
+
+def measure_accuracy(
+    camera: Camera,
+    settings: CircleSettings,
+    *,
+    discs: int,
+    light: float,
+    dark: float,
+    blur_px: float,
+    noise: float,
+    seed: int,
+) -> Accuracy:
+    """Render and fit discs.
+
+    Parameters
+    ----------
+    camera : Camera
+        The camera.
+    settings : CircleSettings
+        Of the detector whose fit is measured.
+    discs : int
+        How many.
+    light, dark : float
+        Grey values of disc and floor.
+    blur_px : float
+        Standard deviation of the optics' blur, pixels.
+    noise : float
+        Standard deviation of the noise, grey levels.
+    seed : int
+        Of places and noise.
+
+    Returns
+    -------
+    Accuracy
+    """
+    table = cached_disc_table(camera, disc_shape(settings))
+    rng = np.random.default_rng(seed)
+    rows, columns = np.nonzero(table.usable)
+    distance, error, normalised = [], [], []
+    failed = 0
+    for index in rng.integers(len(rows), size=discs):
+        pixel = np.array([columns[index], rows[index]]) + rng.uniform(-0.5, 0.5, 2)
+        true_xy = camera.floor_from_pixel(pixel)
+        image = _render(camera, table, true_xy, settings, light, dark, blur_px, noise, rng)
+        nearest = np.array([[columns[index], rows[index]]], np.int64)
+        fit = fit_discs(image, table.floor_xy, nearest, settings.radius_m, estimate_noise(image))
+        if not fit.fitted[0]:
+            failed += 1
+            continue
+        covariance = refined_covariance(camera, fit.floor_xy, fit.covariance, settings)[0]
+        off = fit.floor_xy[0] - true_xy
+        distance.append(float(np.hypot(*true_xy)))
+        error.append(camera.project_floor(fit.floor_xy[0]) - camera.project_floor(true_xy))
+        normalised.append(float(off @ np.linalg.solve(covariance, off)) / 2.0)
+    return Accuracy(np.array(distance), np.array(error), np.array(normalised), failed)
+
+
+def _render(
+    camera: Camera,
+    table: DiscTable,
+    true_xy: NDArray[np.float64],
+    settings: CircleSettings,
+    light: float,
+    dark: float,
+    blur_px: float,
+    noise: float,
+    rng: np.random.Generator,
+) -> NDArray[np.uint8]:
+    """An image of the bare floor with one disc on it."""
+    height, width = table.usable.shape
+    floor = dark + rng.normal(0.0, noise, (height, width))
+    image = np.clip(np.rint(floor), 0, 255).astype(np.uint8)
+    crop = render_disc(camera, true_xy, settings.radius_m, light, dark, blur_px, noise, rng=rng)
+    top, left = max(crop.v0, 0), max(crop.u0, 0)
+    bottom = min(crop.v0 + crop.grey.shape[0], height)
+    right = min(crop.u0 + crop.grey.shape[1], width)
+    image[top:bottom, left:right] = crop.grey[
+        top - crop.v0 : bottom - crop.v0, left - crop.u0 : right - crop.u0
+    ]
+    return image

@@ -1,0 +1,157 @@
+"""Command line of the evaluation."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import tyro
+from tyro.conf import Positional, subcommand
+
+from detect.settings import CircleSettings
+
+_BLURS_PX = (0.3, 0.7, 1.2)
+_BINS_M = ((0.0, 1.5), (1.5, 2.5), (2.5, 4.0), (4.0, 7.0))
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """Refined centres of rendered single discs against the truth, by blur and distance.
+
+    Parameters
+    ----------
+    camera : Path
+        Calibration to render and fit through.
+    discs : int
+        Discs per blur.
+    light : float
+        Grey value of the discs.
+    dark : float
+        Grey value of the floor.
+    noise : float
+        Standard deviation of the noise, grey levels.
+    seed : int
+        Of places and noise.
+    """
+
+    camera: Path = Path("images/e/e.cam")
+    discs: int = 400
+    light: float = 220.0
+    dark: float = 60.0
+    noise: float = 2.0
+    seed: int = 1
+
+
+@dataclass(frozen=True)
+class Photographs:
+    """Detect the discs of every folder below DATA/dev and score them with DATA/evaluate.py.
+
+    Parameters
+    ----------
+    data : Path
+        Folder with `evaluate.py` and `dev`.
+    """
+
+    data: Positional[Path] = Path("../shared/data/discs")
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """Detect the light discs of a rendered run and score them with its evaluate.py.
+
+    Parameters
+    ----------
+    run : Path
+        Folder of the run; `evaluate.py` stands beside it.
+    """
+
+    run: Positional[Path] = Path("../shared/data/rendered/r1")
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run a subcommand; returns the exit code."""
+    command = tyro.cli(
+        Annotated[Accuracy, subcommand("accuracy")]
+        | Annotated[Photographs, subcommand("photographs")]
+        | Annotated[Rendered, subcommand("rendered")],
+        prog="python -m tools.evaluation",
+        description="Prints the figures in the README.",
+        args=arguments,
+    )
+    if isinstance(command, Accuracy):
+        return _accuracy(command)
+    if isinstance(command, Photographs):
+        return _photographs(command)
+    return _rendered(command)
+
+
+def _accuracy(command: Accuracy) -> int:
+    from camera import read_camera
+    from tools.evaluation.accuracy import measure_accuracy
+
+    camera = read_camera(command.camera)
+    print("blur px  distance m  discs   rms u px   rms v px  normalised error^2 / dof")
+    for blur_px in _BLURS_PX:
+        result = measure_accuracy(
+            camera,
+            CircleSettings(),
+            discs=command.discs,
+            light=command.light,
+            dark=command.dark,
+            blur_px=blur_px,
+            noise=command.noise,
+            seed=command.seed,
+        )
+        everything = np.ones(len(result.distance_m), bool)
+        rows = [(f"{low:.1f}-{high:.1f}", low, high) for low, high in _BINS_M]
+        for label, low, high in [*rows, ("all", 0.0, np.inf)]:
+            chosen = everything & (result.distance_m >= low) & (result.distance_m < high)
+            if chosen.any():
+                rms = np.sqrt(np.mean(result.error_px[chosen] ** 2, axis=0))
+                print(
+                    f"{blur_px:7.1f}  {label:>10}  {chosen.sum():5d}  {rms[0]:9.4f}  {rms[1]:9.4f}"
+                    f"  {result.normalised_error[chosen].mean():9.3f}"
+                )
+        print(f"         both coordinates {result.rms_px:.4f} px rms, {result.failed} failed")
+    return 0
+
+
+def _photographs(command: Photographs) -> int:
+    with tempfile.TemporaryDirectory() as folder:
+        files = []
+        for run in sorted(path.parent for path in command.data.glob("dev/*/truth.json")):
+            output = Path(folder) / f"{run.name}.circles"
+            _detect(run, CircleSettings(), output)
+            files.append(str(output))
+        script = str(command.data / "evaluate.py")
+        return subprocess.run([sys.executable, script, "--circles", *files], check=False).returncode
+
+
+def _rendered(command: Rendered) -> int:
+    with tempfile.TemporaryDirectory() as folder:
+        output = Path(folder) / "detected.circles"
+        _detect(command.run, replace(CircleSettings(), polarity="light"), output)
+        script = str((command.run.parent / "evaluate.py").resolve())
+        # The scorer brings a module named camera: it must not find this project's.
+        return subprocess.run(
+            [sys.executable, script, command.run.name, str(output)], check=False, cwd=folder
+        ).returncode
+
+
+def _detect(run: Path, settings: CircleSettings, output: Path) -> None:
+    from detect import __version__
+    from detect.circles_run import detect_circles_run
+    from detect.run import open_run
+
+    summary = detect_circles_run(open_run(run), settings, output, version=__version__)
+    for failure in summary.failures:
+        print(failure, file=sys.stderr)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
