@@ -19,6 +19,9 @@ _LARGEST_FILE_BYTES = 1 << 20
 _LARGEST_EXCERPT = 40
 
 _TOKEN = re.compile(r"[{}\[\]:]|[^\s,{}\[\]:#]+")
+_LINE_END = re.compile(r"\r\n|\r|\n")
+# Python's float also reads "1_000", "infinity" and digits of other scripts.
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 
 # A key's value: its tokens, each with its line.
 _Entries = dict[str, list[tuple[str, int]]]
@@ -47,7 +50,7 @@ def read_camera(path: str | os.PathLike[str]) -> Camera:
     try:
         if path.stat().st_size > _LARGEST_FILE_BYTES:
             raise CameraError(f"{path}: larger than {_LARGEST_FILE_BYTES} bytes: not a .cam file")
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8-sig")
     except FileNotFoundError:
         raise CameraError(f"{path}: no such calibration file") from None
     except (OSError, UnicodeDecodeError) as error:
@@ -65,9 +68,10 @@ def parse_camera(text: str, name: str = "<text>") -> Camera:
         return _numbers(entries.pop(key), key, count, name)
 
     def whole(key: str) -> int:
+        line = entries[key][0][1] if entries.get(key) else 0
         value = numbers(key, 1)[0]
         if value != int(value):
-            raise CameraError(f"{name}: {key} is {value}: expected a whole number")
+            raise CameraError(f"{name}:{line}: {key} is {value}: expected a whole number")
         return int(value)
 
     pose = _rows(numbers("sensor2World", 12))
@@ -123,7 +127,7 @@ def _split(text: str, name: str) -> _Entries:
     """Split the text into keys and the tokens of their values, checking braces and brackets."""
     tokens = [
         (match.group(), number)
-        for number, line in enumerate(text.splitlines(), start=1)
+        for number, line in enumerate(_LINE_END.split(text), start=1)
         for match in _TOKEN.finditer(line.partition("#")[0])
     ]
     words = [token for token, _ in tokens]
@@ -150,7 +154,7 @@ def _split(text: str, name: str) -> _Entries:
                 following = tokens[position + 1][1]
                 raise CameraError(f"{name}:{following}: text after the closing brace")
             return entries
-        if token == ":" or not key:
+        if (token == ":" and not open_until) or not key:
             raise CameraError(f"{name}:{line}: unexpected {_excerpt(token)}: expected 'key: value'")
         if token in closing:
             open_until.append(closing[token])
@@ -166,14 +170,13 @@ def _numbers(value: list[tuple[str, int]], key: str, count: int, name: str) -> l
     for token, line in value:
         if token in "{}[]":
             continue
-        try:
-            numbers.append(float(token))
-        except ValueError:
-            raise CameraError(
-                f"{name}:{line}: {key} has {_excerpt(token)}: expected a number"
-            ) from None
+        if not _NUMBER.fullmatch(token):
+            raise CameraError(f"{name}:{line}: {key} has {_excerpt(token)}: expected a number")
+        numbers.append(float(token))
         if not abs(numbers[-1]) < float("inf"):
-            raise CameraError(f"{name}:{line}: {key} has {token}: expected a finite number")
+            raise CameraError(
+                f"{name}:{line}: {key} has {_excerpt(token)}: expected a number that fits a double"
+            )
     if len(numbers) != count:
         where = f":{value[0][1]}" if value else ""
         raise CameraError(f"{name}{where}: {key} has {len(numbers)} numbers: expected {count}")

@@ -18,11 +18,18 @@ from numpy.typing import NDArray
 
 Coef = tuple[float, float, float, float, float]
 
+#: Coefficients beyond this are no distortion; it also keeps all that follows finite.
+LARGEST_COEFFICIENT = 1e6
+
 #: Largest undistorted radius (tangent of the angle to the optical axis) that is inverted: 89.9 deg.
 RADIUS_LIMIT = 573.0
 
-_TABLE_NODES = 4096
+# So fine that the table's linear interpolation needs but one step of Newton's method.
+_TABLE_NODES = 16384
 _NEWTON_STEPS = 60
+# Coefficients of a polynomial in r that make no difference even at `RADIUS_LIMIT`.
+_NEGLIGIBLE = 1e-30
+_LAST_STEP = 1e-9
 
 
 def radial_factor(radius: NDArray[np.float64], coef: Coef) -> NDArray[np.float64]:
@@ -84,10 +91,18 @@ def fold_radius(coef: Coef) -> float:
         + numerator * denominator
         + r * (numerator.deriv() * denominator - numerator * denominator.deriv())
     )
-    roots = np.concatenate([growth.trim().roots(), denominator.trim().roots()])
-    real = roots.real[np.abs(roots.imag) <= 1e-9 * np.maximum(1.0, np.abs(roots.real))]
-    positive = real[real > 0.0]
-    return float(positive.min()) if positive.size else float("inf")
+    # Stay a little short of a root, so that rounding does not reach past it: near a pole even of
+    # second order the denominator must remain more than rounding.
+    fold = _first_positive_root(growth) * (1.0 - 1e-12)
+    pole = _first_positive_root(denominator) * (1.0 - 1e-7)
+    return min(fold, pole)
+
+
+def _first_positive_root(polynomial: Polynomial) -> float:
+    roots = polynomial.trim(_NEGLIGIBLE).roots()
+    # Rounding can make a conjugate pair of a double root.
+    real = roots.real[np.abs(roots.imag) <= 1e-6 * np.maximum(1.0, np.abs(roots.real))]
+    return float(min(real[real > 0.0], default=np.inf))
 
 
 @lru_cache(maxsize=64)
@@ -111,6 +126,9 @@ def largest_distorted_radius(coef: Coef) -> float:
 def undistorted_radius(distorted: NDArray[np.float64], coef: Coef) -> NDArray[np.float64]:
     """Inverse of g on [0, r_max], to 1e-12 relative to the larger of 1 and r.
 
+    (At the fold itself g' vanishes, so there r is only as good as the last digit of g allows, 1e-8;
+    g of the result is always right to the last digits.)
+
     Newton's method inside a bracket from a table of g, bisecting where a step would leave it; so it
     also converges close to the fold, where g' vanishes.
 
@@ -129,27 +147,30 @@ def undistorted_radius(distorted: NDArray[np.float64], coef: Coef) -> NDArray[np
     target = np.asarray(distorted, dtype=np.float64)
     table_g, table_r = _inverse_table(coef)
     flat = target.ravel()
-    seen = np.isfinite(flat) & (flat >= 0.0) & (flat <= table_g[-1])
-    goal = np.where(seen, flat, 0.0)
+    result = np.full(flat.shape, np.nan)
+    active = np.flatnonzero((flat >= 0.0) & (flat <= table_g[-1]))
+    goal = flat[active]
 
     upper = np.clip(np.searchsorted(table_g, goal, side="left"), 1, len(table_g) - 1)
-    low, high = table_r[upper - 1].copy(), table_r[upper].copy()
+    low, high = table_r[upper - 1], table_r[upper]
     span = table_g[upper] - table_g[upper - 1]
     share = np.divide(goal - table_g[upper - 1], span, out=np.zeros_like(goal), where=span > 0.0)
     r = low + share * (high - low)
     for _ in range(_NEWTON_STEPS):
         f = radial_factor(r, coef)
         error = r * f - goal
-        low = np.where(error < 0.0, r, low)
-        high = np.where(error > 0.0, r, high)
-        slope = f + r * radial_factor_derivative(r, coef)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            step = r - error / slope
-        inside = (step >= low) & (step <= high)
-        following = np.where(inside, step, 0.5 * (low + high))
-        following = np.where(error == 0.0, r, following)
-        moved = np.abs(following - r)
-        r = following
-        if not np.any(moved > 4e-16 * np.maximum(1.0, r)):
+        low = np.where(error <= 0.0, r, low)
+        high = np.where(error >= 0.0, r, high)
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            newton = r - error / (f + r * radial_factor_derivative(r, coef))
+        newton = np.where(error == 0.0, r, newton)
+        # Newton's error squares with each step: after one this small nothing is left to gain.
+        ended = np.abs(newton - r) <= _LAST_STEP * np.maximum(1.0, r)
+        inside = (newton >= low) & (newton <= high)
+        r = np.where(inside, newton, 0.5 * (low + high))
+        result[active] = np.where(ended, np.clip(newton, low, high), r)
+        going = ~ended
+        if not going.any():
             break
-    return np.where(seen, r, np.nan).reshape(target.shape)
+        active, goal, r, low, high = active[going], goal[going], r[going], low[going], high[going]
+    return result.reshape(target.shape)

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import operator
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -22,6 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from camera.distortion import (
+    LARGEST_COEFFICIENT,
     Coef,
     fold_radius,
     largest_distorted_radius,
@@ -70,7 +72,7 @@ class Camera:
     ------
     CameraError
         If a number is not finite, a size or scale not positive, the rotation not a rotation, or the
-        distortion folds inside the image.
+        distortion folds inside the image. The message calls things by the file's names.
 
     References
     ----------
@@ -90,6 +92,9 @@ class Camera:
     unknown: tuple[tuple[str, str], ...] = field(default=())
 
     def __post_init__(self) -> None:
+        for name in ("width", "height", "mount_index"):
+            object.__setattr__(self, name, _whole(name, getattr(self, name)))
+        object.__setattr__(self, "unknown", tuple((key, text) for key, text in self.unknown))
         object.__setattr__(self, "coef", tuple(float(c) for c in self.coef))
         object.__setattr__(self, "robot_from_camera", _pose("sensor2World", self.robot_from_camera))
         if self.sensor_to_tcp is not None:
@@ -114,6 +119,8 @@ class Camera:
         ):
             if not math.isfinite(value):
                 raise CameraError(f"{name} is {value}: expected a finite number")
+        if max(abs(c) for c in self.coef) > LARGEST_COEFFICIENT:
+            raise CameraError(f"coef is {self.coef}: expected at most {LARGEST_COEFFICIENT:g} each")
         for name, value in (("scaleX", self.scale_x), ("scaleY", self.scale_y)):
             if value <= 0.0:
                 raise CameraError(f"{name} is {value}: expected a positive number of pixels")
@@ -155,7 +162,8 @@ class Camera:
             self.width, self.height, self.scale_x, self.scale_y, self.offset_x, self.offset_y,
             *self.coef, *(x for row in self.robot_from_camera for x in row),
         )  # fmt: skip
-        return hashlib.sha256(" ".join(float(n).hex() for n in numbers).encode()).hexdigest()
+        # Adding 0 makes -0 the 0 that it is equal to.
+        return hashlib.sha256(" ".join((n + 0.0).hex() for n in numbers).encode()).hexdigest()
 
     def __str__(self) -> str:
         pitch_deg = math.degrees(math.asin(max(-1.0, min(1.0, -float(self.rotation[2, 2])))))
@@ -182,7 +190,7 @@ class Camera:
         """
         xy = np.asarray(normalised, dtype=np.float64)
         radius = np.hypot(xy[..., 0], xy[..., 1])
-        defined = radius <= self.r_max
+        defined = (radius <= self.r_max) & np.isfinite(radius)
         factor = np.where(defined, radial_factor(np.where(defined, radius, 0.0), self.coef), np.nan)
         return np.stack(
             [
@@ -226,7 +234,9 @@ class Camera:
         """
         p = np.asarray(points_camera, dtype=np.float64)
         depth = np.where(p[..., 2] > 0.0, p[..., 2], np.nan)
-        return self.distort(p[..., :2] / depth[..., None])
+        with np.errstate(over="ignore"):  # a point all but beside the camera
+            normalised = p[..., :2] / depth[..., None]
+        return self.distort(normalised)
 
     def unproject(self, pixels: ArrayLike) -> FloatArray:
         """Directions (x, y, 1) in the camera frame that pixels see.
@@ -370,8 +380,9 @@ def _pose(name: str, rows: ArrayLike) -> Pose:
     if not np.all(np.isfinite(array)):
         raise CameraError(f"{name} has a number that is not finite")
     rotation = array[:, :3]
-    deviation = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
-    if deviation > _ROTATION_TOLERANCE:
+    with np.errstate(over="ignore", invalid="ignore"):
+        deviation = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+    if not deviation <= _ROTATION_TOLERANCE:
         raise CameraError(
             f"{name} is not a rotation: R R^T differs from the identity by {deviation:.3g} "
             f"(at most {_ROTATION_TOLERANCE:g})"
@@ -379,6 +390,13 @@ def _pose(name: str, rows: ArrayLike) -> Pose:
     if np.linalg.det(rotation) < 0.0:
         raise CameraError(f"{name} is not a rotation but a reflection: its determinant is -1")
     return tuple((float(a), float(b), float(c), float(d)) for a, b, c, d in array)
+
+
+def _whole(name: str, value: int) -> int:
+    try:
+        return operator.index(value)
+    except TypeError:
+        raise CameraError(f"{name} is {value!r}: expected a whole number") from None
 
 
 def _read_only(array: FloatArray) -> FloatArray:

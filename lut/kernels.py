@@ -12,6 +12,12 @@ from camera.kernels import project_floor_point
 
 
 @njit(cache=True, error_model="numpy")
+def _inside(us: float, vs: float, width: int, height: int) -> bool:
+    """Whether the pixel nearest to a position belongs to the image; NaN does not."""
+    return 0.0 <= us + 0.5 < width and 0.0 <= vs + 0.5 < height
+
+
+@njit(cache=True, error_model="numpy")
 def count_votes(
     numbers: NDArray[np.float64],
     floor_xy: NDArray[np.float64],
@@ -44,8 +50,7 @@ def count_votes(
                 us, vs = project_floor_point(
                     numbers, floor_xy[v, u, 0] + ring[k, 0], floor_xy[v, u, 1] + ring[k, 1]
                 )
-                # Rounded to the nearest pixel: inside means within half a pixel of the image.
-                if -0.5 <= us < width - 0.5 and -0.5 <= vs < height - 0.5:
+                if _inside(us, vs, width, height):
                     inside += 1
             votes[v, u] = inside
 
@@ -61,6 +66,9 @@ def encode_runs(
     capacity: int,
 ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32], NDArray[np.int32], int]:
     """Run-length encode the samples' offsets along each row.
+
+    Samples outside the image, or that the camera does not see at all, get the pixel above the
+    image's first one in their centre's column: one run, and no farther outside than that.
 
     Parameters
     ----------
@@ -82,7 +90,7 @@ def encode_runs(
     count : int
         Number of runs needed; if larger than `capacity`, the rest was not written.
     """
-    height = usable.shape[0]
+    height, width = usable.shape
     samples = rings.shape[0]
     run_bounds = np.zeros((height, samples + 1), np.int32)
     run_start = np.empty(capacity, np.int32)
@@ -101,8 +109,12 @@ def encode_runs(
                 us, vs = project_floor_point(
                     numbers, floor_xy[v, u, 0] + rings[k, 0], floor_xy[v, u, 1] + rings[k, 1]
                 )
-                du_here = math.floor(us + 0.5) - u
-                dv_here = math.floor(vs + 0.5) - v
+                if _inside(us, vs, width, height):
+                    du_here = math.floor(us + 0.5) - u
+                    dv_here = math.floor(vs + 0.5) - v
+                else:
+                    du_here = 0
+                    dv_here = -1 - v
                 if fresh or du_here != du or dv_here != dv:
                     du = du_here
                     dv = dv_here

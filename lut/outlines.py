@@ -10,7 +10,8 @@ offset from the centre stays the same for some 40 pixels. So the table stores, f
 sample, the *runs* of equal offset. A detector can then copy stretches of image rows instead of
 gathering single pixels.
 
-Samples outside the image do not vote. A centre is usable when at least half of each outline's
+Samples outside the image do not vote: the table sends them to the row above the image, which a
+detector pads with zeros. A centre is usable when at least half of each outline's
 samples are inside, it keeps its distance from the border, and the floor there moves by no more
 than a given length per image row.
 """
@@ -88,11 +89,13 @@ class DiscTable:
     run_start : (N,) int16 or int32
         First column of each run.
     run_du, run_dv : (N,) int16 or int32
-        Offset of the sample from the centre, pixels.
+        Offset of the sample from the centre, pixels. For samples outside the image it leads to row
+        -1, straight above the centre.
     votes_inner, votes_outer : (H, W) uint8
         Samples of each outline inside the image, for usable centres.
     margin_px : int
-        Largest distance of a sample outside the image: padding that makes every offset safe.
+        Padding that makes every offset of every run safe: 1 where samples lie outside the image,
+        more only where a run passes over centres that are not usable.
     floor_xy : (H, W, 2) float32
         Floor position (robot X, Y in metres) that each pixel sees; NaN above the horizon.
     """
