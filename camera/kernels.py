@@ -21,7 +21,7 @@ def camera_numbers(camera: Camera) -> NDArray[np.float64]:
     """All that a projection needs, as one vector, the form in which kernels take a camera.
 
     Order: scale x, y; offset x, y; a2, a3, b1, b2, b3; r_max; the 9 entries of the rotation
-    camera -> robot row by row; the camera's centre in the robot frame.
+    robot -> camera row by row; the camera's centre in the robot frame.
     """
     return np.array(
         [
@@ -31,7 +31,7 @@ def camera_numbers(camera: Camera) -> NDArray[np.float64]:
             camera.offset_y,
             *camera.coef,
             camera.r_max,
-            *camera.rotation.ravel(),
+            *camera.camera_from_robot.ravel(),
             *camera.centre,
         ]
     )
@@ -45,11 +45,11 @@ def project_floor_point(
     dx = x_robot - numbers[19]
     dy = y_robot - numbers[20]
     dz = -numbers[21]
-    z = numbers[12] * dx + numbers[15] * dy + numbers[18] * dz
+    z = numbers[16] * dx + numbers[17] * dy + numbers[18] * dz
     if not z > 0.0:
         return math.nan, math.nan
-    x = (numbers[10] * dx + numbers[13] * dy + numbers[16] * dz) / z
-    y = (numbers[11] * dx + numbers[14] * dy + numbers[17] * dz) / z
+    x = (numbers[10] * dx + numbers[11] * dy + numbers[12] * dz) / z
+    y = (numbers[13] * dx + numbers[14] * dy + numbers[15] * dz) / z
     r = math.sqrt(x * x + y * y)
     if not r <= numbers[9]:
         return math.nan, math.nan

@@ -146,6 +146,15 @@ class Camera:
         return _read_only(np.array(self.robot_from_camera)[:, :3])
 
     @cached_property
+    def camera_from_robot(self) -> FloatArray:
+        """(3, 3) inverse of `rotation`.
+
+        Files give rotations in few digits, so this is not exactly the transpose; with it, what goes
+        from pixel to floor comes back to the same pixel.
+        """
+        return _read_only(np.linalg.inv(self.rotation))
+
+    @cached_property
     def centre(self) -> FloatArray:
         """(3,) position of the camera's centre in the robot frame, metres."""
         return _read_only(np.array(self.robot_from_camera)[:, 3])
@@ -259,7 +268,8 @@ class Camera:
 
     def robot_to_camera(self, points_robot: ArrayLike) -> FloatArray:
         """(..., 3) points of the robot frame in the camera frame, metres."""
-        return (np.asarray(points_robot, dtype=np.float64) - self.centre) @ self.rotation
+        offset = np.asarray(points_robot, dtype=np.float64) - self.centre
+        return np.asarray(offset @ self.camera_from_robot.T)
 
     def project_robot(self, points_robot: ArrayLike) -> FloatArray:
         """(..., 2) pixels of (..., 3) points in the robot frame; NaN as in `project`."""
@@ -356,7 +366,7 @@ class Camera:
         floor_xy = self.floor_from_pixel(pixels)
         point = np.concatenate([floor_xy, np.zeros_like(floor_xy[..., :1])], axis=-1)
         pixels_per_metre = (
-            self.project_jacobian(self.robot_to_camera(point)) @ self.rotation.T[:, :2]
+            self.project_jacobian(self.robot_to_camera(point)) @ self.camera_from_robot[:, :2]
         )
         return _inverse_2x2(pixels_per_metre)
 
