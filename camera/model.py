@@ -152,7 +152,7 @@ class Camera:
         Files give rotations in few digits, so this is not exactly the transpose; with it, what goes
         from pixel to floor comes back to the same pixel.
         """
-        return _read_only(np.linalg.inv(self.rotation))
+        return _read_only(np.asarray(np.linalg.inv(self.rotation), dtype=np.float64))
 
     @cached_property
     def centre(self) -> FloatArray:

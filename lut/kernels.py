@@ -1,4 +1,8 @@
-"""Compiled loops that build tables: arrays in, arrays out."""
+"""Compiled loops that build tables: arrays in, arrays out.
+
+Numba's cache notices a change of this file, but not one of `camera.kernels`, whose function is
+compiled into these: whoever changes that one has to touch this file as well.
+"""
 
 from __future__ import annotations
 
