@@ -112,7 +112,7 @@ def fit_lines(
         table.bearing_rad, table.elevation_tan, tracks.bounds, tracks.row, tracks.column,
         reference, pixel, line, scatter, middle, spread,
     )  # fmt: skip
-    if not settings.refine_scales_px:
+    if not settings.refine_steps_px:
         return LineFits(
             reference_rad=reference,
             pixel_rad=pixel,
@@ -124,6 +124,7 @@ def fit_lines(
             contrast=np.full(count, np.nan),
             sharpness=np.ones(count),
         )
+    scales, farthest = np.array(settings.refine_steps_px).T
     refined_line = line.copy()
     covariance = np.empty((count, 2, 2))
     contrast, sharpness = np.empty(count), np.empty(count)
@@ -131,7 +132,8 @@ def fit_lines(
     refine_lines(
         image, table.column, table.bearing_rad, table.elevation_tan,
         tracks.polarity, tracks.bounds, tracks.row, tracks.column,
-        reference, pixel, middle, np.array(settings.refine_scales_px), settings.coarse_scale_px,
+        reference, pixel, middle, np.ascontiguousarray(scales), np.ascontiguousarray(farthest),
+        settings.fine_scale_px, settings.coarse_scale_px,
         refined_line, covariance, contrast, sharpness, refined,
     )  # fmt: skip
     shift = np.abs(refined_line[:, 0] - line[:, 0] + (refined_line[:, 1] - line[:, 1]) * middle)

@@ -497,9 +497,7 @@ def _cross_row(
 
 
 @njit(cache=True, error_model="numpy")
-def _step_height(
-    image: NDArray[np.uint8], v: int, u: float, sigma: float, reach: int
-) -> float:
+def _step_height(image: NDArray[np.uint8], v: int, u: float, sigma: float, reach: int) -> float:
     """Height of a step at (u, v), brighter on the right, as a derivative of Gaussian sees it."""
     nearest = int(math.floor(u + 0.5))
     base = float(image[v, nearest])
@@ -525,6 +523,8 @@ def refine_lines(
     pixel: NDArray[np.float64],
     middle: NDArray[np.float64],
     scales: NDArray[np.float64],
+    farthest: NDArray[np.float64],
+    fine: float,
     coarse: float,
     line: NDArray[np.float64],
     covariance: NDArray[np.float64],
@@ -552,14 +552,17 @@ def refine_lines(
         See `fit_eigenlines`.
     scales : (K,) float64
         Width of the Gaussian in each step of Newton's method, pixels.
-    coarse : float
-        Width of the Gaussian with which the last one's contrast is compared, pixels.
+    farthest : (K,) float64
+        How far a step may take the middle of a line, pixels; one that would go farther is not made,
+        nor any after it.
+    fine, coarse : float
+        Widths of the Gaussians whose contrasts are compared, pixels.
     line : (T, 2) float64
         a, b of the lines; changed.
     covariance : (T, 2, 2) float64
         Result: of a, b.
     contrast : (T,) float64
-        Result: height of the step, grey values, as the last step's filter sees it.
+        Result: height of the step, grey values, as the fine filter sees it.
     sharpness : (T,) float64
         Result: that contrast relative to the one that the coarse filter sees; near 1 for a sharp edge.
     refined : (T,) bool
@@ -567,6 +570,7 @@ def refine_lines(
     """
     width = image.shape[1]
     at = np.empty(image.shape[0], np.float64)
+    fine_reach = int(math.ceil(3.5 * fine)) + 1
     coarse_reach = int(math.ceil(3.5 * coarse)) + 1
     for t in range(len(sign)):
         begin, end = bounds[t], bounds[t + 1]
@@ -623,16 +627,14 @@ def refine_lines(
                 used += 1
             determinant = hessian_aa * hessian_bb - hessian_ab * hessian_ab
             # No maximum here at this scale: what the coarser ones found stands.
-            if used < 5 or not (
-                hessian_aa < 0.0 and determinant > 1e-12 * hessian_aa * hessian_bb
-            ):
+            if used < 5 or not (hessian_aa < 0.0 and determinant > 1e-12 * hessian_aa * hessian_bb):
                 break
             inverse_aa = hessian_bb / determinant
             inverse_ab = -hessian_ab / determinant
             inverse_bb = hessian_aa / determinant
             change_a = -(inverse_aa * gradient_a + inverse_ab * gradient_b)
             change_b = -(inverse_ab * gradient_a + inverse_bb * gradient_b)
-            if step > 0 and abs(change_a + change_b * middle[t]) > 1.5 * pixel[t]:
+            if abs(change_a + change_b * middle[t]) > farthest[step] * pixel[t]:
                 break
             a += change_a
             b += change_b
@@ -651,8 +653,6 @@ def refine_lines(
         line[t, 1] = b
         if not refined[t]:
             continue
-        fine = scales[len(scales) - 1]
-        fine_reach = int(math.ceil(3.5 * fine)) + 1
         fine_height = 0.0
         coarse_height = 0.0
         used = 0
@@ -666,9 +666,7 @@ def refine_lines(
                 coarse_height += _step_height(image, v, u, coarse, coarse_reach)
                 used += 1
         contrast[t] = sign[t] * fine_height / used if used > 0 else 0.0
-        sharpness[t] = (
-            fine_height / coarse_height if sign[t] * coarse_height > 0.0 else 1.0
-        )
+        sharpness[t] = fine_height / coarse_height if sign[t] * coarse_height > 0.0 else 1.0
 
 
 @njit(cache=True, error_model="numpy")

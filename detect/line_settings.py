@@ -38,11 +38,13 @@ class LineSettings:
         Whether tracks are followed a second time, along the verticals of the estimated tilt.
     guided_pull, guided_reach_px : float
         In the second time, part of a point's offset that the track yields to, and largest offset.
-    refine_scales_px : tuple of float
-        Widths of the Gaussian with which lines are refined on the grey values; none for the
-        eigen-decomposition of the tracked points alone.
-    coarse_scale_px : float
-        Width with which the last refinement's contrast is compared.
+    refine_steps_px : tuple of (float, float)
+        Steps in which lines are refined on the grey values: width of the Gaussian and the farthest
+        that the step may take a line; none for the eigen-decomposition of the tracked points alone.
+        Small widths keep neighbours out of each other's way, but suffer from aliasing: if a wide one
+        agrees with them in the end, the edge stands alone and the wide one is right.
+    fine_scale_px, coarse_scale_px : float
+        Widths whose contrasts are compared: their ratio is the edge's sharpness.
     least_rows : int
         Least number of points of a line.
     least_length_px : float
@@ -92,11 +94,17 @@ class LineSettings:
     guided: bool = True
     guided_pull: float = 0.07
     guided_reach_px: float = 0.75
-    refine_scales_px: tuple[float, ...] = (1.2, 0.8, 0.8)
+    refine_steps_px: tuple[tuple[float, float], ...] = (
+        (1.2, np.inf),
+        (0.8, 1.5),
+        (0.8, 1.5),
+        (1.8, 0.15),
+    )
+    fine_scale_px: float = 0.8
     coarse_scale_px: float = 1.6
     least_rows: int = 14
     least_length_px: float = 24.0
-    least_evidence: float = 6.8
+    least_evidence: float = 7.0
     least_sharpness: float = 0.87
     largest_horizon_gap_px: float = 11.0
     largest_scatter_px: float = 1.0
@@ -106,7 +114,7 @@ class LineSettings:
     consensus: ConsensusSettings = field(default_factory=ConsensusSettings)
     weight_limit: float = 3.0
     same_edge_px: float = 2.0
-    join_px: float = 2.8
+    join_px: float = 2.7
     join_share: float = 0.5
     shoulder_px: float = 5.0
     shoulder_share: float = 0.5
@@ -124,7 +132,7 @@ PUBLISHED = LineSettings(
     start_band_rows=0,
     start_spacing_rows=1,
     guided=False,
-    refine_scales_px=(),
+    refine_steps_px=(),
     least_rows=30,
     least_length_px=0.0,
     least_evidence=0.0,

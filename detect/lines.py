@@ -320,10 +320,10 @@ def line_ends(
             z = rise * np.sqrt(1.0 + x * x)
             x = line[:, 0] + line[:, 1] * z
             # Where the line crosses that row: bearings fall from left to right.
-            column = np.interp(
-                -(phi + np.arctan(x)), -table.bearing_rad[usable], usable
-            )
-            rise = _between_columns(table.elevation_tan, row, column)
+            column = np.interp(-(phi + np.arctan(x)), -table.bearing_rad[usable], usable)
+            moved = _between_columns(table.elevation_tan, row, column)
+            # At the verticals' own ends the neighbouring column may end a row earlier.
+            rise = np.where(np.isfinite(moved), moved, rise)
         z = rise * np.sqrt(1.0 + x * x)
         x = line[:, 0] + line[:, 1] * z
         direction = ahead + x[:, None] * left
