@@ -1,9 +1,10 @@
 """Bearings and inclinations of lines: from their planes, in both conventions, and joined.
 
-A line's row holds its ends in undistorted normalised image coordinates. The plane through the camera's
-centre and both ends has a unit normal n in the robot frame; beta = asin(n_z). alpha is the bearing of
-the horizontal direction in the plane with normal R n, where R undoes the tilt (`detect.tilt`). The data
-set's own rows were made with R's inverse, which adds the tilt instead of removing it.
+A line's row holds its ends in undistorted normalised image coordinates. The plane through the
+camera's centre and both ends has a unit normal n in the robot frame; beta = asin(n_z). alpha is the
+bearing of the horizontal direction in the plane with normal R n, where R undoes the tilt
+(`detect.tilt`). The data set's own rows were made with R's inverse, which adds the tilt instead of
+removing it.
 """
 
 from __future__ import annotations
@@ -62,14 +63,14 @@ def level_bearings(normal: ArrayLike, pitch_rad: float, roll_rad: float) -> Floa
         alpha (rad), 0 forward, positive to the left.
     """
     turned = np.asarray(normal, dtype=np.float64) @ level_rotation(pitch_rad, roll_rad).T
-    # The direction (n_y, -n_x) of the plane lies ahead of the camera, as `plane_normals` turns them.
+    # Of the plane's two level directions (n_y, -n_x) is the one ahead of the camera.
     return np.asarray(np.arctan2(turned[..., 1], turned[..., 0]))
 
 
 def compensated_bearings(
     normal: ArrayLike, tilt: TiltEstimate | None, *, published: bool = False
 ) -> FloatArray:
-    """alpha of lines, compensated for the tilt of their frame.
+    """Bearings of lines, compensated for the tilt of their frame.
 
     Parameters
     ----------

@@ -155,8 +155,8 @@ def lean_onto_tilt(
 ) -> tuple[FloatArray, FloatArray]:
     """Bearings at the horizon when lines may lean only as verticals do.
 
-    The measured lean b is replaced by its best estimate given that it should be `expected_lean` up to
-    a standard deviation, and a, which is correlated with it, follows.
+    The measured lean b is replaced by its best estimate given that it should be `expected_lean` up
+    to a standard deviation, and a, which is correlated with it, follows.
 
     Parameters
     ----------

@@ -1,11 +1,12 @@
 """Compiled loops of the detector of verticals: arrays in, arrays out.
 
-A *strip* image has a pixel (v, c) for row v of the vertical that crosses the horizon at column c (see
-`lut.verticals`): the building's verticals are its columns, whatever the camera's pose and distortion.
+A *strip* image has a pixel (v, c) for row v of the vertical that crosses the horizon at column c
+(see `lut.verticals`): the building's verticals are its columns, whatever the camera's pose and
+distortion.
 
 Lines are described in the chart round a reference bearing phi: a direction at bearing phi + d whose
-elevation has tangent e is X = tan(d), Z = e / cos(d). There every line is straight, X = a + b Z; a is
-the tangent of its bearing at the horizon relative to phi, b its lean.
+elevation has tangent e is X = tan(d), Z = e / cos(d). There every line is straight, X = a + b Z; a
+is the tangent of its bearing at the horizon relative to phi, b its lean.
 """
 
 from __future__ import annotations
@@ -38,8 +39,8 @@ def strip_response(
     column, first_row, last_row
         The table (see `lut.verticals.VerticalTable`).
     across, lever : (2r + 1,) float32
-        Weights across the line, of sum 1, and the coordinate that is correlated with the grey value,
-        of weighted mean 0 and variance 1.
+        Weights across the line, of sum 1, and the coordinate that is correlated with the grey
+        value, of weighted mean 0 and variance 1.
     along : (2s + 1,) float32
         Weights along the line, of sum 1; cut off and made up for where the vertical ends.
     regulariser : float
@@ -161,7 +162,7 @@ def find_starts(
     for c in range(1, width - 1):
         if first_row[c] > last_row[c]:
             continue
-        horizon = int(math.floor(horizon_row[c] + 0.5))
+        horizon = math.floor(horizon_row[c] + 0.5)
         lowest = max(first_row[c], border_rows)
         highest = min(last_row[c], height - 1 - border_rows)
         for k in range(-steps, steps + 1):
@@ -217,7 +218,7 @@ def _follow(
         v += direction
         if v < border or v > height - 1 - border:
             break
-        j = int(math.floor(here + 0.5))
+        j = math.floor(here + 0.5)
         if j < 1 or j > width - 2:
             break
         # A vertical leans by this much in the strip of a tilted camera.
@@ -226,7 +227,7 @@ def _follow(
         if not math.isfinite(rise):
             break
         here += 2.0 * lean * rise / (bearing[j + 1] - bearing[j - 1])
-        j = int(math.floor(here + 0.5))
+        j = math.floor(here + 0.5)
         if j < 2 or j > width - 3:
             break
         left = sign * response[v, j - 1]
@@ -363,7 +364,7 @@ def follow_edges(
             threshold, max_gap, border, pull, reach, row[n:], column[n:], score[n:],
         )  # fmt: skip
         for i in range(bounds[tracks], n):
-            j = int(math.floor(column[i] + 0.5))
+            j = math.floor(column[i] + 0.5)
             for k in range(max(0, j - 1), min(width, j + 2)):
                 followed[layer, row[i], k] = True
         sign[tracks] = polarity
@@ -399,8 +400,8 @@ def fit_eigenlines(
     pixel : (T,) float64
         Result: width of a column there (rad).
     line : (T, 2) float64
-        Result: a, b of X = a + b Z along the larger eigenvalue's eigenvector; NaN for tracks of less
-        than 3 points.
+        Result: a, b of X = a + b Z along the larger eigenvalue's eigenvector; NaN for tracks of
+        less than 3 points.
     straightness : (T,) float64
         Result: root of the smaller eigenvalue of the points' covariance, chart units.
     middle, spread : (T,) float64
@@ -499,7 +500,7 @@ def _cross_row(
 @njit(cache=True, error_model="numpy")
 def _step_height(image: NDArray[np.uint8], v: int, u: float, sigma: float, reach: int) -> float:
     """Height of a step at (u, v), brighter on the right, as a derivative of Gaussian sees it."""
-    nearest = int(math.floor(u + 0.5))
+    nearest = math.floor(u + 0.5)
     base = float(image[v, nearest])
     inverse = 1.0 / (sigma * sigma)
     total = 0.0
@@ -536,7 +537,7 @@ def refine_lines(
 
     Newton's method on the sum, over a track's rows, of the derivative-of-Gaussian response at the
     sub-pixel column at which the line crosses the row. The filter is evaluated there, not
-    interpolated: the maximum has no bias towards whole pixels. The covariance is that of the maximum
+    interpolated: no maximum is drawn towards whole pixels. The covariance is that of the maximum
     under noise that is independent from row to row, taken from the rows' own gradients (a sandwich
     estimator), so it needs no model of the noise.
 
@@ -564,14 +565,14 @@ def refine_lines(
     contrast : (T,) float64
         Result: height of the step, grey values, as the fine filter sees it.
     sharpness : (T,) float64
-        Result: that contrast relative to the one that the coarse filter sees; near 1 for a sharp edge.
+        Result: that contrast relative to the one that the coarse filter sees.
     refined : (T,) bool
         Result: whether at least one step was made.
     """
     width = image.shape[1]
     at = np.empty(image.shape[0], np.float64)
-    fine_reach = int(math.ceil(3.5 * fine)) + 1
-    coarse_reach = int(math.ceil(3.5 * coarse)) + 1
+    fine_reach = math.ceil(3.5 * fine) + 1
+    coarse_reach = math.ceil(3.5 * coarse) + 1
     for t in range(len(sign)):
         begin, end = bounds[t], bounds[t + 1]
         refined[t] = False
@@ -587,7 +588,7 @@ def refine_lines(
             at[i - begin] = column[i]
         for step in range(len(scales)):
             inverse = 1.0 / (scales[step] * scales[step])
-            reach = int(math.ceil(3.5 * scales[step])) + 1
+            reach = math.ceil(3.5 * scales[step]) + 1
             hessian_aa = 0.0
             hessian_ab = 0.0
             hessian_bb = 0.0
@@ -604,7 +605,7 @@ def refine_lines(
                 )
                 if not (u > reach and u < width - 1 - reach):
                     continue
-                nearest = int(math.floor(u + 0.5))
+                nearest = math.floor(u + 0.5)
                 base = float(image[v, nearest])
                 first = 0.0
                 second = 0.0

@@ -41,8 +41,8 @@ class LineSettings:
     refine_steps_px : tuple of (float, float)
         Steps in which lines are refined on the grey values: width of the Gaussian and the farthest
         that the step may take a line; none for the eigen-decomposition of the tracked points alone.
-        Small widths keep neighbours out of each other's way, but suffer from aliasing: if a wide one
-        agrees with them in the end, the edge stands alone and the wide one is right.
+        Small widths keep neighbours out of each other's way, but suffer from aliasing: if a wide
+        one agrees with them in the end, the edge stands alone and the wide one is right.
     fine_scale_px, coarse_scale_px : float
         Widths whose contrasts are compared: their ratio is the edge's sharpness.
     least_rows : int
@@ -54,6 +54,8 @@ class LineSettings:
     least_sharpness : float
         Edges fainter than the image's median must have this part of the sharpness that a quarter of
         its lines stay below: fainter and softer ones are shadows and glare.
+    soft_evidence : float
+        Unless they have this evidence.
     largest_horizon_gap_px : float
         How far a line may end from the horizon.
     largest_scatter_px : float
@@ -106,6 +108,7 @@ class LineSettings:
     least_length_px: float = 24.0
     least_evidence: float = 7.0
     least_sharpness: float = 0.87
+    soft_evidence: float = 40.0
     largest_horizon_gap_px: float = 11.0
     largest_scatter_px: float = 1.0
     largest_shift_px: float = 1.0

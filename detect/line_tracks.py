@@ -46,7 +46,7 @@ class LineTracks:
     row : (P,) int32
         Image row of each point.
     column : (P,) float64
-        Column in the strip: the vertical through that column of the horizon passes through the point.
+        Column in the strip: of the horizon, where the vertical through the point crosses it.
     score : (P,) float32
         Absolute response at the point.
     """
@@ -95,8 +95,8 @@ def line_response(
 ) -> NDArray[np.float32]:
     """How much a grey value step along a vertical explains, at every pixel of the strip.
 
-    With Gaussian weights g round a point and h, the distance across the line in units of its weighted
-    standard deviation, this is the sign of the covariance times
+    With Gaussian weights g round a point and h, the distance across the line in units of its
+    weighted standard deviation, this is the sign of the covariance times
 
         Cov_g(h, I)^2 / (Var_g(I) + regulariser),
 
@@ -192,7 +192,8 @@ def line_tracks(
     settings : LineSettings
         Threshold, gaps, border.
     tilt : TiltEstimate, optional
-        If given, edges are only followed along the verticals that it predicts; else wherever they go.
+        If given, edges are only followed along the verticals that it predicts; else wherever they
+        go.
 
     Returns
     -------

@@ -91,8 +91,10 @@ class LineDetections:
     def landmarks(self) -> tuple[LineLandmark, ...]:
         """Rows for a landmark file, without identifiers; quality is 0 as in the data set's own."""
         return tuple(
-            LineLandmark(*ends, alpha, beta, 0.0, sigma, ids=(-1,))
-            for ends, alpha, beta, sigma in zip(
+            LineLandmark(
+                xtop, ytop, xbottom, ybottom, alpha, beta, quality=0.0, sigma=sigma, ids=(-1,)
+            )
+            for (xtop, ytop, xbottom, ybottom), alpha, beta, sigma in zip(
                 self.ends.tolist(),
                 self.alpha_rad.tolist(),
                 self.beta_rad.tolist(),
@@ -169,8 +171,8 @@ def detect_lines(
 def line_evidence(tracks: LineTracks, fits: LineFits, table: VerticalTable) -> FloatArray:
     """(T,) how much speaks for each track: response summed over its length in pixel widths.
 
-    Soft edges are shadows and glare more often than the building's: their evidence is weakened by the
-    square of their sharpness.
+    Soft edges are shadows and glare more often than the building's: their evidence is weakened by
+    the square of their sharpness.
     """
     return np.asarray(tracks.total_score * table.row_aspect * fits.sharpness**2)
 
@@ -210,7 +212,8 @@ def judge_lines(
         sharpness, contrast = fits.sharpness[accepted], fits.contrast[accepted]
         soft = sharpness < settings.least_sharpness * np.quantile(sharpness, 0.25)
         faint = contrast < np.median(contrast)
-        for t in accepted[soft & faint]:
+        doubtful = evidence[accepted] < settings.soft_evidence
+        for t in accepted[soft & faint & doubtful]:
             fate[t] = "soft"
     return fate
 

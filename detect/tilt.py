@@ -7,8 +7,8 @@ level:
 
     (R n)_z = 0,    R = exp([pitch, roll, 0]x)    (robot frame: X left, Y backward, Z up)
 
-R takes directions measured with the calibrated mounting to level ones. (DLR Spatial Cognition data set
-report, line detection; the data set's own rows apply the inverse of this rotation.)
+R takes directions measured with the calibrated mounting to level ones. (DLR Spatial Cognition data
+set report, line detection; the data set's own rows apply the inverse of this rotation.)
 """
 
 from __future__ import annotations
@@ -131,7 +131,7 @@ def consensus(
     lines = int(consistent.sum())
     if lines < settings.least_lines or np.any(np.abs(tilt) > settings.largest_rad):
         return None, np.abs(normal[:, 2]) <= tolerance
-    return TiltEstimate(float(tilt[0]), float(tilt[1]), covariance, lines), consistent
+    return TiltEstimate(float(tilt[0]), float(tilt[1]), np.asarray(covariance), lines), consistent
 
 
 def level_rotation(pitch_rad: float, roll_rad: float) -> FloatArray:

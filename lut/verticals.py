@@ -1,9 +1,9 @@
 """Where the building's vertical lines appear: the horizon and the verticals through it.
 
-A vertical plane through the camera's centre is seen as one curve in the image. All points on it share
-their bearing, so the curve is named by the one pixel at which it crosses the horizon: for each image
-column the table holds the row of the horizon and the vertical through that point, as a column for
-each row, through the distortion (DLR Spatial Cognition data set report, line detection).
+A vertical plane through the camera's centre is seen as one curve in the image. All points on it
+share their bearing, so the curve is named by the one pixel at which it crosses the horizon: for
+each image column the table holds the row of the horizon and the vertical through that point, as a
+column for each row, through the distortion (DLR Spatial Cognition data set report, line detection).
 """
 
 from __future__ import annotations
@@ -152,8 +152,8 @@ def vertical_columns(
     Returns
     -------
     column : (H, N) float64
-        Column of each vertical at rows 0 ... H-1, inside the image or not; NaN where the row does not
-        show the vertical.
+        Column of each vertical at rows 0 ... H-1, inside the image or not; NaN where the row does
+        not show the vertical.
     elevation_rad : (H, N) float64
         Elevation above the horizon of that point; NaN as above.
     """
