@@ -1,0 +1,89 @@
+"""Images of a floor with discs, and with what is no disc, at places that are known exactly."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from camera import Camera
+from tools.simulator.single_disc import render_disc
+
+FLOOR = 90.0
+LIGHT = 200.0
+DARK = 25.0
+
+FloatArray = NDArray[np.float64]
+
+_CELLS_PER_PIXEL = 6
+_REACH_M = 0.3
+
+
+class PaintedFloor:
+    """A bare floor; what is painted adds to it, the image is taken at the end."""
+
+    def __init__(self, camera: Camera, floor: float = FLOOR) -> None:
+        self.camera = camera
+        self.floor = floor
+        self.grey: FloatArray = np.full((camera.height, camera.width), floor)
+
+    def disc(
+        self, floor_xy: ArrayLike, grey: float = LIGHT, radius_m: float = 0.10, blur_px: float = 0.7
+    ) -> PaintedFloor:
+        crop = render_disc(
+            self.camera, floor_xy, radius_m, grey, self.floor, blur_px, rounded=False
+        )
+        height, width = crop.grey.shape
+        part = np.s_[crop.v0 : crop.v0 + height, crop.u0 : crop.u0 + width]
+        self.grey[part] += crop.grey - self.floor
+        return self
+
+    def shape(
+        self,
+        floor_xy: ArrayLike,
+        inside: Callable[[FloatArray, FloatArray], NDArray[np.bool_]],
+        grey: float = LIGHT,
+    ) -> PaintedFloor:
+        """Anything within 0.3 m, given by which offsets (x, y) in metres are inside."""
+        n = _CELLS_PER_PIXEL
+        angle = np.linspace(0.0, 2.0 * np.pi, 64)
+        around = np.asarray(floor_xy) + _REACH_M * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+        seen = self.camera.project_floor(around)
+        u0, v0 = np.maximum(np.floor(seen.min(axis=0)).astype(int), 0)
+        size = (self.camera.width, self.camera.height)
+        u1, v1 = np.minimum(np.ceil(seen.max(axis=0)).astype(int) + 1, size)
+        fine = (np.arange(n) + 0.5) / n - 0.5
+        u = (np.arange(u0, u1)[:, None] + fine).ravel()
+        v = (np.arange(v0, v1)[:, None] + fine).ravel()
+        uv = np.stack(np.meshgrid(u, v), axis=-1)
+        offset = self.camera.floor_from_pixel(uv) - np.asarray(floor_xy)
+        cells = inside(offset[..., 0], offset[..., 1])
+        share = cells.reshape(v1 - v0, n, u1 - u0, n).mean(axis=(1, 3))
+        self.grey[v0:v1, u0:u1] += (grey - self.floor) * share
+        return self
+
+    def image(self, noise: float = 1.5, seed: int = 0) -> NDArray[np.uint8]:
+        noisy = self.grey + np.random.default_rng(seed).normal(0.0, noise, self.grey.shape)
+        return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
+
+
+def mirrored_camera(camera: Camera) -> Camera:
+    """The camera that sees the world mirrored in robot X as the mirrored image.
+
+    With D = diag(-1, 1, 1) a point at p in the camera frame is mirrored to D p there and from P to
+    D P in the robot frame: P = R p + t becomes D P = (D R D) (D p) + D t.
+    """
+    flip = np.diag([-1.0, 1.0, 1.0])
+    pose = flip @ np.hstack([camera.rotation @ flip, camera.centre[:, None]])
+    a, b, c = (tuple(float(x) for x in row) for row in pose)
+    return replace(
+        camera,
+        offset_x=camera.width - 1 - camera.offset_x,
+        robot_from_camera=(
+            (a[0], a[1], a[2], a[3]),
+            (b[0], b[1], b[2], b[3]),
+            (c[0], c[1], c[2], c[3]),
+        ),
+    )

@@ -1,0 +1,57 @@
+"""The noise estimate against images whose noise is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from detect.disc_fit import estimate_noise
+
+SHAPE = (288, 768)
+
+
+def noisy(grey: NDArray[np.float64], sigma: float, seed: int = 0) -> NDArray[np.uint8]:
+    noise = np.random.default_rng(seed).normal(0.0, sigma, grey.shape)
+    return np.clip(np.rint(grey + noise), 0, 255).astype(np.uint8)
+
+
+def plane() -> NDArray[np.float64]:
+    v, u = np.indices(SHAPE)
+    return np.asarray(40.0 + 0.15 * u + 0.2 * v)
+
+
+def straight_edges() -> NDArray[np.float64]:
+    """Tiles: the mask sees neither horizontal nor vertical edges, only the tiles' corners."""
+    v, u = np.indices(SHAPE)
+    return np.where((u // 24 + v // 16) % 2 == 0, 60.0, 190.0)
+
+
+@pytest.mark.parametrize("sigma", [1.0, 2.0, 3.5, 6.0, 12.0])
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_gaussian_noise_is_measured(sigma: float, seed: int) -> None:
+    image = noisy(np.full(SHAPE, 120.0), sigma, seed)
+    assert estimate_noise(image) == pytest.approx(np.hypot(sigma, np.sqrt(1 / 12)), rel=0.10)
+
+
+@pytest.mark.parametrize("sigma", [1.5, 3.0, 8.0])
+def test_planes_and_straight_edges_are_no_noise(sigma: float) -> None:
+    for grey in (plane(), straight_edges()):
+        assert estimate_noise(noisy(grey, sigma)) == pytest.approx(sigma, rel=0.10)
+
+
+def test_without_noise_there_is_none() -> None:
+    for grey in (np.full(SHAPE, 77.0), straight_edges(), np.full(SHAPE, 255.0)):
+        assert estimate_noise(noisy(grey, 0.0)) == 0.0
+
+
+def test_saturated_parts_do_not_count() -> None:
+    """Half of the image is white and so hides its noise: the other half tells."""
+    grey = np.full(SHAPE, 120.0)
+    grey[:, :420] = 290.0
+    assert estimate_noise(noisy(grey, 3.0)) == pytest.approx(3.0, rel=0.10)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (2, 40), (3, 3)])
+def test_tiny_images_have_a_number(shape: tuple[int, int]) -> None:
+    assert estimate_noise(np.full(shape, 9, np.uint8)) == 0.0
