@@ -319,9 +319,10 @@ class Camera:
         """
         xy = np.asarray(normalised, dtype=np.float64)
         radius = np.hypot(xy[..., 0], xy[..., 1])
-        inside = np.where(radius <= self.r_max, radius, np.nan)
-        factor = radial_factor(inside, self.coef)
-        slope = radial_factor_derivative(inside, self.coef)
+        defined = (radius <= self.r_max) & np.isfinite(radius)
+        xy, radius = np.where(defined[..., None], xy, np.nan), np.where(defined, radius, np.nan)
+        factor = radial_factor(radius, self.coef)
+        slope = radial_factor_derivative(radius, self.coef)
         # d(x f)/dx = f + f' x^2 / r; at r = 0 the second term vanishes.
         unit = xy / np.where(radius > 0.0, radius, 1.0)[..., None]
         outer = slope[..., None, None] * xy[..., :, None] * unit[..., None, :]
@@ -343,7 +344,8 @@ class Camera:
         """
         p = np.asarray(points_camera, dtype=np.float64)
         depth = np.where(p[..., 2] > 0.0, p[..., 2], np.nan)
-        xy = p[..., :2] / depth[..., None]
+        with np.errstate(over="ignore"):
+            xy = p[..., :2] / depth[..., None]
         perspective = np.zeros((*p.shape[:-1], 2, 3))
         perspective[..., 0, 0] = perspective[..., 1, 1] = 1.0
         perspective[..., :, 2] = -xy

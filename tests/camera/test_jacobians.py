@@ -1,0 +1,101 @@
+"""Gradients, tested apart from the values: against finite differences of fourth order."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from hypothesis import given
+from numpy.typing import NDArray
+
+from camera import Camera
+from tests.camera.strategies import cameras, pixel_grid
+
+FloatArray = NDArray[np.float64]
+
+
+def differences(
+    function: Callable[[FloatArray], FloatArray], at: FloatArray, step: FloatArray
+) -> FloatArray:
+    """(N, M, K) derivatives of an (N, K) -> (N, M) function with a step for each of the N."""
+    columns = []
+    for axis in range(at.shape[-1]):
+        offset = np.zeros_like(at)
+        offset[:, axis] = step
+        once = function(at + offset) - function(at - offset)
+        twice = function(at + 2 * offset) - function(at - 2 * offset)
+        columns.append((8.0 * once - twice) / (12.0 * step[:, None]))
+    return np.stack(columns, axis=-1)
+
+
+def assert_close(analytic: FloatArray, numeric: FloatArray, tolerance: float) -> None:
+    """Equal relative to the largest entry of each matrix."""
+    assert np.isfinite(analytic).all()
+    size = np.abs(analytic).max(axis=(-2, -1), keepdims=True)
+    assert np.all(np.abs(analytic - numeric) <= tolerance * size)
+
+
+def interior(camera: Camera) -> FloatArray:
+    """Pixels of the image off its rim: differences need room on both sides of the fold."""
+    middle = np.array([camera.offset_x, camera.offset_y])
+    return np.asarray(middle + 0.9 * (pixel_grid(camera, 7) - middle))
+
+
+@given(cameras())
+def test_of_the_distortion(camera: Camera) -> None:
+    xy = camera.undistort(interior(camera))
+    step = 1e-4 * np.minimum(np.hypot(*xy.T) + 1e-2, camera.r_max - np.hypot(*xy.T))
+    numeric = differences(camera.distort, xy, step)
+    assert_close(camera.distort_jacobian(xy), numeric, 1e-6)
+
+
+def test_of_the_distortion_on_the_optical_axis(published_camera: Camera) -> None:
+    assert np.array_equal(
+        published_camera.distort_jacobian([0.0, 0.0]), [[464.762, 0.0], [0.0, 232.381]]
+    )
+
+
+@given(cameras())
+def test_of_the_projection(camera: Camera) -> None:
+    depths = np.linspace(0.5, 3.0, 49)
+    points = camera.unproject(interior(camera)) * depths[:, None]
+    radius = np.hypot(points[:, 0], points[:, 1]) / points[:, 2]
+    step = 1e-4 * points[:, 2] * np.minimum(radius + 1e-2, camera.r_max - radius)
+    step /= 1.0 + radius
+    numeric = differences(camera.project, points, step)
+    assert_close(camera.project_jacobian(points), numeric, 1e-6)
+
+
+@given(cameras(down_deg=(10.0, 80.0)))
+def test_of_the_floor_position(camera: Camera) -> None:
+    pixels = interior(camera)
+    direction = camera.directions_robot(pixels)
+    pixels = pixels[direction[:, 2] < -0.05 * np.linalg.norm(direction, axis=-1)]
+    # Next to the horizon the floor runs away within pixels: a step is a share of the image there.
+    step = np.full(len(pixels), 1e-5 * min(camera.width, camera.height))
+    numeric = differences(camera.floor_from_pixel, pixels, step)
+    assert_close(camera.floor_jacobian(pixels), numeric, 1e-5)
+
+
+def test_published_differences_are_central_ones_over_a_tenth_of_a_pixel(
+    published_camera: Camera,
+) -> None:
+    pixels = interior(published_camera)
+    pixels = pixels[np.isfinite(published_camera.floor_from_pixel(pixels - [0, 1])[:, 0])]
+    published = published_camera.floor_jacobian_published(pixels)
+    for axis, step in enumerate(np.eye(2) * 0.1):
+        after = published_camera.floor_from_pixel(pixels + step)
+        before = published_camera.floor_from_pixel(pixels - step)
+        assert np.allclose(published[:, :, axis], (after - before) / 0.2, rtol=1e-12, atol=0)
+
+
+def test_published_differences_are_close_to_the_gradient(published_camera: Camera) -> None:
+    v, u = np.mgrid[116:277:16, 15:756:20]
+    pixels = np.stack([u.ravel(), v.ravel()], axis=-1).astype(float)
+    published = published_camera.floor_jacobian_published(pixels)
+    analytic = published_camera.floor_jacobian(pixels)
+    size = np.abs(analytic).max(axis=(-2, -1), keepdims=True)
+    error = np.abs(published - analytic) / size
+    assert error.max() < 1e-5
+    # They are not the gradient, though: the published digits tell them apart.
+    assert error.max() > 1e-7
