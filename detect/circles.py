@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from camera import Camera
 from detect.circle_kernels import local_maxima, quality_map, suppress_neighbours
-from detect.disc_fit import disc_evidence, estimate_noise, fit_discs
+from detect.disc_fit import blur_ratio_of, disc_evidence, estimate_noise, fit_discs
 from detect.errors import FrameError
 from detect.settings import CircleSettings
 from lut import DiscShape, DiscTable
@@ -117,15 +117,21 @@ def detect_circles(
     # centres.
     keep = _alone(floor_xy, found_quality, 0.5 * settings.separation_m)
     pixels, found_quality, floor_xy = pixels[keep], found_quality[keep], floor_xy[keep]
-    first = fit_discs(image, table.floor_xy, pixels, settings.radius_m, noise, first_look=True)
+    ratio = blur_ratio_of(camera)
+    first = fit_discs(
+        image, table.floor_xy, pixels, settings.radius_m, noise, blur_ratio=ratio, first_look=True
+    )
     likely = first.fitted
     if settings.verify:
-        promise = disc_evidence(first, settings.radius_m)
+        promise = disc_evidence(first, settings.radius_m, settings.blur_px)
         likely &= promise >= settings.evidence - _FIRST_LOOK_SLACK
     pixels, found_quality, floor_xy = pixels[likely], found_quality[likely], floor_xy[likely]
     centres = _nearest_pixels(camera, first.floor_xy[likely])
-    fits = fit_discs(image, table.floor_xy, centres, settings.radius_m, noise)
-    evidence = disc_evidence(fits, settings.radius_m)
+    fits = fit_discs(
+        image, table.floor_xy, centres, settings.radius_m, noise, blur_ratio=ratio,
+        blur_guess=first.blur_px[likely],
+    )  # fmt: skip
+    evidence = disc_evidence(fits, settings.radius_m, settings.blur_px)
     # A fit that wandered off, or turned the disc's contrast round, is about something else.
     stayed = np.hypot(*(fits.floor_xy - floor_xy).T) < settings.radius_m
     same_sign = fits.contrast * contrast[pixels[:, 1], pixels[:, 0]] > 0.0

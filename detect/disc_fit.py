@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from camera import Camera
 from detect import disc_fit_kernels as kernels
 from detect.disc_profile import T_LIMIT, Z_LIMIT, disc_profile
 
@@ -24,9 +25,11 @@ _ALL_PIXELS = 40_000
 _FIRST_LOOK_NODES = 5
 _ALL_NODES = 31
 
-#: Pixels within this many radii of the centre are fitted, and those this near to the edge.
+#: Pixels within this many radii of the centre are fitted, and those this near to the edge, in
+#: pixels or in standard deviations of the blur.
 _REACH_RADII = 1.7
 _REACH_PX = 3.0
+_REACH_BLURS = 2.0
 #: Standard deviation of the radius about the nominal one (relative), of the log of the blur; and
 #: the blur in pixels about which it lies.
 _RADIUS_SIGMA = 0.08
@@ -86,6 +89,8 @@ def fit_discs(
     radius_m: float,
     noise: float,
     *,
+    blur_ratio: float = 1.0,
+    blur_guess: FloatArray | None = None,
     first_look: bool = False,
 ) -> DiscFits:
     """Fit a disc at each candidate.
@@ -102,6 +107,10 @@ def fit_discs(
         Nominal radius, metres.
     noise : float
         Standard deviation of the image's noise, grey levels.
+    blur_ratio : float
+        Blur along v over blur along u, in pixels: `blur_ratio_of` the camera.
+    blur_guess : (N,) float64, optional
+        About how blurred each candidate is (along u), pixels.
     first_look : bool
         Use a part of the pixels of large discs and a coarse quadrature: several times faster, good
         enough to tell what is no disc.
@@ -112,16 +121,18 @@ def fit_discs(
     """
     count = _FIRST_LOOK_NODES if first_look else _ALL_NODES
     nodes, weights = np.polynomial.hermite_e.hermegauss(count)
-    settings = np.array(
-        [
-            max(noise, _LEAST_NOISE),
-            _REACH_RADII,
-            _REACH_PX,
-            _RADIUS_SIGMA,
-            _BLUR_PX,
-            _BLUR_SIGMA,
-        ]
+    settings = kernels.FitSettings(
+        noise=max(noise, _LEAST_NOISE),
+        reach_radii=_REACH_RADII,
+        reach_px=_REACH_PX,
+        reach_blurs=_REACH_BLURS,
+        radius_sigma=_RADIUS_SIGMA,
+        blur_px=_BLUR_PX,
+        blur_sigma=_BLUR_SIGMA,
+        blur_ratio=blur_ratio,
     )
+    if blur_guess is None:
+        blur_guess = np.full(len(pixels), _BLUR_PX)
     results, fitted = kernels.fit_discs(
         image,
         floor_xy,
@@ -134,6 +145,7 @@ def fit_discs(
         nodes,
         weights / weights.sum(),
         settings,
+        blur_guess,
         _FIRST_LOOK_PIXELS if first_look else _ALL_PIXELS,
     )
     xx, xy, yy = (results[:, k] for k in (kernels.COV_XX, kernels.COV_XY, kernels.COV_YY))
@@ -151,7 +163,16 @@ def fit_discs(
     )
 
 
-def disc_evidence(fits: DiscFits, radius_m: float) -> FloatArray:
+def blur_ratio_of(camera: Camera) -> float:
+    """Blur along v over blur along u, in pixels.
+
+    Optics blur equally in all directions. Where the scales differ, as in single fields of
+    interlaced frames, a pixel is not square, and the same blur is fewer pixels along v.
+    """
+    return camera.scale_y / camera.scale_x
+
+
+def disc_evidence(fits: DiscFits, radius_m: float, blur_px: float = 1.0) -> FloatArray:
     """How much speaks for a disc: a log-odds score, minus infinity where it cannot be one.
 
     What speaks for a disc: that it explains the grey values, has the right radius, an even outline
@@ -167,6 +188,9 @@ def disc_evidence(fits: DiscFits, radius_m: float) -> FloatArray:
         The fits.
     radius_m : float
         Nominal radius, metres.
+    blur_px : float
+        Blur of the camera's optics (along u), pixels: as far as it goes beyond one pixel, it does
+        not speak against a disc.
 
     Returns
     -------
@@ -179,11 +203,11 @@ def disc_evidence(fits: DiscFits, radius_m: float) -> FloatArray:
     off_radius = np.abs(np.log(relative_radius)) / (0.03 + 0.3 * blur)
     uneven = fits.outline_deviation / (0.03 + 0.2 * blur)
     score = (
-        2.8 * np.log(explained / (1.0 - explained))
+        3.1 * np.log(explained / (1.0 - explained))
         - 1.8 * off_radius
-        - 2.2 * uneven
-        - 5.7 * np.log(blur)
-        - 11.1
+        - 2.6 * uneven
+        - 6.3 * np.log(np.maximum(blur / max(blur_px, 1.0), 0.02))
+        - 11.7
     )
     possible = (
         fits.fitted

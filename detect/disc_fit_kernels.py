@@ -16,12 +16,35 @@ candidate), log blur (pixels), contrast, and the five terms of the background.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from detect.disc_model_kernels import chord_pixel, profile_pixel
+
+
+class FitSettings(NamedTuple):
+    """What the fit is told, apart from the image and the candidates."""
+
+    noise: float
+    """Standard deviation of the noise, grey levels."""
+    reach_radii: float
+    """Pixels within this many radii of the candidate are fitted,"""
+    reach_px: float
+    """and those this near to the disc's edge, pixels,"""
+    reach_blurs: float
+    """or this many standard deviations of the blur."""
+    radius_sigma: float
+    """Standard deviation of the radius about the nominal one, relative."""
+    blur_px: float
+    """The blur about which the fitted one lies (along u), pixels,"""
+    blur_sigma: float
+    """and the standard deviation of its logarithm."""
+    blur_ratio: float
+    """Blur along v over blur along u, in pixels: 0.5 in single fields of interlaced frames."""
+
 
 PARAMETERS = 10
 _NONLINEAR = 4
@@ -59,11 +82,11 @@ def _gather(
     u0: int,
     v0: int,
     radius: float,
-    reach: float,
-    reach_px: float,
+    blur: float,
+    settings: FitSettings,
     pixels: NDArray[np.float64],
 ) -> tuple[int, int]:
-    """Collect the pixels within `reach` radii of the candidate, or `reach_px` of the disc's edge.
+    """Collect the pixels round a candidate whose blur is about `blur`, as the settings say.
 
     Returns their number, and how the disc is seen: 0 face on, 1 flat along v, 2 flat along u.
     """
@@ -81,15 +104,18 @@ def _gather(
     if max(math.hypot(xu, yu), math.hypot(xv, yv)) * _FLAT_PX > radius:
         flat = 1 if math.hypot(xv, yv) >= math.hypot(xu, yu) else 2
     # The window around the outline's ellipse, with room for perspective.
-    room = 1.35 * reach * radius / area
-    half_u = min(int(room * math.hypot(xv, yv) + reach_px) + 1, width)
-    half_v = min(int(room * math.hypot(xu, yu) + reach_px) + 1, height)
+    limit = settings.reach_radii * radius
+    ratio = settings.blur_ratio
+    room = 1.35 * limit / area
+    beyond_u = max(settings.reach_px, settings.reach_blurs * blur)
+    beyond_v = max(settings.reach_px, settings.reach_blurs * blur * ratio)
+    half_u = min(int(room * math.hypot(xv, yv) + beyond_u) + 1, width)
+    half_v = min(int(room * math.hypot(xu, yu) + beyond_v) + 1, height)
     step = 1
     while (2 * half_u // step + 1) * (2 * half_v // step + 1) > pixels.shape[0]:
         step += 1
     x0 = floor_xy[v0, u0, 0]
     y0 = floor_xy[v0, u0, 1]
-    limit = reach * radius
     count = 0
     for v in range(max(1, v0 - half_v), min(height - 1, v0 + half_v + 1), step):
         for u in range(max(1, u0 - half_u), min(width - 1, u0 + half_u + 1), step):
@@ -102,11 +128,18 @@ def _gather(
             yu = 0.5 * (floor_xy[v, u + 1, 1] - floor_xy[v, u - 1, 1])
             xv = 0.5 * (floor_xy[v + 1, u, 0] - floor_xy[v - 1, u, 0])
             yv = 0.5 * (floor_xy[v + 1, u, 1] - floor_xy[v - 1, u, 1])
-            per_px = math.hypot(xu * x + yu * y, xv * x + yv * y) / max(r, 1e-12)
-            beyond_px = (r - radius) / per_px if per_px > 0.0 else 0.0
-            if r > limit and not beyond_px <= reach_px:
+            gu = (xu * x + yu * y) / max(r, 1e-12)
+            gv = (xv * x + yv * y) / max(r, 1e-12)
+            per_px = math.hypot(gu, gv)
+            per_blur = blur * math.hypot(gu, ratio * gv)
+            off_edge = r - radius
+            if (
+                r > limit
+                and not off_edge <= settings.reach_px * per_px
+                and not off_edge <= settings.reach_blurs * per_blur
+            ):
                 continue
-            near = r <= _NEAR_RADII * radius or beyond_px <= _NEAR_PX
+            near = r <= _NEAR_RADII * radius or off_edge <= _NEAR_PX * per_px
             pixels[count, _NEAR] = 1.0 if near else 0.0
             pixels[count, _FX] = x / radius
             pixels[count, _FY] = y / radius
@@ -181,7 +214,8 @@ def _fit(
     t_limit: float,
     nodes: NDArray[np.float64],
     weights: NDArray[np.float64],
-    settings: NDArray[np.float64],
+    settings: FitSettings,
+    blur_guess: float,
     pixels: NDArray[np.float64],
     edge: NDArray[np.float64],
     out: NDArray[np.float64],
@@ -189,14 +223,15 @@ def _fit(
     """Fit one candidate; see `fit_discs`."""
     n_linear = 1 + _BACKGROUND
     out[:] = 0.0
-    noise = settings[0]
-    n, flat = _gather(image, floor_xy, u0, v0, radius, settings[1], settings[2], pixels)
+    noise = settings.noise
+    n, flat = _gather(image, floor_xy, u0, v0, radius, blur_guess, settings, pixels)
     out[PIXELS] = n
     if n < PARAMETERS + 4:
         return False
-    sigma_r = settings[3]
-    log_blur = math.log(settings[4])
-    sigma_blur = settings[5]
+    sigma_r = settings.radius_sigma
+    log_blur = math.log(settings.blur_px)
+    sigma_blur = settings.blur_sigma
+    blur_ratio = settings.blur_ratio
 
     p = np.zeros(PARAMETERS)
     best = np.zeros(PARAMETERS)
@@ -248,7 +283,9 @@ def _fit(
         residual = 0.0
         near_residual = 0.0
         blur = math.exp(p[3])
-        sigma_px = math.sqrt(blur * blur + _PIXEL_VARIANCE)
+        blur_v = blur * blur_ratio
+        sigma_u = math.sqrt(blur * blur + _PIXEL_VARIANCE)
+        sigma_v = math.sqrt(blur_v * blur_v + _PIXEL_VARIANCE)
         for i in range(n):
             x = pixels[i, _FX] - p[0]
             y = pixels[i, _FY] - p[1]
@@ -257,17 +294,20 @@ def _fit(
             yu = pixels[i, _YU]
             yv = pixels[i, _YV]
             if flat == 0:
-                w, dx, dy, dr, ds = profile_pixel(
-                    x, y, xu, xv, yu, yv, p[2], sigma_px, profile, z_limit, t_limit
-                )
+                w, dx, dy, dr, db = profile_pixel(
+                    x, y, xu, xv, yu, yv, p[2], blur, blur_v, sigma_u, sigma_v,
+                    profile, z_limit, t_limit,
+                )  # fmt: skip
             elif flat == 1:
-                w, dx, dy, dr, ds = chord_pixel(
-                    x, y, xv, yv, xu, yu, pixels[i, _GROWTH], p[2], sigma_px, nodes, weights
-                )
+                w, dx, dy, dr, db = chord_pixel(
+                    x, y, xv, yv, xu, yu, pixels[i, _GROWTH], p[2],
+                    blur_v, blur, sigma_v, sigma_u, nodes, weights,
+                )  # fmt: skip
             else:
-                w, dx, dy, dr, ds = chord_pixel(
-                    x, y, xu, yu, xv, yv, pixels[i, _GROWTH], p[2], sigma_px, nodes, weights
-                )
+                w, dx, dy, dr, db = chord_pixel(
+                    x, y, xu, yu, xv, yv, pixels[i, _GROWTH], p[2],
+                    blur, blur_v, sigma_u, sigma_v, nodes, weights,
+                )  # fmt: skip
             xb = pixels[i, _FX]
             yb = pixels[i, _FY]
             grey = p[4] * w + p[5] + p[6] * xb + p[7] * yb
@@ -278,7 +318,7 @@ def _fit(
             row[0] = p[4] * dx
             row[1] = p[4] * dy
             row[2] = p[4] * dr
-            row[3] = p[4] * ds * blur * blur / sigma_px
+            row[3] = p[4] * db
             row[4] = w
             edge[i, 0] = w
             edge[i, 1] = row[2]
@@ -369,7 +409,7 @@ def _fit(
             out[COV_XY] = variance * step[1] * radius * radius
         else:
             out[COV_YY] = variance * step[1] * radius * radius
-    _sectors(pixels, edge, n, best, out)
+    _sectors(pixels, edge, n, best, blur_ratio, out)
     return True
 
 
@@ -400,6 +440,7 @@ def _sectors(
     edge: NDArray[np.float64],
     n: int,
     p: NDArray[np.float64],
+    blur_ratio: float,
     out: NDArray[np.float64],
 ) -> None:
     """How evenly the edge goes round: in each sector its step and how far it is from the circle.
@@ -426,7 +467,8 @@ def _sectors(
         sums[k, 6] += edge[i, 1] * edge[i, 1]
     blurs = 0.0
     weights = 0.0
-    sigma_px = math.sqrt(math.exp(2.0 * p[3]) + _PIXEL_VARIANCE)
+    sigma_u = math.sqrt(math.exp(2.0 * p[3]) + _PIXEL_VARIANCE)
+    sigma_v = math.sqrt(math.exp(2.0 * p[3]) * blur_ratio * blur_ratio + _PIXEL_VARIANCE)
     for i in range(n):
         x = pixels[i, _FX] - p[0]
         y = pixels[i, _FY] - p[1]
@@ -434,7 +476,7 @@ def _sectors(
         gu = (pixels[i, _XU] * x + pixels[i, _YU] * y) / r
         gv = (pixels[i, _XV] * x + pixels[i, _YV] * y) / r
         weight = abs(edge[i, 1])
-        blurs += weight * min(sigma_px * math.sqrt(gu * gu + gv * gv) / p[2], 2.5)
+        blurs += weight * min(math.hypot(sigma_u * gu, sigma_v * gv) / p[2], 2.5)
         weights += weight
     out[RELATIVE_BLUR] = blurs / max(weights, 1e-12)
     seen = 0
@@ -476,10 +518,38 @@ def fit_discs(
     t_limit: float,
     nodes: NDArray[np.float64],
     weights: NDArray[np.float64],
-    settings: NDArray[np.float64],
+    settings: FitSettings,
+    blur_guess: NDArray[np.float64],
     capacity: int,
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Fit a disc at each candidate."""
+    """Fit a disc at each candidate.
+
+    Parameters
+    ----------
+    image : (H, W) uint8
+    floor_xy : (H, W, 2) float32
+        Floor position of each pixel, metres.
+    columns, rows : (N,) int64
+        The candidates' pixels.
+    radius : float
+        Nominal radius, metres.
+    profile, z_limit, t_limit
+        `detect.disc_profile`.
+    nodes, weights : (K,) float64
+        Gauss-Hermite quadrature for a standard normal distribution.
+    settings : FitSettings
+    blur_guess : (N,) float64
+        About how blurred each candidate is (along u), pixels: how far out pixels are gathered.
+    capacity : int
+        Most pixels to use for one candidate; of larger ones every second, third ... is used.
+
+    Returns
+    -------
+    results : (N, RESULT_SIZE) float64
+        Columns as named at the top of this module.
+    fitted : (N,) bool
+        Where the fit came to a result.
+    """
     n = len(columns)
     results = np.zeros((n, RESULT_SIZE))
     fitted = np.zeros(n, np.bool_)
@@ -488,6 +558,6 @@ def fit_discs(
     for i in range(n):
         fitted[i] = _fit(
             image, floor_xy, columns[i], rows[i], radius, profile, z_limit, t_limit,
-            nodes, weights, settings, pixels, edge, results[i],
+            nodes, weights, settings, blur_guess[i], pixels, edge, results[i],
         )  # fmt: skip
     return results, fitted

@@ -3,7 +3,10 @@
 Both work in units of the nominal radius, on the floor, about a pixel that sees the floor at (x, y)
 from the disc's centre and by whose step in u or v the floor moves as the Jacobian says. Both return
 
-    W, dW/dx_centre, dW/dy_centre, dW/dradius, dW/dsigma_px
+    W, dW/dx_centre, dW/dy_centre, dW/dradius, dW/dlog(blur)
+
+A blur is given by its standard deviation along the image axes: of all of it (`sigma`: the optics
+and the pixel itself), and of the optics alone (`blur`), which is what the fit varies.
 
 `profile_pixel` is exact for a disc blurred evenly in all directions of the floor, and good where
 the blur is small against the disc. `chord_pixel` is for discs that are seen so flat that the blur
@@ -34,7 +37,10 @@ def profile_pixel(
     yu: float,
     yv: float,
     radius: float,
-    sigma_px: float,
+    blur_u: float,
+    blur_v: float,
+    sigma_u: float,
+    sigma_v: float,
     profile: NDArray[np.float64],
     z_limit: float,
     t_limit: float,
@@ -50,8 +56,10 @@ def profile_pixel(
     ny = y / r if r > 0.0 else 0.0
     gu = xu * nx + yu * ny
     gv = xv * nx + yv * ny
-    floor_per_px = math.sqrt(gu * gu + gv * gv)
-    sigma = sigma_px * floor_per_px
+    gu *= gu
+    gv *= gv
+    sigma = math.sqrt(sigma_u * sigma_u * gu + sigma_v * sigma_v * gv)
+    optics = (blur_u * blur_u * gu + blur_v * blur_v * gv) / (sigma * sigma)
     z = (r - radius) / sigma
     t = min(sigma / radius, t_limit)
     fz = (min(max(z, -z_limit), z_limit) + z_limit) / z_step
@@ -76,7 +84,7 @@ def profile_pixel(
         -per_r * nx,
         -per_r * ny,
         -per_r - dwt * t / radius,
-        (dwt * t - dwz * z) / sigma_px,
+        (dwt * t - dwz * z) * optics,
     )
 
 
@@ -90,25 +98,28 @@ def chord_pixel(
     y2: float,
     growth: float,
     radius: float,
-    sigma_px: float,
+    blur_1: float,
+    blur_2: float,
+    sigma_1: float,
+    sigma_2: float,
     nodes: NDArray[np.float64],
     weights: NDArray[np.float64],
 ) -> tuple[float, float, float, float, float]:
     """W by chords along the steep image axis.
 
-    (x1, y1) is the floor's step along the steep axis, (x2, y2) along the other, `growth` the
-    relative growth of the steep step from one pixel to the next; `nodes` and `weights` are those
-    of the Gauss-Hermite quadrature for a standard normal distribution.
+    (x1, y1) is the floor's step along the steep axis, (x2, y2) along the other, and so are the
+    blurs; `growth` the relative growth of the steep step from one pixel to the next; `nodes` and
+    `weights` are those of the Gauss-Hermite quadrature for a standard normal distribution.
     """
     total = 0.0
     d_x = 0.0
     d_y = 0.0
     d_radius = 0.0
-    d_sigma = 0.0
+    d_blur = 0.0
     a = x1 * x1 + y1 * y1
     flattest = _FLATTEST * math.sqrt(a)
     for k in range(len(nodes)):
-        aside = sigma_px * nodes[k]
+        aside = sigma_2 * nodes[k]
         qx = x + x2 * aside
         qy = y + y2 * aside
         b = qx * x1 + qy * y1
@@ -123,9 +134,9 @@ def chord_pixel(
             # The step grows along the way: the pixel distance that covers d of today's steps.
             bend = min(max(1.0 - growth * d, 0.3), 3.0)
             delta = d * (1.0 - 0.5 * growth * d) if abs(growth * d) < 0.7 else d
-            s = delta / sigma_px
+            s = delta / sigma_1
             total += sign * weights[k] * 0.5 * math.erfc(-s * _ROOT_HALF)
-            density = sign * weights[k] * math.exp(-0.5 * s * s) / (_ROOT_2PI * sigma_px)
+            density = sign * weights[k] * math.exp(-0.5 * s * s) / (_ROOT_2PI * sigma_1)
             nx = (qx + x1 * d) / radius
             ny = (qy + y1 * d) / radius
             slope = nx * x1 + ny * y1
@@ -135,5 +146,7 @@ def chord_pixel(
             d_x += per_d * nx / slope
             d_y += per_d * ny / slope
             d_radius += per_d / slope
-            d_sigma -= density * s + per_d * nodes[k] * (nx * x2 + ny * y2) / slope
-    return total, d_x, d_y, d_radius, d_sigma
+            along = density * s * blur_1 * blur_1 / sigma_1
+            across = per_d * nodes[k] * (nx * x2 + ny * y2) / slope
+            d_blur -= along + across * blur_2 * blur_2 / sigma_2
+    return total, d_x, d_y, d_radius, d_blur

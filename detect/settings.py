@@ -46,6 +46,9 @@ class CircleSettings:
         Fit a disc to the grey values at each candidate and drop those without evidence of a disc.
     evidence : float
         Least evidence (log-odds, see `detect.disc_fit.disc_evidence`).
+    blur_px : float
+        Standard deviation of the optics' blur along u, pixels. Blurred edges speak against a disc
+        unless the camera blurs everything: the data set's own does, by about 6.
     refine : bool
         Report the fitted position and its covariance instead of the pixel's.
     systematic_px : float
@@ -66,7 +69,8 @@ class CircleSettings:
     noise_floor: float = 2.0
     separation_m: float = 0.14
     verify: bool = True
-    evidence: float = 1.0
+    evidence: float = 1.3
+    blur_px: float = 1.0
     refine: bool = True
     systematic_px: float = 0.003
     tilt_sigma_deg: float = 0.0
@@ -80,7 +84,7 @@ class CircleSettings:
             self.radius_m,
             f"between the outlines ({self.inner_radius_m:g} and {self.outer_radius_m:g})",
         )
-        for name in ("noise_floor", "separation_m", "systematic_px", "tilt_sigma_deg"):
+        for name in ("noise_floor", "separation_m", "blur_px", "systematic_px", "tilt_sigma_deg"):
             value = getattr(self, name)
             _expect(0.0 <= value < math.inf, name, value, "0 or more")
         _expect(math.isfinite(self.evidence), "evidence", self.evidence, "a finite number")

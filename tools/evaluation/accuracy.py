@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from camera import Camera
 from detect.circles import disc_shape, refined_covariance
-from detect.disc_fit import estimate_noise, fit_discs
+from detect.disc_fit import blur_ratio_of, estimate_noise, fit_discs
 from detect.settings import CircleSettings
 from lut import DiscTable, cached_disc_table
 from tools.simulator.single_disc import render_disc
@@ -71,7 +71,7 @@ def measure_accuracy(
     light, dark : float
         Grey values of disc and floor.
     blur_px : float
-        Standard deviation of the optics' blur, pixels.
+        Standard deviation of the optics' blur along u, pixels; along v it is the same angle.
     noise : float
         Standard deviation of the noise, grey levels.
     seed : int
@@ -91,7 +91,14 @@ def measure_accuracy(
         true_xy = camera.floor_from_pixel(pixel)
         image = _render(camera, table, true_xy, settings, light, dark, blur_px, noise, rng)
         nearest = np.array([[columns[index], rows[index]]], np.int64)
-        fit = fit_discs(image, table.floor_xy, nearest, settings.radius_m, estimate_noise(image))
+        fit = fit_discs(
+            image,
+            table.floor_xy,
+            nearest,
+            settings.radius_m,
+            estimate_noise(image),
+            blur_ratio=blur_ratio_of(camera),
+        )
         if not fit.fitted[0]:
             failed += 1
             continue
@@ -118,7 +125,8 @@ def _render(
     height, width = table.usable.shape
     floor = dark + rng.normal(0.0, noise, (height, width))
     image = np.clip(np.rint(floor), 0, 255).astype(np.uint8)
-    crop = render_disc(camera, true_xy, settings.radius_m, light, dark, blur_px, noise, rng=rng)
+    blur = (blur_px, blur_px * camera.scale_y / camera.scale_x)
+    crop = render_disc(camera, true_xy, settings.radius_m, light, dark, blur, noise, rng=rng)
     top, left = max(crop.v0, 0), max(crop.u0, 0)
     bottom = min(crop.v0 + crop.grey.shape[0], height)
     right = min(crop.u0 + crop.grey.shape[1], width)
