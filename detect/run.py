@@ -136,7 +136,10 @@ def read_image(frame: RunFrame, camera: Camera) -> NDArray[np.uint8]:
         raise FrameError(f"{frame.image}: is empty: expected an image")
     if content.startswith(_JPEG_BEGIN) and _JPEG_END not in content[-64:]:
         raise FrameError(f"{frame.image}: the JPEG is cut off: its end is missing")
-    image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_GRAYSCALE)
+    try:
+        image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_GRAYSCALE)
+    except cv2.error:  # sizes beyond OpenCV's bounds are no None
+        image = None
     if image is None:
         raise FrameError(f"{frame.image}: cannot be decoded: expected an image")
     if image.shape != (camera.height, camera.width):

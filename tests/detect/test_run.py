@@ -1,0 +1,331 @@
+"""Runs on disk: what is found, in which order, and what is refused with which words."""
+
+from __future__ import annotations
+
+import shutil
+import struct
+import zlib
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from camera import Camera, CameraError
+from detect.errors import DetectError, FrameError
+from detect.run import RunFrame, open_run, read_image
+from landmarks import LandmarkFileError, Step
+
+ZEROS = (0.0,) * 9
+TEXTURE = np.random.default_rng(3).integers(0, 256, (288, 768)).astype(np.uint8)
+
+
+def touch(folder: Path, *names: str) -> None:
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).touch()
+
+
+def step_row(prefix: str, dx: float = 0.25) -> str:
+    return f"STEP {prefix} {dx:.5f} 0.1 0.01 1e-5 0 1e-5 0 0 1e-4\n"
+
+
+@pytest.fixture
+def run_folder(tmp_path: Path, published_cam_text: str) -> Path:
+    folder = tmp_path / "k"
+    folder.mkdir()
+    (folder / "k.cam").write_text(published_cam_text)
+    return folder
+
+
+def prefixes(folder: Path) -> list[str]:
+    return [frame.step.prefix for frame in open_run(folder).frames]
+
+
+def test_run_folder_of_the_data_set(run_folder: Path, published_camera: Camera) -> None:
+    touch(run_folder, "images/k.0000.jpg", "images/k.0001.jpg")
+    (run_folder / "k.txt").write_text(
+        "# odometry\n" + step_row("k.0000", 0.5) + step_row("k.0001", -0.25)
+    )
+    run = open_run(run_folder)
+    assert run.name == "k"
+    assert run.camera == published_camera
+    assert run.odometry == run_folder / "k.txt"
+    assert [frame.image for frame in run.frames] == [
+        run_folder / "images" / "k.0000.jpg",
+        run_folder / "images" / "k.0001.jpg",
+    ]
+    first = run.frames[0].step
+    assert first == Step("k.0000", 0.5, 0.1, 0.01, 1e-5, 0.0, 1e-5, 0.0, 0.0, 1e-4)
+    assert run.frames[1].step.dx == -0.25
+    assert run.images_without_step == ()
+
+
+def test_flat_folder_of_images(run_folder: Path) -> None:
+    touch(run_folder, "b.png", "a.JPG", "notes.md", "c.tiff")
+    run = open_run(run_folder)
+    assert run.odometry is None
+    assert [frame.step for frame in run.frames] == [Step(name, *ZEROS) for name in "abc"]
+    assert [frame.image for frame in run.frames] == [
+        run_folder / name for name in ("a.JPG", "b.png", "c.tiff")
+    ]
+
+
+def test_images_folder_goes_before_loose_images(run_folder: Path) -> None:
+    touch(run_folder, "images/a.png", "preview.png")
+    assert prefixes(run_folder) == ["a"]
+
+
+def test_names_are_in_natural_order(run_folder: Path) -> None:
+    names = ["img10", "img9", "img1", "img100", "img2", "img010", "a5b10", "a5b9", "a05b9"]
+    touch(run_folder, *[f"{name}.png" for name in names])
+    found = prefixes(run_folder)
+    assert sorted(found) == sorted(names)
+    plain = [name for name in found if "0" not in name[:4] or name in ("img10", "img100")]
+    assert plain == ["a5b9", "a5b10", "img1", "img2", "img9", "img10", "img100"]
+
+
+def test_white_space_in_names_does_not_break_rows(run_folder: Path) -> None:
+    touch(run_folder, "left image 1.png")
+    (frame,) = open_run(run_folder).frames
+    assert frame.step.prefix == "left_image_1"
+    assert frame.image == run_folder / "left image 1.png"
+
+
+@pytest.mark.parametrize(
+    "prefix",
+    ["k.0007", "k.0007.jpg", "images/k.0007", "../k/images/k.0007.jpg", "images\\k.0007.jpg"],
+)
+def test_prefixes_name_images(run_folder: Path, prefix: str) -> None:
+    touch(run_folder, "images/k.0007.jpg", "images/k.0008.jpg")
+    (run_folder / "k.txt").write_text(step_row(prefix))
+    run = open_run(run_folder)
+    assert [frame.image for frame in run.frames] == [run_folder / "images" / "k.0007.jpg"]
+    assert run.frames[0].step.prefix == prefix
+    assert run.images_without_step == (run_folder / "images" / "k.0008.jpg",)
+
+
+def test_step_without_image(run_folder: Path, published_camera: Camera) -> None:
+    touch(run_folder, "images/k.0000.jpg")
+    (run_folder / "k.txt").write_text(step_row("k.0000") + step_row("k.0001"))
+    missing = open_run(run_folder).frames[1]
+    assert missing.image is None
+    with pytest.raises(FrameError, match=r"^k\.0001: no image of that name in the run$"):
+        read_image(missing, published_camera)
+
+
+def test_odometry_of_the_landmark_file(run_folder: Path) -> None:
+    """Landmark rows between the steps are no concern of the run's."""
+    touch(run_folder, "images/k.0000.jpg", "images/k.0001.jpg")
+    (run_folder / "map.circles").write_bytes(
+        (
+            step_row("k.0001", 0.75)
+            + "LANDMARK_C 0.1 -2 0.9 0.0016 0 0.0016 4\n"
+            + step_row("k.0000", 0.125)
+        )
+        .replace("\n", "\r\n")
+        .encode()
+    )
+    run = open_run(run_folder)
+    assert run.odometry == run_folder / "map.circles"
+    assert [(f.step.prefix, f.step.dx) for f in run.frames] == [("k.0001", 0.75), ("k.0000", 0.125)]
+
+
+def test_own_odometry_goes_before_the_landmark_file(run_folder: Path) -> None:
+    touch(run_folder, "images/k.0000.jpg")
+    (run_folder / "k.txt").write_text(step_row("k.0000", 0.75))
+    (run_folder / "map.circles").write_text(step_row("k.0000", 0.5))
+    assert open_run(run_folder).frames[0].step.dx == 0.75
+
+
+def test_malformed_step_is_named_by_file_and_line(run_folder: Path) -> None:
+    touch(run_folder, "images/k.0000.jpg")
+    (run_folder / "k.txt").write_text(step_row("k.0000") + "STEP k.0001 0.1 oops 0 1 0 1 0 0 1\n")
+    with pytest.raises(LandmarkFileError, match=r"k\.txt:2\b.*oops"):
+        open_run(run_folder)
+
+
+def test_no_folder(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    for path in (tmp_path / "nowhere", tmp_path / "file"):
+        with pytest.raises(DetectError, match="expected a run folder or a folder of images") as e:
+            open_run(path)
+        assert str(e.value).startswith(f"{path}: ")
+
+
+def test_no_images(run_folder: Path) -> None:
+    touch(run_folder, "notes.md")
+    with pytest.raises(DetectError, match=r"no images: expected .*\.jpg .*\.png"):
+        open_run(run_folder)
+
+
+def test_no_calibration(run_folder: Path) -> None:
+    touch(run_folder, "a.png")
+    (run_folder / "k.cam").unlink()
+    with pytest.raises(DetectError, match=r"no calibration: expected a \.cam .*--camera"):
+        open_run(run_folder)
+
+
+def test_the_only_calibration_may_have_any_name(run_folder: Path, published_camera: Camera) -> None:
+    touch(run_folder, "a.png")
+    (run_folder / "k.cam").rename(run_folder / "whatever.cam")
+    assert open_run(run_folder).camera == published_camera
+
+
+def test_of_several_calibrations_the_runs_own(run_folder: Path, published_camera: Camera) -> None:
+    touch(run_folder, "a.png", "a.cam")
+    assert open_run(run_folder).camera == published_camera
+
+
+def test_several_calibrations_none_its_own(run_folder: Path) -> None:
+    touch(run_folder, "a.png", "l.cam")
+    (run_folder / "k.cam").rename(run_folder / "r.cam")
+    with pytest.raises(DetectError, match=r"several calibrations \(l\.cam, r\.cam\).*--camera"):
+        open_run(run_folder)
+
+
+def test_named_calibration_goes_before_the_runs_own(
+    run_folder: Path, tmp_path: Path, published_cam_text: str
+) -> None:
+    touch(run_folder, "a.png")
+    other = tmp_path / "other.cam"
+    other.write_text(published_cam_text.replace("offsetX: 384", "offsetX: 380"))
+    assert open_run(run_folder, other).camera.offset_x == 380
+
+
+def test_calibration_that_cannot_be_read(run_folder: Path) -> None:
+    touch(run_folder, "a.png")
+    (run_folder / "k.cam").write_text("{ SmRadialDistortedCamera width: many }")
+    with pytest.raises(CameraError, match=r"k\.cam"):
+        open_run(run_folder)
+
+
+# -- images ---------------------------------------------------------------------------------
+
+
+def frame_of(path: Path) -> RunFrame:
+    return RunFrame(Step(path.stem, *ZEROS), path)
+
+
+def refusal(path: Path, camera: Camera) -> str:
+    with pytest.raises(FrameError) as error:
+        read_image(frame_of(path), camera)
+    message = str(error.value)
+    assert message.startswith(f"{path}: ")
+    assert "\n" not in message
+    return message
+
+
+def written(path: Path, image: NDArray[np.integer[Any]]) -> Path:
+    assert cv2.imwrite(str(path), image)
+    return path
+
+
+@pytest.mark.parametrize("suffix", ["png", "pgm", "bmp", "tif"])
+def test_grey_values_are_those_of_the_file(
+    tmp_path: Path, published_camera: Camera, suffix: str
+) -> None:
+    path = written(tmp_path / f"a.{suffix}", TEXTURE)
+    image = read_image(frame_of(path), published_camera)
+    assert image.dtype == np.uint8
+    np.testing.assert_array_equal(image, TEXTURE)
+
+
+def test_jpeg_is_decoded(tmp_path: Path, published_camera: Camera) -> None:
+    v, u = np.indices((288, 768))
+    smooth = (40 + u / 6 + v / 6).astype(np.uint8)
+    image = read_image(frame_of(written(tmp_path / "a.jpg", smooth)), published_camera)
+    assert np.abs(image.astype(int) - smooth).max() <= 3
+
+
+def test_colours_become_their_brightness(tmp_path: Path, published_camera: Camera) -> None:
+    colours = np.random.default_rng(5).integers(0, 256, (288, 768, 3)).astype(np.uint8)
+    image = read_image(frame_of(written(tmp_path / "a.png", colours)), published_camera)
+    luma = colours @ np.array([0.114, 0.587, 0.299])
+    assert np.abs(image - luma).max() <= 1.1
+
+
+def test_sixteen_bits_become_eight(tmp_path: Path, published_camera: Camera) -> None:
+    deep = TEXTURE.astype(np.uint16) * 256 + 100
+    image = read_image(frame_of(written(tmp_path / "a.png", deep)), published_camera)
+    assert np.abs(image.astype(int) - TEXTURE).max() <= 1
+
+
+def test_missing_file(tmp_path: Path, published_camera: Camera) -> None:
+    assert "cannot be read: No such file" in refusal(tmp_path / "a.png", published_camera)
+
+
+def test_dangling_link(run_folder: Path, published_camera: Camera) -> None:
+    (run_folder / "a.png").symlink_to(run_folder / "gone.png")
+    (frame,) = open_run(run_folder).frames
+    assert frame.image == run_folder / "a.png"
+    assert "cannot be read" in refusal(run_folder / "a.png", published_camera)
+
+
+def test_folder_in_the_place_of_an_image(run_folder: Path, published_camera: Camera) -> None:
+    (run_folder / "a.png").mkdir()
+    assert "cannot be read: Is a directory" in refusal(run_folder / "a.png", published_camera)
+
+
+def test_empty_file(tmp_path: Path, published_camera: Camera) -> None:
+    touch(tmp_path, "a.jpg")
+    assert "is empty" in refusal(tmp_path / "a.jpg", published_camera)
+
+
+def test_no_image_inside(tmp_path: Path, published_camera: Camera) -> None:
+    path = tmp_path / "a.jpg"
+    path.write_bytes(b"<html>404</html>" * 100)
+    assert "cannot be decoded: expected an image" in refusal(path, published_camera)
+
+
+@pytest.mark.parametrize("share", [0.02, 0.3, 0.7, 0.99])
+@pytest.mark.parametrize("suffix", ["jpg", "png", "bmp", "pgm", "tif"])
+def test_truncated_image(
+    tmp_path: Path, published_camera: Camera, suffix: str, share: float
+) -> None:
+    path = written(tmp_path / f"a.{suffix}", TEXTURE)
+    content = path.read_bytes()
+    path.write_bytes(content[: int(share * len(content))])
+    message = refusal(path, published_camera)
+    assert "cut off" in message or "cannot be decoded" in message
+
+
+@pytest.mark.parametrize("size", [(288, 767), (576, 768), (768, 288), (1, 1)])
+def test_wrong_size(tmp_path: Path, published_camera: Camera, size: tuple[int, int]) -> None:
+    path = written(tmp_path / "a.png", np.zeros(size, np.uint8))
+    message = refusal(path, published_camera)
+    assert f"is {size[1]}x{size[0]} px: expected 768x288" in message
+
+
+def test_size_beyond_all_bounds(tmp_path: Path, published_camera: Camera) -> None:
+    """A few bytes that claim to be an image of gigabytes."""
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return (
+            struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        )
+
+    header = struct.pack(">IIBBBBB", 200_000, 200_000, 8, 0, 0, 0, 0)
+    path = tmp_path / "a.png"
+    path.write_bytes(
+        b"\x89PNG\r\n\x1a\n"
+        + chunk(b"IHDR", header)
+        + chunk(b"IDAT", zlib.compress(b"\0" * 100))
+        + chunk(b"IEND", b"")
+    )
+    assert "cannot be decoded" in refusal(path, published_camera)
+
+
+def test_images_of_the_demo_run_are_read(project_root: Path, tmp_path: Path) -> None:
+    source = project_root / "images" / "e"
+    folder = tmp_path / "e"
+    folder.mkdir()
+    shutil.copy(source / "e.cam", folder)
+    shutil.copy(source / "images" / "e.0003.jpg", folder)
+    run = open_run(folder)
+    image = read_image(run.frames[0], run.camera)
+    np.testing.assert_array_equal(
+        image, cv2.imread(str(source / "images" / "e.0003.jpg"), cv2.IMREAD_GRAYSCALE)
+    )
