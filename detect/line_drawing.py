@@ -174,8 +174,8 @@ def _horizon_crossing(
     table: VerticalTable, found: LineDetections, track: int
 ) -> tuple[float, float]:
     bearing = found.fits.reference_rad[track] + np.arctan(found.fits.line[track, 0])
+    u = float(table.columns_at(np.array([bearing]))[0])
     columns = np.flatnonzero(table.usable)
-    u = float(np.interp(-bearing, -table.bearing_rad[columns], columns))
     return u, float(np.interp(u, columns, table.horizon_row[columns]))
 
 

@@ -65,7 +65,10 @@ class LineSettings:
     largest_noise_px : float
         Largest standard deviation of a line's place at the horizon due to noise.
     bend_px : float
-        What real edges and calibrations bend, in the uncertainty of a line's inclination.
+        Standard deviation of a line's lean over its length due to all but noise.
+    largest_lean_rad, largest_lean_sigmas, largest_lean_px : float
+        How far a line may lean from the vertical: its angle, standard deviations due to noise, and
+        pixels over its length, added in squares.
     consensus : ConsensusSettings
         How tilt is estimated and what is vertical.
     weight_limit : float
@@ -113,7 +116,10 @@ class LineSettings:
     largest_scatter_px: float = 1.0
     largest_shift_px: float = 1.0
     largest_noise_px: float = 0.3
-    bend_px: float = 0.15
+    bend_px: float = 0.2
+    largest_lean_rad: float = np.radians(0.7)
+    largest_lean_sigmas: float = 8.0
+    largest_lean_px: float = 1.5
     consensus: ConsensusSettings = field(default_factory=ConsensusSettings)
     weight_limit: float = 3.0
     same_edge_px: float = 2.0
@@ -143,6 +149,7 @@ PUBLISHED = LineSettings(
     largest_horizon_gap_px=np.inf,
     largest_shift_px=np.inf,
     largest_noise_px=np.inf,
+    bend_px=0.7,
     join_share=0.0,
     sigma_px=1.0,
     alpha="published",

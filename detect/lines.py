@@ -223,11 +223,17 @@ def agree_on_tilt(
 ) -> TiltEstimate | None:
     """Estimate the tilt from the accepted lines; those that disagree are marked "not vertical"."""
     accepted = np.flatnonzero([f == ACCEPTED for f in fate])
-    # Of a regression on errors that stay the same along an edge: 12 = (length / deviation)^2.
-    bend = (settings.bend_px * fits.pixel_rad[accepted]) ** 2 / (12.0 * fits.spread[accepted])
+    noise = fits.covariance[accepted, 1, 1]
+    # One pixel from end to end: 12 = (length / standard deviation of its points)^2.
+    per_length = fits.pixel_rad[accepted] / np.sqrt(12.0 * fits.spread[accepted])
     tilt, consistent = consensus(
         fits.normal[accepted],
-        fits.covariance[accepted, 1, 1] + bend,
+        noise + (settings.bend_px * per_length) ** 2,
+        np.sqrt(
+            settings.largest_lean_rad**2
+            + settings.largest_lean_sigmas**2 * noise
+            + (settings.largest_lean_px * per_length) ** 2
+        ),
         np.minimum(evidence[accepted] / 10.0, settings.weight_limit),
         settings.consensus,
     )
@@ -314,7 +320,6 @@ def line_ends(
     ahead = np.stack([np.sin(phi), -np.cos(phi), np.zeros_like(phi)], axis=-1)
     left = np.stack([np.cos(phi), np.sin(phi), np.zeros_like(phi)], axis=-1)
     ends = []
-    usable = np.flatnonzero(table.usable)
     for point in (tracks.bounds[:-1][chosen], tracks.bounds[1:][chosen] - 1):
         row, column = tracks.row[point], tracks.column[point]
         rise = _between_columns(table.elevation_tan, row, column)
@@ -322,8 +327,7 @@ def line_ends(
             x = line[:, 0] + line[:, 1] * rise
             z = rise * np.sqrt(1.0 + x * x)
             x = line[:, 0] + line[:, 1] * z
-            # Where the line crosses that row: bearings fall from left to right.
-            column = np.interp(-(phi + np.arctan(x)), -table.bearing_rad[usable], usable)
+            column = table.columns_at(phi + np.arctan(x))
             moved = _between_columns(table.elevation_tan, row, column)
             # At the verticals' own ends the neighbouring column may end a row earlier.
             rise = np.where(np.isfinite(moved), moved, rise)

@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 FloatArray = NDArray[np.float64]
 
 _REFINEMENTS = 6
+#: Standard deviations from which on a line's pull no longer grows.
 _SOFTENING = 2.0
 
 
@@ -55,10 +56,6 @@ class ConsensusSettings:
         Largest absolute pitch and roll.
     prior_rad : float
         Standard deviation of the tilt; decides only between tilts that the lines support alike.
-    tolerance_rad : float
-        How far a real vertical may be from vertical.
-    tolerance_sigmas : float
-        What its own uncertainty adds to that, standard deviations.
     building_rad : float
         Standard deviation of real verticals about the vertical.
     proposers : int
@@ -69,9 +66,7 @@ class ConsensusSettings:
 
     largest_rad: float = np.radians(5.0)
     prior_rad: float = np.radians(2.0)
-    tolerance_rad: float = np.radians(0.7)
-    tolerance_sigmas: float = 10.0
-    building_rad: float = np.radians(0.03)
+    building_rad: float = np.radians(0.045)
     proposers: int = 24
     least_lines: int = 3
 
@@ -79,6 +74,7 @@ class ConsensusSettings:
 def consensus(
     normal: FloatArray,
     inclination_variance: FloatArray,
+    tolerance: FloatArray,
     weight: FloatArray,
     settings: ConsensusSettings,
 ) -> tuple[TiltEstimate | None, NDArray[np.bool_]]:
@@ -90,6 +86,8 @@ def consensus(
         Unit normals, in the calibrated robot frame, of the planes through the camera and each line.
     inclination_variance : (N,) float64
         Variance of the normals' inclinations (rad^2).
+    tolerance : (N,) float64
+        Largest inclinations that the lines may have and be verticals (rad).
     weight : (N,) float64
         Votes of each line, at least 0.
     settings : ConsensusSettings
@@ -104,9 +102,6 @@ def consensus(
     """
     from detect.line_kernels import vote_for_tilt
 
-    tolerance = np.hypot(
-        settings.tolerance_rad, settings.tolerance_sigmas * np.sqrt(inclination_variance)
-    )
     strongest = np.argsort(-weight, kind="stable")[: settings.proposers]
     tilt = np.array(
         vote_for_tilt(
@@ -116,18 +111,17 @@ def consensus(
     deviation = np.sqrt(settings.building_rad**2 + inclination_variance)
     prior = np.eye(2) / settings.prior_rad**2
     covariance = np.linalg.inv(prior)
-    consistent = np.zeros(len(normal), np.bool_)
     for _ in range(_REFINEMENTS):
-        off = _inclination(normal, tilt)
-        consistent = np.abs(off) <= tolerance
+        turned = normal @ level_rotation(tilt[0], tilt[1]).T
+        agrees = np.abs(turned[:, 2]) <= tolerance
         # Cauchy's weights: a line of furniture or a shadow among few lines must not pull.
-        softened = deviation * np.sqrt(1.0 + (off / (_SOFTENING * deviation)) ** 2)
-        design = np.stack([normal[:, 1], -normal[:, 0]], axis=-1) / softened[:, None]
-        seen = -normal[:, 2] / softened
-        information = design[consistent].T @ design[consistent] + prior
-        covariance = np.linalg.inv(information)
-        tilt = covariance @ (design[consistent].T @ seen[consistent])
-    consistent = np.abs(_inclination(normal, tilt)) <= tolerance
+        softened = deviation * np.sqrt(1.0 + (turned[:, 2] / (_SOFTENING * deviation)) ** 2)
+        turned = (turned / softened[:, None])[agrees]
+        design = np.stack([turned[:, 1], -turned[:, 0]], axis=-1)
+        covariance = np.linalg.inv(design.T @ design + prior)
+        tilt = tilt - covariance @ (design.T @ turned[:, 2] + prior @ tilt)
+    turned = normal @ level_rotation(tilt[0], tilt[1]).T
+    consistent = np.abs(turned[:, 2]) <= tolerance
     lines = int(consistent.sum())
     if lines < settings.least_lines or np.any(np.abs(tilt) > settings.largest_rad):
         return None, np.abs(normal[:, 2]) <= tolerance
@@ -145,8 +139,3 @@ def lean(bearing_rad: ArrayLike, pitch_rad: float, roll_rad: float) -> FloatArra
     """How a vertical at a bearing leans to the left in the chart of a tilted camera (dX / dZ)."""
     bearing = np.asarray(bearing_rad, dtype=np.float64)
     return np.asarray(pitch_rad * np.sin(bearing) - roll_rad * np.cos(bearing))
-
-
-def _inclination(normal: FloatArray, tilt: FloatArray) -> FloatArray:
-    """Z of the turned normals, to first order in the tilt: the refinement undoes the rest."""
-    return np.asarray(normal[:, 2] + tilt[0] * normal[:, 1] - tilt[1] * normal[:, 0])

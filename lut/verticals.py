@@ -62,6 +62,13 @@ class VerticalTable:
         """(W,) bool, the columns that have a vertical."""
         return self.first_row <= self.last_row
 
+    def columns_at(self, bearing_rad: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(N,) columns at which (N,) bearings lie on the horizon; at its ends for those outside."""
+        columns = np.flatnonzero(self.usable)
+        bearing = self.bearing_rad[columns]
+        order = np.argsort(bearing)
+        return np.asarray(np.interp(bearing_rad, bearing[order], columns[order]))
+
 
 def build_vertical_table(camera: Camera) -> VerticalTable:
     """Compute the horizon and the verticals through it.

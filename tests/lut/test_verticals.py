@@ -1,0 +1,150 @@
+"""The table of verticals against points in space projected through the camera."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from camera import Camera
+from lut.verticals import STEEPEST_SLOPE, VerticalTable, build_vertical_table
+from tests.detect.line_scene import mirrored, pinhole
+
+BARREL = (0.0, -0.08, 0.0, 0.0, 0.0)
+
+
+@pytest.fixture(scope="module")
+def published_table(published_camera: Camera) -> VerticalTable:
+    return build_vertical_table(published_camera)
+
+
+def strip_points(table: VerticalTable, c: int) -> np.ndarray:
+    rows = np.arange(table.first_row[c], table.last_row[c] + 1)
+    return np.stack([table.column[rows, c].astype(np.float64), rows.astype(np.float64)], axis=-1)
+
+
+def test_horizon_is_where_directions_are_level(
+    published_camera: Camera, published_table: VerticalTable
+) -> None:
+    columns = np.arange(published_camera.width, dtype=np.float64)
+    seen = published_camera.directions_robot(
+        np.stack([columns, published_table.horizon_row], axis=-1)
+    )
+    np.testing.assert_allclose(seen[:, 2] / np.hypot(*seen[:, :2].T), 0.0, atol=1e-9)
+    np.testing.assert_allclose(
+        np.arctan2(seen[:, 0], -seen[:, 1]), published_table.bearing_rad, atol=1e-12
+    )
+
+
+@pytest.mark.parametrize("c", [5, 130, 384, 600, 760])
+def test_points_on_a_vertical_project_onto_its_columns(
+    published_camera: Camera, published_table: VerticalTable, c: int
+) -> None:
+    bearing = published_table.bearing_rad[c]
+    rows = np.arange(published_table.first_row[c], published_table.last_row[c] + 1)
+    height = 2.5 * published_table.elevation_tan[rows, c].astype(np.float64)
+    foot = published_camera.centre[:2] + 2.5 * np.array([np.sin(bearing), -np.cos(bearing)])
+    points = np.column_stack(
+        [np.broadcast_to(foot, (len(rows), 2)), published_camera.centre[2] + height]
+    )
+    pixels = published_camera.project_robot(points)
+    # Single precision of the table, at 45 deg of elevation.
+    np.testing.assert_allclose(pixels[:, 1], rows, atol=5e-4)
+    np.testing.assert_allclose(pixels[:, 0], published_table.column[rows, c], atol=5e-4)
+    assert len(rows) > 150
+
+
+def test_vertical_passes_through_its_column_on_the_horizon(
+    published_table: VerticalTable,
+) -> None:
+    for c in np.flatnonzero(published_table.usable)[5:-5:37]:
+        points = strip_points(published_table, int(c))
+        at_horizon = np.interp(published_table.horizon_row[c], points[:, 1], points[:, 0])
+        # A straight line between rows, on a curve.
+        assert at_horizon == pytest.approx(c, abs=2e-3)
+        bearing = published_table.bearing_rad[c : c + 1]
+        assert published_table.columns_at(bearing) == pytest.approx(c)
+
+
+@given(
+    pitch=st.floats(-30.0, 30.0),
+    roll=st.floats(-40.0, 40.0),
+    aspect=st.sampled_from([1.0, 2.0]),
+    coef=st.sampled_from([(0.0,) * 5, BARREL]),
+)
+@settings(max_examples=25, deadline=None)
+def test_any_pose_gives_verticals_inside_the_image(
+    pitch: float, roll: float, aspect: float, coef: tuple[float, float, float, float, float]
+) -> None:
+    camera = pinhole(90, 60, 80.0, pitch_deg=pitch, roll_deg=roll, row_aspect=aspect, coef=coef)
+    table = build_vertical_table(camera)
+    shown = np.isfinite(table.column)
+    assert np.array_equal(shown, np.isfinite(table.elevation_tan))
+    rows = np.arange(camera.height)[:, None]
+    assert np.array_equal(shown, (rows >= table.first_row) & (rows <= table.last_row))
+    assert np.all((table.column[shown] >= 0.0) & (table.column[shown] <= camera.width - 1))
+    assert np.all(np.isfinite(table.horizon_row[table.usable]))
+    assert np.all(shown[np.rint(table.horizon_row[table.usable]).astype(int), table.usable])
+    steep = np.abs(np.diff(table.column.astype(np.float64), axis=0))
+    assert not np.any(steep > STEEPEST_SLOPE + 0.02)
+    for c in np.flatnonzero(table.usable)[::11]:
+        points = strip_points(table, int(c))
+        seen = camera.directions_robot(points)
+        np.testing.assert_allclose(
+            np.arctan2(seen[:, 0], -seen[:, 1]), table.bearing_rad[c], atol=2e-6
+        )
+        np.testing.assert_allclose(
+            seen[:, 2] / np.hypot(seen[:, 0], seen[:, 1]),
+            table.elevation_tan[points[:, 1].astype(int), c],
+            atol=2e-6,
+        )
+
+
+def test_camera_that_sees_no_horizon_has_no_verticals() -> None:
+    for pitch in (-70.0, 70.0):
+        table = build_vertical_table(pinhole(90, 60, 80.0, pitch_deg=pitch))
+        assert not table.usable.any()
+        assert np.all(np.isnan(table.horizon_row))
+        assert np.all(np.isnan(table.column))
+
+
+def test_horizon_that_leaves_the_image_on_one_side_gives_part_of_a_table() -> None:
+    camera = pinhole(160, 60, 120.0, pitch_deg=8.0, roll_deg=15.0)
+    table = build_vertical_table(camera)
+    inside = np.isfinite(table.horizon_row)
+    assert 0 < inside.sum() < camera.width
+    # One stretch of columns, at one side.
+    assert np.count_nonzero(np.diff(inside.astype(int))) == 1
+    level = camera.directions_robot(
+        np.stack([np.flatnonzero(inside), table.horizon_row[inside]], axis=-1)
+    )
+    np.testing.assert_allclose(level[:, 2], 0.0, atol=1e-10)
+
+
+def test_verticals_beyond_45_degrees_are_marked() -> None:
+    rolled = build_vertical_table(pinhole(90, 60, 80.0, roll_deg=50.0))
+    assert np.isfinite(rolled.horizon_row).any()
+    assert not rolled.usable.any()
+
+
+def test_upside_down_camera_sees_verticals_too() -> None:
+    table = build_vertical_table(pinhole(90, 60, 80.0, roll_deg=180.0))
+    assert table.usable.all()
+    # Left of the image is right of the robot, and up is down.
+    assert np.all(np.diff(table.bearing_rad) > 0.0)
+    assert np.all(np.diff(table.elevation_tan[:, 45]) > 0.0)
+
+
+def test_mirrored_camera_gives_the_mirrored_table() -> None:
+    camera = pinhole(91, 60, 80.0, pitch_deg=12.0, roll_deg=6.0, coef=BARREL)
+    table = build_vertical_table(camera)
+    other = build_vertical_table(mirrored(camera))
+    np.testing.assert_allclose(other.horizon_row[::-1], table.horizon_row, atol=1e-9)
+    np.testing.assert_allclose(other.bearing_rad[::-1], -table.bearing_rad, atol=1e-12)
+    np.testing.assert_array_equal(other.first_row[::-1], table.first_row)
+    np.testing.assert_allclose(90.0 - other.column[:, ::-1], table.column, atol=2e-5)
+
+
+def test_half_frames_have_rows_twice_as_high(published_table: VerticalTable) -> None:
+    assert published_table.row_aspect == 2.0
