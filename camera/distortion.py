@@ -29,6 +29,8 @@ _TABLE_NODES = 16384
 _NEWTON_STEPS = 60
 # Coefficients of a polynomial in r that make no difference even at `RADIUS_LIMIT`.
 _NEGLIGIBLE = 1e-30
+# Folds farther out than 89.994 deg are rounding, not distortion.
+_SMALLEST_INVERSE = 1e-4
 _LAST_STEP = 1e-9
 
 
@@ -99,10 +101,14 @@ def fold_radius(coef: Coef) -> float:
 
 
 def _first_positive_root(polynomial: Polynomial) -> float:
-    roots = polynomial.trim(_NEGLIGIBLE).roots()
+    """The smallest positive root of a polynomial whose constant term is 1."""
+    # In 1/r the polynomial is monic and the root sought the largest one, so that it is found well
+    # even when the higher coefficients all but vanish.
+    inverse = Polynomial(polynomial.trim(_NEGLIGIBLE).coef[::-1]).roots()
     # Rounding can make a conjugate pair of a double root.
-    real = roots.real[np.abs(roots.imag) <= 1e-6 * np.maximum(1.0, np.abs(roots.real))]
-    return float(min(real[real > 0.0], default=np.inf))
+    real = inverse.real[np.abs(inverse.imag) <= 1e-6 * np.abs(inverse)]
+    largest = float(max(real, default=0.0))
+    return 1.0 / largest if largest > _SMALLEST_INVERSE else float("inf")
 
 
 @lru_cache(maxsize=64)

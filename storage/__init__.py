@@ -49,7 +49,7 @@ def write_whole(path: str | os.PathLike[str], *, overwrite: bool) -> Iterator[Bi
         If the folder cannot be written to.
     """
     path = Path(path)
-    if not overwrite and path.exists():
+    if not overwrite and os.path.lexists(path):
         raise OutputExistsError(path)
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
     temporary = Path(name)
@@ -77,4 +77,6 @@ def _place_new(temporary: Path, path: Path) -> None:
     except FileExistsError:
         raise OutputExistsError(path) from None
     except OSError:  # a file system without hard links
+        if os.path.lexists(path):
+            raise OutputExistsError(path) from None
         temporary.replace(path)

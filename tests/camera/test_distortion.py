@@ -59,6 +59,7 @@ def test_a_pole_of_first_or_second_order_ends_the_projection(coef: Coef, pole: f
 @example((0.1, 0.0, -0.5, 0.0, 0.0))
 @example((0.1, 0.0, -1.0, 0.25, 0.0))
 @example((0.0, 0.0, 0.0, 0.0, 1e-300))
+@example((0.0, -0.25, 0.0, 0.0, 1e-30))
 def test_up_to_the_fold_the_distorted_radius_grows_and_no_farther(coef: Coef) -> None:
     end = min(fold_radius(coef), 20.0)
     r = np.linspace(0.0, end, 2001)
