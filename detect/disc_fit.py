@@ -43,6 +43,10 @@ _LEAST_NOISE = 0.3
 _RADIUS_RANGE = (0.75, 1.28)
 _LEAST_EXPLAINED = 0.35
 _LEAST_SECTORS = 0.75
+#: An outline may be this uneven where the disc explains more than the given share: with nothing
+#: else there to disturb it, it is the shape that is wrong (a square of the same size, say).
+_MOST_UNEVEN = 1.2
+_UNDISTURBED = 0.75
 
 
 @dataclass(frozen=True)
@@ -215,6 +219,7 @@ def disc_evidence(fits: DiscFits, radius_m: float, blur_px: float = 1.0) -> Floa
         & (relative_radius < _RADIUS_RANGE[1])
         & (fits.explained >= _LEAST_EXPLAINED)
         & (fits.sectors_good > _LEAST_SECTORS)
+        & ((uneven < _MOST_UNEVEN) | (fits.explained < _UNDISTURBED))
     )
     return np.asarray(np.where(possible, score, -np.inf))
 

@@ -69,7 +69,7 @@ class CircleSettings:
     noise_floor: float = 2.0
     separation_m: float = 0.14
     verify: bool = True
-    evidence: float = 1.3
+    evidence: float = 1.1
     blur_px: float = 1.0
     refine: bool = True
     systematic_px: float = 0.003
