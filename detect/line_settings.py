@@ -103,7 +103,7 @@ class LineSettings:
         (1.2, np.inf),
         (0.8, 1.5),
         (0.8, 1.5),
-        (1.8, 0.15),
+        (1.8, 0.1),
     )
     fine_scale_px: float = 0.8
     coarse_scale_px: float = 1.6
