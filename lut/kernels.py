@@ -79,7 +79,8 @@ def encode_runs(
     numbers, floor_xy
         As in `count_votes`.
     usable : (H, W) bool
-        Usable centres. Others between a row's ends continue the run they lie in.
+        Usable centres. Others between a row's ends continue the run they lie in while that stays
+        inside the image.
     row_begin, row_end : (H,) int32
         Columns between which a row's usable centres lie.
     rings : (2K, 2) float64
@@ -108,17 +109,17 @@ def encode_runs(
             dv = 0
             fresh = True
             for u in range(row_begin[v], row_end[v]):
-                if not usable[v, u]:
+                du_here = 0
+                dv_here = -1 - v
+                if usable[v, u]:
+                    us, vs = project_floor_point(
+                        numbers, floor_xy[v, u, 0] + rings[k, 0], floor_xy[v, u, 1] + rings[k, 1]
+                    )
+                    if _inside(us, vs, width, height):
+                        du_here = math.floor(us + 0.5) - u
+                        dv_here = math.floor(vs + 0.5) - v
+                elif 0 <= u + du < width:
                     continue
-                us, vs = project_floor_point(
-                    numbers, floor_xy[v, u, 0] + rings[k, 0], floor_xy[v, u, 1] + rings[k, 1]
-                )
-                if _inside(us, vs, width, height):
-                    du_here = math.floor(us + 0.5) - u
-                    dv_here = math.floor(vs + 0.5) - v
-                else:
-                    du_here = 0
-                    dv_here = -1 - v
                 if fresh or du_here != du or dv_here != dv:
                     du = du_here
                     dv = dv_here

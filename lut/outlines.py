@@ -94,8 +94,8 @@ class DiscTable:
     votes_inner, votes_outer : (H, W) uint8
         Samples of each outline inside the image, for usable centres.
     margin_px : int
-        Padding that makes every offset of every run safe: 1 where samples lie outside the image,
-        more only where a run passes over centres that are not usable.
+        Padding that makes every offset of every run safe: 1 if samples lie outside the image, else
+        0.
     floor_xy : (H, W, 2) float32
         Floor position (robot X, Y in metres) that each pixel sees; NaN above the horizon.
     """
@@ -173,6 +173,7 @@ def build_disc_table(camera: Camera, shape: DiscShape) -> DiscTable:
             break
         capacity = count
     run_start, run_du, run_dv = run_start[:count], run_du[:count], run_dv[:count]
+    run_row = np.repeat(np.arange(camera.height), run_bounds[:, -1] - run_bounds[:, 0])
     return DiscTable(
         samples=shape.samples,
         row_begin=row_begin,
@@ -184,7 +185,7 @@ def build_disc_table(camera: Camera, shape: DiscShape) -> DiscTable:
         run_dv=_narrow(run_dv),
         votes_inner=np.where(usable, votes_inner, 0).astype(np.uint8),
         votes_outer=np.where(usable, votes_outer, 0).astype(np.uint8),
-        margin_px=_margin(camera, row_end, run_bounds, run_start, run_du, run_dv),
+        margin_px=int(np.any(run_row + run_dv < 0)),
         floor_xy=floor_xy.astype(np.float32),
     )
 
@@ -208,33 +209,6 @@ def _within_limits(
     per_row = np.gradient(floor_xy, axis=0) if height > 1 else np.full_like(floor_xy, np.nan)
     near = np.hypot(per_row[..., 0], per_row[..., 1]) <= shape.far_limit_m_per_px
     return np.asarray(near & inside_v[:, None] & inside_u[None, :])
-
-
-def _margin(
-    camera: Camera,
-    row_end: NDArray[np.int32],
-    run_bounds: NDArray[np.int32],
-    run_start: NDArray[np.int32],
-    run_du: NDArray[np.int32],
-    run_dv: NDArray[np.int32],
-) -> int:
-    """How far outside the image runs reach, pixels."""
-    if not len(run_start):
-        return 0
-    per_row = np.diff(run_bounds[:, [0, -1]], axis=1)[:, 0]
-    row = np.repeat(np.arange(camera.height), per_row)
-    end = np.append(run_start[1:], 0)
-    last = np.zeros(len(run_start), bool)
-    bounds = run_bounds[:, 1:][per_row > 0]
-    last[bounds.ravel() - 1] = True
-    end = np.where(last, row_end[row], end)
-    return max(
-        0,
-        int(-(run_start + run_du).min()),
-        int((end - 1 + run_du).max()) - (camera.width - 1),
-        int(-(row + run_dv).min()),
-        int((row + run_dv).max()) - (camera.height - 1),
-    )
 
 
 def _narrow(values: NDArray[np.int32]) -> NDArray[np.int32]:

@@ -1,0 +1,294 @@
+"""Disc tables against a plain computation of the same, pixel by pixel."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from camera import Camera
+from landmarks import read_frames
+from lut import (
+    DiscShape,
+    DiscTable,
+    TableError,
+    build_disc_table,
+    floor_positions,
+    ring,
+)
+from tests.camera.strategies import cameras
+
+IntArray = NDArray[np.int64]
+
+
+# -- the reference --------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass(frozen=True)
+class Outlines:
+    """What a table says, without its economies: (H, W, 2 samples) pixels around every pixel."""
+
+    column: IntArray
+    row: IntArray
+    inside: NDArray[np.bool_]
+    usable: NDArray[np.bool_]
+
+
+def plain_outlines(camera: Camera, shape: DiscShape) -> Outlines:
+    """The definition: floor position -> ring -> image -> nearest pixel."""
+    v, u = np.mgrid[0 : camera.height, 0 : camera.width]
+    floor_xy = camera.floor_from_pixel(np.stack([u, v], axis=-1).astype(float))
+    rings = [ring(radius, shape.samples) for radius in (shape.inner_radius_m, shape.outer_radius_m)]
+    seen = camera.project_floor(floor_xy[:, :, None] + np.concatenate(rings))
+    with np.errstate(invalid="ignore"):
+        nearest = np.floor(seen + 0.5)
+        inside = np.all((nearest >= 0) & (nearest < [camera.width, camera.height]), axis=-1)
+        per_row = np.hypot(*np.moveaxis(np.gradient(floor_xy, axis=0), -1, 0))
+        usable = per_row <= shape.far_limit_m_per_px
+    border = shape.border_px
+    usable &= (u >= border) & (u <= camera.width - border)
+    usable &= (v >= border) & (v <= camera.height - border)
+    for outline in (inside[..., : shape.samples], inside[..., shape.samples :]):
+        usable &= 2 * outline.sum(axis=-1) >= shape.samples
+    nearest = np.where(inside[..., None], nearest, -1.0).astype(np.int64)
+    return Outlines(nearest[..., 0], nearest[..., 1], inside, usable)
+
+
+def decoded(table: DiscTable) -> tuple[IntArray, IntArray]:
+    """(H, W, 2 samples) column and row of every sample, as the runs say; -10**6 where none does."""
+    height, width = table.usable.shape
+    column = np.full((height, width, 2 * table.samples), -(10**6))
+    row = column.copy()
+    for v in range(height):
+        for k in range(2 * table.samples):
+            first, end = table.run_bounds[v, k], table.run_bounds[v, k + 1]
+            starts = [*table.run_start[first:end], table.row_end[v]]
+            for run, u0, u1 in zip(range(first, end), starts, starts[1:]):
+                column[v, u0:u1, k] = np.arange(u0, u1) + table.run_du[run]
+                row[v, u0:u1, k] = v + table.run_dv[run]
+    return column, row
+
+
+def assert_table_is(table: DiscTable, plain: Outlines) -> None:
+    """Bit for bit, for all usable centres; and safe everywhere."""
+    height, width = plain.usable.shape
+    assert np.array_equal(table.usable, plain.usable)
+    column, row = decoded(table)
+    usable = plain.usable
+    voting = plain.inside & usable[..., None]
+    assert np.array_equal(column[voting], plain.column[voting])
+    assert np.array_equal(row[voting], plain.row[voting])
+
+    # Samples outside: straight above the image.
+    aside = ~plain.inside & usable[..., None]
+    own_column = np.broadcast_to(np.arange(width)[None, :, None], column.shape)
+    assert np.array_equal(column[aside], own_column[aside])
+    assert np.all(row[aside] == -1)
+
+    for votes, outline in (
+        (table.votes_inner, plain.inside[..., : table.samples]),
+        (table.votes_outer, plain.inside[..., table.samples :]),
+    ):
+        assert votes.dtype == np.uint8
+        assert np.array_equal(votes, np.where(usable, outline.sum(axis=-1), 0))
+
+    # Whatever a run reaches, over unusable centres too, lies within the padding, and the padding
+    # is no larger than that takes.
+    reached = row != -(10**6)
+    beyond = [
+        np.max(amount[reached], initial=0)
+        for amount in (-column, column - (width - 1), -row, row - (height - 1))
+    ]
+    assert table.margin_px == max(beyond)
+    assert table.margin_px <= 1
+
+    for v in range(height):
+        columns = np.flatnonzero(usable[v])
+        if len(columns):
+            assert (table.row_begin[v], table.row_end[v]) == (columns[0], columns[-1] + 1)
+        else:
+            assert table.row_begin[v] == table.row_end[v]
+
+
+# -- the published calibration --------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def published_table(published_camera: Camera) -> DiscTable:
+    return build_disc_table(published_camera, DiscShape())
+
+
+def test_the_published_table_is_what_a_plain_computation_says(
+    published_camera: Camera, published_table: DiscTable
+) -> None:
+    assert_table_is(published_table, plain_outlines(published_camera, DiscShape()))
+
+
+def test_the_published_limits_are_those_of_the_shipped_file(published_table: DiscTable) -> None:
+    rows, columns = np.nonzero(published_table.usable)
+    assert (rows.min(), rows.max()) == (116, 276)
+    assert (columns.min(), columns.max()) == (12, 756)
+
+
+def test_every_shipped_centre_is_usable(
+    published_camera: Camera, published_table: DiscTable, shared_data: Path
+) -> None:
+    frames = read_frames(shared_data / "dlr" / "map.circles")
+    shipped = np.array([(disc.px, disc.py) for frame in frames for disc in frame.circles])
+    pixels = np.rint(published_camera.project_floor(shipped)).astype(int)
+    assert len(pixels) == 14745
+    assert published_table.usable[pixels[:, 1], pixels[:, 0]].all()
+    # The file's own near and far limits: its first and last rows are the table's.
+    assert (pixels[:, 1].min(), pixels[:, 1].max()) == (116, 276)
+    assert (pixels[:, 0].min(), pixels[:, 0].max()) == (15, 755)
+
+
+def test_the_floor_positions_are_the_camera_s(
+    published_camera: Camera, published_table: DiscTable
+) -> None:
+    floor_xy = floor_positions(published_camera)
+    assert floor_xy.shape == (288, 768, 2)
+    for u, v in ((0, 287), (767, 287), (384, 200), (100, 130)):
+        assert floor_xy[v, u] == pytest.approx(published_camera.floor_from_pixel([u, v]), rel=1e-12)
+    assert np.isnan(floor_xy[0, 384]).all()
+    assert np.array_equal(published_table.floor_xy, floor_xy.astype(np.float32), equal_nan=True)
+
+
+def test_runs_are_long(published_table: DiscTable) -> None:
+    # What makes a detector fast: many centres for each stretch of an image row that is copied.
+    centres = published_table.usable.sum() * 2 * published_table.samples
+    assert centres / len(published_table.run_start) > 30
+    assert published_table.run_start.dtype == np.int16
+
+
+@pytest.mark.parametrize(
+    "shape",
+    [
+        DiscShape(inner_radius_m=0.03, outer_radius_m=0.05, samples=3, border_px=0),
+        DiscShape(inner_radius_m=0.2, outer_radius_m=0.9, samples=33, far_limit_m_per_px=0.5),
+    ],
+)
+def test_other_radii_and_sample_counts(published_camera: Camera, shape: DiscShape) -> None:
+    # A quarter of the image size is as good and a sixteenth of the work.
+    small = dataclasses.replace(
+        published_camera, width=192, height=72, scale_x=464.762 / 4, scale_y=232.381 / 4,
+        offset_x=96.0, offset_y=36.0,
+    )  # fmt: skip
+    table = build_disc_table(small, shape)
+    assert table.usable.any()
+    assert_table_is(table, plain_outlines(small, shape))
+
+
+# -- any camera -----------------------------------------------------------------------------------
+
+
+@st.composite
+def shapes(draw: st.DrawFn) -> DiscShape:
+    inner = draw(st.floats(0.01, 1.0))
+    return DiscShape(
+        inner_radius_m=inner,
+        outer_radius_m=inner * draw(st.floats(1.1, 5.0)),
+        samples=draw(st.integers(3, 20)),
+        border_px=draw(st.integers(0, 6)),
+        far_limit_m_per_px=draw(st.floats(0.001, 5.0)),
+    )
+
+
+@settings(deadline=None)
+@given(cameras(largest_side=40, down_deg=(-10.0, 90.0)), shapes())
+def test_any_camera_s_table_is_what_a_plain_computation_says(
+    camera: Camera, shape: DiscShape
+) -> None:
+    assert_table_is(build_disc_table(camera, shape), plain_outlines(camera, shape))
+
+
+def wide_and_low() -> Camera:
+    """Sees 160 deg across, 15 cm above the floor: rings reach behind it and past the fold."""
+    return Camera(
+        width=60, height=40, scale_x=20.0, scale_y=20.0, offset_x=30.0, offset_y=20.0,
+        coef=(0.0, -0.2, 0.0, 0.5, 0.0),
+        robot_from_camera=((-1.0, 0, 0, 0.0), (0, 0.6, -0.8, 0.0), (0, -0.8, -0.6, 0.15)),
+    )  # fmt: skip
+
+
+def test_samples_that_the_camera_cannot_see_at_all_do_not_vote() -> None:
+    camera = wide_and_low()
+    shape = DiscShape(0.1, 0.5, samples=16, border_px=0, far_limit_m_per_px=1.0)
+    table = build_disc_table(camera, shape)
+    rings = np.concatenate([ring(0.1, 16), ring(0.5, 16)])
+    undefined = np.isnan(camera.project_floor(table.floor_xy[:, :, None] + rings)).any(axis=-1)
+    assert (undefined & table.usable[..., None]).any()
+    assert_table_is(table, plain_outlines(camera, shape))
+
+
+def test_a_camera_that_looks_up_gets_an_empty_table(published_camera: Camera) -> None:
+    up = dataclasses.replace(
+        published_camera,
+        robot_from_camera=((-1.0, 0, 0, 0.0), (0, 1.0, 0, 0.0), (0, 0, -1.0, 1.5)),
+    )
+    assert build_disc_table(up, DiscShape()).usable.any()  # straight down, the same mount
+    up = dataclasses.replace(
+        published_camera,
+        robot_from_camera=((1.0, 0, 0, 0.0), (0, 1.0, 0, 0.0), (0, 0, 1.0, 1.5)),
+    )
+    table = build_disc_table(up, DiscShape())
+    assert not table.usable.any()
+    assert np.array_equal(table.row_begin, table.row_end)
+    assert len(table.run_start) == len(table.run_du) == len(table.run_dv) == 0
+    assert not table.run_bounds.any()
+    assert table.margin_px == 0
+    assert np.isnan(table.floor_xy).all()
+
+
+@pytest.mark.parametrize("height_m", [0.0, -1.5])
+def test_a_camera_that_is_not_above_the_floor_is_refused(
+    published_camera: Camera, height_m: float
+) -> None:
+    pose = np.array(published_camera.robot_from_camera)
+    pose[2, 3] = height_m
+    below = dataclasses.replace(
+        published_camera,
+        robot_from_camera=tuple((row[0], row[1], row[2], row[3]) for row in pose.tolist()),
+    )
+    with pytest.raises(TableError, match="above the floor: expected more than 0"):
+        build_disc_table(below, DiscShape())
+
+
+def test_rings_are_equally_spaced_circles_that_begin_to_the_left() -> None:
+    points = ring(0.14, 16)
+    assert np.hypot(*points.T) == pytest.approx(0.14)
+    assert points[0] == pytest.approx([0.14, 0.0])
+    assert points[4] == pytest.approx([0.0, 0.14])
+    gaps = np.hypot(*(points - np.roll(points, 1, axis=0)).T)
+    assert gaps == pytest.approx(2 * 0.14 * np.sin(np.pi / 16))
+
+
+def test_a_table_is_the_same_every_time(published_camera: Camera) -> None:
+    first, second = (build_disc_table(published_camera, DiscShape(samples=4)) for _ in range(2))
+    for field in dataclasses.fields(DiscTable):
+        a, b = getattr(first, field.name), getattr(second, field.name)
+        assert np.asarray(a).tobytes() == np.asarray(b).tobytes()
+
+
+@pytest.mark.parametrize(
+    ("changes", "complaint"),
+    [
+        ({"inner_radius_m": 0.0}, "expected 0 < inner < outer"),
+        ({"inner_radius_m": 0.14}, "expected 0 < inner < outer"),
+        ({"outer_radius_m": float("inf")}, "expected 0 < inner < outer"),
+        ({"outer_radius_m": float("nan")}, "expected 0 < inner < outer"),
+        ({"samples": 2}, "2 samples on an outline: expected 3 to 128"),
+        ({"samples": 129}, "129 samples on an outline: expected 3 to 128"),
+        ({"border_px": -1}, "border of -1 px: expected 0 or more"),
+        ({"far_limit_m_per_px": 0.0}, "far limit of 0 m: expected more than 0"),
+        ({"far_limit_m_per_px": float("nan")}, "far limit of nan m"),
+    ],
+)
+def test_impossible_outlines_are_refused(changes: dict[str, float], complaint: str) -> None:
+    with pytest.raises(TableError, match=complaint):
+        dataclasses.replace(DiscShape(), **changes)  # type: ignore[arg-type]
