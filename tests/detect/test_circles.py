@@ -1,0 +1,528 @@
+"""The disc detector on images whose discs are known exactly."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+import pytest
+import scipy.ndimage
+from hypothesis import Phase, assume, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from numpy.typing import NDArray
+
+from camera import Camera
+from detect.circle_kernels import local_maxima, suppress_neighbours
+from detect.circles import (
+    CircleDetections,
+    detect_circles,
+    disc_shape,
+    published_covariance,
+    quality_of_centres,
+    tilt_jacobian,
+)
+from detect.errors import FrameError
+from detect.settings import PUBLISHED, CircleSettings, Polarity
+from lut import DiscShape, DiscTable, build_disc_table, ring
+from tests.detect.painted_floor import DARK, LIGHT, PaintedFloor, mirrored_camera
+from tools.evaluation.accuracy import measure_accuracy
+
+FloatArray = NDArray[np.float64]
+
+DEFAULT = CircleSettings()
+
+#: Near and far, left and right, no two in each other's outlines.
+PLACES = np.array(
+    [(0.0, -1.0), (0.5, -1.3), (-0.6, -1.7), (0.9, -2.2), (-0.2, -2.6), (1.0, -3.2), (-1.1, -3.3)]
+)
+LIGHT_ONES = np.array([0, 2, 3, 5])
+DARK_ONES = np.array([1, 4, 6])
+
+
+@lru_cache(maxsize=8)
+def table_of(camera: Camera, shape: DiscShape) -> DiscTable:
+    return build_disc_table(camera, shape)
+
+
+def detect(
+    image: NDArray[np.uint8], camera: Camera, settings: CircleSettings = DEFAULT
+) -> CircleDetections:
+    return detect_circles(image, camera, table_of(camera, disc_shape(settings)), settings)
+
+
+@pytest.fixture(scope="module")
+def discs_image(published_camera: Camera) -> NDArray[np.uint8]:
+    floor = PaintedFloor(published_camera)
+    for number, place in enumerate(PLACES):
+        floor.disc(place, LIGHT if number in LIGHT_ONES else DARK)
+    return floor.image()
+
+
+def assert_found_once(found: CircleDetections, places: FloatArray, within_m: float) -> None:
+    """One row for each place and no other."""
+    distance = np.linalg.norm(found.floor_xy[:, None] - places, axis=-1)
+    assert len(found) == len(places)
+    assert sorted(distance.argmin(axis=1)) == list(range(len(places)))
+    assert distance.min(axis=1).max() <= within_m
+
+
+# -- what is found --------------------------------------------------------------------------
+
+
+def test_discs_are_found_where_they_are(
+    discs_image: NDArray[np.uint8], published_camera: Camera
+) -> None:
+    found = detect(discs_image, published_camera)
+    assert_found_once(found, PLACES, within_m=0.002)
+    order = found.pixels[:, 1] * published_camera.width + found.pixels[:, 0]
+    assert np.all(np.diff(order) > 0)
+    pixel_xy = published_camera.floor_from_pixel(found.pixels)
+    assert np.linalg.norm(pixel_xy - found.floor_xy, axis=1).max() < 0.06
+    assert np.all((found.quality >= DEFAULT.threshold) & (found.quality <= 1.0))
+    assert np.all(found.evidence >= DEFAULT.evidence)
+
+
+def test_covariances_of_refined_discs_fit_their_errors(
+    discs_image: NDArray[np.uint8], published_camera: Camera
+) -> None:
+    found = detect(discs_image, published_camera)
+    nearest = np.linalg.norm(found.floor_xy[:, None] - PLACES, axis=-1).argmin(axis=1)
+    error = found.floor_xy - PLACES[nearest]
+    assert np.all(np.linalg.eigvalsh(found.covariance) > 0.0)
+    normalised = np.einsum("ni,nij,nj->n", error, np.linalg.inv(found.covariance), error)
+    # 14 degrees of freedom: outside of these with a probability of 1e-4 on either side.
+    assert 2.0 < normalised.sum() < 43.0
+
+
+@pytest.mark.parametrize(
+    ("polarity", "wanted"), [("light", LIGHT_ONES), ("dark", DARK_ONES), ("any", np.arange(7))]
+)
+@pytest.mark.parametrize("refine", [True, False])
+def test_polarity_chooses(
+    discs_image: NDArray[np.uint8],
+    published_camera: Camera,
+    polarity: Polarity,
+    wanted: NDArray[np.int64],
+    refine: bool,
+) -> None:
+    asked = replace(DEFAULT, polarity=polarity, refine=refine)
+    found = detect(discs_image, published_camera, asked)
+    assert_found_once(found, PLACES[wanted], within_m=0.002 if refine else 0.06)
+
+
+def test_published_detector_obeys_polarity(
+    discs_image: NDArray[np.uint8], published_camera: Camera
+) -> None:
+    rows = {
+        polarity: {
+            tuple(pixel)
+            for pixel in detect(
+                discs_image, published_camera, replace(PUBLISHED, polarity=polarity)
+            ).pixels.tolist()
+        }
+        for polarity in ("any", "light", "dark")
+    }
+    assert rows["light"]
+    assert rows["dark"]
+    assert not rows["light"] & rows["dark"]
+    assert rows["any"] == rows["light"] | rows["dark"]
+
+
+def test_suppression_alone_makes_one_disc_one_row(
+    discs_image: NDArray[np.uint8], published_camera: Camera
+) -> None:
+    plain = replace(PUBLISHED, separation_m=0.14)
+    found = detect(discs_image, published_camera, plain)
+    assert_found_once(found, PLACES, within_m=0.06)
+    assert len(detect(discs_image, published_camera, PUBLISHED)) > len(PLACES)
+
+
+def test_disc_partly_behind_the_lower_border(published_camera: Camera) -> None:
+    """A disc as near as centres may be: 12 px above the lower border, which cuts it."""
+    place = published_camera.floor_from_pixel(np.array([380.0, 276.0]))
+    outline = published_camera.project_floor(place + ring(0.10, 64))
+    assert outline[:, 1].max() > published_camera.height
+    image = PaintedFloor(published_camera).disc(place).image()
+    assert_found_once(detect(image, published_camera), place[None], within_m=0.005)
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+def test_disc_at_the_side_border(published_camera: Camera, side: int) -> None:
+    u = 14.0 if side < 0 else published_camera.width - 15.0
+    place = published_camera.floor_from_pixel(np.array([u, 200.0]))
+    outline = published_camera.project_floor(place + ring(0.10, 64))
+    assert outline[:, 0].min() < 0 or outline[:, 0].max() > published_camera.width - 1
+    image = PaintedFloor(published_camera).disc(place, DARK).image()
+    assert_found_once(detect(image, published_camera), place[None], within_m=0.01)
+
+
+@settings(max_examples=15, deadline=None)
+@given(
+    x=st.floats(-0.8, 0.8),
+    y=st.floats(-3.0, -0.95),
+    grey=st.sampled_from([20.0, 50.0, 140.0, 240.0]),
+    blur=st.floats(0.4, 1.2),
+    seed=st.integers(0, 2**32 - 1),
+)
+def test_a_disc_anywhere_is_one_row(
+    published_camera: Camera, x: float, y: float, grey: float, blur: float, seed: int
+) -> None:
+    image = PaintedFloor(published_camera).disc((x, y), grey, blur_px=blur).image(seed=seed)
+    assert_found_once(detect(image, published_camera), np.array([[x, y]]), within_m=0.006)
+
+
+# -- what is not found ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("noise", [0.5, 2.0, 8.0, 25.0])
+def test_nothing_on_a_bare_floor(published_camera: Camera, noise: float) -> None:
+    floor = PaintedFloor(published_camera)
+    for seed in range(8):
+        assert len(detect(floor.image(noise, seed), published_camera)) == 0
+
+
+@pytest.mark.parametrize("preset", [DEFAULT, PUBLISHED], ids=["default", "published"])
+@pytest.mark.parametrize("grey", [0, 1, 128, 254, 255])
+def test_nothing_in_an_even_image(
+    published_camera: Camera, grey: int, preset: CircleSettings
+) -> None:
+    image = np.full((published_camera.height, published_camera.width), grey, np.uint8)
+    found = detect(image, published_camera, preset)
+    assert len(found) == 0
+    assert found.pixels.shape == found.floor_xy.shape == (0, 2)
+    assert found.covariance.shape == (0, 2, 2)
+
+
+def test_a_light_disc_in_a_saturated_image_cannot_be_seen(published_camera: Camera) -> None:
+    floor = PaintedFloor(published_camera, floor=270.0)
+    assert len(detect(floor.disc((0.2, -1.5), 300.0).image(), published_camera)) == 0
+
+
+def _square(x: FloatArray, y: FloatArray) -> NDArray[np.bool_]:
+    return np.maximum(np.abs(x), np.abs(y)) < 0.10
+
+
+def _ring(x: FloatArray, y: FloatArray) -> NDArray[np.bool_]:
+    radius = np.hypot(x, y)
+    return (radius > 0.07) & (radius < 0.10)
+
+
+def _triangle(x: FloatArray, y: FloatArray) -> NDArray[np.bool_]:
+    return (y > -0.10) & (y < 0.10 - 2.0 * np.abs(x))
+
+
+def _large_disc(x: FloatArray, y: FloatArray) -> NDArray[np.bool_]:
+    return np.hypot(x, y) < 0.16
+
+
+def _small_disc(x: FloatArray, y: FloatArray) -> NDArray[np.bool_]:
+    return np.hypot(x, y) < 0.07
+
+
+def _strip(x: FloatArray, y: FloatArray) -> NDArray[np.bool_]:
+    return (np.abs(x) < 0.07) & (np.abs(y) < 0.25)
+
+
+def _corner(x: FloatArray, y: FloatArray) -> NDArray[np.bool_]:
+    return (x > -0.1) & (y > -0.1)
+
+
+@pytest.mark.parametrize(
+    "inside", [_square, _ring, _triangle, _large_disc, _small_disc, _strip, _corner]
+)
+@pytest.mark.parametrize("place", [(0.2, -1.1), (-0.4, -1.8), (0.1, -2.4)])
+def test_what_is_no_disc_is_not_reported(
+    published_camera: Camera,
+    inside: Callable[[FloatArray, FloatArray], NDArray[np.bool_]],
+    place: tuple[float, float],
+) -> None:
+    """Beside each a true disc, which is."""
+    disc = np.array([place[0] - 0.7, place[1]])
+    floor = PaintedFloor(published_camera).shape(place, inside).disc(disc)
+    assert_found_once(detect(floor.image(), published_camera), disc[None], within_m=0.004)
+
+
+def test_verification_is_what_drops_the_square(published_camera: Camera) -> None:
+    image = PaintedFloor(published_camera).shape((0.2, -1.1), _square).image()
+    assert len(detect(image, published_camera, replace(DEFAULT, verify=False, refine=False))) >= 1
+    assert len(detect(image, published_camera)) == 0
+
+
+def test_noise_floor_drops_what_is_hardly_there(published_camera: Camera) -> None:
+    place = np.array([(0.1, -1.2)])
+    image = PaintedFloor(published_camera).disc(place[0], 100.0).image(noise=2.0)
+    assert_found_once(detect(image, published_camera), place, within_m=0.02)
+    assert len(detect(image, published_camera, replace(DEFAULT, noise_floor=10.0))) == 0
+
+
+def test_image_of_another_size_is_refused(published_camera: Camera) -> None:
+    with pytest.raises(FrameError, match="768x576 px: the calibration is for 768x288"):
+        detect(np.zeros((576, 768), np.uint8), published_camera)
+
+
+# -- the published detector -----------------------------------------------------------------
+
+
+def test_published_rows_are_pixels(
+    discs_image: NDArray[np.uint8], published_camera: Camera
+) -> None:
+    found = detect(discs_image, published_camera, PUBLISHED)
+    table = table_of(published_camera, disc_shape(PUBLISHED))
+    quality, _ = quality_of_centres(discs_image, table)
+    columns, rows = found.pixels.T
+    assert np.issubdtype(found.pixels.dtype, np.integer)
+    np.testing.assert_array_equal(found.floor_xy, published_camera.floor_from_pixel(found.pixels))
+    np.testing.assert_array_equal(found.quality, quality[rows, columns])
+    assert np.all(np.isnan(found.evidence))
+    order = rows * published_camera.width + columns
+    assert np.all(np.diff(order) > 0)
+    # 0.6 at least, and none of the 8 neighbours higher: all such pixels, and no others.
+    highest = quality == scipy.ndimage.maximum_filter(quality, size=3, mode="constant")
+    expected = np.flatnonzero((highest & (quality >= 0.6)).ravel())
+    np.testing.assert_array_equal(order, expected)
+
+
+def test_published_covariance_is_the_formula(published_camera: Camera) -> None:
+    """(0.04 m)^2 I + 2 px^2 J J^T with J by central differences over +-0.1 px."""
+    pixels = np.array([[384, 270], [100, 120], [700, 90], [50, 200], [384, 60]])
+    for pixel, covariance in zip(pixels, published_covariance(published_camera, pixels)):
+        jacobian = np.column_stack(
+            [
+                published_camera.floor_from_pixel(pixel + step)
+                - published_camera.floor_from_pixel(pixel - step)
+                for step in 0.1 * np.eye(2)
+            ]
+        )
+        jacobian /= 0.2
+        expected = 0.04**2 * np.eye(2) + 2.0 * jacobian @ jacobian.T
+        np.testing.assert_allclose(covariance, expected, rtol=1e-10, atol=0.0)
+
+
+def test_published_rows_have_the_published_covariance(
+    discs_image: NDArray[np.uint8], published_camera: Camera
+) -> None:
+    for asked in (PUBLISHED, replace(DEFAULT, refine=False)):
+        found = detect(discs_image, published_camera, asked)
+        expected = published_covariance(published_camera, found.pixels)
+        np.testing.assert_array_equal(found.covariance, expected)
+
+
+def test_quality_is_that_of_the_outlines(
+    discs_image: NDArray[np.uint8], published_camera: Camera
+) -> None:
+    """Otsu's quotient from the definition, the outlines straight through the camera."""
+    table = table_of(published_camera, disc_shape(PUBLISHED))
+    quality, contrast = quality_of_centres(discs_image, table)
+    rng = np.random.default_rng(11)
+    rows, columns = np.nonzero(table.usable)
+    some = rng.choice(len(rows), 300, replace=False)
+    peaks = detect(discs_image, published_camera, PUBLISHED).pixels
+    for u, v in [*zip(columns[some], rows[some]), *peaks]:
+        centre = published_camera.floor_from_pixel(np.array([u, v], float))
+        values = []
+        for radius in (0.06, 0.14):
+            seen = np.rint(published_camera.project_floor(centre + ring(radius, 16))).astype(int)
+            inside = np.all((seen >= 0) & (seen < (768, 288)), axis=1)
+            values.append(discs_image[seen[inside, 1], seen[inside, 0]].astype(float))
+        both = np.concatenate(values)
+        within = sum(len(part) * part.var() for part in values) / len(both)
+        assert contrast[v, u] == pytest.approx(values[0].mean() - values[1].mean(), abs=1e-4)
+        assert quality[v, u] == pytest.approx(1.0 - within / both.var(), abs=1e-9)
+    assert np.all(quality[~table.usable] == 0.0)
+
+
+@settings(max_examples=12, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    span=st.integers(1, 50),
+    gain=st.sampled_from([-5, -3, -1, 2, 4, 5]),
+    offset=st.integers(0, 5),
+)
+def test_quality_does_not_depend_on_brightness(
+    published_camera: Camera, seed: int, span: int, gain: int, offset: int
+) -> None:
+    table = table_of(published_camera, disc_shape(DEFAULT))
+    rng = np.random.default_rng(seed)
+    image = rng.integers(0, span + 1, table.usable.shape).astype(np.uint8)
+    quality, contrast = quality_of_centres(image, table)
+    assert quality.min() >= 0.0
+    assert quality.max() <= 1.0
+    shown = gain * image.astype(int) + (offset if gain > 0 else 255 - offset)
+    assert shown.min() >= 0
+    assert shown.max() <= 255
+    changed, changed_contrast = quality_of_centres(shown.astype(np.uint8), table)
+    np.testing.assert_allclose(changed, quality, rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(changed_contrast, gain * contrast, rtol=1e-5, atol=1e-4)
+
+
+# -- local maxima and suppression -----------------------------------------------------------
+
+
+@given(
+    hnp.arrays(
+        np.float64,
+        hnp.array_shapes(min_dims=2, max_dims=2, min_side=1, max_side=9),
+        elements=st.sampled_from([0.0, 0.3, 0.5, 0.7, 1.0]),
+    )
+)
+@settings(max_examples=300, deadline=None)
+def test_every_summit_is_found_once(quality: FloatArray) -> None:
+    """Connected pixels of equal quality with nothing higher around them: one row each."""
+    columns, rows = local_maxima(quality, 0.5)
+    expected = 0
+    claimed = np.zeros(len(columns), int)
+    for value in np.unique(quality[quality >= 0.5]):
+        labels, count = scipy.ndimage.label(quality == value, np.ones((3, 3)))
+        for label in range(1, count + 1):
+            plateau = labels == label
+            around = scipy.ndimage.binary_dilation(plateau, np.ones((3, 3))) & ~plateau
+            if np.any(quality[around] > value):
+                continue
+            expected += 1
+            claimed += plateau[rows, columns]
+    assert len(columns) == expected
+    assert np.all(claimed == 1)
+    assert np.all(np.diff(rows * quality.shape[1] + columns) > 0)
+
+
+@given(
+    hnp.arrays(np.float64, (12, 2), elements=st.floats(-0.3, 0.3)),
+    hnp.arrays(np.float64, 12, elements=st.sampled_from([0.2, 0.5, 0.9])),
+)
+@settings(max_examples=200, deadline=None)
+def test_suppression_keeps_the_best(floor_xy: FloatArray, score: FloatArray) -> None:
+    kept = suppress_neighbours(floor_xy, score, 0.14)
+    squared = ((floor_xy[:, None] - floor_xy) ** 2).sum(axis=-1)
+    near = squared < 0.14 * 0.14
+    for i in range(len(score)):
+        rivals = np.flatnonzero(near[i] & kept & (np.arange(len(score)) != i))
+        if kept[i]:
+            assert len(rivals) == 0
+        else:
+            assert np.any((score[rivals] > score[i]) | ((score[rivals] == score[i]) & (rivals < i)))
+
+
+# -- laws -----------------------------------------------------------------------------------
+
+FLIP = np.diag([-1.0, 1.0])
+
+
+def test_mirrored_camera_sees_the_mirrored_floor(published_camera: Camera) -> None:
+    mirrored = mirrored_camera(published_camera)
+    points = np.random.default_rng(2).uniform((-2, -5), (2, -0.8), (200, 2))
+    seen, seen_mirrored = (
+        published_camera.project_floor(points),
+        mirrored.project_floor(points @ FLIP),
+    )
+    assert np.isfinite(seen).any()
+    np.testing.assert_allclose(
+        published_camera.width - 1 - seen[:, 0], seen_mirrored[:, 0], atol=1e-9
+    )
+    np.testing.assert_allclose(seen[:, 1], seen_mirrored[:, 1], atol=1e-9)
+
+
+def image_and_mirror_image(
+    camera: Camera, shift: float, seed: int
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    floor = PaintedFloor(camera)
+    for number, place in enumerate(PLACES):
+        floor.disc(place + np.array([shift, 0.0]), LIGHT if number in LIGHT_ONES else DARK)
+    image = floor.image(noise=2.0, seed=seed)
+    return image, np.ascontiguousarray(image[:, ::-1])
+
+
+def mirrored_rows(found: CircleDetections, width: int) -> CircleDetections:
+    """The rows of the mirrored world, in scan order."""
+    pixels = np.stack([width - 1 - found.pixels[:, 0], found.pixels[:, 1]], axis=-1)
+    order = np.lexsort((pixels[:, 0], pixels[:, 1]))
+    return CircleDetections(
+        pixels=pixels[order],
+        floor_xy=found.floor_xy[order] @ FLIP,
+        covariance=FLIP @ found.covariance[order] @ FLIP,
+        quality=found.quality[order],
+        evidence=found.evidence[order],
+    )
+
+
+@settings(max_examples=10, deadline=None, phases=[Phase.explicit, Phase.generate])
+@given(seed=st.integers(0, 2**32 - 1), shift=st.floats(-0.2, 0.2))
+def test_mirrored_image_and_camera_give_mirrored_rows(
+    published_camera: Camera, seed: int, shift: float
+) -> None:
+    """An even number of samples from +X on is its own mirror image, and so is every row.
+
+    But for what depends on the scan's direction: half pixels are rounded up (no sample of the
+    published camera lies that near to one), of neighbours of equal quality the first is reported
+    (such images are passed over), and the border's limits are 12 px and 13 px.
+    """
+    image, mirror_image = image_and_mirror_image(published_camera, shift, seed)
+    width = published_camera.width
+    quality, _ = quality_of_centres(image, table_of(published_camera, disc_shape(PUBLISHED)))
+    found = detect(image, published_camera, PUBLISHED)
+    for u, v in found.pixels:
+        around = quality[v - 1 : v + 2, u - 1 : u + 2]
+        assume(np.count_nonzero(around == quality[v, u]) == 1)
+    back = mirrored_rows(detect(mirror_image, mirrored_camera(published_camera), PUBLISHED), width)
+    a, b = ((rows.pixels[:, 0] > 13) & (rows.pixels[:, 0] < width - 14) for rows in (found, back))
+    assert np.count_nonzero(a) >= len(PLACES)
+    np.testing.assert_array_equal(back.pixels[b], found.pixels[a])
+    np.testing.assert_array_equal(back.quality[b], found.quality[a])
+    np.testing.assert_allclose(back.floor_xy[b], found.floor_xy[a], rtol=0.0, atol=1e-10)
+    np.testing.assert_allclose(back.covariance[b], found.covariance[a], rtol=1e-6, atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_mirrored_discs_are_refined_alike(published_camera: Camera, seed: int) -> None:
+    """The fit's pixels depend a little on the scan's direction: far less than the fit is worth."""
+    image, mirror_image = image_and_mirror_image(published_camera, 0.03 * seed, seed)
+    found = detect(image, published_camera)
+    back = mirrored_rows(
+        detect(mirror_image, mirrored_camera(published_camera)), published_camera.width
+    )
+    assert len(found) == len(back) == len(PLACES)
+    distance = np.linalg.norm(found.floor_xy[:, None] - back.floor_xy, axis=-1)
+    partner = distance.argmin(axis=1)
+    assert sorted(partner) == list(range(len(PLACES)))
+    moved = distance.min(axis=1)
+    deviation = np.sqrt(np.linalg.eigvalsh(found.covariance)[:, 0])
+    assert np.all(moved < 0.7 * deviation)
+    assert moved.max() < 1e-4
+    largest = np.abs(found.covariance).max(axis=(1, 2))
+    turned = np.abs(back.covariance[partner] - found.covariance).max(axis=(1, 2))
+    assert np.all(turned < 0.2 * largest)
+    np.testing.assert_allclose(back.quality[partner], found.quality, rtol=0.0, atol=0.005)
+
+
+def test_tilt_jacobian_is_how_positions_move(published_camera: Camera) -> None:
+    """Finite differences: rays of the same pixels with the camera turned a little."""
+    place = np.array([[0.4, -1.6], [-0.8, -2.7]])
+    pixels = published_camera.project_floor(place)
+    analytic = tilt_jacobian(published_camera, place)
+    step = 1e-6
+    for axis in range(2):
+        ends = []
+        for sign in (1.0, -1.0):
+            w = np.zeros(3)
+            w[axis] = sign * step
+            direction = published_camera.directions_robot(pixels)
+            direction = direction + np.cross(w, direction)
+            along = -published_camera.centre[2] / direction[:, 2]
+            ends.append(published_camera.centre[:2] + along[:, None] * direction[:, :2])
+        numeric = (ends[0] - ends[1]) / (2.0 * step)
+        np.testing.assert_allclose(analytic[:, :, axis], numeric, rtol=1e-6, atol=1e-8)
+
+
+# -- accuracy -------------------------------------------------------------------------------
+
+
+@pytest.mark.long
+def test_refined_discs_are_accurate_and_their_covariance_honest(published_camera: Camera) -> None:
+    result = measure_accuracy(
+        published_camera, DEFAULT, discs=400, light=220.0, dark=60.0, blur_px=0.7, noise=2.0, seed=4
+    )
+    assert result.failed == 0
+    assert result.rms_px <= 0.02
+    assert 0.5 <= float(np.mean(result.normalised_error)) <= 1.5
