@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, event, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -31,12 +31,16 @@ IntArray = NDArray[np.int64]
 
 @dataclasses.dataclass(frozen=True)
 class Outlines:
-    """What a table says, without its economies: (H, W, 2 samples) pixels around every pixel."""
+    """What a table says, without its economies: (H, W, 2 samples) pixels around every pixel.
+
+    `doubtful` if a sample falls so near to the border of two pixels that rounding decides.
+    """
 
     column: IntArray
     row: IntArray
     inside: NDArray[np.bool_]
     usable: NDArray[np.bool_]
+    doubtful: bool
 
 
 def plain_outlines(camera: Camera, shape: DiscShape) -> Outlines:
@@ -47,6 +51,7 @@ def plain_outlines(camera: Camera, shape: DiscShape) -> Outlines:
     seen = camera.project_floor(floor_xy[:, :, None] + np.concatenate(rings))
     with np.errstate(invalid="ignore"):
         nearest = np.floor(seen + 0.5)
+        doubtful = bool(np.any(np.abs(seen + 0.5 - np.rint(seen + 0.5)) < 1e-9))
         inside = np.all((nearest >= 0) & (nearest < [camera.width, camera.height]), axis=-1)
         per_row = np.hypot(*np.moveaxis(np.gradient(floor_xy, axis=0), -1, 0))
         usable = per_row <= shape.far_limit_m_per_px
@@ -56,7 +61,7 @@ def plain_outlines(camera: Camera, shape: DiscShape) -> Outlines:
     for outline in (inside[..., : shape.samples], inside[..., shape.samples :]):
         usable &= 2 * outline.sum(axis=-1) >= shape.samples
     nearest = np.where(inside[..., None], nearest, -1.0).astype(np.int64)
-    return Outlines(nearest[..., 0], nearest[..., 1], inside, usable)
+    return Outlines(nearest[..., 0], nearest[..., 1], inside, usable, doubtful)
 
 
 def decoded(table: DiscTable) -> tuple[IntArray, IntArray]:
@@ -204,7 +209,10 @@ def shapes(draw: st.DrawFn) -> DiscShape:
 def test_any_camera_s_table_is_what_a_plain_computation_says(
     camera: Camera, shape: DiscShape
 ) -> None:
-    assert_table_is(build_disc_table(camera, shape), plain_outlines(camera, shape))
+    plain = plain_outlines(camera, shape)
+    assume(not plain.doubtful)
+    event(f"usable centres: {plain.usable.any()}")
+    assert_table_is(build_disc_table(camera, shape), plain)
 
 
 def wide_and_low() -> Camera:
