@@ -2,14 +2,56 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import math
+from dataclasses import dataclass
 from typing import Literal
 
-import numpy as np
-
+from detect.errors import DetectError
 from detect.tilt import ConsensusSettings
 
 BearingConvention = Literal["level", "published"]
+
+_POSITIVE = (
+    "sigma_across_px",
+    "sigma_along_rows",
+    "regulariser",
+    "start_spacing_rows",
+    "guided_reach_px",
+    "fine_scale_px",
+    "coarse_scale_px",
+    "weight_limit",
+    "sigma_px",
+    "largest_tilt_deg",
+    "tilt_prior_deg",
+    "building_deg",
+)
+_NOT_NEGATIVE = (
+    "border_rows",
+    "start_band_rows",
+    "gap_rows",
+    "least_length_px",
+    "least_evidence",
+    "least_sharpness",
+    "soft_evidence",
+    "largest_horizon_gap_px",
+    "largest_scatter_px",
+    "largest_shift_px",
+    "largest_noise_px",
+    "bend_px",
+    "largest_lean_deg",
+    "largest_lean_sigmas",
+    "largest_lean_px",
+    "same_edge_px",
+    "join_px",
+    "join_share",
+    "shoulder_px",
+    "shoulder_share",
+)
+
+
+def _expect(condition: bool, name: str, value: float, expected: str) -> None:
+    if not condition:
+        raise DetectError(f"{name} is {value:g}: expected {expected}")
 
 
 @dataclass(frozen=True)
@@ -66,11 +108,19 @@ class LineSettings:
         Largest standard deviation of a line's place at the horizon due to noise.
     bend_px : float
         Standard deviation of a line's lean over its length due to all but noise.
-    largest_lean_rad, largest_lean_sigmas, largest_lean_px : float
+    largest_lean_deg, largest_lean_sigmas, largest_lean_px : float
         How far a line may lean from the vertical: its angle, standard deviations due to noise, and
         pixels over its length, added in squares.
-    consensus : ConsensusSettings
-        How tilt is estimated and what is vertical.
+    largest_tilt_deg : float
+        Largest absolute pitch and roll.
+    tilt_prior_deg : float
+        Standard deviation of the tilt; decides only between tilts that the lines support alike.
+    building_deg : float
+        Standard deviation of real verticals about the vertical.
+    proposers : int
+        The tilt is looked for among those that pairs of this many lines, the strongest, agree with.
+    least_lines : int
+        With fewer lines that agree there is no tilt.
     weight_limit : float
         Votes of a line in the consensus grow with its evidence up to this.
     same_edge_px : float
@@ -100,7 +150,7 @@ class LineSettings:
     guided_pull: float = 0.07
     guided_reach_px: float = 0.75
     refine_steps_px: tuple[tuple[float, float], ...] = (
-        (1.2, np.inf),
+        (1.2, math.inf),
         (0.8, 1.5),
         (0.8, 1.5),
         (1.8, 0.1),
@@ -117,10 +167,14 @@ class LineSettings:
     largest_shift_px: float = 1.0
     largest_noise_px: float = 0.3
     bend_px: float = 0.2
-    largest_lean_rad: float = np.radians(0.7)
+    largest_lean_deg: float = 0.7
     largest_lean_sigmas: float = 8.0
     largest_lean_px: float = 1.5
-    consensus: ConsensusSettings = field(default_factory=ConsensusSettings)
+    largest_tilt_deg: float = 5.0
+    tilt_prior_deg: float = 2.0
+    building_deg: float = 0.045
+    proposers: int = 24
+    least_lines: int = 3
     weight_limit: float = 3.0
     same_edge_px: float = 2.0
     join_px: float = 2.7
@@ -129,6 +183,33 @@ class LineSettings:
     shoulder_share: float = 0.5
     sigma_px: float = 0.9
     alpha: BearingConvention = "level"
+
+    def __post_init__(self) -> None:
+        for name in _POSITIVE:
+            value = getattr(self, name)
+            _expect(0.0 < value < math.inf, name, value, "above 0")
+        for name in _NOT_NEGATIVE:
+            _expect(getattr(self, name) >= 0.0, name, getattr(self, name), "0 or more")
+        for name in ("threshold", "guided_pull"):
+            value = getattr(self, name)
+            _expect(0.0 < value <= 1.0, name, value, "above 0, at most 1")
+        _expect(self.least_rows >= 5, "least_rows", self.least_rows, "5 or more")
+        _expect(self.least_lines >= 2, "least_lines", self.least_lines, "2 or more")
+        _expect(self.proposers >= 2, "proposers", self.proposers, "2 or more")
+        for scale, farthest in self.refine_steps_px:
+            _expect(0.3 <= scale < 20.0, "refine_steps_px", scale, "a width of 0.3 to 20")
+            _expect(farthest >= 0.0, "refine_steps_px", farthest, "a distance of 0 or more")
+
+    @property
+    def consensus(self) -> ConsensusSettings:
+        """What of this the estimation of the tilt is told."""
+        return ConsensusSettings(
+            largest_rad=math.radians(self.largest_tilt_deg),
+            prior_rad=math.radians(self.tilt_prior_deg),
+            building_rad=math.radians(self.building_deg),
+            proposers=self.proposers,
+            least_lines=self.least_lines,
+        )
 
 
 #: The report's parameters to the letter; what it does not say is set to change nothing.
@@ -146,9 +227,9 @@ PUBLISHED = LineSettings(
     least_length_px=0.0,
     least_evidence=0.0,
     least_sharpness=0.0,
-    largest_horizon_gap_px=np.inf,
-    largest_shift_px=np.inf,
-    largest_noise_px=np.inf,
+    largest_horizon_gap_px=math.inf,
+    largest_shift_px=math.inf,
+    largest_noise_px=math.inf,
     bend_px=0.7,
     join_share=0.0,
     sigma_px=1.0,

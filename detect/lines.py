@@ -13,11 +13,13 @@ The path of an image, each step a function of its own:
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from detect.errors import FrameError
 from detect.line_bearing import (
     close_groups,
     compensated_bearings,
@@ -124,11 +126,11 @@ def detect_lines(
 
     Raises
     ------
-    ValueError
+    FrameError
         If the image is not of the table's size or not of 8 bit grey values.
     """
     if image.shape != table.column.shape or image.dtype != np.uint8:
-        raise ValueError(
+        raise FrameError(
             f"image is {image.dtype} of shape {image.shape}: expected uint8 of the table's shape "
             f"{table.column.shape}"
         )
@@ -230,7 +232,7 @@ def agree_on_tilt(
         fits.normal[accepted],
         noise + (settings.bend_px * per_length) ** 2,
         np.sqrt(
-            settings.largest_lean_rad**2
+            math.radians(settings.largest_lean_deg) ** 2
             + settings.largest_lean_sigmas**2 * noise
             + (settings.largest_lean_px * per_length) ** 2
         ),
@@ -316,6 +318,8 @@ def line_ends(
     (N, 4) float64
         xtop, ytop, xbottom, ybottom: undistorted normalised coordinates.
     """
+    if not len(chosen):
+        return np.zeros((0, 4))
     phi, line = fits.reference_rad[chosen], fits.line[chosen]
     ahead = np.stack([np.sin(phi), -np.cos(phi), np.zeros_like(phi)], axis=-1)
     left = np.stack([np.cos(phi), np.sin(phi), np.zeros_like(phi)], axis=-1)

@@ -63,8 +63,13 @@ class VerticalTable:
         return self.first_row <= self.last_row
 
     def columns_at(self, bearing_rad: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(N,) columns at which (N,) bearings lie on the horizon; at its ends for those outside."""
+        """(N,) columns at which (N,) bearings lie on the horizon; at its ends for those outside.
+
+        NaN where the table has no verticals.
+        """
         columns = np.flatnonzero(self.usable)
+        if not len(columns):
+            return np.full(bearing_rad.shape, np.nan)
         bearing = self.bearing_rad[columns]
         order = np.argsort(bearing)
         return np.asarray(np.interp(bearing_rad, bearing[order], columns[order]))

@@ -70,7 +70,7 @@ def mirrored(camera: Camera) -> Camera:
 
 
 def edge_columns(camera: Camera, bearing_rad: float, rows: FloatArray) -> FloatArray:
-    """Columns at which the vertical at a bearing crosses (fractional) rows, by projecting points."""
+    """Columns at which the vertical at a bearing crosses fractional rows, from projected points."""
     elevation = np.radians(np.linspace(-70.0, 70.0, 1401))
     direction = np.stack(
         [
@@ -107,7 +107,7 @@ def render(
         image += edge.contrast * share.reshape(camera.height, _SUBROWS, -1).mean(axis=1)
     if rng is not None:
         image = image + rng.normal(0.0, noise, image.shape)
-    return np.clip(np.rint(image), 0, 255).astype(np.uint8)
+    return np.asarray(np.clip(np.rint(image), 0, 255), np.uint8)
 
 
 def _blurred_pixel(distance: FloatArray, blur: float) -> FloatArray:
@@ -123,6 +123,4 @@ def _blurred_pixel(distance: FloatArray, blur: float) -> FloatArray:
 def _pose(
     rotation: FloatArray, centre: FloatArray
 ) -> tuple[tuple[float, float, float, float], ...]:
-    return tuple(
-        (float(a), float(b), float(c), float(t)) for (a, b, c), t in zip(rotation, centre)
-    )
+    return tuple((float(a), float(b), float(c), float(t)) for (a, b, c), t in zip(rotation, centre))

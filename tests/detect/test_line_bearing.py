@@ -52,9 +52,7 @@ def test_published_inclinations(
     rows = [published_rows[step][k] for k in UNJOINED[step]]
     # The ends are printed with 6 digits; the shortest line turns the last of them into 5e-6.
     printed = [row.beta for row in rows]
-    np.testing.assert_allclose(
-        inclinations(normals_of(rows, published_camera)), printed, atol=5e-6
-    )
+    np.testing.assert_allclose(inclinations(normals_of(rows, published_camera)), printed, atol=5e-6)
 
 
 def test_published_bearings(
@@ -80,7 +78,7 @@ def test_published_bearings(
 def test_compensation_gives_the_bearing_of_a_vertical_back(
     bearing: float, low: float, high: float, pitch: float, roll: float
 ) -> None:
-    """A vertical is seen by a camera that is tilted by R: its directions are R' times level ones."""
+    """A camera that is tilted by R sees directions R' times the level ones."""
     from detect.tilt import level_rotation
 
     level = np.array([np.sin(bearing), -np.cos(bearing), 0.0])
@@ -94,7 +92,10 @@ def test_compensation_gives_the_bearing_of_a_vertical_back(
 def test_plane_normals_do_not_depend_on_where_the_ends_are(published_camera: Camera) -> None:
     top, bottom = np.array([0.3, -0.55]), np.array([0.24, 0.1])
     ends = np.array(
-        [[*(top + s * (bottom - top)), *(top + t * (bottom - top))] for s, t in ((0, 1), (0.2, 0.9))]
+        [
+            [*(top + s * (bottom - top)), *(top + t * (bottom - top))]
+            for s, t in ((0, 1), (0.2, 0.9))
+        ]
     )
     normal = plane_normals(ends, published_camera.rotation)
     np.testing.assert_allclose(normal[0], normal[1], atol=1e-12)

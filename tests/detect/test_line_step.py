@@ -116,6 +116,4 @@ def test_neighbouring_edges_do_not_push_each_other() -> None:
     left, right = bearing_at(camera, table, 0.3), bearing_at(camera, table, 5.3)
     image = render(camera, [Edge(left, 100.0), Edge(right, -100.0)], grey=80.0)
     found = detect_lines(image, table)
-    np.testing.assert_allclose(
-        found.alpha_rad, [left, right], atol=0.1 * found.fits.pixel_rad[0]
-    )
+    np.testing.assert_allclose(found.alpha_rad, [left, right], atol=0.1 * found.fits.pixel_rad[0])

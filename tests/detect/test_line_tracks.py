@@ -1,0 +1,149 @@
+"""The response of the filter, its maxima on the horizon, and tracking over gaps."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from detect.line_settings import DEFAULT, PUBLISHED
+from detect.line_tracks import (
+    gaussian_window,
+    line_response,
+    line_starts,
+    line_tracks,
+)
+from detect.tilt import TiltEstimate
+from lut.verticals import build_vertical_table
+from tests.detect.line_scene import Edge, pinhole, render, tilted
+
+CAMERA = pinhole(96, 64, 110.0)
+TABLE = build_vertical_table(CAMERA)
+
+
+def step_image(left: int, right: int, column: int = 48) -> np.ndarray:
+    image = np.full((64, 96), left, np.uint8)
+    image[:, column:] = right
+    return image
+
+
+@given(hnp.arrays(np.uint8, (64, 96)))
+@settings(max_examples=10, deadline=None)
+def test_response_is_a_squared_correlation(image: np.ndarray) -> None:
+    for preset in (DEFAULT, PUBLISHED):
+        response = line_response(image, TABLE, replace(preset, regulariser=1e-3))
+        assert np.abs(response).max() <= 1.0 + 1e-4
+
+
+def test_response_is_the_squared_correlation_of_the_window() -> None:
+    """Against its definition, evaluated directly where strip and image are the same."""
+    image = np.random.default_rng(0).integers(0, 256, (64, 96)).astype(np.uint8)
+    across, along = gaussian_window(0.8), gaussian_window(2.0)
+    weight = along[:, None] * across[None, :]
+    response = line_response(image, TABLE, DEFAULT)
+    distance = np.broadcast_to(np.arange(-3.0, 4.0), weight.shape)
+    distance = distance / np.sqrt(np.sum(weight * distance**2))
+    for v in (8, 30, 55):
+        for c in (10, 47, 80):
+            window = image[v - 6 : v + 7, c - 3 : c + 4].astype(np.float64)
+            covariance = np.sum(weight * distance * window)
+            variance = np.sum(weight * window**2) - np.sum(weight * window) ** 2
+            expected = covariance * abs(covariance) / (variance + DEFAULT.regulariser)
+            assert response[v, c] == pytest.approx(expected, abs=2e-5)
+
+
+def test_ideal_step_reaches_two_over_pi() -> None:
+    wide = replace(DEFAULT, sigma_across_px=2.5, sigma_along_rows=7.0, regulariser=1e-3)
+    rising = line_response(step_image(50, 180), TABLE, wide)
+    falling = line_response(step_image(180, 50), TABLE, wide)
+    # The step lies between two columns.
+    assert rising[32, 47:49].max() == pytest.approx(2.0 / np.pi, abs=0.02)
+    np.testing.assert_allclose(falling, -rising, atol=1e-4)
+
+
+@given(gain=st.sampled_from([1, 2, 3]), offset=st.integers(0, 60))
+@settings(max_examples=10, deadline=None)
+def test_affine_brightness_changes_only_what_the_regulariser_adds(gain: int, offset: int) -> None:
+    image = np.random.default_rng(1).integers(0, 60, (64, 96)).astype(np.uint8)
+    bright = (gain * image.astype(int) + offset).astype(np.uint8)
+    first = line_response(image, TABLE, DEFAULT)
+    second = line_response(bright, TABLE, replace(DEFAULT, regulariser=40.0 * gain**2))
+    np.testing.assert_allclose(second, first, atol=1e-4)
+
+
+def test_filter_goes_up_to_where_the_verticals_end() -> None:
+    """Windows are cut off at the border, not the image: a step is as good there as elsewhere."""
+    response = line_response(step_image(50, 180), TABLE, DEFAULT)
+    # In the middle of the image, where verticals are columns.
+    np.testing.assert_allclose(response[:, 48], response[32, 48], atol=1e-4)
+
+
+def test_starts_lie_on_the_horizon_band_highest_first() -> None:
+    image = render(CAMERA, [Edge(0.2, 40.0), Edge(-0.1, 90.0)], grey=60.0)
+    response = line_response(image, TABLE, DEFAULT)
+    on_horizon = line_starts(response, TABLE, replace(DEFAULT, start_band_rows=0))
+    np.testing.assert_array_equal(
+        on_horizon.row, np.rint(TABLE.horizon_row[on_horizon.column]).astype(int)
+    )
+    assert len(on_horizon.row) == 2
+    band = line_starts(response, TABLE, replace(DEFAULT, start_band_rows=8))
+    assert set(np.unique(band.row - np.rint(TABLE.horizon_row[band.column]))) == {-8, -4, 0, 4, 8}
+    assert np.all(np.diff(band.score) <= 0.0)
+    assert np.all(band.score >= DEFAULT.threshold)
+
+
+@pytest.mark.parametrize("gap", [5, 25])
+def test_tracks_bridge_gaps_up_to_a_length(gap: int) -> None:
+    image = step_image(60, 160)
+    below = int(TABLE.horizon_row[48]) + 6
+    # A bright block hides the edge; the filter sees it from a few rows away.
+    image[below : below + gap] = 110
+    response = line_response(image, TABLE, DEFAULT)
+    starts = line_starts(response, TABLE, replace(DEFAULT, start_band_rows=0))
+    tracks = line_tracks(response, starts, TABLE, DEFAULT)
+    assert len(tracks) == 1
+    assert tracks.top_row[0] == DEFAULT.border_rows
+    if gap == 5:
+        assert tracks.bottom_row[0] == 63 - DEFAULT.border_rows
+    else:
+        assert tracks.bottom_row[0] < below + 3
+
+
+def test_tracks_know_polarity_and_follow_subpixel() -> None:
+    camera = tilted(CAMERA, 0.0, np.radians(4.0))
+    image = render(camera, [Edge(0.1, 80.0), Edge(-0.15, -60.0)], grey=100.0)
+    response = line_response(image, TABLE, DEFAULT)
+    tracks = line_tracks(response, line_starts(response, TABLE, DEFAULT), TABLE, DEFAULT)
+    assert sorted(tracks.polarity) == [-1.0, 1.0]
+    for t in range(2):
+        part = slice(tracks.bounds[t], tracks.bounds[t + 1])
+        rows, columns = tracks.row[part], tracks.column[part]
+        np.testing.assert_array_equal(rows, np.arange(rows[0], rows[-1] + 1))
+        line = np.polyfit(rows, columns, 1)
+        # tan 4 deg, in the strip of the untilted camera.
+        assert abs(line[0]) == pytest.approx(np.tan(np.radians(4.0)), rel=0.05)
+        assert np.abs(columns - np.polyval(line, rows)).max() < 0.12
+
+
+def test_guided_tracks_leave_edges_that_lean_otherwise() -> None:
+    leaning = render(tilted(CAMERA, 0.0, np.radians(5.0)), [Edge(0.0, 90.0)])
+    response = line_response(leaning, TABLE, DEFAULT)
+    starts = line_starts(response, TABLE, replace(DEFAULT, start_band_rows=0))
+    none, right = (TiltEstimate(0.0, np.radians(roll), np.eye(2), 3) for roll in (0.0, 5.0))
+    assert line_tracks(response, starts, TABLE, DEFAULT).points[0] == 60
+    assert line_tracks(response, starts, TABLE, DEFAULT, right).points[0] == 60
+    assert line_tracks(response, starts, TABLE, DEFAULT, none).points[0] < 45
+
+
+def test_no_horizon_no_tracks() -> None:
+    table = build_vertical_table(pinhole(96, 64, 110.0, pitch_deg=70.0))
+    image = step_image(50, 180)
+    response = line_response(image, table, DEFAULT)
+    assert not response.any()
+    tracks = line_tracks(response, line_starts(response, table, DEFAULT), table, DEFAULT)
+    assert len(tracks) == 0
+    assert len(tracks.total_score) == 0

@@ -1,0 +1,345 @@
+"""The detector of verticals as a whole: rendered scenes, laws, and photographs with truth."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from camera import Camera, read_camera
+from detect.errors import DetectError, FrameError
+from detect.line_bearing import compensated_bearings, inclinations, plane_normals
+from detect.line_drawing import draw_lines, draw_response, draw_tracks, track_pixels
+from detect.line_settings import DEFAULT, PUBLISHED, LineSettings
+from detect.lines import ACCEPTED, JOINED, detect_lines
+from lut.verticals import build_vertical_table
+from tests.detect.line_scene import Edge, edge_columns, mirrored, pinhole, render, tilted
+
+BARREL = (0.0, -0.1, 0.0, 0.0, 0.0)
+CAMERA = pinhole(240, 160, 200.0, pitch_deg=10.0, roll_deg=1.0, coef=BARREL)
+TABLE = build_vertical_table(CAMERA)
+EDGES = (
+    Edge(0.45, 60.0),
+    Edge(0.30, -40.0),
+    Edge(0.14, 70.0),
+    Edge(-0.02, -90.0),
+    Edge(-0.21, 50.0),
+    Edge(-0.40, -35.0),
+)
+
+
+def scene(camera: Camera, edges: Sequence[Edge] = EDGES, seed: int = 0) -> np.ndarray:
+    return render(camera, edges, noise=2.0, rng=np.random.default_rng(seed))
+
+
+def truth(edges: Sequence[Edge] = EDGES) -> np.ndarray:
+    return np.array([edge.bearing_rad for edge in edges])
+
+
+@pytest.mark.parametrize("tilt_deg", [(0.0, 0.0), (2.3, 0.0), (-1.5, 2.0), (3.5, -3.0)])
+def test_bearings_and_tilt_of_a_tilted_camera(tilt_deg: tuple[float, float]) -> None:
+    """Calibrated with one pose, standing in another: bearings are those of the world."""
+    pitch, roll = np.radians(tilt_deg)
+    found = detect_lines(scene(tilted(CAMERA, pitch, roll)), TABLE)
+    np.testing.assert_allclose(found.alpha_rad, truth(), atol=4e-4)
+    assert found.tilt is not None
+    assert found.tilt.lines == len(EDGES)
+    assert (found.tilt.pitch_rad, found.tilt.roll_rad) == pytest.approx(
+        (pitch, roll), abs=np.radians(0.08)
+    )
+    # Uncompensated bearings are off by more.
+    if max(np.abs(tilt_deg)) > 3.0:
+        raw = compensated_bearings(plane_normals(found.ends, CAMERA.rotation), None)
+        assert np.abs(raw - truth()).max() > 1e-3
+
+
+def test_rows_hold_ends_beta_and_sigma() -> None:
+    found = detect_lines(scene(tilted(CAMERA, 0.02, -0.01)), TABLE)
+    rows = found.landmarks()
+    assert len(rows) == len(EDGES)
+    for row, bearing in zip(rows, truth()):
+        assert row.ids == (-1,)
+        assert row.quality == 0.0
+        ends = [row.xtop, row.ytop, row.xbottom, row.ybottom]
+        normal = plane_normals(ends, CAMERA.rotation)
+        assert row.beta == pytest.approx(float(inclinations(normal)), abs=1e-6)
+        assert row.ytop < row.ybottom
+        assert abs(row.alpha - bearing) < 3.0 * row.sigma
+        # Ends lie on whole rows, and on the edge.
+        pixels = CAMERA.distort(np.reshape(ends, (2, 2)))
+        np.testing.assert_allclose(pixels[:, 1], np.rint(pixels[:, 1]), atol=0.02)
+        expected = edge_columns(tilted(CAMERA, 0.02, -0.01), bearing, pixels[:, 1])
+        np.testing.assert_allclose(pixels[:, 0], expected, atol=0.3)
+    # Leftmost first.
+    assert np.all(np.diff(found.alpha_rad) < 0.0)
+
+
+def test_published_convention_turns_the_other_way() -> None:
+    image = scene(tilted(CAMERA, 0.04, 0.0))
+    level = detect_lines(image, TABLE)
+    other = detect_lines(image, TABLE, replace(DEFAULT, alpha="published"))
+    assert level.tilt is not None
+    np.testing.assert_allclose(other.ends, level.ends, atol=1e-9)
+    np.testing.assert_allclose(
+        other.alpha_rad,
+        compensated_bearings(
+            plane_normals(level.ends, CAMERA.rotation), level.tilt, published=True
+        ),
+        atol=1e-6,
+    )
+    assert np.abs(other.alpha_rad - level.alpha_rad).max() > 1e-3
+
+
+def test_published_preset_keeps_its_margin_of_22_rows() -> None:
+    camera = pinhole(240, 160, 200.0)
+    table = build_vertical_table(camera)
+    found = detect_lines(scene(camera), table, PUBLISHED)
+    np.testing.assert_allclose(found.alpha_rad, truth(), atol=3e-3)
+    rows = camera.distort(found.ends.reshape(-1, 2, 2))[..., 1]
+    np.testing.assert_allclose(rows, [[22.0, 137.0]] * len(EDGES), atol=0.02)
+
+
+@given(gain=st.floats(0.8, 2.0), offset=st.floats(0.0, 10.0))
+@settings(max_examples=8, deadline=None)
+def test_affine_brightness_does_not_matter(gain: float, offset: float) -> None:
+    """Up to quantisation and what the regulariser adds."""
+    plain = [Edge(edge.bearing_rad, 0.6 * edge.contrast) for edge in EDGES]
+    changed = [Edge(edge.bearing_rad, gain * edge.contrast) for edge in plain]
+    first = detect_lines(render(CAMERA, plain, grey=60.0), TABLE)
+    second = detect_lines(render(CAMERA, changed, grey=60.0 * gain + offset), TABLE)
+    np.testing.assert_allclose(second.alpha_rad, first.alpha_rad, atol=5e-4)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_mirrored_image_and_camera_give_mirrored_rows(seed: int) -> None:
+    image = scene(tilted(CAMERA, 0.02, 0.01), seed=seed)
+    found = detect_lines(image, TABLE)
+    other = detect_lines(
+        np.ascontiguousarray(image[:, ::-1]), build_vertical_table(mirrored(CAMERA))
+    )
+    assert len(found) == len(EDGES)
+    np.testing.assert_allclose(-other.alpha_rad[::-1], found.alpha_rad, atol=2e-5)
+    np.testing.assert_allclose(other.sigma_rad[::-1], found.sigma_rad, rtol=2e-2)
+    np.testing.assert_allclose(other.ends[::-1], found.ends * [-1.0, 1.0, -1.0, 1.0], atol=2e-4)
+    assert found.tilt is not None
+    assert other.tilt is not None
+    assert other.tilt.pitch_rad == pytest.approx(found.tilt.pitch_rad, abs=1e-4)
+    assert other.tilt.roll_rad == pytest.approx(-found.tilt.roll_rad, abs=1e-4)
+
+
+@given(
+    pitch=st.floats(-30.0, 30.0),
+    roll=st.floats(-25.0, 25.0),
+    seed=st.integers(0, 1000),
+)
+@settings(max_examples=25, deadline=None)
+def test_no_row_outside_the_view(pitch: float, roll: float, seed: int) -> None:
+    camera = pinhole(120, 90, 90.0, pitch_deg=pitch, roll_deg=roll, coef=BARREL)
+    rng = np.random.default_rng(seed)
+    image = np.repeat(rng.integers(0, 256, (1, 120)), 90, axis=0).astype(np.uint8)
+    image = np.asarray(cv2.GaussianBlur(image, (5, 1), 1.0), np.uint8)
+    table = build_vertical_table(camera)
+    found = detect_lines(image, table)
+    pixels = camera.distort(found.ends.reshape(-1, 2, 2))
+    assert np.all((pixels >= -0.5) & (pixels <= [119.5, 89.5]))
+    assert all(np.isfinite(row.sigma) and row.sigma > 0.0 for row in found.landmarks())
+    if not table.usable.any():
+        assert len(found) == 0
+        assert found.tilt is None
+
+
+def test_two_lines_are_rows_without_a_tilt() -> None:
+    found = detect_lines(scene(CAMERA, EDGES[:2]), TABLE)
+    assert found.tilt is None
+    np.testing.assert_allclose(found.alpha_rad, truth(EDGES[:2]), atol=4e-4)
+
+
+def test_leaning_edges_are_no_verticals() -> None:
+    camera = pinhole(240, 160, 200.0)
+    table = build_vertical_table(camera)
+    image = scene(camera).astype(np.float64)
+    columns, rows = np.meshgrid(np.arange(240), np.arange(160))
+    image += np.where(columns > 165 + 0.12 * (rows - 80), -60.0, 0.0)
+    found = detect_lines(np.clip(image, 0, 255).astype(np.uint8), table)
+    np.testing.assert_allclose(found.alpha_rad, truth(), atol=5e-4)
+    assert found.tilt is not None
+    assert abs(found.tilt.roll_rad) < np.radians(0.1)
+
+
+def test_close_edges_are_joined_to_one_row() -> None:
+    camera = pinhole(240, 160, 200.0)
+    table = build_vertical_table(camera)
+    bar = [Edge(0.003, 80.0), Edge(-0.006, -80.0)]
+    apart = detect_lines(render(camera, bar, grey=80.0), table, replace(DEFAULT, join_px=1.0))
+    joined = detect_lines(render(camera, bar, grey=80.0), table)
+    assert (len(apart), len(joined)) == (2, 1)
+    assert len(joined.members[0]) == 2
+    assert sorted(joined.fate[t] for t in joined.members[0]) == [ACCEPTED, JOINED]
+    share = joined.evidence[list(joined.members[0])]
+    share = share / share.sum()
+    order = np.argsort(-joined.evidence[list(joined.members[0])])
+    sides = apart.alpha_rad[np.argsort(-apart.evidence[[m[0] for m in apart.members]])]
+    mean = share[order] @ sides
+    assert joined.alpha_rad[0] == pytest.approx(mean, abs=1e-6)
+    spread = share[order] @ (apart.sigma_rad**2 + (sides - mean) ** 2)
+    assert joined.sigma_rad[0] == pytest.approx(np.sqrt(spread), rel=1e-3)
+
+
+def test_same_image_gives_the_same_rows() -> None:
+    image = scene(CAMERA)
+    assert detect_lines(image, TABLE).landmarks() == detect_lines(image, TABLE).landmarks()
+
+
+@pytest.mark.parametrize("value", [0, 255])
+def test_blank_images_give_nothing(value: int) -> None:
+    found = detect_lines(np.full((160, 240), value, np.uint8), TABLE)
+    assert (len(found), found.tilt, found.landmarks(), found.fate) == (0, None, (), ())
+
+
+@pytest.mark.parametrize(
+    "image", [np.zeros((160, 241), np.uint8), np.zeros((160, 240), np.float64)]
+)
+def test_wrong_images_are_refused(image: np.ndarray) -> None:
+    with pytest.raises(FrameError, match=r"image is .* expected uint8 of the table's shape"):
+        detect_lines(image, TABLE)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("threshold", 0.0),
+        ("sigma_across_px", -1.0),
+        ("regulariser", 0.0),
+        ("least_rows", 2),
+        ("join_px", -0.5),
+        ("refine_steps_px", ((0.0, 1.0),)),
+        ("largest_tilt_deg", float("nan")),
+    ],
+)
+def test_settings_without_sense_are_refused(name: str, value: object) -> None:
+    with pytest.raises(DetectError, match=f"{name} is .*: expected"):
+        LineSettings(**{name: value})  # type: ignore[arg-type]
+
+
+# -- drawings ---------------------------------------------------------------------------------
+
+
+def test_drawn_lines_lie_on_the_edges() -> None:
+    image = np.full((160, 240), 90, np.uint8)
+    found = detect_lines(scene(CAMERA), TABLE)
+    picture = draw_lines(image, CAMERA, TABLE, found)
+    green = (picture[..., 1] > 150) & (picture[..., 2] < 120)
+    rows = np.arange(40, 120)
+    for bearing in truth():
+        u = np.rint(edge_columns(CAMERA, bearing, rows.astype(np.float64))).astype(int)
+        assert np.mean([green[v, c - 1 : c + 2].any() for v, c in zip(rows, u)]) > 0.9
+    assert picture.shape == (160, 240, 3)
+
+
+def test_drawn_tracks_name_their_fates() -> None:
+    image = scene(CAMERA)
+    found = detect_lines(image, TABLE)
+    picture = draw_tracks(image, TABLE, found)
+    assert picture.shape[0] > 160
+    kept = draw_tracks(image, TABLE, found, rejected=False, reasons=False)
+    track = found.members[0][0]
+    pixels = np.rint(track_pixels(found.tracks, TABLE, track)).astype(int)
+    assert np.all(kept[pixels[:, 1], pixels[:, 0]] == [60, 220, 60])
+
+
+def test_drawn_response_shows_polarity() -> None:
+    found = detect_lines(scene(CAMERA), TABLE)
+    picture = draw_response(found.response, TABLE)
+    rising, falling = found.response > 0.3, found.response < -0.3
+    assert np.all(picture[rising, 2] > 150)
+    assert np.all(picture[rising, 0] == 0)
+    assert np.all(picture[falling, 0] > 150)
+
+
+# -- photographs and renders with truth ---------------------------------------------------------
+
+
+def load(path: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    """A scoring script that lies beside the data, with its own neighbours to import."""
+    monkeypatch.syspath_prepend(str(path.parent))
+    # Its neighbour `camera.py` must not be taken for the project's package, nor stay.
+    kept = {name: sys.modules.pop(name, None) for name in ("camera", "geometry")}
+    try:
+        spec = importlib.util.spec_from_file_location(f"score_{path.parent.name}", path)
+        assert spec is not None
+        assert spec.loader is not None
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+    finally:
+        for name, package in kept.items():
+            sys.modules.pop(name, None)
+            if package is not None:
+                sys.modules[name] = package
+    return module
+
+
+def read_image(path: Path) -> np.ndarray:
+    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    assert image is not None
+    return np.asarray(image, np.uint8)
+
+
+@pytest.mark.long
+def test_photographs_of_buildings(shared_data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = shared_data / "york"
+    annotated = json.loads((folder / "dev" / "truth.json").read_text())
+    score = load(folder / "evaluate.py", monkeypatch)
+    bearings, covered = {}, []
+    for name, real in annotated.items():
+        camera = read_camera(folder / "dev" / name / f"{name}.cam")
+        image = read_image(folder / "dev" / name / "images" / f"{name}.jpg")
+        found = detect_lines(image, build_vertical_table(camera))
+        bearings[name] = found.alpha_rad
+        lines = np.array([line["alpha"] for line in real["york"] if line["length"] >= 30])
+        for k, _, error_deg in score.match(found.alpha_rad, lines, 0.5):
+            covered.append(abs(np.radians(error_deg)) < 2.0 * found.sigma_rad[k])
+    limits = type("Limits", (), {"min_gt_len": 30.0, "gt_gap": 10.0})
+    result = score.score(bearings, annotated, limits)
+    assert result["recall_york@0.25"] > 0.90
+    assert result["precision@0.25"] > 0.89
+    assert result["err_york_median"] < 0.035
+    assert result["err_york_p95"] < 0.20
+    assert np.mean(covered) > 0.94
+
+
+@pytest.mark.long
+def test_rendered_office(shared_data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = shared_data / "rendered"
+    real = json.loads((folder / "r1" / "truth.json").read_text())
+    camera = read_camera(folder / "r1" / "r1.cam")
+    table = build_vertical_table(camera)
+    rows, errors, squared = {}, [], []
+    for frame in real["frames"]:
+        image = read_image(folder / "r1" / "images" / f"{frame['prefix']}.jpg")
+        found = detect_lines(image, table)
+        bearings = zip(found.alpha_rad, found.beta_rad, found.sigma_rad)
+        rows[frame["prefix"]] = {"L": [[0, 0, 0, 0, a, b, 0, s] for a, b, s in bearings]}
+        if found.tilt is not None and found.tilt.lines >= 5:
+            error = np.array([found.tilt.pitch_rad, found.tilt.roll_rad]) - frame["tilt"]
+            errors.append(np.degrees(error))
+            squared.append(error @ np.linalg.solve(found.tilt.covariance, error) / 2.0)
+    score = load(folder / "evaluate.py", monkeypatch)
+    result = score.score_lines(real, rows)
+    assert result["recall"] > 0.95
+    assert result["fp_rate"] <= 0.01
+    assert result["bearing_err_median_deg"] < 0.05
+    assert result["bearing_err_95_deg"] < 0.25
+    assert 0.7 < result["norm_err2_mean"] < 1.3
+    assert len(errors) > 50
+    assert np.all(np.sqrt(np.mean(np.square(errors), axis=0)) < 0.15)
+    assert 0.7 < np.mean(squared) < 1.4
