@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -115,16 +116,19 @@ def detect_circles_run(
             if on_progress is not None:
                 on_progress()
 
-    head = _head(settings, version, run)
-    write_frames(output, frames(), head=head, overwrite=overwrite)
-    if json_output is not None:
-        document = {
-            "version": version,
-            "settings": dataclasses.asdict(settings),
-            "camera": run.camera.content_hash,
-            "frames": records,
-        }
-        with write_whole(json_output, overwrite=overwrite) as stream:
+    # The JSON is opened first: if it cannot be written, nothing is.
+    with ExitStack() as outputs:
+        stream = None
+        if json_output is not None:
+            stream = outputs.enter_context(write_whole(json_output, overwrite=overwrite))
+        write_frames(output, frames(), head=_head(settings, version, run), overwrite=overwrite)
+        if stream is not None:
+            document = {
+                "version": version,
+                "settings": dataclasses.asdict(settings),
+                "camera": run.camera.content_hash,
+                "frames": records,
+            }
             stream.write(json.dumps(document, indent=1).encode() + b"\n")
     return summary
 
@@ -160,4 +164,4 @@ def _head(settings: CircleSettings, version: str, run: Run) -> str:
         f"camera {run.camera}",
         f"settings {values}",
     ]
-    return "".join(f"# {line}\n" for line in lines)
+    return "\n".join(lines)
