@@ -1,0 +1,362 @@
+"""The command line: what it prints, writes and exits with."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from detect.cli import main
+from landmarks import read_frames, read_steps
+from tests.detect.conftest import SMALL_RUN_DISCS
+
+Captured = pytest.CaptureFixture[str]
+
+
+def files_in(folder: Path) -> dict[str, bytes]:
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+def assert_refused(arguments: list[str], run: Path, names: str, captured: Captured) -> str:
+    """Exit code 1, one line that names the file, and nothing written or changed."""
+    before = files_in(run)
+    assert main(arguments) == 1
+    shown = captured.readouterr()
+    assert shown.out == ""
+    (line,) = shown.err.splitlines()
+    assert line.startswith("error: ")
+    assert names in line
+    assert files_in(run) == before
+    return line
+
+
+def settings_of(output: Path) -> dict[str, str]:
+    (line,) = [text for text in output.read_text().splitlines() if text.startswith("# settings ")]
+    return dict(word.split("=") for word in line.split()[2:])
+
+
+# -- circles --------------------------------------------------------------------------------
+
+
+def test_run_is_detected(small_run: Path, capsys: Captured) -> None:
+    assert main(["circles", str(small_run)]) == 0
+    output = small_run / "detected.circles"
+    assert f"{output}: 3 discs in 3 frames" in capsys.readouterr().out
+    frames = list(read_frames(output))
+    assert [len(frame.circles) for frame in frames] == [len(d) for d in SMALL_RUN_DISCS.values()]
+    assert [frame.step for frame in frames] == list(read_steps(small_run / "s.txt"))
+
+
+def test_flat_folder_and_named_files(small_run: Path, tmp_path: Path) -> None:
+    flat = tmp_path / "flat"
+    (small_run / "images").rename(flat)
+    output = tmp_path / "rows.circles"
+    arguments = ["circles", str(flat), "--camera", str(small_run / "s.cam"), "-o", str(output)]
+    assert main(arguments) == 0
+    assert [len(frame.circles) for frame in read_frames(output)] == [2, 1, 0]
+    assert not (flat / "detected.circles").exists()
+
+
+def test_settings_are_flags(small_run: Path) -> None:
+    assert main(["circles", str(small_run), "--polarity", "dark", "--threshold", "0.5"]) == 0
+    output = small_run / "detected.circles"
+    assert settings_of(output)["polarity"] == "dark"
+    assert settings_of(output)["threshold"] == "0.5"
+    assert all(frame.circles == () for frame in read_frames(output))
+
+
+@pytest.mark.parametrize("preset", [["--preset", "published"], ["--preset=published"]])
+def test_published_preset(small_run: Path, preset: list[str]) -> None:
+    from dataclasses import asdict
+
+    from detect.settings import PUBLISHED
+
+    assert main(["circles", str(small_run), *preset]) == 0
+    written = settings_of(small_run / "detected.circles")
+    assert written == {name: str(value) for name, value in asdict(PUBLISHED).items()}
+    assert len(next(iter(read_frames(small_run / "detected.circles"))).circles) > 2
+
+
+@pytest.mark.parametrize("first", [True, False])
+def test_flags_override_the_preset(small_run: Path, first: bool) -> None:
+    preset, flag = ["--preset", "published"], ["--threshold", "0.95", "--separation-m", "0.2"]
+    arguments = [*flag, *preset] if first else [*preset, *flag]
+    assert main(["circles", str(small_run), *arguments]) == 0
+    written = settings_of(small_run / "detected.circles")
+    assert (written["threshold"], written["separation_m"]) == ("0.95", "0.2")
+    assert (written["refine"], written["noise_floor"]) == ("False", "0.0")
+    counts = [len(frame.circles) for frame in read_frames(small_run / "detected.circles")]
+    assert counts == [2, 1, 0]
+
+
+def test_verification_can_be_turned_off(small_run: Path) -> None:
+    assert main(["circles", str(small_run), "--no-verify", "--no-refine"]) == 0
+    written = settings_of(small_run / "detected.circles")
+    assert (written["verify"], written["refine"]) == ("False", "False")
+
+
+def test_json_and_drawings(small_run: Path, tmp_path: Path) -> None:
+    drawings, as_json = tmp_path / "new" / "drawings", tmp_path / "rows.json"
+    arguments = ["circles", str(small_run), "--draw", str(drawings), "--json", str(as_json)]
+    assert main(arguments) == 0
+    frames = json.loads(as_json.read_text())["frames"]
+    assert [len(frame["discs"]) for frame in frames] == [2, 1, 0]
+    assert sorted(path.name for path in drawings.iterdir()) == [f"{p}.png" for p in SMALL_RUN_DISCS]
+    for frame in frames:
+        name = f"{frame['frame']}.png"
+        image = cv2.imread(str(small_run / "images" / name), cv2.IMREAD_GRAYSCALE)
+        drawn = cv2.imread(str(drawings / name), cv2.IMREAD_COLOR)
+        assert image is not None
+        assert drawn is not None
+        marked = np.any(drawn != image[:, :, None], axis=2)
+        assert marked.any() == bool(frame["discs"])
+        for disc in frame["discs"]:
+            u, v = disc["pixel"]
+            assert marked[v - 40 : v + 41, u - 60 : u + 61].sum() > 100
+            marked[v - 40 : v + 41, u - 60 : u + 61] = False
+        assert not marked.any()
+
+
+def test_bad_image_costs_its_frame_only(small_run: Path, capsys: Captured) -> None:
+    bad = small_run / "images" / "s.0001.png"
+    bad.write_bytes(b"no image")
+    assert main(["circles", str(small_run)]) == 3
+    shown = capsys.readouterr()
+    assert "2 discs in 3 frames" in shown.out
+    lines = shown.err.splitlines()
+    listed = lines.index("1 frames could not be worked on:")
+    assert lines[listed + 1] == f"  {bad}: cannot be decoded: expected an image"
+    assert len(lines) == listed + 2
+    frames = list(read_frames(small_run / "detected.circles"))
+    assert [frame.step.prefix for frame in frames] == list(SMALL_RUN_DISCS)
+    assert [len(frame.circles) for frame in frames] == [2, 0, 0]
+
+
+def test_image_of_another_size_is_listed(small_run: Path, capsys: Captured) -> None:
+    bad = small_run / "images" / "s.0000.png"
+    assert cv2.imwrite(str(bad), np.zeros((576, 768), np.uint8))
+    assert main(["circles", str(small_run)]) == 3
+    expected = f"{bad}: is 768x576 px: expected 768x288, the calibration's size"
+    assert expected in capsys.readouterr().err
+
+
+def test_long_lists_of_bad_images_are_cut(small_run: Path, capsys: Captured) -> None:
+    (small_run / "s.txt").unlink()
+    for number in range(14):
+        (small_run / "images" / f"z{number}.png").touch()
+    assert main(["circles", str(small_run)]) == 3
+    lines = capsys.readouterr().err.splitlines()
+    assert "14 frames could not be worked on:" in lines
+    assert sum("is empty" in line for line in lines) == 10
+    assert lines[-1] == "  and 4 more"
+
+
+def test_images_without_step_are_told(small_run: Path, capsys: Captured) -> None:
+    rows = (small_run / "s.txt").read_text().splitlines()
+    (small_run / "s.txt").write_text("\n".join(rows[:-1]) + "\n")
+    assert main(["circles", str(small_run)]) == 0
+    assert "1 images are not named by a STEP row" in capsys.readouterr().out
+
+
+def test_no_such_run(small_run: Path, capsys: Captured) -> None:
+    assert_refused(["circles", str(small_run / "t")], small_run, str(small_run / "t"), capsys)
+
+
+def test_missing_calibration(small_run: Path, capsys: Captured) -> None:
+    (small_run / "s.cam").unlink()
+    line = assert_refused(["circles", str(small_run)], small_run, str(small_run), capsys)
+    assert "expected a .cam file" in line
+
+
+def test_missing_named_calibration(small_run: Path, capsys: Captured) -> None:
+    arguments = ["circles", str(small_run), "--camera", str(small_run / "t.cam")]
+    assert_refused(arguments, small_run, "t.cam", capsys)
+
+
+def test_malformed_calibration(small_run: Path, capsys: Captured) -> None:
+    text = (small_run / "s.cam").read_text()
+    (small_run / "s.cam").write_text(text.replace("width: 768", "width: wide"))
+    line = assert_refused(["circles", str(small_run)], small_run, "s.cam", capsys)
+    assert "width" in line
+
+
+@pytest.mark.parametrize(
+    ("row", "told"),
+    [
+        ("STEP s.0003 0.1 0.2\n", "s.txt:5"),
+        ("STEP s.0003 0.1 0.2 x 0 0 0 0 0 0\n", "s.txt:5"),
+        ("STEP s.0003 nan 0.2 0 0 0 0 0 0 0\n", "s.txt:5"),
+        ("NONSENSE 1 2 3\n", "s.txt:5"),
+    ],
+)
+def test_malformed_odometry(small_run: Path, capsys: Captured, row: str, told: str) -> None:
+    with (small_run / "s.txt").open("a") as stream:
+        stream.write(row)
+    assert_refused(["circles", str(small_run)], small_run, told, capsys)
+
+
+@pytest.mark.parametrize("flag", ["-o", "--json"])
+def test_existing_output_stays(small_run: Path, capsys: Captured, flag: str) -> None:
+    precious = small_run / "precious"
+    precious.write_text("precious")
+    line = assert_refused(
+        ["circles", str(small_run), flag, str(precious)], small_run, str(precious), capsys
+    )
+    assert "--force" in line
+    assert main(["circles", str(small_run), flag, str(precious), "--force"]) == 0
+    assert precious.read_text() != "precious"
+
+
+def test_existing_drawings_stay(small_run: Path, tmp_path: Path, capsys: Captured) -> None:
+    drawings = tmp_path / "drawings"
+    drawings.mkdir()
+    (drawings / "s.0001.png").write_text("precious")
+    before = files_in(small_run)
+    assert main(["circles", str(small_run), "--draw", str(drawings)]) == 1
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last.startswith("error: ")
+    assert "s.0001.png" in last
+    assert (drawings / "s.0001.png").read_text() == "precious"
+    assert files_in(small_run) == before
+
+
+@pytest.mark.parametrize("flag", ["-o", "--json"])
+def test_outputs_into_no_folder(small_run: Path, capsys: Captured, flag: str) -> None:
+    before = files_in(small_run)
+    assert main(["circles", str(small_run), flag, str(small_run / "none" / "rows")]) == 1
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last.startswith("error: ")
+    assert str(small_run / "none") in last
+    assert files_in(small_run) == before
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        ["circles"],
+        [],
+        ["squares", "RUN"],
+        ["circles", "RUN", "--nonsense"],
+        ["circles", "RUN", "--preset", "best"],
+        ["circles", "RUN", "--threshold", "high"],
+        ["circles", "RUN", "--threshold", "0"],
+        ["circles", "RUN", "--threshold", "nan"],
+        ["circles", "RUN", "--separation-m", "-1"],
+        ["circles", "RUN", "--polarity", "grey"],
+        ["compare", "RUN", "--gate-m", "0"],
+    ],
+)
+def test_wrong_command_lines(small_run: Path, capsys: Captured, wrong: list[str]) -> None:
+    before = files_in(small_run)
+    with pytest.raises(SystemExit) as end:
+        main([str(small_run) if word == "RUN" else word for word in wrong])
+    assert end.value.code == 2
+    shown = capsys.readouterr()
+    assert shown.out == ""
+    assert shown.err != ""
+    assert files_in(small_run) == before
+
+
+def test_refused_settings_are_named(small_run: Path, capsys: Captured) -> None:
+    with pytest.raises(SystemExit):
+        main(["circles", str(small_run), "--threshold", "1.5"])
+    assert "threshold is 1.5" in capsys.readouterr().err
+
+
+# -- compare --------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def compared_run(small_run: Path, capsys: Captured) -> Path:
+    """Of four reference rows three are found, and nothing else."""
+    assert main(["circles", str(small_run)]) == 0
+    reference = (small_run / "detected.circles").read_text()
+    (small_run / "map.circles").write_text(reference + "LANDMARK_C 1 -3 0.9 0.002 0 0.003 7\n")
+    capsys.readouterr()
+    return small_run
+
+
+@pytest.mark.parametrize(
+    ("demands", "code", "unmet"),
+    [
+        ([], 0, 0),
+        (["--min-recall", "0.75"], 0, 0),
+        (["--min-recall", "0.76"], 1, 1),
+        (["--min-precision", "1.0"], 0, 0),
+        (["--min-recall", "0.7", "--min-precision", "1"], 0, 0),
+        (["--min-recall", "0.9", "--min-precision", "1"], 1, 1),
+    ],
+)
+def test_demands_decide_the_exit_code(
+    compared_run: Path, capsys: Captured, demands: list[str], code: int, unmet: int
+) -> None:
+    assert main(["compare", str(compared_run), *demands]) == code
+    shown = capsys.readouterr()
+    lines = shown.err.splitlines()
+    assert len(lines) == unmet
+    assert all("recall" in line for line in lines)
+    assert "0.75" in shown.out or "75" in shown.out
+
+
+def test_unmet_precision(compared_run: Path, capsys: Captured) -> None:
+    extra = "LANDMARK_C -1 -2 0.9 0.002 0 0.003 -1\n"
+    rows = (compared_run / "detected.circles").read_text()
+    (compared_run / "detected.circles").write_text(rows + extra)
+    assert main(["compare", str(compared_run), "--min-precision", "0.76"]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "precision" in line
+    assert main(["compare", str(compared_run), "--min-precision", "0.75"]) == 0
+
+
+def test_comparison_as_json(compared_run: Path, tmp_path: Path) -> None:
+    as_json = tmp_path / "result.json"
+    assert main(["compare", str(compared_run), "--json", str(as_json)]) == 0
+    result = json.loads(as_json.read_text())
+    assert (result["reference"], result["detected"], result["matched"]) == (4, 3, 3)
+    assert (result["recall"], result["precision"]) == (0.75, 1.0)
+
+
+def test_nothing_to_compare(small_run: Path, capsys: Captured) -> None:
+    assert_refused(["compare", str(small_run)], small_run, "map.circles", capsys)
+
+
+def test_malformed_reference(compared_run: Path, capsys: Captured) -> None:
+    with (compared_run / "map.circles").open("a") as stream:
+        stream.write("LANDMARK_C 1 2 3\n")
+    line_count = len((compared_run / "map.circles").read_text().splitlines())
+    arguments = ["compare", str(compared_run)]
+    assert_refused(arguments, compared_run, f"map.circles:{line_count}", capsys)
+
+
+# -- help -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("command", [[], ["circles"], ["compare"]])
+def test_help_needs_nothing_heavy(command: list[str]) -> None:
+    program = (
+        "import sys\n"
+        "from detect.cli import main\n"
+        "try:\n"
+        f"    main({[*command, '--help']!r})\n"
+        "except SystemExit as end:\n"
+        "    heavy = {'numba', 'cv2', 'scipy', 'skimage', 'pycolmap'} & set(sys.modules)\n"
+        "    print('exit', end.code, 'heavy', sorted(heavy))\n"
+    )
+    root = Path(__file__).resolve().parents[2]
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=root, capture_output=True, text=True, check=True
+    )
+    assert done.stderr == ""
+    assert done.stdout.splitlines()[-1] == "exit 0 heavy []"
+    wanted = {"": ["circles", "compare"], "circles": ["--preset", "--refine", "--threshold"]}
+    for word in wanted.get(" ".join(command), ["--min-recall", "--reference"]):
+        assert word in done.stdout
