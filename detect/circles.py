@@ -30,6 +30,9 @@ PUBLISHED_PIXEL_VARIANCE = 2.0
 #: Candidates whose first look is this much below the required evidence are not fitted in full.
 _FIRST_LOOK_SLACK = 6.0
 
+#: For the noise floor an image's noise is never less than this: one grey level, its resolution.
+_LEAST_NOISE = 1.0
+
 
 @dataclass(frozen=True)
 class CircleDetections:
@@ -96,7 +99,8 @@ def detect_circles(
     columns, rows = local_maxima(quality, settings.threshold)
 
     noise = estimate_noise(image)
-    strong = np.abs(contrast[rows, columns]) >= settings.noise_floor * noise
+    weakest = settings.noise_floor * max(noise, _LEAST_NOISE)
+    strong = np.abs(contrast[rows, columns]) >= weakest
     columns, rows = columns[strong], rows[strong]
     pixels = np.stack([columns, rows], axis=-1)
     found_quality = quality[rows, columns]
@@ -262,7 +266,11 @@ def refined_covariance(
 
 
 def tilt_jacobian(camera: Camera, floor_xy: FloatArray) -> FloatArray:
-    """How far positions move when the camera turns about the robot's X and Y axes.
+    """How far positions seem to move when the robot tilts about the robot frame's X and Y axes.
+
+    The robot tilts where it stands, on the floor: a floor point then has the height
+    x w_Y - y w_X in the robot's frame, and is seen where the ray through it meets the floor that
+    the calibration believes in.
 
     Parameters
     ----------
@@ -276,12 +284,9 @@ def tilt_jacobian(camera: Camera, floor_xy: FloatArray) -> FloatArray:
     (N, 2, 2) float64
         d(X, Y) / d(rotation about X, about Y), metres per radian.
     """
-    x, y = floor_xy[:, 0] - camera.centre[0], floor_xy[:, 1] - camera.centre[1]
-    h = camera.centre[2]
-    # A ray d = (x, y, -h) turned by w becomes d + w x d and meets the floor where its height is -h.
-    about_x = np.stack([x * y / h, h + y * y / h], axis=-1)
-    about_y = np.stack([-h - x * x / h, -x * y / h], axis=-1)
-    return np.stack([about_x, about_y], axis=-1)
+    per_height = (floor_xy - camera.centre[:2]) / camera.centre[2]
+    height_per_tilt = np.stack([-floor_xy[:, 1], floor_xy[:, 0]], axis=-1)
+    return np.asarray(per_height[:, :, None] * height_per_tilt[:, None, :])
 
 
 def _nearest_pixels(camera: Camera, floor_xy: FloatArray) -> NDArray[np.int64]:

@@ -39,7 +39,8 @@ class CircleSettings:
     polarity : {"any", "light", "dark"}
         Which discs to look for: lighter than the floor, darker, or both.
     noise_floor : float
-        Least contrast between the outlines, in standard deviations of the image's noise.
+        Least contrast between the outlines, in standard deviations of the image's noise (or in
+        grey levels, where the noise is less than one).
     separation_m : float
         Of detections closer than this on the floor only the best is reported; 0 reports all.
     verify : bool
@@ -54,7 +55,7 @@ class CircleSettings:
     systematic_px : float
         Systematic error of a refined position, pixels: added to its covariance.
     tilt_sigma_deg : float
-        Uncertainty of the camera's pitch and roll, degrees: added to a refined position's
+        Uncertainty of the robot's pitch and roll, degrees: added to a refined position's
         covariance.
     """
 
@@ -66,7 +67,7 @@ class CircleSettings:
     border_px: int = 12
     far_limit_m_per_px: float = 0.12
     polarity: Polarity = "any"
-    noise_floor: float = 2.0
+    noise_floor: float = 3.0
     separation_m: float = 0.14
     verify: bool = True
     evidence: float = 1.1
