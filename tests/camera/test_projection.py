@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from camera import Camera
@@ -139,6 +139,7 @@ def test_any_leading_shape_is_kept(published_camera: Camera) -> None:
         assert np.allclose(function(pixels[1, 3]), whole[1, 3], rtol=1e-9, atol=0, equal_nan=True)
 
 
+@settings(deadline=None)  # the first example waits for the compiler
 @given(cameras(), st.integers(0, 2**32 - 1))
 def test_the_compiled_projection_is_the_camera_s(camera: Camera, seed: int) -> None:
     numbers = camera_numbers(camera)
