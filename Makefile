@@ -13,7 +13,7 @@ setup:
 	@$(PYTHON) tools/make_environment.py $(VENV)
 
 demo: setup
-	$(BIN)/detect circles images/e --force --draw build/demo
+	$(BIN)/detect circles images/e --force
 	$(BIN)/detect compare images/e
 
 test: setup
