@@ -102,7 +102,7 @@ def fit_lines(
         One for each track. Without refinement the covariance is that of independent points with the
         scatter that the track shows.
     """
-    from detect.line_kernels import fit_eigenlines, refine_lines
+    from detect.line_fit_kernels import fit_eigenlines, refine_lines
 
     count = len(tracks)
     reference, pixel = np.empty(count), np.empty(count)

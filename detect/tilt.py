@@ -100,7 +100,7 @@ def consensus(
     consistent : (N,) bool
         Lines that are vertical under that tilt; without an estimate, under no tilt.
     """
-    from detect.line_kernels import vote_for_tilt
+    from detect.tilt_kernels import vote_for_tilt
 
     strongest = np.argsort(-weight, kind="stable")[: settings.proposers]
     tilt = np.array(
