@@ -11,11 +11,9 @@ import pytest
 import scipy.ndimage
 from hypothesis import Phase, assume, given, settings
 from hypothesis import strategies as st
-from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
 
 from camera import Camera
-from detect.circle_kernels import local_maxima, suppress_neighbours
 from detect.circles import (
     CircleDetections,
     detect_circles,
@@ -332,77 +330,6 @@ def test_quality_is_that_of_the_outlines(
         assert contrast[v, u] == pytest.approx(values[0].mean() - values[1].mean(), abs=1e-4)
         assert quality[v, u] == pytest.approx(1.0 - within / both.var(), abs=1e-9)
     assert np.all(quality[~table.usable] == 0.0)
-
-
-@settings(max_examples=12, deadline=None)
-@given(
-    seed=st.integers(0, 2**32 - 1),
-    span=st.integers(1, 50),
-    gain=st.sampled_from([-5, -3, -1, 2, 4, 5]),
-    offset=st.integers(0, 5),
-)
-def test_quality_does_not_depend_on_brightness(
-    published_camera: Camera, seed: int, span: int, gain: int, offset: int
-) -> None:
-    table = table_of(published_camera, disc_shape(DEFAULT))
-    rng = np.random.default_rng(seed)
-    image = rng.integers(0, span + 1, table.usable.shape).astype(np.uint8)
-    quality, contrast = quality_of_centres(image, table)
-    assert quality.min() >= 0.0
-    assert quality.max() <= 1.0
-    shown = gain * image.astype(int) + (offset if gain > 0 else 255 - offset)
-    assert shown.min() >= 0
-    assert shown.max() <= 255
-    changed, changed_contrast = quality_of_centres(shown.astype(np.uint8), table)
-    np.testing.assert_allclose(changed, quality, rtol=1e-12, atol=1e-15)
-    np.testing.assert_allclose(changed_contrast, gain * contrast, rtol=1e-5, atol=1e-4)
-
-
-# -- local maxima and suppression -----------------------------------------------------------
-
-
-@given(
-    hnp.arrays(
-        np.float64,
-        hnp.array_shapes(min_dims=2, max_dims=2, min_side=1, max_side=9),
-        elements=st.sampled_from([0.0, 0.3, 0.5, 0.7, 1.0]),
-    )
-)
-@settings(max_examples=300, deadline=None)
-def test_every_summit_is_found_once(quality: FloatArray) -> None:
-    """Connected pixels of equal quality with nothing higher around them: one row each."""
-    columns, rows = local_maxima(quality, 0.5)
-    expected = 0
-    claimed = np.zeros(len(columns), int)
-    for value in np.unique(quality[quality >= 0.5]):
-        labels, count = scipy.ndimage.label(quality == value, np.ones((3, 3)))
-        for label in range(1, count + 1):
-            plateau = labels == label
-            around = scipy.ndimage.binary_dilation(plateau, np.ones((3, 3))) & ~plateau
-            if np.any(quality[around] > value):
-                continue
-            expected += 1
-            claimed += plateau[rows, columns]
-    assert len(columns) == expected
-    assert np.all(claimed == 1)
-    assert np.all(np.diff(rows * quality.shape[1] + columns) > 0)
-
-
-@given(
-    hnp.arrays(np.float64, (12, 2), elements=st.floats(-0.3, 0.3)),
-    hnp.arrays(np.float64, 12, elements=st.sampled_from([0.2, 0.5, 0.9])),
-)
-@settings(max_examples=200, deadline=None)
-def test_suppression_keeps_the_best(floor_xy: FloatArray, score: FloatArray) -> None:
-    kept = suppress_neighbours(floor_xy, score, 0.14)
-    squared = ((floor_xy[:, None] - floor_xy) ** 2).sum(axis=-1)
-    near = squared < 0.14 * 0.14
-    for i in range(len(score)):
-        rivals = np.flatnonzero(near[i] & kept & (np.arange(len(score)) != i))
-        if kept[i]:
-            assert len(rivals) == 0
-        else:
-            assert np.any((score[rivals] > score[i]) | ((score[rivals] == score[i]) & (rivals < i)))
 
 
 # -- laws -----------------------------------------------------------------------------------
