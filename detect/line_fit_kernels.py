@@ -139,15 +139,36 @@ def _cross_row(
 
 
 @njit(cache=True, error_model="numpy")
-def _step_height(image: NDArray[np.uint8], v: int, u: float, sigma: float, reach: int) -> float:
+def _gaussian(sigma: float) -> NDArray[np.float64]:
+    """(reach + 1,) exp(-k^2 / 2 sigma^2) for k = 0, 1, ... as far as it counts."""
+    reach = math.ceil(3.5 * sigma) + 1
+    weight = np.empty(reach + 1)
+    for k in range(reach + 1):
+        weight[k] = math.exp(-0.5 * (k / sigma) ** 2)
+    return weight
+
+
+@njit(cache=True, error_model="numpy")
+def _step_height(
+    image: NDArray[np.uint8], v: int, u: float, sigma: float, gaussian: NDArray[np.float64]
+) -> float:
     """Height of a step at (u, v), brighter on the right, as a derivative of Gaussian sees it."""
     nearest = math.floor(u + 0.5)
     base = float(image[v, nearest])
     inverse = 1.0 / (sigma * sigma)
+    off = u - nearest
+    # exp(-(k - off)^2 / 2 sigma^2) = exp(-off^2 / 2 sigma^2) exp(off / sigma^2)^k gaussian[k]
+    ratio = math.exp(off * inverse)
+    right = math.exp(-0.5 * off * off * inverse)
+    left = right
     total = 0.0
-    for k in range(-reach, reach + 1):
-        d = nearest + k - u
-        total += d * math.exp(-0.5 * d * d * inverse) * (float(image[v, nearest + k]) - base)
+    for k in range(1, len(gaussian)):
+        right *= ratio
+        left /= ratio
+        total += gaussian[k] * (
+            (k - off) * right * (image[v, nearest + k] - base)
+            - (k + off) * left * (image[v, nearest - k] - base)
+        )
     return total * inverse
 
 
@@ -212,8 +233,9 @@ def refine_lines(
     """
     width = image.shape[1]
     at = np.empty(image.shape[0], np.float64)
-    fine_reach = math.ceil(3.5 * fine) + 1
-    coarse_reach = math.ceil(3.5 * coarse) + 1
+    fine_gaussian = _gaussian(fine)
+    coarse_gaussian = _gaussian(coarse)
+    margin = len(coarse_gaussian) - 1
     for t in range(len(sign)):
         begin, end = bounds[t], bounds[t + 1]
         refined[t] = False
@@ -229,7 +251,8 @@ def refine_lines(
             at[i - begin] = column[i]
         for step in range(len(scales)):
             inverse = 1.0 / (scales[step] * scales[step])
-            reach = math.ceil(3.5 * scales[step]) + 1
+            gaussian = _gaussian(scales[step])
+            reach = len(gaussian) - 1
             hessian_aa = 0.0
             hessian_ab = 0.0
             hessian_bb = 0.0
@@ -248,14 +271,26 @@ def refine_lines(
                     continue
                 nearest = math.floor(u + 0.5)
                 base = float(image[v, nearest])
+                off = u - nearest
+                # The Gaussian's values as in `_step_height`.
+                ratio = math.exp(off * inverse)
+                right = math.exp(-0.5 * off * off * inverse)
+                left = right
                 first = 0.0
                 second = 0.0
-                for k in range(-reach, reach + 1):
-                    d = nearest + k - u
+                for k in range(1, reach + 1):
+                    right *= ratio
+                    left /= ratio
+                    above = gaussian[k] * right * (image[v, nearest + k] - base)
+                    below = gaussian[k] * left * (image[v, nearest - k] - base)
+                    d = k - off
                     q = d * d * inverse
-                    weighted = math.exp(-0.5 * q) * (float(image[v, nearest + k]) - base)
-                    first += (q - 1.0) * weighted
-                    second += (q - 3.0) * d * inverse * weighted
+                    first += (q - 1.0) * above
+                    second += (q - 3.0) * d * inverse * above
+                    d = k + off
+                    q = d * d * inverse
+                    first += (q - 1.0) * below
+                    second -= (q - 3.0) * d * inverse * below
                 first *= sign[t]
                 second *= sign[t]
                 hessian_aa += second * by_a * by_a
@@ -303,9 +338,9 @@ def refine_lines(
             at[i - begin], u, by_a, by_b = _cross_row(
                 table_column, bearing, elevation_tan, phi, a, b, v, at[i - begin]
             )
-            if u > coarse_reach and u < width - 1 - coarse_reach:
-                fine_height += _step_height(image, v, u, fine, fine_reach)
-                coarse_height += _step_height(image, v, u, coarse, coarse_reach)
+            if u > margin and u < width - 1 - margin:
+                fine_height += _step_height(image, v, u, fine, fine_gaussian)
+                coarse_height += _step_height(image, v, u, coarse, coarse_gaussian)
                 used += 1
         contrast[t] = sign[t] * fine_height / used if used > 0 else 0.0
         sharpness[t] = fine_height / coarse_height if sign[t] * coarse_height > 0.0 else 1.0

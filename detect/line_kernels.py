@@ -15,6 +15,35 @@ from numpy.typing import NDArray
 
 
 @njit(cache=True, error_model="numpy")
+def _cut_response(
+    mean_strip: NDArray[np.float32],
+    cov_strip: NDArray[np.float32],
+    square_strip: NDArray[np.float32],
+    along: NDArray[np.float32],
+    noise: np.float32,
+    v: int,
+    c: int,
+    first: int,
+    last: int,
+) -> np.float32:
+    """Response in a window that is cut off at a vertical's ends."""
+    s = (len(along) - 1) // 2
+    share = np.float32(0.0)
+    mean = np.float32(0.0)
+    cov = np.float32(0.0)
+    square = np.float32(0.0)
+    for k in range(max(-s, first - v), min(s, last - v) + 1):
+        w = along[k + s]
+        share += w
+        mean += w * mean_strip[v + k, c]
+        cov += w * cov_strip[v + k, c]
+        square += w * square_strip[v + k, c]
+    mean /= share
+    cov /= share
+    return cov * abs(cov) / (abs(square / share - mean * mean) + noise)
+
+
+@njit(cache=True, error_model="numpy")
 def strip_response(
     image: NDArray[np.uint8],
     column: NDArray[np.float32],
@@ -48,9 +77,6 @@ def strip_response(
     height, width = image.shape
     r = (len(across) - 1) // 2
     s = (len(along) - 1) // 2
-    part = np.zeros(2 * s + 2, np.float32)
-    for k in range(2 * s + 1):
-        part[k + 1] = part[k] + along[k]
     mean_strip = np.zeros((height, width), np.float32)
     cov_strip = np.zeros((height, width), np.float32)
     square_strip = np.zeros((height, width), np.float32)
@@ -58,6 +84,8 @@ def strip_response(
     mean = np.zeros(width, np.float32)
     cov = np.zeros(width, np.float32)
     square = np.zeros(width, np.float32)
+    leftmost = np.float32(r)
+    rightmost = np.float32(width - 1 - r)
     for v in range(height):
         # Grey values about 0 keep the small variances exact in single precision.
         for u in range(width):
@@ -66,7 +94,7 @@ def strip_response(
         for u in range(r, width - r):
             g = grey[u]
             mean[u] = centre * g
-            cov[u] = 0.0
+            cov[u] = np.float32(0.0)
             square[u] = centre * g * g
         for k in range(1, r + 1):
             w = across[r + k]
@@ -78,17 +106,13 @@ def strip_response(
                 cov[u] += h * (right - left)
                 square[u] += w * (left * left + right * right)
         for c in range(width):
-            if v < first_row[c] or v > last_row[c]:
-                continue
             x = column[v, c]
-            j = int(x)
-            if j < r or j + 1 > width - 1 - r:
-                continue
-            f = x - np.float32(j)
-            e = np.float32(1.0) - f
-            mean_strip[v, c] = e * mean[j] + f * mean[j + 1]
-            cov_strip[v, c] = e * cov[j] + f * cov[j + 1]
-            square_strip[v, c] = e * square[j] + f * square[j + 1]
+            if x >= leftmost and x < rightmost:
+                j = int(x)
+                f = x - np.float32(j)
+                mean_strip[v, c] = mean[j] + f * (mean[j + 1] - mean[j])
+                cov_strip[v, c] = cov[j] + f * (cov[j + 1] - cov[j])
+                square_strip[v, c] = square[j] + f * (square[j + 1] - square[j])
     noise = np.float32(regulariser)
     for v in range(height):
         mean[:] = 0.0
@@ -103,17 +127,25 @@ def strip_response(
             for c in range(width):
                 square[c] += w * square_strip[v + k, c]
         for c in range(width):
-            response[v, c] = 0.0
-            if v < first_row[c] or v > last_row[c]:
-                continue
-            here = column[v, c]
-            if here < r or here >= width - 1 - r:
-                continue
-            share = part[min(s, last_row[c] - v) + s + 1] - part[max(-s, first_row[c] - v) + s]
-            m = mean[c] / share
-            h = cov[c] / share
-            variance = max(square[c] / share - m * m, np.float32(0.0)) + noise
-            response[v, c] = h * abs(h) / variance
+            # Rounding can make a vanishing variance negative.
+            variance = square[c] - mean[c] * mean[c]
+            grey[c] = cov[c] * abs(cov[c]) / (abs(variance) + noise)
+        for c in range(width):
+            x = column[v, c]
+            response[v, c] = grey[c] if (x >= leftmost) & (x < rightmost) else np.float32(0.0)
+    # Near a vertical's ends the window is cut off.
+    for c in range(width):
+        first = first_row[c]
+        last = last_row[c]
+        for end in range(2):
+            lowest = first if end == 0 else max(last - s + 1, first + s)
+            highest = min(first + s - 1, last) if end == 0 else last
+            for v in range(lowest, highest + 1):
+                x = column[v, c]
+                if x >= leftmost and x < rightmost:
+                    response[v, c] = _cut_response(
+                        mean_strip, cov_strip, square_strip, along, noise, v, c, first, last
+                    )
 
 
 @njit(cache=True, error_model="numpy")
