@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from camera import Camera
 from detect import disc_fit_kernels as kernels
+from detect.disc_patch_kernels import FitSettings
 from detect.disc_profile import T_LIMIT, Z_LIMIT, disc_profile
 
 FloatArray = NDArray[np.float64]
@@ -125,7 +126,7 @@ def fit_discs(
     """
     count = _FIRST_LOOK_NODES if first_look else _ALL_NODES
     nodes, weights = np.polynomial.hermite_e.hermegauss(count)
-    settings = kernels.FitSettings(
+    settings = FitSettings(
         noise=max(noise, _LEAST_NOISE),
         reach_radii=_REACH_RADII,
         reach_px=_REACH_PX,
