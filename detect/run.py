@@ -134,7 +134,7 @@ def read_image(frame: RunFrame, camera: Camera) -> NDArray[np.uint8]:
         raise FrameError(f"{frame.image}: cannot be read: {error.strerror}") from None
     if not content:
         raise FrameError(f"{frame.image}: is empty: expected an image")
-    if content.startswith(_JPEG_BEGIN) and _JPEG_END not in content[-64:]:
+    if content.startswith(_JPEG_BEGIN) and _JPEG_END not in content[len(content) // 2 :]:
         raise FrameError(f"{frame.image}: the JPEG is cut off: its end is missing")
     try:
         image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_GRAYSCALE)

@@ -22,7 +22,7 @@ from lut.outlines import DiscShape, DiscTable, build_disc_table
 from storage import write_whole
 
 #: Raised with every change of what tables hold or how they are computed.
-TABLE_VERSION = 3
+TABLE_VERSION = 4
 
 _DIGEST_BYTES = hashlib.sha256().digest_size
 

@@ -51,7 +51,11 @@ def write_whole(path: str | os.PathLike[str], *, overwrite: bool) -> Iterator[Bi
     path = Path(path)
     if not overwrite and os.path.lexists(path):
         raise OutputExistsError(path)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
+    try:
+        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
+    except OSError as error:
+        # The temporary file's name would mean nothing to whoever reads the message.
+        raise type(error)(error.errno, error.strerror, str(path)) from None
     temporary = Path(name)
     try:
         with os.fdopen(handle, "wb") as stream:
