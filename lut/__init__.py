@@ -1,6 +1,6 @@
 """What a calibration decides before the first image: tables, and their cache."""
 
-from lut.cache import TABLE_VERSION, cache_folder, cached_disc_table
+from lut.cache import TABLE_VERSION, cache_folder, cached_disc_table, cached_vertical_table
 from lut.errors import TableError
 from lut.outlines import (
     MIN_SHARE_INSIDE,
@@ -10,6 +10,7 @@ from lut.outlines import (
     floor_positions,
     ring,
 )
+from lut.verticals import VerticalTable, build_vertical_table
 
 __all__ = [
     "MIN_SHARE_INSIDE",
@@ -17,9 +18,12 @@ __all__ = [
     "DiscShape",
     "DiscTable",
     "TableError",
+    "VerticalTable",
     "build_disc_table",
+    "build_vertical_table",
     "cache_folder",
     "cached_disc_table",
+    "cached_vertical_table",
     "floor_positions",
     "ring",
 ]

@@ -13,16 +13,20 @@ import hashlib
 import io
 import os
 from pathlib import Path
+from typing import TypeVar
 from zipfile import BadZipFile
 
 import numpy as np
 
 from camera import Camera
 from lut.outlines import DiscShape, DiscTable, build_disc_table
+from lut.verticals import VerticalTable, build_vertical_table
 from storage import write_whole
 
 #: Raised with every change of what tables hold or how they are computed.
 TABLE_VERSION = 4
+
+Table = TypeVar("Table", DiscTable, VerticalTable)
 
 _DIGEST_BYTES = hashlib.sha256().digest_size
 
@@ -60,20 +64,44 @@ def cached_disc_table(camera: Camera, shape: DiscShape, folder: Path | None = No
     """
     folder = cache_folder() if folder is None else folder
     path = folder / f"discs-{_key(camera, shape)}.table"
-    table = _read(path)
+    table = _read(path, DiscTable)
     if table is None:
         table = build_disc_table(camera, shape)
         _keep(path, table)
     return table
 
 
-def _key(camera: Camera, shape: DiscShape) -> str:
-    numbers = [float(value).hex() for value in dataclasses.astuple(shape)]
-    parts = ["discs", str(TABLE_VERSION), camera.content_hash, *numbers]
+def cached_vertical_table(camera: Camera, folder: Path | None = None) -> VerticalTable:
+    """The table of verticals of a camera, from the cache or computed, as `cached_disc_table`.
+
+    Parameters
+    ----------
+    camera : Camera
+        The calibrated camera.
+    folder : path, optional
+        The cache; by default `cache_folder`.
+
+    Returns
+    -------
+    VerticalTable
+        Equal to that of `lut.build_vertical_table`.
+    """
+    path = (cache_folder() if folder is None else folder) / f"verticals-{_key(camera)}.table"
+    table = _read(path, VerticalTable)
+    if table is None:
+        table = build_vertical_table(camera)
+        _keep(path, table)
+    return table
+
+
+def _key(camera: Camera, shape: DiscShape | None = None) -> str:
+    values = () if shape is None else dataclasses.astuple(shape)
+    numbers = [float(value).hex() for value in values]
+    parts = [str(TABLE_VERSION), camera.content_hash, *numbers]
     return hashlib.sha256(" ".join(parts).encode()).hexdigest()[:32]
 
 
-def _read(path: Path) -> DiscTable | None:
+def _read(path: Path, kind: type[Table]) -> Table | None:
     """The table in a file; None if there is none or it is damaged."""
     try:
         content = path.read_bytes()
@@ -84,14 +112,14 @@ def _read(path: Path) -> DiscTable | None:
         return None
     try:
         with np.load(io.BytesIO(payload), allow_pickle=False) as arrays:
+            # Numbers were stored as arrays without dimensions.
             fields = {name: arrays[name] for name in arrays.files}
-        samples, margin_px = int(fields.pop("samples")), int(fields.pop("margin_px"))
-        return DiscTable(samples=samples, margin_px=margin_px, **fields)
+        return kind(**{name: a if a.ndim else a.item() for name, a in fields.items()})
     except (ValueError, KeyError, TypeError, EOFError, OSError, BadZipFile):
         return None
 
 
-def _keep(path: Path, table: DiscTable) -> None:
+def _keep(path: Path, table: DiscTable | VerticalTable) -> None:
     buffer = io.BytesIO()
     fields = {f.name: getattr(table, f.name) for f in dataclasses.fields(table)}
     np.savez(buffer, allow_pickle=False, **fields)
