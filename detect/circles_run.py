@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,11 +12,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from camera import Camera
 from detect.circles import CircleDetections, detect_circles, disc_shape
 from detect.errors import FrameError
+from detect.levelling import level_covariances, level_positions
 from detect.run import Run, RunFrame, read_image
 from detect.settings import CircleSettings
-from landmarks import Frame, circle_landmarks, write_frames
+from landmarks import Frame, FrameTilt, circle_landmarks, write_frames
 from lut import cached_disc_table
 from storage import write_whole
 
@@ -52,6 +54,7 @@ def detect_circles_run(
     version: str,
     overwrite: bool = False,
     json_output: Path | None = None,
+    tilts: Mapping[str, FrameTilt] | None = None,
     on_frame: FrameSink | None = None,
     on_progress: Callable[[], None] | None = None,
 ) -> CirclesSummary:
@@ -71,6 +74,8 @@ def detect_circles_run(
         Whether existing files may be replaced.
     json_output : path, optional
         Where the rows go as JSON as well.
+    tilts : mapping, optional
+        Tilts by image prefix: the positions of frames that have one are corrected for it.
     on_frame : callable, optional
         Called with each frame that could be worked on.
     on_progress : callable, optional
@@ -97,6 +102,8 @@ def detect_circles_run(
             try:
                 image = read_image(frame, run.camera)
                 found = detect_circles(image, run.camera, table, settings)
+                if tilts is not None and frame.step.prefix in tilts:
+                    found = levelled(found, run.camera, tilts[frame.step.prefix])
             except FrameError as error:
                 summary.failures.append(str(error))
                 records.append({"frame": frame.step.prefix, "error": str(error)})
@@ -131,6 +138,23 @@ def detect_circles_run(
             }
             stream.write(json.dumps(document, indent=1).encode() + b"\n")
     return summary
+
+
+def levelled(found: CircleDetections, camera: Camera, tilt: FrameTilt) -> CircleDetections:
+    """The same discs, their positions and covariances corrected for a tilt."""
+    tilt_covariance = np.array([[tilt.cpp, tilt.cpr], [tilt.cpr, tilt.crr]])
+    floor_xy = level_positions(camera, found.floor_xy, tilt.pitch, tilt.roll)
+    covariance = level_covariances(
+        camera, found.floor_xy, found.covariance, tilt.pitch, tilt.roll, tilt_covariance
+    )
+    down = np.all(np.isfinite(floor_xy), axis=-1) & np.all(np.isfinite(covariance), axis=(-1, -2))
+    return CircleDetections(
+        pixels=found.pixels[down],
+        floor_xy=floor_xy[down],
+        covariance=covariance[down],
+        quality=found.quality[down],
+        evidence=found.evidence[down],
+    )
 
 
 def _disc_records(found: CircleDetections) -> list[dict[str, object]]:

@@ -9,7 +9,7 @@ not met; 2 the command line was wrong; 3 some frames could not be worked on (the
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -17,6 +17,8 @@ import tyro
 from tyro.conf import OmitArgPrefixes, Positional, arg, subcommand
 
 from detect.compare_result import CompareOptions
+from detect.line_settings import PRESETS as LINE_PRESETS
+from detect.line_settings import LineSettings
 from detect.settings import PUBLISHED, CircleSettings
 
 if TYPE_CHECKING:
@@ -28,6 +30,8 @@ if TYPE_CHECKING:
     from camera import Camera
     from detect.circles import CircleDetections
     from detect.circles_run import FrameSink
+    from detect.lines import LineDetections
+    from detect.lines_run import LineSink
     from detect.run import RunFrame
 
 Preset = Literal["default", "published"]
@@ -35,7 +39,7 @@ Preset = Literal["default", "published"]
 EXIT_ERROR = 1
 EXIT_FRAMES_FAILED = 3
 
-_PRESETS = {"default": CircleSettings(), "published": PUBLISHED}
+_CIRCLE_PRESETS = {"default": CircleSettings(), "published": PUBLISHED}
 _SHOWN_FAILURES = 10
 
 
@@ -55,6 +59,8 @@ class Circles:
         Calibration, if it is not the one in the run folder.
     output : Path
         The file to write; by default detected.circles in the run folder.
+    tilt : Path
+        Tilts of the frames (written by `detect lines`): positions are corrected for them.
     force : bool
         Replace existing files.
     draw : Path
@@ -67,10 +73,54 @@ class Circles:
     preset: Preset = "default"
     camera: Path | None = None
     output: Annotated[Path | None, arg(aliases=["-o"])] = None
+    tilt: Path | None = None
     force: bool = False
     draw: Path | None = None
     json: Path | None = None
     settings: OmitArgPrefixes[CircleSettings] = field(default_factory=CircleSettings)
+
+
+@dataclass(frozen=True)
+class Lines:
+    """Detect the verticals of a run and write them to a .lines file, and the tilt to a .tilt file.
+
+    Example: detect lines images/e --join-threshold 0.006
+
+    Parameters
+    ----------
+    run : Path
+        Run folder of the data set's layout, or a folder of images with a .cam in it.
+    preset : str
+        Values that the other flags start from: `published` is the report's parameters.
+    camera : Path
+        Calibration, if it is not the one in the run folder.
+    output : Path
+        The file to write; by default detected.lines in the run folder.
+    tilt : Path
+        The tilt file to write; by default the output's name with the ending .tilt.
+    ids_from : Path
+        A .lines file whose IDs are carried over where the match is unambiguous.
+    join_threshold : float
+        Lines whose bearings are closer than this (radians) are joined; overrides `--join-px`.
+    force : bool
+        Replace existing files.
+    draw : Path
+        Folder for images with the lines and their standard deviations drawn in.
+    rejected : bool
+        Draw the rejected tracks and the reasons, too.
+    """
+
+    run: Positional[Path]
+    preset: Preset = "default"
+    camera: Path | None = None
+    output: Annotated[Path | None, arg(aliases=["-o"])] = None
+    tilt: Path | None = None
+    ids_from: Path | None = None
+    join_threshold: float | None = None
+    force: bool = False
+    draw: Path | None = None
+    rejected: bool = False
+    settings: OmitArgPrefixes[LineSettings] = field(default_factory=LineSettings)
 
 
 @dataclass(frozen=True)
@@ -110,12 +160,18 @@ class Compare:
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
     given = sys.argv[1:] if arguments is None else arguments
-    settings = _PRESETS.get(_preset(given), CircleSettings())
+    preset = _preset(given)
+    circles = _CIRCLE_PRESETS.get(preset, CircleSettings())
+    lines = LINE_PRESETS.get(preset, LineSettings())
     command = tyro.cli(
         Annotated[
             Annotated[
                 Circles,
-                subcommand("circles", default=Circles(run=tyro.MISSING, settings=settings)),
+                subcommand("circles", default=Circles(run=tyro.MISSING, settings=circles)),
+            ]
+            | Annotated[
+                Lines,
+                subcommand("lines", default=Lines(run=tyro.MISSING, settings=lines)),
             ]
             | Annotated[Compare, subcommand("compare")],
             arg(name=""),
@@ -125,7 +181,11 @@ def main(arguments: list[str] | None = None) -> int:
         args=given,
     )
     try:
-        return _circles(command) if isinstance(command, Circles) else _compare(command)
+        if isinstance(command, Circles):
+            return _circles(command)
+        if isinstance(command, Lines):
+            return _lines(command)
+        return _compare(command)
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return 130
@@ -150,6 +210,7 @@ def _circles(command: Circles) -> int:
     from detect import __version__
     from detect.circles_run import detect_circles_run
     from detect.run import open_run
+    from landmarks import read_tilts
     from storage import OutputExistsError
 
     run = open_run(command.run, command.camera)
@@ -177,6 +238,7 @@ def _circles(command: Circles) -> int:
             version=__version__,
             overwrite=command.force,
             json_output=command.json,
+            tilts=None if command.tilt is None else read_tilts(command.tilt),
             on_frame=draw,
             on_progress=advance,
         )
@@ -185,6 +247,88 @@ def _circles(command: Circles) -> int:
         print(f"{summary.images_without_step} images are not named by a STEP row: left out")
     _print_failures(summary.failures)
     return EXIT_FRAMES_FAILED if summary.failures else 0
+
+
+def _lines(command: Lines) -> int:
+    from rich.console import Console
+
+    from detect import __version__
+    from detect.compare import image_name
+    from detect.lines_run import detect_lines_run
+    from detect.run import open_run
+    from landmarks import read_frames
+    from storage import OutputExistsError
+
+    run = open_run(command.run, command.camera)
+    output = command.output if command.output is not None else command.run / "detected.lines"
+    tilt = command.tilt if command.tilt is not None else output.with_suffix(".tilt")
+    for path in (output, tilt):
+        if path.exists() and not command.force:
+            raise OutputExistsError(path)
+    settings = command.settings
+    if command.join_threshold is not None:
+        # On the horizon straight ahead, a bearing of one radian is scale_x pixels wide.
+        settings = replace(settings, join_px=command.join_threshold * run.camera.scale_x)
+    reference = None
+    if command.ids_from is not None:
+        by_name = {image_name(f.step.prefix): f.lines for f in read_frames(command.ids_from)}
+        reference = {
+            frame.step.prefix: by_name.get(image_name(frame.step.prefix), ())
+            for frame in run.frames
+        }
+    draw = None
+    if command.draw is not None:
+        draw = _line_drawing_sink(command.draw, run.camera, command.rejected, command.force)
+
+    console = Console(stderr=True)
+    with _progress(console) as progress:
+        task = progress.add_task("lines", total=len(run.frames), rate="")
+
+        def advance() -> None:
+            progress.advance(task)
+            speed = progress.tasks[0].finished_speed or progress.tasks[0].speed
+            progress.update(task, rate=f"{speed:.1f} images/s" if speed else "")
+
+        summary = detect_lines_run(
+            run,
+            settings,
+            output,
+            tilt,
+            version=__version__,
+            overwrite=command.force,
+            reference=reference,
+            on_frame=draw,
+            on_progress=advance,
+        )
+    print(f"{output}: {summary.lines} lines in {summary.frames} frames")
+    print(f"{tilt}: the tilt of {summary.tilts} frames")
+    if summary.images_without_step:
+        print(f"{summary.images_without_step} images are not named by a STEP row: left out")
+    _print_failures(summary.failures)
+    return EXIT_FRAMES_FAILED if summary.failures else 0
+
+
+def _line_drawing_sink(folder: Path, camera: Camera, rejected: bool, overwrite: bool) -> LineSink:
+    """What draws each frame's lines into a PNG."""
+    import cv2
+
+    from detect.line_drawing import draw_lines, draw_tracks
+    from lut import cached_vertical_table
+    from storage import write_whole
+
+    folder.mkdir(parents=True, exist_ok=True)
+    table = cached_vertical_table(camera)
+
+    def draw(frame: RunFrame, image: NDArray[np.uint8], found: LineDetections) -> None:
+        picture = draw_lines(image, camera, table, found)
+        if rejected:
+            picture = draw_tracks(image, table, found, rejected=True, reasons=True)
+        _, encoded = cv2.imencode(".png", picture)
+        name = f"{Path(frame.step.prefix).name}.png"
+        with write_whole(folder / name, overwrite=overwrite) as stream:
+            stream.write(encoded.tobytes())
+
+    return draw
 
 
 def _drawing_sink(

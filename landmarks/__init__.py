@@ -34,6 +34,7 @@ from landmarks.records import (
     Row,
     Step,
 )
+from landmarks.tilts import FrameTilt, format_no_tilt, format_tilt, read_tilts
 from landmarks.writing import format_record, write_frames, write_rows
 
 __all__ = [
@@ -42,6 +43,7 @@ __all__ = [
     "CircleLandmark",
     "DetectorSettings",
     "Frame",
+    "FrameTilt",
     "Landmark",
     "LandmarkError",
     "LandmarkFileError",
@@ -55,7 +57,9 @@ __all__ = [
     "associate_within_covariance",
     "circle_arrays",
     "circle_landmarks",
+    "format_no_tilt",
     "format_record",
+    "format_tilt",
     "frames_of_rows",
     "is_positive_definite",
     "parse_record",
@@ -63,6 +67,7 @@ __all__ = [
     "read_frames",
     "read_rows",
     "read_steps",
+    "read_tilts",
     "squared_mahalanobis",
     "wrap_angle",
     "write_frames",

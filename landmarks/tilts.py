@@ -1,0 +1,117 @@
+"""Tilt files: pitch and roll of each frame, as the building's verticals show it.
+
+One row per frame, ``#`` comments and blank lines skipped:
+
+    TILT <image> <pitch> <roll> <cPP> <cPR> <cRR> <lines>
+    NOTILT <image> <lines>
+
+Pitch and roll (radians) are the rotation vector (pitch, roll, 0) about the robot's X and Y axes
+that turns measured directions level; then its covariance and the number of verticals that agree
+with it. A frame with too few of them has a NOTILT row.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from landmarks.errors import LandmarkFileError
+
+_LARGEST_ROW = 65536
+
+
+@dataclass(frozen=True, slots=True)
+class FrameTilt:
+    """The tilt of one frame.
+
+    Attributes
+    ----------
+    prefix : str
+        The frame's image.
+    pitch, roll : float
+        Rotation vector about the robot's X and Y that turns measured directions level (rad).
+    cpp, cpr, crr : float
+        Its covariance (rad^2).
+    lines : int
+        Verticals that agree with it.
+    """
+
+    prefix: str
+    pitch: float
+    roll: float
+    cpp: float
+    cpr: float
+    crr: float
+    lines: int
+
+
+def format_tilt(tilt: FrameTilt) -> str:
+    """The row of a frame that has a tilt, without line end."""
+    return (
+        f"TILT {tilt.prefix} {tilt.pitch:.6f} {tilt.roll:.6f} "
+        f"{tilt.cpp:.6g} {tilt.cpr:.6g} {tilt.crr:.6g} {tilt.lines}"
+    )
+
+
+def format_no_tilt(prefix: str, lines: int) -> str:
+    """The row of a frame that has none, without line end."""
+    return f"NOTILT {prefix} {lines}"
+
+
+def read_tilts(path: str | os.PathLike[str]) -> dict[str, FrameTilt]:
+    """Read a tilt file.
+
+    Parameters
+    ----------
+    path : path
+        The file.
+
+    Returns
+    -------
+    dict
+        The frames that have a tilt, by their image prefix.
+
+    Raises
+    ------
+    LandmarkFileError
+        If the file cannot be read or a row is malformed; names file and line.
+    """
+    return {tilt.prefix: tilt for tilt in _rows(Path(path))}
+
+
+def _rows(path: Path) -> Iterator[FrameTilt]:
+    try:
+        with path.open(encoding="utf-8", errors="surrogateescape") as stream:
+            for number, line in enumerate(stream, start=1):
+                if len(line) > _LARGEST_ROW:
+                    raise LandmarkFileError(str(path), number, "the row is too long")
+                words = line.partition("#")[0].split()
+                if not words or words[0] == "NOTILT":
+                    continue
+                yield _tilt(words, str(path), number)
+    except FileNotFoundError:
+        raise LandmarkFileError(str(path), None, "no such tilt file") from None
+    except OSError as error:
+        raise LandmarkFileError(str(path), None, f"cannot be read: {error.strerror}") from None
+
+
+def _tilt(words: list[str], name: str, number: int) -> FrameTilt:
+    if words[0] != "TILT" or len(words) != 8:
+        found = ascii(" ".join(words)[:40])
+        raise LandmarkFileError(
+            name, number, f"{found}: expected TILT, an image, 5 numbers and a count"
+        )
+    try:
+        values = [float(word) for word in words[2:7]]
+        lines = int(words[7])
+    except ValueError:
+        values, lines = [math.nan], 0
+    if not all(math.isfinite(value) for value in values):
+        raise LandmarkFileError(name, number, "expected 5 finite numbers and a whole one")
+    pitch, roll, cpp, cpr, crr = values
+    if not (cpp > 0.0 and crr > 0.0 and cpp * crr > cpr * cpr):
+        raise LandmarkFileError(name, number, "the tilt's covariance is not positive definite")
+    return FrameTilt(words[1], pitch, roll, cpp, cpr, crr, lines)
