@@ -107,7 +107,9 @@ class Lines:
     draw : Path
         Folder for images with the lines and their standard deviations drawn in.
     rejected : bool
-        Draw the rejected tracks and the reasons, too.
+        Draw all tracks instead, the rejected ones with the reason.
+    response : bool
+        Draw the filter's response as well, into files of their own.
     """
 
     run: Positional[Path]
@@ -120,7 +122,37 @@ class Lines:
     force: bool = False
     draw: Path | None = None
     rejected: bool = False
+    response: bool = False
     settings: OmitArgPrefixes[LineSettings] = field(default_factory=LineSettings)
+
+
+@dataclass(frozen=True)
+class All:
+    """Detect verticals, tilt and discs of a run; the discs' positions are corrected for the tilt.
+
+    Example: detect all images/e --circles.polarity light
+
+    Parameters
+    ----------
+    run : Path
+        Run folder of the data set's layout, or a folder of images with a .cam in it.
+    preset : str
+        Values that the other flags start from.
+    camera : Path
+        Calibration, if it is not the one in the run folder.
+    output : Path
+        Folder for detected.circles, detected.lines and detected.tilt; by default the run's.
+    force : bool
+        Replace existing files.
+    """
+
+    run: Positional[Path]
+    preset: Preset = "default"
+    camera: Path | None = None
+    output: Annotated[Path | None, arg(aliases=["-o"])] = None
+    force: bool = False
+    circles: CircleSettings = field(default_factory=CircleSettings)
+    lines: LineSettings = field(default_factory=LineSettings)
 
 
 @dataclass(frozen=True)
@@ -173,6 +205,10 @@ def main(arguments: list[str] | None = None) -> int:
                 Lines,
                 subcommand("lines", default=Lines(run=tyro.MISSING, settings=lines)),
             ]
+            | Annotated[
+                All,
+                subcommand("all", default=All(run=tyro.MISSING, circles=circles, lines=lines)),
+            ]
             | Annotated[Compare, subcommand("compare")],
             arg(name=""),
         ],
@@ -185,6 +221,8 @@ def main(arguments: list[str] | None = None) -> int:
             return _circles(command)
         if isinstance(command, Lines):
             return _lines(command)
+        if isinstance(command, All):
+            return _all(command)
         return _compare(command)
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
@@ -253,7 +291,7 @@ def _lines(command: Lines) -> int:
     from rich.console import Console
 
     from detect import __version__
-    from detect.compare import image_name
+    from detect.compare_pairing import image_name
     from detect.lines_run import detect_lines_run
     from detect.run import open_run
     from landmarks import read_frames
@@ -278,7 +316,7 @@ def _lines(command: Lines) -> int:
         }
     draw = None
     if command.draw is not None:
-        draw = _line_drawing_sink(command.draw, run.camera, command.rejected, command.force)
+        draw = _line_drawing_sink(command, command.draw, run.camera)
 
     console = Console(stderr=True)
     with _progress(console) as progress:
@@ -308,11 +346,33 @@ def _lines(command: Lines) -> int:
     return EXIT_FRAMES_FAILED if summary.failures else 0
 
 
-def _line_drawing_sink(folder: Path, camera: Camera, rejected: bool, overwrite: bool) -> LineSink:
-    """What draws each frame's lines into a PNG."""
+def _all(command: All) -> int:
+    folder = command.output if command.output is not None else command.run
+    tilt = folder / "detected.tilt"
+    lines = Lines(
+        run=command.run,
+        camera=command.camera,
+        output=folder / "detected.lines",
+        tilt=tilt,
+        force=command.force,
+        settings=command.lines,
+    )
+    circles = Circles(
+        run=command.run,
+        camera=command.camera,
+        output=folder / "detected.circles",
+        tilt=tilt,
+        force=command.force,
+        settings=command.circles,
+    )
+    return max(_lines(lines), _circles(circles))
+
+
+def _line_drawing_sink(command: Lines, folder: Path, camera: Camera) -> LineSink:
+    """What draws each frame's lines into PNGs."""
     import cv2
 
-    from detect.line_drawing import draw_lines, draw_tracks
+    from detect.line_drawing import draw_lines, draw_response, draw_tracks
     from lut import cached_vertical_table
     from storage import write_whole
 
@@ -320,13 +380,17 @@ def _line_drawing_sink(folder: Path, camera: Camera, rejected: bool, overwrite: 
     table = cached_vertical_table(camera)
 
     def draw(frame: RunFrame, image: NDArray[np.uint8], found: LineDetections) -> None:
-        picture = draw_lines(image, camera, table, found)
-        if rejected:
-            picture = draw_tracks(image, table, found, rejected=True, reasons=True)
-        _, encoded = cv2.imencode(".png", picture)
-        name = f"{Path(frame.step.prefix).name}.png"
-        with write_whole(folder / name, overwrite=overwrite) as stream:
-            stream.write(encoded.tobytes())
+        if command.rejected:
+            pictures = {"": draw_tracks(image, table, found, rejected=True, reasons=True)}
+        else:
+            pictures = {"": draw_lines(image, camera, table, found)}
+        if command.response:
+            pictures[".response"] = draw_response(found.response, table)
+        for kind, picture in pictures.items():
+            _, encoded = cv2.imencode(".png", picture)
+            name = f"{Path(frame.step.prefix).name}{kind}.png"
+            with write_whole(folder / name, overwrite=command.force) as stream:
+                stream.write(encoded.tobytes())
 
     return draw
 

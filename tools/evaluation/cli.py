@@ -7,13 +7,16 @@ import sys
 import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 import tyro
 from tyro.conf import Positional, subcommand
 
+from detect.line_settings import PRESETS as LINE_PRESETS
+from detect.line_settings import LineSettings
 from detect.settings import CircleSettings
+from landmarks import FrameTilt
 
 _BLURS_PX = (0.3, 0.7, 1.2)
 _BINS_M = ((0.0, 1.5), (1.5, 2.5), (2.5, 4.0), (4.0, 7.0))
@@ -73,12 +76,46 @@ class Rendered:
     run: Positional[Path] = Path("../shared/data/rendered/r1")
 
 
+@dataclass(frozen=True)
+class Buildings:
+    """Detect the verticals of every folder below DATA/dev and score them with DATA/evaluate.py.
+
+    Parameters
+    ----------
+    data : Path
+        Folder with `evaluate.py` and `dev`.
+    preset : str
+        Preset of the line detector.
+    """
+
+    data: Positional[Path] = Path("../shared/data/york")
+    preset: Literal["default", "published"] = "default"
+
+
+@dataclass(frozen=True)
+class RenderedLines:
+    """Detect the verticals and the tilt of a rendered run; score both, and the discs levelled.
+
+    Parameters
+    ----------
+    run : Path
+        Folder of the run; `evaluate.py` stands beside it.
+    preset : str
+        Preset of the line detector.
+    """
+
+    run: Positional[Path] = Path("../shared/data/rendered/r1")
+    preset: Literal["default", "published"] = "default"
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Run a subcommand; returns the exit code."""
     command = tyro.cli(
         Annotated[Accuracy, subcommand("accuracy")]
         | Annotated[Photographs, subcommand("photographs")]
-        | Annotated[Rendered, subcommand("rendered")],
+        | Annotated[Rendered, subcommand("rendered")]
+        | Annotated[Buildings, subcommand("buildings")]
+        | Annotated[RenderedLines, subcommand("rendered-lines")],
         prog="python -m tools.evaluation",
         description="Prints the figures in the README.",
         args=arguments,
@@ -87,7 +124,11 @@ def main(arguments: list[str] | None = None) -> int:
         return _accuracy(command)
     if isinstance(command, Photographs):
         return _photographs(command)
-    return _rendered(command)
+    if isinstance(command, Rendered):
+        return _rendered(command)
+    if isinstance(command, Buildings):
+        return _buildings(command)
+    return _rendered_lines(command)
 
 
 def _accuracy(command: Accuracy) -> int:
@@ -143,12 +184,71 @@ def _rendered(command: Rendered) -> int:
         ).returncode
 
 
-def _detect(run: Path, settings: CircleSettings, output: Path) -> None:
+def _buildings(command: Buildings) -> int:
+    with tempfile.TemporaryDirectory() as folder:
+        files = []
+        for run in sorted(path.parent for path in command.data.glob("dev/*/truth.json")):
+            output = Path(folder) / f"{run.name}.lines"
+            _detect_lines(run, LINE_PRESETS[command.preset], output)
+            files.append(str(output))
+        script = str(command.data / "evaluate.py")
+        return subprocess.run([sys.executable, script, "--lines", *files], check=False).returncode
+
+
+def _rendered_lines(command: RenderedLines) -> int:
+    import json
+
+    from landmarks import read_tilts
+
+    with tempfile.TemporaryDirectory() as folder:
+        output = Path(folder) / "detected.lines"
+        _detect_lines(command.run, LINE_PRESETS[command.preset], output)
+        tilts = read_tilts(output.with_suffix(".tilt"))
+        discs = Path(folder) / "detected.circles"
+        settings = replace(CircleSettings(), polarity="light")
+        _detect(command.run, settings, discs, tilts)
+        script = str((command.run.parent / "evaluate.py").resolve())
+        code = 0
+        for path in (output, discs):
+            code |= subprocess.run(
+                [sys.executable, script, command.run.name, str(path)], check=False, cwd=folder
+            ).returncode
+    truth = json.loads((command.run / "truth.json").read_text())
+    errors, normalised = [], []
+    for frame in truth["frames"]:
+        tilt = tilts.get(frame["prefix"])
+        if tilt is not None and tilt.lines >= 5:
+            error = np.array([tilt.pitch, tilt.roll]) - np.array(frame["tilt"])
+            covariance = np.array([[tilt.cpp, tilt.cpr], [tilt.cpr, tilt.crr]])
+            errors.append(np.degrees(error))
+            normalised.append(error @ np.linalg.solve(covariance, error) / 2.0)
+    rms = np.sqrt(np.mean(np.square(errors), axis=0))
+    print(
+        f"tilt: {len(errors)} frames with 5 lines, rms error pitch {rms[0]:.3f} deg "
+        f"roll {rms[1]:.3f} deg, normalised error^2 / dof {np.mean(normalised):.2f}"
+    )
+    return code
+
+
+def _detect_lines(run: Path, settings: LineSettings, output: Path) -> None:
+    from detect import __version__
+    from detect.lines_run import detect_lines_run
+    from detect.run import open_run
+
+    tilts = output.with_suffix(".tilt")
+    summary = detect_lines_run(open_run(run), settings, output, tilts, version=__version__)
+    for failure in summary.failures:
+        print(failure, file=sys.stderr)
+
+
+def _detect(
+    run: Path, settings: CircleSettings, output: Path, tilts: dict[str, FrameTilt] | None = None
+) -> None:
     from detect import __version__
     from detect.circles_run import detect_circles_run
     from detect.run import open_run
 
-    summary = detect_circles_run(open_run(run), settings, output, version=__version__)
+    summary = detect_circles_run(open_run(run), settings, output, version=__version__, tilts=tilts)
     for failure in summary.failures:
         print(failure, file=sys.stderr)
 

@@ -1,0 +1,57 @@
+"""Tilt files: what is written is read, and what is wrong is named."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from landmarks import FrameTilt, LandmarkFileError, format_no_tilt, format_tilt, read_tilts
+
+ANGLE = st.floats(-0.2, 0.2)
+VARIANCE = st.floats(1e-9, 1e-3)
+
+
+@given(pitch=ANGLE, roll=ANGLE, cpp=VARIANCE, crr=VARIANCE, c=st.floats(-0.9, 0.9))
+def test_written_tilts_are_read(
+    tmp_path_factory: pytest.TempPathFactory,
+    pitch: float,
+    roll: float,
+    cpp: float,
+    crr: float,
+    c: float,
+) -> None:
+    tilt = FrameTilt("e.0001", pitch, roll, cpp, c * (cpp * crr) ** 0.5, crr, 7)
+    path = tmp_path_factory.mktemp("tilt") / "e.tilt"
+    path.write_text(f"# head\n\n{format_no_tilt('e.0000', 2)}\n{format_tilt(tilt)}\n")
+    (read,) = read_tilts(path).values()
+    assert (read.prefix, read.lines) == ("e.0001", 7)
+    assert read.pitch == pytest.approx(pitch, abs=5e-7)
+    assert read.roll == pytest.approx(roll, abs=5e-7)
+    assert read.cpp == pytest.approx(cpp, rel=1e-5)
+    assert read.crr == pytest.approx(crr, rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    "row",
+    [
+        "TILT e.0000 0.01 0.02 1e-6 0 1e-6",
+        "TILT e.0000 0.01 0.02 1e-6 0 1e-6 many",
+        "TILT e.0000 nan 0.02 1e-6 0 1e-6 5",
+        "TILT e.0000 0.01 0.02 1e-6 2e-6 1e-6 5",
+        "TILT e.0000 0.01 0.02 -1e-6 0 1e-6 5",
+        "STEP e.0000 0 0 0",
+    ],
+)
+def test_malformed_rows_are_named(tmp_path: Path, row: str) -> None:
+    path = tmp_path / "e.tilt"
+    path.write_text(f"# head\n{row}\n")
+    with pytest.raises(LandmarkFileError, match=r"e\.tilt:2: "):
+        read_tilts(path)
+
+
+def test_missing_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(LandmarkFileError, match=r"none\.tilt: no such tilt file"):
+        read_tilts(tmp_path / "none.tilt")
