@@ -16,6 +16,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from detect.compare_figures import fraction, normalised_error, quantile
+from detect.compare_pairing import FrameMatch, image_name, match_rows, pair_frames, shown_name
 from detect.compare_result import (
     CompareError,
     CompareOptions,
@@ -37,14 +39,13 @@ from landmarks import (
     squared_mahalanobis,
 )
 
+__all__ = ["DISTANCE_EDGES_M", "compare_frames", "compare_runs", "image_name"]
+
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 # The forward distances for which the data set's own qualities are known.
 DISTANCE_EDGES_M = (0.8, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0)
-_IMAGE_EXTENSIONS = (".jpg", ".jpeg", ".png", ".pgm", ".ppm", ".bmp", ".tif", ".tiff")
-_LONGEST_SHOWN_NAME = 80
-_BAND = (0.025, 0.975)
 
 
 def compare_runs(
@@ -101,18 +102,15 @@ def compare_frames(
 
     See `compare_runs`.
     """
-    reference_rows = _rows_by_image(reference, reference_name)
-    detected_rows = _rows_by_image(detected, detected_name)
-    only_in_reference = tuple(name for name in reference_rows if name not in detected_rows)
-    only_in_detected = tuple(name for name in detected_rows if name not in reference_rows)
-    if options.all_frames:
-        names = [*reference_rows, *only_in_detected]
-    else:
-        names = [name for name in reference_rows if name in detected_rows]
-    matches = [
-        _match_frame(name, reference_rows.get(name, ()), detected_rows.get(name, ()), options)
-        for name in names
-    ]
+    paired = pair_frames(
+        reference,
+        detected,
+        lambda frame: frame.circles,
+        all_frames=options.all_frames,
+        reference_name=reference_name,
+        detected_name=detected_name,
+    )
+    matches = [_match_frame(*frame, options) for frame in paired.frames]
     wanted = _pool([(match.reference, match.pairs.first) for match in matches])
     found = _pool([(match.detected, match.pairs.second) for match in matches])
     offset_xy = found.xy[found.paired] - wanted.xy[wanted.paired]
@@ -127,42 +125,23 @@ def compare_frames(
         set_aside=sum(match.set_aside for match in matches),
         recall=_mean(wanted.is_paired),
         precision=_mean(found.is_paired),
-        error_median_m=_quantile(error_m, 0.5),
-        error_95_m=_quantile(error_m, 0.95),
+        error_median_m=quantile(error_m, 0.5),
+        error_95_m=quantile(error_m, 0.95),
         normalised_error=_normalised_error(
             offset_xy, _error_covariance(wanted, found, options.error_covariance)
         ),
-        reference_quality_matched=_quantile(wanted.quality[wanted.is_paired], 0.5),
-        reference_quality_missed=_quantile(wanted.quality[~wanted.is_paired], 0.5),
-        detected_quality_matched=_quantile(found.quality[found.is_paired], 0.5),
-        detected_quality_extra=_quantile(found.quality[~found.is_paired], 0.5),
+        reference_quality_matched=quantile(wanted.quality[wanted.is_paired], 0.5),
+        reference_quality_missed=quantile(wanted.quality[~wanted.is_paired], 0.5),
+        detected_quality_matched=quantile(found.quality[found.is_paired], 0.5),
+        detected_quality_extra=quantile(found.quality[~found.is_paired], 0.5),
         bins=tuple(
             _distance_bin(from_m, to_m, wanted, found, error_m)
             for from_m, to_m in pairwise((-inf, *DISTANCE_EDGES_M, inf))
         ),
         frames=_frame_scores(matches, error_m),
-        frames_only_in_reference=only_in_reference,
-        frames_only_in_detected=only_in_detected,
+        frames_only_in_reference=paired.only_in_reference,
+        frames_only_in_detected=paired.only_in_detected,
     )
-
-
-def image_name(prefix: str) -> str:
-    """Name of an image without directories (of either system) and image extension."""
-    name = prefix.replace("\\", "/").rpartition("/")[2]
-    # Not just any suffix: the data set's prefixes end in a number, as in e.0067.
-    stem, dot, extension = name.rpartition(".")
-    return stem if stem and (dot + extension).lower() in _IMAGE_EXTENSIONS else name
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _FrameMatch:
-    """One frame's rows that count, and which of them belong together."""
-
-    name: str
-    reference: Sequence[CircleLandmark]
-    detected: Sequence[CircleLandmark]
-    pairs: Association
-    set_aside: int
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -176,40 +155,25 @@ class _Pool:
     is_paired: BoolArray
 
 
-def _rows_by_image(frames: Iterable[Frame], name: str) -> dict[str, tuple[CircleLandmark, ...]]:
-    rows: dict[str, tuple[CircleLandmark, ...]] = {}
-    for frame in frames:
-        image = image_name(frame.step.prefix)
-        if image in rows:
-            raise CompareError(f"{name}: two frames of image {_shown(image)}: expected one")
-        rows[image] = frame.circles
-    return rows
-
-
 def _match_frame(
     name: str,
     reference: Sequence[CircleLandmark],
     detected: Sequence[CircleLandmark],
     options: CompareOptions,
-) -> _FrameMatch:
+) -> FrameMatch[CircleLandmark]:
     measurable = is_positive_definite(circle_arrays(reference).covariance)
     if options.sigma is not None and not measurable.all():
         raise CompareError(
-            f"frame {_shown(name)}: a reference row's covariance is not positive definite: "
+            f"frame {shown_name(name)}: a reference row's covariance is not positive definite: "
             "expected one to measure sigmas in; a gate in metres needs none"
         )
-    counted = [row for row in reference if row.identified or not options.only_identified]
-    uncounted = [row for row in reference if not row.identified and options.only_identified]
-    pairs = _pair_up(counted, detected, options)
-    set_aside = 0
-    if uncounted:
-        alone = [detected[i] for i in pairs.second_alone]
-        aside = _pair_up(uncounted, alone, options)
-        set_aside = len(aside.second)
-        kept = sorted([*pairs.second, *pairs.second_alone[aside.second_alone]])
-        detected = [detected[i] for i in kept]
-        pairs = _pair_up(counted, detected, options)
-    return _FrameMatch(name, counted, detected, pairs, set_aside)
+    return match_rows(
+        name,
+        reference,
+        detected,
+        lambda some, others: _pair_up(some, others, options),
+        only_identified=options.only_identified,
+    )
 
 
 def _pair_up(
@@ -243,16 +207,12 @@ def _error_covariance(wanted: _Pool, found: _Pool, source: ErrorCovariance) -> F
 
 
 def _normalised_error(offset_xy: FloatArray, covariance: FloatArray) -> NormalisedError:
-    from scipy.stats import chi2
-
     usable = is_positive_definite(covariance)
-    dof = 2 * int(usable.sum())
-    left_out = len(usable) - int(usable.sum())
-    if dof == 0:
-        return NormalisedError(per_dof=None, dof=0, band=None, left_out=left_out)
-    squared = squared_mahalanobis(offset_xy[usable], covariance[usable])
-    low, high = (float(chi2.ppf(p, dof)) / dof for p in _BAND)
-    return NormalisedError(float(squared.sum()) / dof, dof, (low, high), left_out)
+    return normalised_error(
+        squared_mahalanobis(offset_xy[usable], covariance[usable]),
+        dof_per_row=2,
+        left_out=int((~usable).sum()),
+    )
 
 
 def _distance_bin(
@@ -270,13 +230,15 @@ def _distance_bin(
         extra=int((found_here & ~found.is_paired).sum()),
         recall=_mean(wanted.is_paired[wanted_here]),
         precision=_mean(found.is_paired[found_here]),
-        reference_quality_median=_quantile(wanted.quality[wanted_here], 0.5),
-        detected_quality_median=_quantile(found.quality[found_here], 0.5),
-        error_median_m=_quantile(error_m[wanted_here[wanted.paired]], 0.5),
+        reference_quality_median=quantile(wanted.quality[wanted_here], 0.5),
+        detected_quality_median=quantile(found.quality[found_here], 0.5),
+        error_median_m=quantile(error_m[wanted_here[wanted.paired]], 0.5),
     )
 
 
-def _frame_scores(matches: Sequence[_FrameMatch], error_m: FloatArray) -> tuple[FrameScore, ...]:
+def _frame_scores(
+    matches: Sequence[FrameMatch[CircleLandmark]], error_m: FloatArray
+) -> tuple[FrameScore, ...]:
     ends = list(accumulate(len(match.pairs.first) for match in matches))
     return tuple(
         FrameScore(
@@ -284,19 +246,11 @@ def _frame_scores(matches: Sequence[_FrameMatch], error_m: FloatArray) -> tuple[
             matched=len(match.pairs.first),
             missed=len(match.pairs.first_alone),
             extra=len(match.pairs.second_alone),
-            largest_error_m=_quantile(error_m[end - len(match.pairs.first) : end], 1.0),
+            largest_error_m=quantile(error_m[end - len(match.pairs.first) : end], 1.0),
         )
         for match, end in zip(matches, ends)
     )
 
 
-def _shown(image: str) -> str:
-    return repr(image[:_LONGEST_SHOWN_NAME])
-
-
 def _mean(mask: BoolArray) -> float | None:
-    return float(mask.mean()) if len(mask) else None
-
-
-def _quantile(values: FloatArray, q: float) -> float | None:
-    return float(np.quantile(values, q)) if len(values) else None
+    return fraction(int(mask.sum()), len(mask))

@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
-import io
 import json
 from dataclasses import asdict
 
-from rich import box
-from rich.console import Console, Group
+from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
 from detect.compare_result import Comparison, DistanceBin
+from detect.compare_tables import (
+    frames_text,
+    normalised_error_text,
+    number,
+    plain_text,
+    printable,
+    rows_text,
+    summary_table,
+    titled_table,
+)
 
 _WORST_FRAMES = 10
-_NONE = "-"
 
 
 def comparison_tables(comparison: Comparison) -> Group:
@@ -37,10 +44,7 @@ def comparison_tables(comparison: Comparison) -> Group:
 
 def format_text(comparison: Comparison, *, width: int = 100) -> str:
     """Lay a comparison out as plain text of at most `width` columns, without colour."""
-    stream = io.StringIO()
-    console = Console(file=stream, width=width, color_system=None, force_terminal=False)
-    console.print(comparison_tables(comparison))
-    return "\n".join(line.rstrip() for line in stream.getvalue().splitlines()) + "\n"
+    return plain_text(comparison_tables(comparison), width)
 
 
 def format_json(comparison: Comparison) -> str:
@@ -64,59 +68,49 @@ def format_json(comparison: Comparison) -> str:
 
 def _summary(c: Comparison) -> Table:
     gate = f"{c.options.gate_m:g} m" if c.options.sigma is None else f"{c.options.sigma:g} sigma"
-    table = Table(box=None, show_header=False, pad_edge=False)
-    table.add_column(style="bold", no_wrap=True)
-    table.add_column(overflow="fold")
-
-    def add(name: str, value: str) -> None:
-        table.add_row(name, Text(value))
-
-    add("reference", _printable(c.reference_name))
-    add("detected", _printable(c.detected_name))
-    add(
-        "frames",
-        f"{len(c.frames)} compared; {len(c.frames_only_in_reference)} only in the reference, "
-        f"{len(c.frames_only_in_detected)} only detected"
-        f" ({'counted' if c.options.all_frames else 'not counted'})",
+    rows = (
+        ("reference", printable(c.reference_name)),
+        ("detected", printable(c.detected_name)),
+        (
+            "frames",
+            frames_text(
+                len(c.frames),
+                len(c.frames_only_in_reference),
+                len(c.frames_only_in_detected),
+                counted=c.options.all_frames,
+            ),
+        ),
+        (
+            "rows",
+            rows_text(
+                c.reference, c.detected, c.set_aside, only_identified=c.options.only_identified
+            ),
+        ),
+        (f"within {gate}", f"{c.matched} matched, {c.missed} missed, {c.extra} extra"),
+        ("recall", number(c.recall, 4)),
+        ("precision", number(c.precision, 4)),
+        (
+            "position error",
+            f"median {number(c.error_median_m, 4)} m, 95 % {number(c.error_95_m, 4)} m",
+        ),
+        ("normalised error", _normalised_error(c)),
+        (
+            "reference quality",
+            f"median {number(c.reference_quality_matched, 3)} matched, "
+            f"{number(c.reference_quality_missed, 3)} missed",
+        ),
+        (
+            "detected quality",
+            f"median {number(c.detected_quality_matched, 3)} matched, "
+            f"{number(c.detected_quality_extra, 3)} extra",
+        ),
     )
-    add("rows", f"{c.reference} reference, {c.detected} detected" + _set_aside(c))
-    add(f"within {gate}", f"{c.matched} matched, {c.missed} missed, {c.extra} extra")
-    add("recall", _number(c.recall, 4))
-    add("precision", _number(c.precision, 4))
-    add(
-        "position error",
-        f"median {_number(c.error_median_m, 4)} m, 95 % {_number(c.error_95_m, 4)} m",
-    )
-    add("normalised error", _normalised_error(c))
-    add(
-        "reference quality",
-        f"median {_number(c.reference_quality_matched, 3)} matched, "
-        f"{_number(c.reference_quality_missed, 3)} missed",
-    )
-    add(
-        "detected quality",
-        f"median {_number(c.detected_quality_matched, 3)} matched, "
-        f"{_number(c.detected_quality_extra, 3)} extra",
-    )
-    return table
-
-
-def _set_aside(c: Comparison) -> str:
-    if not c.options.only_identified:
-        return ""
-    return f" (with an ID only; {c.set_aside} on rows without one set aside)"
+    return summary_table(rows)
 
 
 def _normalised_error(c: Comparison) -> str:
     error = c.normalised_error
-    if error.band is None:
-        text = _NONE
-    else:
-        low, high = error.band
-        text = (
-            f"{_number(error.per_dof, 3)} squared per degree of freedom "
-            f"(95 % band {low:.3f} to {high:.3f})"
-        )
+    text = normalised_error_text(error)
     source = {"detected": "detected", "reference": "reference", "sum": "detected plus reference"}
     text += f", covariance: {source[c.options.error_covariance]}"
     if error.left_out:
@@ -125,7 +119,7 @@ def _normalised_error(c: Comparison) -> str:
 
 
 def _over_distance(c: Comparison) -> Table:
-    table = _table("By forward distance (position error and quality: medians)")
+    table = titled_table("By forward distance (position error and quality: medians)")
     for heading in (
         "metres", "reference", "missed", "recall", "detected", "extra", "precision",
         "error", "ref. quality", "det. quality", "diff.",
@@ -138,14 +132,14 @@ def _over_distance(c: Comparison) -> Table:
             _range(part),
             str(part.reference),
             str(part.missed),
-            _number(part.recall, 3),
+            number(part.recall, 3),
             str(part.detected),
             str(part.extra),
-            _number(part.precision, 3),
-            _number(part.error_median_m, 3),
-            _number(part.reference_quality_median, 3),
-            _number(part.detected_quality_median, 3),
-            _number(part.quality_difference, 3),
+            number(part.precision, 3),
+            number(part.error_median_m, 3),
+            number(part.reference_quality_median, 3),
+            number(part.detected_quality_median, 3),
+            number(part.quality_difference, 3),
         )
     return table
 
@@ -159,31 +153,16 @@ def _range(part: DistanceBin) -> str:
 
 
 def _worst_frames(c: Comparison) -> Table:
-    table = _table("Worst frames")
+    table = titled_table("Worst frames")
     table.add_column("image", overflow="fold")
     for heading in ("matched", "missed", "extra", "largest error m"):
         table.add_column(heading, justify="right")
     for frame in c.worst_frames(_WORST_FRAMES):
         table.add_row(
-            Text(_printable(frame.name)),
+            Text(printable(frame.name)),
             str(frame.matched),
             str(frame.missed),
             str(frame.extra),
-            _number(frame.largest_error_m, 3),
+            number(frame.largest_error_m, 3),
         )
     return table
-
-
-def _table(title: str) -> Table:
-    return Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=0)
-
-
-def _number(value: float | None, decimals: int) -> str:
-    if value is None:
-        return _NONE
-    return f"{round(value, decimals) + 0.0:.{decimals}f}"  # adding 0 makes -0 a 0
-
-
-def _printable(name: str) -> str:
-    """A name from a file, with what a terminal would choke on or obey escaped."""
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in name)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from math import isfinite
-from typing import Literal
+from typing import Literal, Protocol
 
 ErrorCovariance = Literal["detected", "reference", "sum"]
 
@@ -86,19 +86,19 @@ class DistanceBin:
 
 @dataclass(frozen=True, slots=True)
 class NormalisedError:
-    """Squared position errors in units of their covariance.
+    """Squared errors in units of their covariance.
 
     Attributes
     ----------
     per_dof : float or None
         Mean per degree of freedom: 1 if the covariance is right, more if it promises too much.
     dof : int
-        Degrees of freedom: two for each matched row.
+        Degrees of freedom: two for each matched disc, one for each matched line.
     band : (float, float) or None
         Where `per_dof` lies with 95 % probability if errors are normal, independent and have that
         covariance.
     left_out : int
-        Matched rows whose covariance is not positive definite.
+        Matched rows whose covariance is not positive definite, or whose sigma is not positive.
     """
 
     per_dof: float | None
@@ -154,14 +154,26 @@ class Comparison:
         return tuple(ranked[:count])
 
 
+class Rates(Protocol):
+    """What demands are made on: a comparison of discs or of lines."""
+
+    @property
+    def recall(self) -> float | None:
+        """Share of the reference rows that were found."""
+
+    @property
+    def precision(self) -> float | None:
+        """Share of the detected rows that are right."""
+
+
 def unmet_demands(
-    comparison: Comparison, *, min_recall: float | None = None, min_precision: float | None = None
+    comparison: Rates, *, min_recall: float | None = None, min_precision: float | None = None
 ) -> tuple[str, ...]:
     """Say which demands a comparison fails: a command that made them exits 1 if there are any.
 
     Parameters
     ----------
-    comparison : Comparison
+    comparison : Comparison or LineComparison
         The figures.
     min_recall, min_precision : float, optional
         Least values. A figure that there are no rows for fails its demand.
