@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 import tempfile
@@ -108,6 +109,19 @@ class RenderedLines:
     preset: Literal["default", "published"] = "default"
 
 
+@dataclass(frozen=True)
+class Tilt:
+    """Detect the tilt of a simulated run, level its discs, and hold both against the truth.
+
+    Parameters
+    ----------
+    run : Path
+        Run made by `python -m tools.simulator`.
+    """
+
+    run: Positional[Path] = Path("images/e")
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Run a subcommand; returns the exit code."""
     command = tyro.cli(
@@ -115,7 +129,8 @@ def main(arguments: list[str] | None = None) -> int:
         | Annotated[Photographs, subcommand("photographs")]
         | Annotated[Rendered, subcommand("rendered")]
         | Annotated[Buildings, subcommand("buildings")]
-        | Annotated[RenderedLines, subcommand("rendered-lines")],
+        | Annotated[RenderedLines, subcommand("rendered-lines")]
+        | Annotated[Tilt, subcommand("tilt")],
         prog="python -m tools.evaluation",
         description="Prints the figures in the README.",
         args=arguments,
@@ -128,7 +143,9 @@ def main(arguments: list[str] | None = None) -> int:
         return _rendered(command)
     if isinstance(command, Buildings):
         return _buildings(command)
-    return _rendered_lines(command)
+    if isinstance(command, RenderedLines):
+        return _rendered_lines(command)
+    return _tilt(command)
 
 
 def _accuracy(command: Accuracy) -> int:
@@ -196,8 +213,6 @@ def _buildings(command: Buildings) -> int:
 
 
 def _rendered_lines(command: RenderedLines) -> int:
-    import json
-
     from landmarks import read_tilts
 
     with tempfile.TemporaryDirectory() as folder:
@@ -213,7 +228,40 @@ def _rendered_lines(command: RenderedLines) -> int:
             code |= subprocess.run(
                 [sys.executable, script, command.run.name, str(path)], check=False, cwd=folder
             ).returncode
-    truth = json.loads((command.run / "truth.json").read_text())
+    _print_tilt_errors(command.run, tilts)
+    return code
+
+
+def _tilt(command: Tilt) -> int:
+    from detect.compare import compare_runs
+    from detect.compare_result import CompareOptions
+    from landmarks import read_tilts
+
+    options = CompareOptions(gate_m=0.3)
+    with tempfile.TemporaryDirectory() as folder:
+        output = Path(folder) / "detected.lines"
+        _detect_lines(command.run, LINE_PRESETS["default"], output)
+        tilts = read_tilts(output.with_suffix(".tilt"))
+        _print_tilt_errors(command.run, tilts)
+        settings = replace(CircleSettings(), polarity="light", far_limit_m_per_px=0.05)
+        for label, known in (("without", None), ("with", tilts)):
+            discs = Path(folder) / f"{label}.circles"
+            _detect(command.run, settings, discs, known)
+            result = compare_runs(command.run, detected=discs, options=options)
+            far = [b for b in result.bins if b.from_m is not None and b.from_m >= 3.0]
+            errors = ", ".join(
+                f"{b.error_median_m:.4f}" for b in far if b.error_median_m is not None
+            )
+            print(
+                f"discs {label} the tilt: median error {result.error_median_m:.4f} m, "
+                f"from 3 m on, by bin: {errors} m"
+            )
+    return 0
+
+
+def _print_tilt_errors(run: Path, tilts: dict[str, FrameTilt]) -> None:
+    """Hold tilts against the truth of a rendered or simulated run."""
+    truth = json.loads((run / "truth.json").read_text())
     errors, normalised = [], []
     for frame in truth["frames"]:
         tilt = tilts.get(frame["prefix"])
@@ -227,7 +275,6 @@ def _rendered_lines(command: RenderedLines) -> int:
         f"tilt: {len(errors)} frames with 5 lines, rms error pitch {rms[0]:.3f} deg "
         f"roll {rms[1]:.3f} deg, normalised error^2 / dof {np.mean(normalised):.2f}"
     )
-    return code
 
 
 def _detect_lines(run: Path, settings: LineSettings, output: Path) -> None:
