@@ -24,12 +24,13 @@ from detect.settings import PUBLISHED, CircleSettings
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
-    from rich.console import Console
+    from rich.console import Console, Group
     from rich.progress import Progress
 
     from camera import Camera
     from detect.circles import CircleDetections
     from detect.circles_run import FrameSink
+    from detect.compare_result import Rates
     from detect.lines import LineDetections
     from detect.lines_run import LineSink
     from detect.run import RunFrame
@@ -157,18 +158,24 @@ class All:
 
 @dataclass(frozen=True)
 class Compare:
-    """Compare detected discs with reference rows: matched, missed, extra, errors.
+    """Compare detected rows with reference rows: matched, missed, extra, errors.
 
-    Example: detect compare images/e --min-recall 0.9
+    Example: detect compare images/e --min-recall 0.9, or: detect compare images/e --lines
 
     Parameters
     ----------
     run : Path
         Run folder.
+    lines : bool
+        Compare verticals instead of discs.
     reference : Path
-        Reference rows; by default map.circles in the run folder.
+        Reference rows; by default map.circles (map.lines) in the run folder.
     detected : Path
-        Detected rows; by default detected.circles in the run folder.
+        Detected rows; by default detected.circles (detected.lines) in the run folder.
+    tolerance_deg : float
+        Bearings of the same line differ by at most this,
+    sigmas : float
+        or by this many standard deviations of the detected one.
     min_recall : float
         Exit with 1 if the recall is lower.
     min_precision : float
@@ -180,8 +187,11 @@ class Compare:
     """
 
     run: Positional[Path]
+    lines: bool = False
     reference: Path | None = None
     detected: Path | None = None
+    tolerance_deg: float = 0.5
+    sigmas: float = 2.0
     min_recall: float | None = None
     min_precision: float | None = None
     json: Path | None = None
@@ -419,10 +429,26 @@ def _drawing_sink(
 def _compare(command: Compare) -> int:
     from rich.console import Console
 
-    from detect.compare import compare_runs
-    from detect.compare_report import comparison_tables, format_json
     from detect.compare_result import unmet_demands
     from storage import write_whole
+
+    tables, text, result = _compared_lines(command) if command.lines else _compared_discs(command)
+    Console().print(tables)
+    if command.json is not None:
+        with write_whole(command.json, overwrite=command.force) as stream:
+            stream.write(text.encode())
+    unmet = unmet_demands(
+        result, min_recall=command.min_recall, min_precision=command.min_precision
+    )
+    for sentence in unmet:
+        print(sentence, file=sys.stderr)
+    return EXIT_ERROR if unmet else 0
+
+
+def _compared_discs(command: Compare) -> tuple[Group, str, Rates]:
+    """The tables, the JSON and the result of a comparison of discs."""
+    from detect.compare import compare_runs
+    from detect.compare_report import comparison_tables, format_json
 
     result = compare_runs(
         command.run,
@@ -430,16 +456,25 @@ def _compare(command: Compare) -> int:
         detected=command.detected,
         options=command.options,
     )
-    Console().print(comparison_tables(result))
-    if command.json is not None:
-        with write_whole(command.json, overwrite=command.force) as stream:
-            stream.write(format_json(result).encode())
-    unmet = unmet_demands(
-        result, min_recall=command.min_recall, min_precision=command.min_precision
+    return comparison_tables(result), format_json(result), result
+
+
+def _compared_lines(command: Compare) -> tuple[Group, str, Rates]:
+    """The tables, the JSON and the result of a comparison of verticals."""
+    from detect.compare_lines import compare_line_runs
+    from detect.compare_lines_report import format_line_json, line_comparison_tables
+    from detect.compare_lines_result import LineCompareOptions
+
+    options = LineCompareOptions(
+        tolerance_deg=command.tolerance_deg,
+        sigmas=command.sigmas,
+        only_identified=command.options.only_identified,
+        all_frames=command.options.all_frames,
     )
-    for sentence in unmet:
-        print(sentence, file=sys.stderr)
-    return EXIT_ERROR if unmet else 0
+    result = compare_line_runs(
+        command.run, reference=command.reference, detected=command.detected, options=options
+    )
+    return line_comparison_tables(result), format_line_json(result), result
 
 
 def _progress(console: Console) -> Progress:

@@ -166,13 +166,13 @@ class LineSettings:
     largest_scatter_px: float = 1.0
     largest_shift_px: float = 1.0
     largest_noise_px: float = 0.3
-    bend_px: float = 0.2
+    bend_px: float = 0.125
     largest_lean_deg: float = 0.7
     largest_lean_sigmas: float = 8.0
     largest_lean_px: float = 1.5
     largest_tilt_deg: float = 5.0
     tilt_prior_deg: float = 2.0
-    building_deg: float = 0.045
+    building_deg: float = 0.036
     proposers: int = 24
     least_lines: int = 3
     weight_limit: float = 3.0

@@ -41,10 +41,10 @@ class Run:
     """Frames to render."""
     seed: int = 1
     """Everything about the run follows from it."""
-    discs: int = 576
-    """Discs on the floor along the way."""
-    lookalikes: int = 140
-    """Other things on the floor."""
+    discs: int | None = None
+    """Discs on the floor along the way; by default as dense as 576 in 3297 frames."""
+    lookalikes: int | None = None
+    """Other things on the floor; by default as dense as 140 in 3297 frames."""
     visits: float = 0.6
     """Probability that a room with an open door is visited in passing."""
     skip: int = 0
@@ -71,8 +71,8 @@ class Rows:
     """Steps to drive."""
     seed: int = 1
     """Everything about the run follows from it."""
-    discs: int = 576
-    """Discs on the floor along the way."""
+    discs: int | None = None
+    """Discs on the floor along the way; by default as dense as 576 in 3297 frames."""
     visits: float = 0.6
     """Probability that a room with an open door is visited in passing."""
     unlabelled: float = 0.03
@@ -137,6 +137,14 @@ class Discs:
     """Replace a file that exists."""
 
 
+_FULL_FRAMES, _FULL_DISCS, _FULL_LOOKALIKES = 3297, 576, 140
+
+
+def _by_length(given: int | None, full: int, frames: int) -> int:
+    """How many things a run gets: what was asked for, or as many as its length allows."""
+    return given if given is not None else max(1, round(full * frames / _FULL_FRAMES))
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; 0 if all went well."""
     command = tyro.cli(
@@ -178,7 +186,8 @@ def _run(command: Demo | Run) -> str:
     if isinstance(command, Run):
         settings = RunSettings(
             name=command.output.resolve().name, frames=command.frames, seed=command.seed,
-            discs=command.discs, lookalikes=command.lookalikes, visits=command.visits,
+            discs=_by_length(command.discs, _FULL_DISCS, command.frames),
+            lookalikes=_by_length(command.lookalikes, _FULL_LOOKALIKES, command.frames), visits=command.visits,
             skip=command.skip, unlabelled=command.unlabelled, style=command.style,
             camera_text=_camera_text(command.camera), sensor=command.sensor,
         )  # fmt: skip
@@ -197,7 +206,7 @@ def _rows(command: Rows) -> str:
 
     settings = RunSettings(
         name=command.output.resolve().name, frames=command.frames, seed=command.seed,
-        discs=command.discs, lookalikes=0, visits=command.visits, unlabelled=command.unlabelled,
+        discs=_by_length(command.discs, _FULL_DISCS, command.frames), lookalikes=0, visits=command.visits, unlabelled=command.unlabelled,
         camera_text=_camera_text(command.camera), style=command.style,
     )  # fmt: skip
     rows = write_rows(
