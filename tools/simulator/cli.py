@@ -187,9 +187,9 @@ def _run(command: Demo | Run) -> str:
         settings = RunSettings(
             name=command.output.resolve().name, frames=command.frames, seed=command.seed,
             discs=_by_length(command.discs, _FULL_DISCS, command.frames),
-            lookalikes=_by_length(command.lookalikes, _FULL_LOOKALIKES, command.frames), visits=command.visits,
-            skip=command.skip, unlabelled=command.unlabelled, style=command.style,
-            camera_text=_camera_text(command.camera), sensor=command.sensor,
+            lookalikes=_by_length(command.lookalikes, _FULL_LOOKALIKES, command.frames),
+            visits=command.visits, skip=command.skip, unlabelled=command.unlabelled,
+            style=command.style, camera_text=_camera_text(command.camera), sensor=command.sensor,
         )  # fmt: skip
     rows = _with_progress(
         settings.frames,
@@ -206,7 +206,8 @@ def _rows(command: Rows) -> str:
 
     settings = RunSettings(
         name=command.output.resolve().name, frames=command.frames, seed=command.seed,
-        discs=_by_length(command.discs, _FULL_DISCS, command.frames), lookalikes=0, visits=command.visits, unlabelled=command.unlabelled,
+        discs=_by_length(command.discs, _FULL_DISCS, command.frames), lookalikes=0,
+        visits=command.visits, unlabelled=command.unlabelled,
         camera_text=_camera_text(command.camera), style=command.style,
     )  # fmt: skip
     rows = write_rows(
