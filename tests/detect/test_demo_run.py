@@ -10,7 +10,11 @@ import pytest
 
 from detect.circles_run import detect_circles_run
 from detect.compare import compare_runs
+from detect.compare_lines import compare_line_runs
+from detect.compare_lines_result import LineComparison
 from detect.compare_result import CompareOptions, Comparison
+from detect.line_settings import LineSettings
+from detect.lines_run import detect_lines_run
 from detect.run import open_run
 from detect.settings import PUBLISHED, CircleSettings
 
@@ -64,6 +68,44 @@ def test_given_runs_are_found_again(request: pytest.FixtureRequest, tmp_path: Pa
         result = redetected(run, LIKE_SHIPPED, folder)
         assert result.recall is not None
         assert result.recall >= 0.90, f"{run}: recall {result.recall:.3f}"
+
+
+def redetected_lines(run: Path, folder: Path) -> LineComparison:
+    output = folder / "detected.lines"
+    summary = detect_lines_run(
+        open_run(run), LineSettings(), output, folder / "detected.tilt", version="test"
+    )
+    assert summary.failures == []
+    return compare_line_runs(run, detected=output)
+
+
+@pytest.mark.long
+def test_verticals_of_the_demo_run_are_found_again(project_root: Path, tmp_path: Path) -> None:
+    result = redetected_lines(project_root / "images" / "e", tmp_path)
+    # The truth lists every vertical with a step of 12 grey values over 20 rows, however far from
+    # the horizon: many are too short for the detector.
+    assert result.recall is not None
+    assert result.recall >= 0.6
+    assert result.bearing_median_deg is not None
+    assert result.bearing_median_deg <= 0.03
+    assert result.bearing_95_deg is not None
+    assert result.bearing_95_deg <= 0.2
+
+
+@pytest.mark.long
+def test_verticals_of_given_runs_are_found_again(
+    request: pytest.FixtureRequest, tmp_path: Path
+) -> None:
+    given = [Path(run) for run in request.config.getoption("--run")]
+    runs = [run for run in given if (run / "map.lines").is_file()]
+    if not runs:
+        pytest.skip("no run folder with map.lines was given by --run")
+    for number, run in enumerate(runs):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        result = redetected_lines(run, folder)
+        assert result.recall is not None
+        assert result.recall >= 0.5, f"{run}: recall {result.recall:.3f}"
 
 
 def test_same_run_gives_the_same_bytes(project_root: Path, tmp_path: Path) -> None:
