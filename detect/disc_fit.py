@@ -185,7 +185,8 @@ def disc_evidence(fits: DiscFits, radius_m: float, blur_px: float = 1.0) -> Floa
     circle of the right size, defocus blurs the edge of a disc that explains everything. So they
     are weighed by a logistic regression. Its weights were fitted to some 18,000 discs, and to what
     else has a high quality, in photographs and renders: as they are, and with glare, shade,
-    defocus, motion blur, noise and low contrast added.
+    defocus, motion blur, noise and low contrast added. They are constants: that fitting is not
+    part of the project.
 
     Parameters
     ----------
