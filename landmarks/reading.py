@@ -1,4 +1,4 @@
-"""Reading landmark files: ``.circles``, ``.lines`` and the STEP rows of ``<run>.txt``.
+"""Reading landmark files: ``.circles``, ``.lines``, ``.markers``, and the STEP rows of ``.txt``.
 
 A file is read row by row as it is asked for, so that its size does not matter. Line ends may be
 LF or CRLF. ``#`` at the start of a word begins a comment. A trailing backslash continues a row, but
@@ -17,12 +17,16 @@ from landmarks.errors import LandmarkError, LandmarkFileError, excerpt
 from landmarks.records import (
     CIRCLE_NUMBERS,
     LINE_NUMBERS,
+    MARKER_CORNER_NUMBERS,
+    MARKER_CORNERS,
     STEP_NUMBERS,
     CircleLandmark,
     DetectorSettings,
     Frame,
     Landmark,
     LineLandmark,
+    MarkerCorner,
+    MarkerLandmark,
     Record,
     Row,
     Step,
@@ -185,7 +189,8 @@ def _parse(text: bytes) -> Record | None:
     if keyword.endswith(b"DETECTOR"):
         return DetectorSettings(_decode(keyword), tuple(map(_decode, words[1:])))
     raise LandmarkError(
-        f"row starts with {excerpt(keyword)}: expected STEP, LANDMARK_C, LANDMARK_L or a # comment"
+        f"row starts with {excerpt(keyword)}: expected STEP, LANDMARK_C, LANDMARK_L, "
+        "LANDMARK_M or a # comment"
     )
 
 
@@ -210,12 +215,31 @@ def _parse_line(words: list[bytes]) -> LineLandmark:
     return LineLandmark(xtop, ytop, xbottom, ybottom, alpha, beta, quality, sigma, ids)
 
 
+def _parse_marker(words: list[bytes]) -> MarkerLandmark:
+    expected = 3 + len(MARKER_CORNERS) * len(MARKER_CORNER_NUMBERS)
+    if len(words) != 1 + expected:
+        raise LandmarkError(
+            f"LANDMARK_M with {len(words) - 1} values: expected {expected}: dictionary ID quality "
+            f"and four times {' '.join(MARKER_CORNER_NUMBERS)}"
+        )
+    (quality,) = _numbers(words[3:4], ("quality",))
+    per_corner = len(MARKER_CORNER_NUMBERS)
+    first, second, third, fourth = (
+        MarkerCorner(*_numbers(words[start : start + per_corner], MARKER_CORNER_NUMBERS))
+        for start in range(4, 1 + expected, per_corner)
+    )
+    return MarkerLandmark(
+        _decode(words[1]), _identifier(words[2]), quality, (first, second, third, fourth)
+    )
+
+
 _PARSERS: dict[bytes, Callable[[list[bytes]], Record]] = {
     b"STEP": _parse_step,
     b"LANDMARK_C": _parse_circle,
     # What the comments at the head of the data set's files of circles call the row.
     b"LANDMARK": _parse_circle,
     b"LANDMARK_L": _parse_line,
+    b"LANDMARK_M": _parse_marker,
 }
 
 

@@ -16,6 +16,9 @@ STEP_NUMBERS = ("dx", "dy", "dphi", "cxx", "cxy", "cyy", "cxphi", "cyphi", "cphi
 CIRCLE_NUMBERS = ("px", "py", "quality", "cxx", "cxy", "cyy")
 LINE_NUMBERS = ("xtop", "ytop", "xbottom", "ybottom", "alpha", "beta", "quality", "sigma")
 
+MARKER_CORNERS = ("top left", "top right", "bottom right", "bottom left")
+MARKER_CORNER_NUMBERS = ("u", "v", "cuu", "cuv", "cvv")
+
 _LARGEST_ID = 2**63 - 1
 _BLANK = re.compile(r"[ \t\n\r\v\f]")
 
@@ -141,6 +144,69 @@ class LineLandmark:
 
 
 @dataclass(frozen=True, slots=True)
+class MarkerCorner:
+    """A corner of a square marker in an image.
+
+    Attributes
+    ----------
+    u, v : float
+        Where it is seen, lens distortion included (px; the top left pixel's centre is 0, 0).
+    cuu, cuv, cvv : float
+        Covariance of (u, v) (px^2).
+
+    Raises
+    ------
+    LandmarkError
+        If a number is not finite.
+    """
+
+    u: float
+    v: float
+    cuu: float
+    cuv: float
+    cvv: float
+
+    def __post_init__(self) -> None:
+        _demand_finite(self, MARKER_CORNER_NUMBERS)
+
+
+@dataclass(frozen=True, slots=True)
+class MarkerLandmark:
+    """A square marker as seen in one image.
+
+    Attributes
+    ----------
+    dictionary : str
+        Which set of markers it is from; an identifier means nothing without it.
+    id : int
+        The marker's number in that set.
+    quality : float
+        How well the marker's cells agree with the pattern: 1 is perfect.
+    corners : tuple of 4 MarkerCorner
+        Top left, top right, bottom right, bottom left of the marker as it is printed.
+
+    Raises
+    ------
+    LandmarkError
+        If a number is not finite, the identifier is negative or too large, the corners are not
+        four, or the dictionary's name could not be read back from a file.
+    """
+
+    dictionary: str
+    id: int
+    quality: float
+    corners: tuple[MarkerCorner, MarkerCorner, MarkerCorner, MarkerCorner]
+
+    def __post_init__(self) -> None:
+        _demand_word(self.dictionary, "dictionary of markers")
+        if not 0 <= self.id <= _LARGEST_ID:
+            raise LandmarkError(f"marker's ID is {self.id:.6g}: expected 0 or more, 64 bits")
+        _demand_finite(self, ("quality",))
+        if len(self.corners) != len(MARKER_CORNERS):
+            raise LandmarkError(f"marker has {len(self.corners)} corners: expected 4")
+
+
+@dataclass(frozen=True, slots=True)
 class DetectorSettings:
     """How a detector was set, as the data set's files may say at their head.
 
@@ -170,7 +236,7 @@ class DetectorSettings:
             raise LandmarkError(f"keyword is {shown}: expected one that ends in DETECTOR")
 
 
-Landmark = CircleLandmark | LineLandmark
+Landmark = CircleLandmark | LineLandmark | MarkerLandmark
 Record = Step | Landmark | DetectorSettings
 
 
@@ -190,6 +256,11 @@ class Frame:
     def lines(self) -> tuple[LineLandmark, ...]:
         """The lines among the landmarks, in the file's order."""
         return tuple(row for row in self.landmarks if isinstance(row, LineLandmark))
+
+    @property
+    def markers(self) -> tuple[MarkerLandmark, ...]:
+        """The square markers among the landmarks, in the file's order."""
+        return tuple(row for row in self.landmarks if isinstance(row, MarkerLandmark))
 
 
 @dataclass(frozen=True, slots=True)

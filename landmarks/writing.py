@@ -10,6 +10,7 @@ from landmarks.records import (
     CircleLandmark,
     DetectorSettings,
     Frame,
+    MarkerLandmark,
     Record,
     Row,
     Step,
@@ -23,7 +24,7 @@ def format_record(record: Record) -> str:
     """Lay a record out as a row of a file, without line end.
 
     Poses of steps have 5 decimals and their covariances 12, as C's ``%8.5f`` and ``%.12f``;
-    landmarks have 6 significant digits, as C's ``%g``.
+    landmarks have 6 significant digits, as C's ``%g``; corners of markers, in pixels, 4 decimals.
     """
     if isinstance(record, Step):
         return (
@@ -33,6 +34,10 @@ def format_record(record: Record) -> str:
         )
     if isinstance(record, DetectorSettings):
         return " ".join([record.keyword, *record.words])
+    if isinstance(record, MarkerLandmark):
+        corners = (f"{c.u:.4f} {c.v:.4f} {c.cuu:g} {c.cuv:g} {c.cvv:g}" for c in record.corners)
+        head = f"LANDMARK_M {record.dictionary} {record.id:d} {record.quality:g}"
+        return " ".join([head, *corners])
     if isinstance(record, CircleLandmark):
         text = (
             f"LANDMARK_C {record.px:g} {record.py:g} {record.quality:g} "
