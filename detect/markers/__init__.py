@@ -1,0 +1,1 @@
+"""The detector of square markers, in three phases: candidates, filtering, refinement."""
