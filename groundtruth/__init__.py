@@ -1,0 +1,15 @@
+"""Where the robot really was: its poses from markers seen by calibrated cameras.
+
+Frames: the *robot* has x forward, y left, z up; the *world* z up, and the robot's heading theta is
+its x axis' angle in the world, counter-clockwise; *cameras* and *markers* as in `camera` and
+`landmarks`. A transform `a_from_b` takes points of frame b to frame a. Metres, radians, seconds.
+"""
+
+from importlib.metadata import PackageNotFoundError, version
+
+try:
+    __version__ = version("redetect")
+except PackageNotFoundError:  # a checkout that was never installed
+    __version__ = "unknown"
+
+__all__ = ["__version__"]

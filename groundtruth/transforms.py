@@ -1,0 +1,178 @@
+"""Rigid transforms SE(3): 4x4 matrices, their tangents, and how uncertainty moves with them.
+
+A tangent xi = (v, w) is a translation (m) and a rotation vector (rad), in this order. Poses are
+perturbed on the right, T exp(xi): a covariance (6, 6) of a pose `a_from_b` belongs to such a xi and
+so is expressed in the axes of frame b. All functions work on stacks of any leading shape.
+
+References
+----------
+T. D. Barfoot, *State Estimation for Robotics*, 2nd ed., 2024, chapter 8.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
+
+FloatArray = NDArray[np.float64]
+
+#: Below this angle (rad) closed forms lose more digits than their series.
+_SMALL_ANGLE_RAD = 1e-2
+
+
+def hat(vectors: ArrayLike) -> FloatArray:
+    """(..., 3, 3) matrices [w]x with [w]x p = w x p, of (..., 3) vectors."""
+    w = np.asarray(vectors, dtype=np.float64)
+    matrix = np.zeros((*w.shape[:-1], 3, 3))
+    matrix[..., 0, 1], matrix[..., 0, 2], matrix[..., 1, 2] = -w[..., 2], w[..., 1], -w[..., 0]
+    matrix[..., 1, 0], matrix[..., 2, 0], matrix[..., 2, 1] = w[..., 2], -w[..., 1], w[..., 0]
+    return matrix
+
+
+def transform(rotation: ArrayLike, translation: ArrayLike) -> FloatArray:
+    """(..., 4, 4) transforms of (..., 3, 3) rotations and (..., 3) translations (m)."""
+    r = np.asarray(rotation, dtype=np.float64)
+    t = np.asarray(translation, dtype=np.float64)
+    matrix = np.zeros((*np.broadcast_shapes(r.shape[:-2], t.shape[:-1]), 4, 4))
+    matrix[..., :3, :3], matrix[..., :3, 3], matrix[..., 3, 3] = r, t, 1.0
+    return matrix
+
+
+def transform_from_quaternion(quaternion_xyzw: ArrayLike, translation: ArrayLike) -> FloatArray:
+    """(..., 4, 4) transforms of (..., 4) quaternions x, y, z, w and (..., 3) translations (m)."""
+    q = np.asarray(quaternion_xyzw, dtype=np.float64)
+    rotation = Rotation.from_quat(q.reshape(-1, 4)).as_matrix().reshape(*q.shape[:-1], 3, 3)
+    return transform(rotation, translation)
+
+
+def quaternion_xyzw(transforms: ArrayLike) -> FloatArray:
+    """(..., 4) unit quaternions x, y, z, w >= 0 of the rotations of (..., 4, 4) transforms."""
+    t = np.asarray(transforms, dtype=np.float64)
+    q = Rotation.from_matrix(t[..., :3, :3].reshape(-1, 3, 3)).as_quat(canonical=True)
+    return np.asarray(q.reshape(*t.shape[:-2], 4))
+
+
+def planar_transform(x_m: float, y_m: float, theta_rad: float) -> FloatArray:
+    """(4, 4) pose of a robot standing level on the floor at x, y with heading theta."""
+    c, s = np.cos(theta_rad), np.sin(theta_rad)
+    return transform([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]], [x_m, y_m, 0.0])
+
+
+def inverse(transforms: ArrayLike) -> FloatArray:
+    """Inverses of (..., 4, 4) transforms."""
+    t = np.asarray(transforms, dtype=np.float64)
+    back = np.swapaxes(t[..., :3, :3], -1, -2)
+    return transform(back, -(back @ t[..., :3, 3:])[..., 0])
+
+
+def apply(transforms: ArrayLike, points: ArrayLike) -> FloatArray:
+    """(..., 3) points taken by (..., 4, 4) transforms (leading shapes are broadcast)."""
+    t = np.asarray(transforms, dtype=np.float64)
+    p = np.asarray(points, dtype=np.float64)
+    return np.asarray((t[..., :3, :3] @ p[..., None])[..., 0] + t[..., :3, 3])
+
+
+def exp_se3(tangents: ArrayLike) -> FloatArray:
+    """(..., 4, 4) transforms of (..., 6) tangents (v, w)."""
+    xi = np.asarray(tangents, dtype=np.float64)
+    w = xi[..., 3:]
+    rotation = Rotation.from_rotvec(w.reshape(-1, 3)).as_matrix().reshape(*w.shape[:-1], 3, 3)
+    return transform(rotation, (_left_jacobian_so3(w) @ xi[..., :3, None])[..., 0])
+
+
+def log_se3(transforms: ArrayLike) -> FloatArray:
+    """(..., 6) tangents (v, w) of (..., 4, 4) transforms, the rotation's angle at most pi."""
+    t = np.asarray(transforms, dtype=np.float64)
+    w = Rotation.from_matrix(t[..., :3, :3].reshape(-1, 3, 3)).as_rotvec()
+    w = w.reshape(*t.shape[:-2], 3)
+    v = np.linalg.solve(_left_jacobian_so3(w), t[..., :3, 3:])[..., 0]
+    return np.concatenate([v, w], axis=-1)
+
+
+def adjoint(transforms: ArrayLike) -> FloatArray:
+    """(..., 6, 6) matrices Ad with T exp(xi) = exp(Ad xi) T, of (..., 4, 4) transforms T."""
+    t = np.asarray(transforms, dtype=np.float64)
+    rotation = t[..., :3, :3]
+    matrix = np.zeros((*t.shape[:-2], 6, 6))
+    matrix[..., :3, :3] = matrix[..., 3:, 3:] = rotation
+    matrix[..., :3, 3:] = hat(t[..., :3, 3]) @ rotation
+    return matrix
+
+
+def right_jacobian(tangents: ArrayLike) -> FloatArray:
+    """(..., 6, 6) matrices J with exp(xi + d) = exp(xi) exp(J d) for small d, of (..., 6) xi."""
+    xi = -np.asarray(tangents, dtype=np.float64)  # the left Jacobian of the opposite tangent
+    rotation_part = _left_jacobian_so3(xi[..., 3:])
+    matrix = np.zeros((*xi.shape[:-1], 6, 6))
+    matrix[..., :3, :3] = matrix[..., 3:, 3:] = rotation_part
+    matrix[..., :3, 3:] = _left_jacobian_coupling(xi)
+    return matrix
+
+
+def rotation_angle(transforms: ArrayLike) -> FloatArray:
+    """(...) angles in [0, pi] (rad) of the rotations of (..., 4, 4) transforms."""
+    t = np.asarray(transforms, dtype=np.float64)
+    magnitude = Rotation.from_matrix(t[..., :3, :3].reshape(-1, 3, 3)).magnitude()
+    return np.asarray(magnitude.reshape(t.shape[:-2]))
+
+
+def heading(transforms: ArrayLike) -> FloatArray:
+    """(...) headings theta (rad): angles of the x axes of (..., 4, 4) poses in the world."""
+    t = np.asarray(transforms, dtype=np.float64)
+    return np.asarray(np.arctan2(t[..., 1, 0], t[..., 0, 0]))
+
+
+def roll_pitch(transforms: ArrayLike) -> FloatArray:
+    """(..., 2) roll about x and pitch about y (rad) of (..., 4, 4) poses, as in yaw-pitch-roll."""
+    t = np.asarray(transforms, dtype=np.float64)
+    roll = np.arctan2(t[..., 2, 1], t[..., 2, 2])
+    pitch = np.arcsin(np.clip(-t[..., 2, 0], -1.0, 1.0))
+    return np.stack([roll, pitch], axis=-1)
+
+
+def _left_jacobian_so3(w: FloatArray) -> FloatArray:
+    angle = np.linalg.norm(w, axis=-1)[..., None, None]
+    a, b = _coefficients(angle)
+    cross = hat(w)
+    return np.asarray(np.eye(3) + a * cross + b * (cross @ cross))
+
+
+def _coefficients(angle: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """(1 - cos t) / t^2 and (t - sin t) / t^3."""
+    square = angle * angle
+    small = angle < _SMALL_ANGLE_RAD
+    t = np.where(small, 1.0, angle)
+    a = np.where(
+        small, 0.5 - square / 24.0 * (1.0 - square / 30.0), 2.0 * np.sin(t / 2) ** 2 / t**2
+    )
+    b = np.where(small, 1.0 / 6.0 - square / 120.0 * (1.0 - square / 42.0), (t - np.sin(t)) / t**3)
+    return a, b
+
+
+def _left_jacobian_coupling(xi: FloatArray) -> FloatArray:
+    """Barfoot's Q(xi), the off-diagonal block of SE(3)'s left Jacobian."""
+    rho, phi = hat(xi[..., :3]), hat(xi[..., 3:])
+    angle = np.linalg.norm(xi[..., 3:], axis=-1)[..., None, None]
+    _, b = _coefficients(angle)
+    square = angle * angle
+    # The closed forms of the higher coefficients cancel more than those above.
+    small = angle < 0.1
+    t = np.where(small, 1.0, angle)
+    c = np.where(
+        small,
+        1.0 / 24.0 - square / 720.0 * (1.0 - square / 56.0 * (1.0 - square / 90.0)),
+        (t**2 + 2.0 * np.cos(t) - 2.0) / (2.0 * t**4),
+    )
+    d = np.where(
+        small,
+        1.0 / 120.0 - square / 2520.0 * (1.0 - square / 48.0 * (1.0 - square / 82.5)),
+        (2.0 * t - 3.0 * np.sin(t) + t * np.cos(t)) / (2.0 * t**5),
+    )
+    pr, rp, prp = phi @ rho, rho @ phi, phi @ rho @ phi
+    return np.asarray(
+        0.5 * rho
+        + b * (pr + rp + prp)
+        + c * (phi @ pr + rp @ phi - 3.0 * prp)
+        + d * (prp @ phi + phi @ prp)
+    )
