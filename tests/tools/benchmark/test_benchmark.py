@@ -1,0 +1,94 @@
+"""The whole benchmark on next to nothing."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from camera import write_camera
+from detect.run import open_run
+from tools.benchmark.cli import main
+from tools.benchmark.errors import BenchmarkError
+from tools.benchmark.functions import ALL, CIRCLES, DECODING, KERNEL, LINES, PLAIN_GATHER, RESPONSE
+from tools.benchmark.material import repeated_run
+from tools.benchmark.runs import commands, measure_runs, perform
+
+
+@pytest.fixture
+def short_run(project_root: Path, tmp_path: Path) -> Path:
+    return repeated_run(open_run(project_root / "images/e"), tmp_path, 2)
+
+
+@pytest.mark.long
+def test_a_pass_over_a_run_writes_what_the_command_writes(short_run: Path, tmp_path: Path) -> None:
+    output = tmp_path / "output"
+    output.mkdir()
+    all_commands = commands(short_run, output)
+    frames, decoding, seconds = measure_runs(all_commands, short_run, 1)
+    assert frames == 2
+    assert decoding.shape == (1,)
+    assert set(seconds) == set(all_commands)
+    assert all(np.all(taken > 0.0) for taken in seconds.values())
+    written = {path.name for path in output.iterdir()}
+    assert {"published.circles", "detected.circles", "detected.lines", "detected.tilt"} <= written
+
+
+def test_a_pass_that_fails_is_an_error(short_run: Path, tmp_path: Path) -> None:
+    (short_run / "images" / "e.000001.jpg").write_bytes(b"no image")
+    with pytest.raises(BenchmarkError, match=r"ended with 3.*cannot be decoded"):
+        perform(commands(short_run, tmp_path)["detect circles --preset published"])
+
+
+def test_a_run_without_images_ends_in_one_line(
+    tmp_path: Path, project_root: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_camera(open_run(project_root / "images/e").camera, tmp_path / "a.cam")
+    assert main(["--run", str(tmp_path)]) == 1
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_existing_files_are_refused_before_any_work(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    existing = tmp_path / "speed.json"
+    existing.write_text("mine")
+    assert main(["--run", str(tmp_path / "none"), "--json", str(existing)]) == 1
+    assert "speed.json" in capsys.readouterr().err
+    assert existing.read_text() == "mine"
+
+
+@pytest.mark.long
+def test_the_command_measures_everything(
+    short_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    files = {kind: tmp_path / f"speed.{kind}" for kind in ("json", "png", "md")}
+    arguments = [
+        "--run", str(short_run), "--photographs", str(short_run / "images"),
+        "--pictures", "1", "--rounds", "1", "--run-rounds", "1",
+        "--factors", "0.5", "1", "--landmarks", "0", "3", "--frames", "1", "2", "--jobs", "1",
+        "--json", str(files["json"]), "--plot", str(files["png"]), "--markdown", str(files["md"]),
+    ]  # fmt: skip
+    assert main(arguments) == 0
+    assert "decoding" in capsys.readouterr().out
+
+    document = json.loads(files["json"].read_text())
+    assert [kind["kind"] for kind in document["kinds"]] == ["demo", "noise", "photographs"]
+    for kind in document["kinds"]:
+        names = [function["name"] for function in kind["functions"]]
+        assert len(set(names)) == len(names)
+        assert {DECODING, KERNEL, CIRCLES, RESPONSE, LINES, ALL, PLAIN_GATHER} <= set(names)
+        assert {"cv2.HoughCircles", "cv2.SimpleBlobDetector", "skimage hough_circle"} <= set(names)
+        assert all(function["ms"]["median"] > 0.0 for function in kind["functions"])
+        for compared in kind["comparisons"]:
+            assert {compared["slower"], compared["faster"]} <= set(names)
+    assert [point["amount"] for point in document["by_megapixels"]] == pytest.approx(
+        [384 * 144 / 1e6, 768 * 288 / 1e6]
+    )
+    assert [point["amount"] for point in document["by_discs"]] == [0, 3]
+    assert [(times["frames"], times["jobs"]) for times in document["by_frames"]] == [(1, 1), (2, 1)]
+    assert len(document["runs"]) == len(commands(short_run, tmp_path))
+    assert files["png"].read_bytes().startswith(b"\x89PNG")
+    assert KERNEL in files["md"].read_text()

@@ -1,0 +1,141 @@
+"""What is reported follows from what was measured."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from tools.benchmark.functions import DECODING, Measured
+from tools.benchmark.machine import Machine, cpu_model, this_machine
+from tools.benchmark.plot import plot_png
+from tools.benchmark.report import format_markdown, number
+from tools.benchmark.result import (
+    GrowthPoint,
+    KindTimes,
+    Result,
+    comparisons,
+    format_json,
+    function_times,
+    run_times,
+)
+
+_MEASURED = [
+    Measured(DECODING, "decoding", lambda p: p),
+    Measured("own", "circles", lambda p: p),
+    Measured("cv2 LSD", "peer", lambda p: p),
+]
+_SECONDS = {
+    DECODING: np.array([[0.001, 0.002], [0.003, 0.004]]),
+    "own": np.array([[0.004, 0.006], [0.006, 0.004]]),
+    "cv2 LSD": np.array([[0.040, np.nan], [0.030, np.nan]]),
+}
+
+
+def _result() -> Result:
+    functions = function_times(_MEASURED, _SECONDS)
+    kind = KindTimes("demo", "frames", 2, functions, comparisons([("cv2 LSD", "own")], _SECONDS))
+    passes = [
+        run_times("detect all", 10, jobs, np.array([2.0, 2.0, 4.0]) / jobs, np.full(3, 0.5))
+        for jobs in (1, 2)
+    ]
+    points = tuple(GrowthPoint(amount, functions) for amount in (0.2, 0.9))
+    return Result(
+        machine=Machine("A processor", 2, "Linux", {"python": "3"}),
+        settings={"rounds": 2},
+        absent=("something",),
+        skipped=("photographs: no folder was given",),
+        kinds=(kind,),
+        runs=tuple(passes),
+        by_megapixels=points,
+        by_discs=points,
+        by_verticals=points,
+        by_frames=tuple(passes),
+    )
+
+
+def test_times_and_ratios_are_medians_of_calls_and_of_pairs() -> None:
+    own = function_times(_MEASURED, _SECONDS)[1]
+    assert own.ms.median == pytest.approx(5.0)
+    assert own.ms.least == pytest.approx(4.0)
+    # The pairs' ratios are 4, 3, 2, 1; the ratio of the medians would be 2.
+    assert own.decodings.median == pytest.approx(2.5)
+    assert (own.decodings.lower_quartile, own.decodings.upper_quartile) == (1.75, 3.25)
+
+
+def test_decoding_takes_as_long_as_decoding() -> None:
+    decoding = function_times(_MEASURED, _SECONDS)[0]
+    assert decoding.decodings.lower_quartile == decoding.decodings.upper_quartile == 1.0
+
+
+def test_peers_are_compared_where_both_were_measured() -> None:
+    found = comparisons([("cv2 LSD", "own"), ("absent", "own")], _SECONDS)
+    assert [c.slower for c in found] == ["cv2 LSD"]
+    assert found[0].ratio.median == pytest.approx(7.5)  # of 10 and 5
+    assert found[0].ratio.count == 2
+
+
+def test_the_share_of_decoding_is_per_job() -> None:
+    times = run_times("detect all", 100, 2, np.array([1.0, 2.0, 4.0]), np.array([0.2, 0.4, 0.8]))
+    assert times.images_per_s.median == pytest.approx(50.0)
+    # Decoding alone runs at 500, 250, 125 images per second, two jobs at 50, 25, 12.5 each.
+    assert times.share_of_decoding.median == pytest.approx(0.1)
+    assert times.share_of_decoding.least == pytest.approx(0.1)
+
+
+def test_json_holds_all_of_it() -> None:
+    document = json.loads(format_json(_result()))
+    assert set(document) == {
+        "machine", "settings", "absent", "skipped", "kinds", "runs",
+        "by_megapixels", "by_discs", "by_verticals", "by_frames",
+    }  # fmt: skip
+    function = document["kinds"][0]["functions"][1]
+    assert function["name"] == "own"
+    assert function["decodings"] == {
+        "median": 2.5, "lower_quartile": 1.75, "upper_quartile": 3.25, "least": 1.0, "count": 4,
+    }  # fmt: skip
+    assert document["by_frames"][1]["images_per_s"]["median"] == 10.0
+    assert document["by_megapixels"][1]["amount"] == 0.9
+
+
+def test_markdown_tells_ratios_first_and_what_is_missing() -> None:
+    text = format_markdown(_result())
+    assert "| own | 2.50 (1.75 - 3.25); 5.00 ms |" in text
+    assert "| cv2 LSD / own | 7.50 (6.25 - 8.75) |" in text
+    assert "| `detect all`, 10 frames | 2 | 10.0 | 0.25 (0.19 - 0.25) |" in text
+    assert "not installed: something" in text
+    assert "not measured: photographs: no folder was given" in text
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (1458.2, "1,458"),
+        (99.96, "100"),
+        (12.34, "12.3"),
+        (9.996, "10.0"),
+        (1.0, "1.00"),
+        (0.0712, "0.071"),
+        (0.0041, "0.0041"),
+    ],
+)
+def test_numbers_keep_two_or_three_digits(value: float, text: str) -> None:
+    assert number(value) == text
+
+
+def test_the_plot_is_a_picture() -> None:
+    import cv2
+
+    picture = cv2.imdecode(np.frombuffer(plot_png(_result()), np.uint8), cv2.IMREAD_COLOR)
+    assert picture is not None
+    assert picture.shape == (850, 1300, 3)
+    assert np.ptp(picture) == 255
+
+
+def test_the_processor_is_the_one_that_the_system_names() -> None:
+    assert cpu_model("processor\t: 0\nmodel name\t: A: B\nmodel\t: 7\n") == "A: B"
+    assert cpu_model("nothing of the kind") == ""
+    machine = this_machine()
+    assert machine.cores >= 1
+    assert machine.versions["numpy"] == np.__version__

@@ -1,0 +1,175 @@
+"""The result as tables for a terminal, and as Markdown. Ratios come first: they are what holds."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from rich.console import Group
+from rich.table import Table
+from rich.text import Text
+
+from tools.benchmark.result import KindTimes, Result, RunTimes
+from tools.benchmark.timing import Spread
+
+
+def result_tables(result: Result) -> Group:
+    """Everything but the growth curves' single functions, for a terminal."""
+    parts: list[Table | Text] = [Text(line) for line in description_lines(result)]
+    parts += [_kind_table(kind) for kind in result.kinds]
+    parts += [_comparison_table(kind) for kind in result.kinds if kind.comparisons]
+    parts.append(_runs_table("Whole runs, files in, files out", result.runs))
+    for title, points in (
+        ("Growth with the image, Mpixel", result.by_megapixels),
+        ("Growth with the discs", result.by_discs),
+        ("Growth with the verticals", result.by_verticals),
+    ):
+        table = Table(title=title, title_justify="left")
+        names = [function.name for function in points[0].functions] if points else []
+        table.add_column("")
+        for name in names:
+            table.add_column(f"{name} / ms", justify="right")
+        for point in points:
+            table.add_row(f"{point.amount:.3g}", *(number(t.ms.median) for t in point.functions))
+        parts.append(table)
+    parts.append(_runs_table("Growth with the frames", result.by_frames))
+    return Group(*parts)
+
+
+def description_lines(result: Result) -> list[str]:
+    """What it was measured on, and what was not measured."""
+    machine = result.machine
+    versions = ", ".join(f"{name} {version}" for name, version in machine.versions.items())
+    lines = [f"{machine.cpu}, {machine.cores} cores, {machine.system}; {versions}"]
+    lines += [f"not installed: {name}" for name in result.absent]
+    lines += [f"not measured: {sentence}" for sentence in result.skipped]
+    return lines
+
+
+def format_markdown(result: Result) -> str:
+    """The tables that documents show: functions on all kinds of pictures, and whole runs."""
+    kinds = result.kinds
+    lines = [
+        *(f"- {line}" for line in description_lines(result)),
+        *(f"- {kind.kind}: {kind.pictures} {kind.description}" for kind in kinds),
+        "",
+        "Median time per image, one core, in times that decoding the same image takes (quartiles; "
+        "milliseconds):",
+        "",
+        *_markdown_row(["", *(kind.kind for kind in kinds)], head=True),
+    ]
+    for function in kinds[0].functions:
+        cells = []
+        for kind in kinds:
+            times = next(t for t in kind.functions if t.name == function.name)
+            cells.append(f"{spread(times.decodings)}; {number(times.ms.median)} ms")
+        lines += _markdown_row([function.name, *cells])
+    lines += [
+        "",
+        "How many times as long as the detector of this project a peer takes on the same image "
+        "(quartiles):",
+        "",
+        *_markdown_row(["peer / own", *(kind.kind for kind in kinds)], head=True),
+    ]
+    for compared in kinds[0].comparisons:
+        cells = [
+            spread(next(c.ratio for c in kind.comparisons if c.slower == compared.slower))
+            for kind in kinds
+        ]
+        lines += _markdown_row([f"{compared.slower} / {compared.faster}", *cells])
+    lines += [
+        "",
+        "Whole runs, files in, files out:",
+        "",
+        *_markdown_row(
+            ["", "jobs", "images/s", "per job, share of decoding alone (quartiles)"], head=True
+        ),
+    ]
+    for passes in result.runs:
+        lines += _markdown_row(
+            [
+                f"`{passes.command}`, {passes.frames} frames",
+                str(passes.jobs),
+                number(passes.images_per_s.median),
+                spread(passes.share_of_decoding),
+            ]
+        )
+    return "\n".join(lines) + "\n"
+
+
+def number(value: float) -> str:
+    """A positive number in two or three digits, without an exponent."""
+    for least, digits in ((99.95, 0), (9.995, 1), (0.0995, 2), (0.00995, 3)):
+        if value >= least:
+            return f"{value:,.{digits}f}"
+    return f"{value:.4f}"
+
+
+def spread(values: Spread) -> str:
+    """Median and quartiles."""
+    return f"{number(values.median)} ({_quartiles(values)})"
+
+
+def _kind_table(kind: KindTimes) -> Table:
+    table = Table(title=f"{kind.kind}: {kind.pictures} {kind.description}", title_justify="left")
+    table.add_column("function", no_wrap=True)
+    for column in ("x decoding", "quartiles", "ms/image", "quartiles", "calls"):
+        table.add_column(column, justify="right")
+    group = kind.functions[0].group
+    for times in kind.functions:
+        if times.group != group:
+            table.add_section()
+            group = times.group
+        table.add_row(
+            times.name,
+            number(times.decodings.median),
+            _quartiles(times.decodings),
+            number(times.ms.median),
+            _quartiles(times.ms),
+            str(times.ms.count),
+        )
+    return table
+
+
+def _comparison_table(kind: KindTimes) -> Table:
+    table = Table(title=f"{kind.kind}: peers", title_justify="left")
+    table.add_column("time of peer / own")
+    table.add_column("ratio", justify="right")
+    table.add_column("quartiles", justify="right")
+    for compared in kind.comparisons:
+        table.add_row(
+            f"{compared.slower} / {compared.faster}",
+            number(compared.ratio.median),
+            _quartiles(compared.ratio),
+        )
+    return table
+
+
+def _runs_table(title: str, runs: Iterable[RunTimes]) -> Table:
+    table = Table(
+        title=title,
+        title_justify="left",
+        caption="* images per second and job / those of decoding the same files, and nothing else",
+        caption_justify="left",
+    )
+    table.add_column("command", no_wrap=True)
+    for column in ("share*", "quartiles", "images/s", "frames", "jobs"):
+        table.add_column(column, justify="right")
+    for times in runs:
+        table.add_row(
+            times.command,
+            number(times.share_of_decoding.median),
+            _quartiles(times.share_of_decoding),
+            number(times.images_per_s.median),
+            str(times.frames),
+            str(times.jobs),
+        )
+    return table
+
+
+def _quartiles(values: Spread) -> str:
+    return f"{number(values.lower_quartile)} - {number(values.upper_quartile)}"
+
+
+def _markdown_row(cells: list[str], *, head: bool = False) -> list[str]:
+    row = f"| {' | '.join(cells)} |"
+    return [row, f"|{'---|' * len(cells)}"] if head else [row]

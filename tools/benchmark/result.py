@@ -1,0 +1,200 @@
+"""What a benchmark found: plain values, and their JSON."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from tools.benchmark.functions import DECODING, Measured
+from tools.benchmark.machine import Machine
+from tools.benchmark.timing import FloatArray, Spread, paired_ratios, spread_of
+
+
+@dataclass(frozen=True)
+class FunctionTimes:
+    """Times of one function on some pictures.
+
+    Attributes
+    ----------
+    name, group : str
+        As in `Measured`.
+    ms : Spread
+        Milliseconds per image.
+    decodings : Spread
+        The same, in times that decoding the same image took in the same round.
+    """
+
+    name: str
+    group: str
+    ms: Spread
+    decodings: Spread
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """How many times as long as one function another takes on the same image.
+
+    Attributes
+    ----------
+    slower, faster : str
+        Names; `slower` is expected to be, the ratio tells.
+    ratio : Spread
+        Time of `slower` / time of `faster`.
+    """
+
+    slower: str
+    faster: str
+    ratio: Spread
+
+
+@dataclass(frozen=True)
+class KindTimes:
+    """Times on one kind of pictures.
+
+    Attributes
+    ----------
+    kind : str
+        "demo", "noise" or "photographs".
+    description : str
+        What the pictures are.
+    pictures : int
+        How many there were.
+    functions : tuple of FunctionTimes
+    comparisons : tuple of Comparison
+        Peers against what does their work here.
+    """
+
+    kind: str
+    description: str
+    pictures: int
+    functions: tuple[FunctionTimes, ...]
+    comparisons: tuple[Comparison, ...]
+
+
+@dataclass(frozen=True)
+class RunTimes:
+    """Passes over a whole run, files in and files out.
+
+    Attributes
+    ----------
+    command : str
+        What was carried out.
+    frames, jobs : int
+        Frames of the run, processes or threads at work.
+    images_per_s : Spread
+        Images per second, by all jobs together.
+    share_of_decoding : Spread
+        Images per second and job / images per second when one core decodes the same files from
+        memory and does nothing else.
+    """
+
+    command: str
+    frames: int
+    jobs: int
+    images_per_s: Spread
+    share_of_decoding: Spread
+
+
+@dataclass(frozen=True)
+class GrowthPoint:
+    """Times at one point of a growth curve: how much there was, and what that took."""
+
+    amount: float
+    functions: tuple[FunctionTimes, ...]
+
+
+@dataclass(frozen=True)
+class Result:
+    """All that a benchmark found.
+
+    Attributes
+    ----------
+    machine : Machine
+    settings : mapping
+        What decided how it was measured.
+    absent : tuple of str
+        Peers that are not installed.
+    skipped : tuple of str
+        A sentence for each thing that was not measured.
+    kinds : tuple of KindTimes
+    runs : tuple of RunTimes
+        The demo run, all commands.
+    by_megapixels, by_discs, by_verticals : tuple of GrowthPoint
+        Growth curves.
+    by_frames : tuple of RunTimes
+        `detect all` on runs of growing length.
+    """
+
+    machine: Machine
+    settings: Mapping[str, Any]
+    absent: tuple[str, ...]
+    skipped: tuple[str, ...]
+    kinds: tuple[KindTimes, ...]
+    runs: tuple[RunTimes, ...]
+    by_megapixels: tuple[GrowthPoint, ...]
+    by_discs: tuple[GrowthPoint, ...]
+    by_verticals: tuple[GrowthPoint, ...]
+    by_frames: tuple[RunTimes, ...]
+
+
+def function_times(
+    measured: Sequence[Measured], seconds: Mapping[str, FloatArray]
+) -> tuple[FunctionTimes, ...]:
+    """Sum up the times of functions that were measured in turn with decoding.
+
+    Parameters
+    ----------
+    measured : sequence of Measured
+    seconds : mapping
+        As from `measure_in_turn`; decoding must be among them.
+    """
+    reference = seconds[DECODING]
+    return tuple(
+        FunctionTimes(
+            function.name,
+            function.group,
+            spread_of(1e3 * seconds[function.name]),
+            spread_of(paired_ratios(seconds[function.name], reference)),
+        )
+        for function in measured
+    )
+
+
+def comparisons(
+    pairs: Sequence[tuple[str, str]], seconds: Mapping[str, FloatArray]
+) -> tuple[Comparison, ...]:
+    """Ratios of (slower, faster) pairs of functions; pairs that were not measured are left out."""
+    return tuple(
+        Comparison(slower, faster, spread_of(paired_ratios(seconds[slower], seconds[faster])))
+        for slower, faster in pairs
+        if slower in seconds and faster in seconds
+    )
+
+
+def run_times(
+    command: str, frames: int, jobs: int, seconds: FloatArray, decoding: FloatArray
+) -> RunTimes:
+    """Sum up passes over a run.
+
+    Parameters
+    ----------
+    command : str
+    frames, jobs : int
+    seconds, decoding : (rounds,) float64
+        Of the command, and of decoding the same files in the same round; NaN where left out.
+    """
+    return RunTimes(
+        command,
+        frames,
+        jobs,
+        spread_of(frames / seconds),
+        spread_of(paired_ratios(decoding, seconds) / jobs),
+    )
+
+
+def format_json(result: Result) -> str:
+    """The result as JSON, ending with a line end."""
+    return json.dumps(dataclasses.asdict(result), indent=1) + "\n"

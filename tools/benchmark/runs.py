@@ -1,0 +1,124 @@
+"""Whole runs: files in, files out, through what the command ``detect`` carries out."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import io
+import time
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from detect.cli import All, Circles, Lines
+from detect.commands import carry_out
+from detect.run import open_run
+from detect.settings import PUBLISHED
+from tools.benchmark.errors import BenchmarkError
+from tools.benchmark.material import decode
+from tools.benchmark.timing import FloatArray, measure_in_turn
+
+Command = All | Circles | Lines
+Key = TypeVar("Key", bound=Hashable)
+
+#: A command that has taken this long is left out of later rounds, seconds.
+_BUDGET_S = 10.0
+
+
+def jobs_available() -> bool:
+    """Whether the commands can work on several frames at once."""
+    return "jobs" in {f.name for f in dataclasses.fields(All)}
+
+
+def commands(run: Path, output: Path) -> dict[str, Command]:
+    """The commands that are measured on a run; their files go into a folder."""
+    return {
+        "detect circles --preset published": Circles(
+            run=run, output=output / "published.circles", force=True, settings=PUBLISHED
+        ),
+        "detect circles": Circles(run=run, output=output / "discs.circles", force=True),
+        "detect lines": Lines(run=run, output=output / "verticals.lines", force=True),
+        "detect all": All(run=run, output=output, force=True),
+    }
+
+
+def with_jobs(command: Command, jobs: int) -> Command:
+    """The same command with so many jobs.
+
+    Raises
+    ------
+    BenchmarkError
+        If there should be more than one and the command cannot.
+    """
+    if jobs_available():
+        changes: dict[str, int] = {"jobs": jobs}
+        return dataclasses.replace(command, **changes)  # type: ignore[arg-type]
+    if jobs != 1:
+        raise BenchmarkError(f"{jobs} jobs: expected 1, the commands know no others")
+    return command
+
+
+def perform(command: Command) -> None:
+    """Carry out a command as ``detect`` does, but silently.
+
+    Raises
+    ------
+    BenchmarkError
+        If it does not end well.
+    """
+    said = io.StringIO()
+    with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+        code = carry_out(command)
+    if code != 0:
+        report = " ".join(said.getvalue().split())
+        raise BenchmarkError(f"detect ended with {code}: expected 0: {report}")
+
+
+def decode_run(files: Sequence[NDArray[np.uint8]]) -> None:
+    """Decode all of a run's files, already in memory, and do nothing with them."""
+    for content in files:
+        decode(content)
+
+
+def measure_runs(
+    performed: Mapping[Key, Command],
+    run: Path,
+    rounds: int,
+    clock: Callable[[], float] = time.perf_counter,
+) -> tuple[int, FloatArray, dict[Key, FloatArray]]:
+    """Time whole passes over a run, in turn with decoding its files from memory.
+
+    Parameters
+    ----------
+    performed : mapping
+        Commands by any key, all on `run`.
+    run : path
+        The run folder.
+    rounds : int
+        Passes; slow commands are measured three times at least.
+    clock : callable
+        Seconds.
+
+    Returns
+    -------
+    frames : int
+    decoding : (rounds,) float64
+        Seconds of decoding the run.
+    seconds : dict of (rounds,) float64
+        Seconds of each command; NaN where it was left out.
+    """
+    opened = open_run(run)
+    paths = [frame.image for frame in opened.frames if frame.image is not None]
+    files = [np.fromfile(path, np.uint8) for path in paths]
+
+    def performing(command: Command) -> Callable[[int], object]:
+        return lambda _: perform(command)
+
+    functions: dict[str, Callable[[int], object]] = {"": lambda _: decode_run(files)}
+    functions |= {str(i): performing(command) for i, command in enumerate(performed.values())}
+    seconds = measure_in_turn(functions, 1, rounds, _BUDGET_S, clock)
+    by_key = {key: seconds[str(i)][:, 0] for i, key in enumerate(performed)}
+    return len(paths), seconds[""][:, 0], by_key
