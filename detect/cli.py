@@ -3,7 +3,8 @@
 Only what `--help` needs is imported at once; everything heavy waits for the command that uses it.
 
 Exit codes: 0 all went well; 1 the command could not be carried out, or a demand of `compare` was
-not met; 2 the command line was wrong; 3 some frames could not be worked on (the others were).
+not met; 2 the command line was wrong; 3 some frames could not be worked on (the others were);
+130 it was interrupted, and wrote nothing.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import tyro
 from tyro.conf import OmitArgPrefixes, Positional, arg, subcommand
 
 from detect.compare_result import CompareOptions
+from detect.errors import WorkerError
 from detect.line_settings import PRESETS as LINE_PRESETS
 from detect.line_settings import LineSettings
 from detect.settings import PUBLISHED, CircleSettings
@@ -25,6 +27,7 @@ Preset = Literal["default", "published"]
 
 EXIT_ERROR = 1
 EXIT_FRAMES_FAILED = 3
+EXIT_INTERRUPTED = 130
 
 _CIRCLE_PRESETS = {"default": CircleSettings(), "published": PUBLISHED}
 
@@ -53,6 +56,11 @@ class Circles:
         Folder for images with the outlines and qualities drawn in.
     json : Path
         Write the rows with their pixels and evidence as JSON as well.
+    jobs : int
+        Processes that share the work, 1 for none beside this one; by default as many as there are
+        cores, for runs of hundreds of frames. What is written is the same.
+    cluster : str
+        Address of a dask scheduler (tcp://host:8786) whose workers do the work instead.
     """
 
     run: Positional[Path]
@@ -63,6 +71,8 @@ class Circles:
     force: bool = False
     draw: Path | None = None
     json: Path | None = None
+    jobs: int | None = None
+    cluster: str | None = None
     settings: OmitArgPrefixes[CircleSettings] = field(default_factory=CircleSettings)
 
 
@@ -96,6 +106,11 @@ class Lines:
         Draw all tracks instead, the rejected ones with the reason.
     response : bool
         Draw the filter's response as well, into files of their own.
+    jobs : int
+        Processes that share the work, 1 for none beside this one; by default as many as there are
+        cores, for runs of hundreds of frames. What is written is the same.
+    cluster : str
+        Address of a dask scheduler (tcp://host:8786) whose workers do the work instead.
     """
 
     run: Positional[Path]
@@ -109,6 +124,8 @@ class Lines:
     draw: Path | None = None
     rejected: bool = False
     response: bool = False
+    jobs: int | None = None
+    cluster: str | None = None
     settings: OmitArgPrefixes[LineSettings] = field(default_factory=LineSettings)
 
 
@@ -130,6 +147,11 @@ class All:
         Folder for detected.circles, detected.lines and detected.tilt; by default the run's.
     force : bool
         Replace existing files.
+    jobs : int
+        Processes that share the work, 1 for none beside this one; by default as many as there are
+        cores, for runs of hundreds of frames. What is written is the same.
+    cluster : str
+        Address of a dask scheduler (tcp://host:8786) whose workers do the work instead.
     """
 
     run: Positional[Path]
@@ -137,6 +159,8 @@ class All:
     camera: Path | None = None
     output: Annotated[Path | None, arg(aliases=["-o"])] = None
     force: bool = False
+    jobs: int | None = None
+    cluster: str | None = None
     circles: CircleSettings = field(default_factory=CircleSettings)
     lines: LineSettings = field(default_factory=LineSettings)
 
@@ -186,11 +210,24 @@ class Compare:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
-    given = sys.argv[1:] if arguments is None else arguments
+    try:
+        command = _parsed(sys.argv[1:] if arguments is None else arguments)
+        from detect.commands import carry_out
+
+        return carry_out(command)
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return EXIT_INTERRUPTED
+    except (ValueError, OSError, WorkerError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return EXIT_ERROR
+
+
+def _parsed(given: list[str]) -> Circles | Lines | All | Compare:
     preset = _preset(given)
     circles = _CIRCLE_PRESETS.get(preset, CircleSettings())
     lines = LINE_PRESETS.get(preset, LineSettings())
-    command = tyro.cli(
+    return tyro.cli(
         Annotated[
             Annotated[
                 Circles,
@@ -211,16 +248,6 @@ def main(arguments: list[str] | None = None) -> int:
         description="Landmarks with covariances out of a calibrated camera's images.",
         args=given,
     )
-    from detect.commands import carry_out
-
-    try:
-        return carry_out(command)
-    except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
-        return 130
-    except (ValueError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return EXIT_ERROR
 
 
 def _preset(arguments: list[str]) -> str:

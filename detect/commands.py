@@ -6,33 +6,28 @@ Each command imports what it needs when it runs: comparing files takes no compil
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from detect.announcing import show_announcements
 from detect.cli import EXIT_ERROR, EXIT_FRAMES_FAILED, All, Circles, Compare, Lines
+from detect.errors import WorkerError
+from detect.progress import print_failures, progress_bar
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
     from rich.console import Group
 
-    from camera import Camera
-    from detect.circles import CircleDetections
-    from detect.circles_run import FrameSink
     from detect.compare_result import Rates
-    from detect.lines import LineDetections
-    from detect.lines_run import LineSink
-    from detect.run import RunFrame
-    from detect.settings import CircleSettings
-
-_SHOWN_FAILURES = 10
+    from detect.dispatch import Workers
+    from detect.run import Run
+    from detect.stream import RunSummary
 
 
 def carry_out(command: Circles | Lines | All | Compare) -> int:
     """Carry out a command; returns the exit code."""
+    show_announcements()
     if isinstance(command, Circles):
         return _circles(command)
     if isinstance(command, Lines):
@@ -47,18 +42,13 @@ def _circles(command: Circles) -> int:
     from detect.circles_run import detect_circles_run
     from detect.run import open_run
     from landmarks import read_tilts
-    from storage import OutputExistsError
 
     run = open_run(command.run, command.camera)
     output = command.output if command.output is not None else command.run / "detected.circles"
-    for path in (output, command.json):
-        if path is not None and path.exists() and not command.force:
-            raise OutputExistsError(path)
-    draw: FrameSink | None = None
+    _demand_new([output, command.json], command.force)
     if command.draw is not None:
-        draw = _drawing_sink(command.draw, run.camera, command.settings, command.force)
-
-    with _progress("discs", len(run.frames)) as advance:
+        command.draw.mkdir(parents=True, exist_ok=True)
+    with progress_bar("discs", len(run.frames)) as advance:
         summary = detect_circles_run(
             run,
             command.settings,
@@ -67,14 +57,12 @@ def _circles(command: Circles) -> int:
             overwrite=command.force,
             json_output=command.json,
             tilts=None if command.tilt is None else read_tilts(command.tilt),
-            on_frame=draw,
+            pictures=command.draw,
+            workers=_workers(command, run),
             on_progress=advance,
         )
     print(f"{output}: {summary.discs} discs in {summary.frames} frames")
-    if summary.images_without_step:
-        print(f"{summary.images_without_step} images are not named by a STEP row: left out")
-    _print_failures(summary.failures)
-    return EXIT_FRAMES_FAILED if summary.failures else 0
+    return _exit_code(summary)
 
 
 def _lines(command: Lines) -> int:
@@ -83,14 +71,11 @@ def _lines(command: Lines) -> int:
     from detect.lines_run import detect_lines_run
     from detect.run import open_run
     from landmarks import read_frames
-    from storage import OutputExistsError
 
     run = open_run(command.run, command.camera)
     output = command.output if command.output is not None else command.run / "detected.lines"
     tilt = command.tilt if command.tilt is not None else output.with_suffix(".tilt")
-    for path in (output, tilt):
-        if path.exists() and not command.force:
-            raise OutputExistsError(path)
+    _demand_new([output, tilt], command.force)
     settings = command.settings
     if command.join_threshold is not None:
         # On the horizon straight ahead, a bearing of one radian is scale_x pixels wide.
@@ -102,11 +87,9 @@ def _lines(command: Lines) -> int:
             frame.step.prefix: by_name.get(image_name(frame.step.prefix), ())
             for frame in run.frames
         }
-    draw = None
     if command.draw is not None:
-        draw = _line_drawing_sink(command, command.draw, run.camera)
-
-    with _progress("lines", len(run.frames)) as advance:
+        command.draw.mkdir(parents=True, exist_ok=True)
+    with progress_bar("lines", len(run.frames)) as advance:
         summary = detect_lines_run(
             run,
             settings,
@@ -115,85 +98,72 @@ def _lines(command: Lines) -> int:
             version=__version__,
             overwrite=command.force,
             reference=reference,
-            on_frame=draw,
+            pictures=command.draw,
+            drawing="tracks" if command.rejected else "lines",
+            draw_response=command.response,
+            workers=_workers(command, run),
             on_progress=advance,
         )
     print(f"{output}: {summary.lines} lines in {summary.frames} frames")
     print(f"{tilt}: the tilt of {summary.tilts} frames")
-    if summary.images_without_step:
-        print(f"{summary.images_without_step} images are not named by a STEP row: left out")
-    _print_failures(summary.failures)
-    return EXIT_FRAMES_FAILED if summary.failures else 0
+    return _exit_code(summary)
 
 
 def _all(command: All) -> int:
+    from detect import __version__
+    from detect.all_run import detect_all_run
+    from detect.run import open_run
+
+    run = open_run(command.run, command.camera)
     folder = command.output if command.output is not None else command.run
-    tilt = folder / "detected.tilt"
-    lines = Lines(
-        run=command.run,
-        camera=command.camera,
-        output=folder / "detected.lines",
-        tilt=tilt,
-        force=command.force,
-        settings=command.lines,
-    )
-    circles = Circles(
-        run=command.run,
-        camera=command.camera,
-        output=folder / "detected.circles",
-        tilt=tilt,
-        force=command.force,
-        settings=command.circles,
-    )
-    return max(_lines(lines), _circles(circles))
+    lines, tilt, circles = (folder / f"detected.{kind}" for kind in ("lines", "tilt", "circles"))
+    _demand_new([lines, tilt, circles], command.force)
+    with progress_bar("lines, tilt and discs", len(run.frames)) as advance:
+        summary = detect_all_run(
+            run,
+            command.lines,
+            command.circles,
+            lines,
+            tilt,
+            circles,
+            version=__version__,
+            overwrite=command.force,
+            workers=_workers(command, run),
+            on_progress=advance,
+        )
+    print(f"{lines}: {summary.lines} lines in {summary.frames} frames")
+    print(f"{tilt}: the tilt of {summary.tilts} frames")
+    print(f"{circles}: {summary.discs} discs in {summary.frames} frames")
+    return _exit_code(summary)
 
 
-def _line_drawing_sink(command: Lines, folder: Path, camera: Camera) -> LineSink:
-    """What draws each frame's lines into PNGs."""
-    import cv2
+def _workers(command: Circles | Lines | All, run: Run) -> Workers:
+    """Who does the work of a command."""
+    from detect.workers import cluster_workers, default_jobs, local_workers
 
-    from detect.line_drawing import draw_lines, draw_response, draw_tracks
-    from lut import cached_vertical_table
-    from storage import write_whole
-
-    folder.mkdir(parents=True, exist_ok=True)
-    table = cached_vertical_table(camera)
-
-    def draw(frame: RunFrame, image: NDArray[np.uint8], found: LineDetections) -> None:
-        if command.rejected:
-            pictures = {"": draw_tracks(image, table, found, rejected=True, reasons=True)}
-        else:
-            pictures = {"": draw_lines(image, camera, table, found)}
-        if command.response:
-            pictures[".response"] = draw_response(found.response, table)
-        for kind, picture in pictures.items():
-            _, encoded = cv2.imencode(".png", picture)
-            name = f"{Path(frame.step.prefix).name}{kind}.png"
-            with write_whole(folder / name, overwrite=command.force) as stream:
-                stream.write(encoded.tobytes())
-
-    return draw
+    draws = not isinstance(command, All) and command.draw is not None
+    if command.cluster is not None:
+        if command.jobs is not None:
+            raise WorkerError("--jobs and --cluster: expected one of them")
+        return cluster_workers(command.cluster, pictures=draws)
+    jobs = command.jobs if command.jobs is not None else default_jobs(len(run.frames))
+    return local_workers(jobs, pictures=draws)
 
 
-def _drawing_sink(
-    folder: Path, camera: Camera, settings: CircleSettings, overwrite: bool
-) -> FrameSink:
-    """What draws each frame's detections into a PNG."""
-    import cv2
+def _demand_new(outputs: Sequence[Path | None], force: bool) -> None:
+    from storage import OutputExistsError
 
-    from detect.drawing import draw_circles
-    from storage import write_whole
+    for path in outputs:
+        if path is not None and path.exists() and not force:
+            raise OutputExistsError(path)
 
-    folder.mkdir(parents=True, exist_ok=True)
 
-    def draw(frame: RunFrame, image: NDArray[np.uint8], found: CircleDetections) -> None:
-        picture = draw_circles(image, camera, found, settings)
-        _, encoded = cv2.imencode(".png", picture)
-        name = f"{Path(frame.step.prefix).name}.png"
-        with write_whole(folder / name, overwrite=overwrite) as stream:
-            stream.write(encoded.tobytes())
-
-    return draw
+def _exit_code(summary: RunSummary) -> int:
+    """Tell what is wrong with a run; returns the exit code."""
+    if summary.images_without_step:
+        print(f"{summary.images_without_step} images are not named by a STEP row: left out")
+    print_failures(summary.failed, summary.failures)
+    return EXIT_FRAMES_FAILED if summary.failed else 0
 
 
 def _compare(command: Compare) -> int:
@@ -245,48 +215,3 @@ def _compared_lines(command: Compare) -> tuple[Group, str, Rates]:
         command.run, reference=command.reference, detected=command.detected, options=options
     )
     return line_comparison_tables(result), format_line_json(result), result
-
-
-@contextmanager
-def _progress(label: str, total: int) -> Iterator[Callable[[], None]]:
-    """A progress bar with the rate, on a terminal; yields what to call after every frame."""
-    from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
-
-    console = Console(stderr=True)
-    progress = Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[rate]}", justify="right"),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-        console=console,
-        disable=not console.is_terminal,
-    )
-    with progress:
-        task = progress.add_task(label, total=total, rate="")
-
-        def advance() -> None:
-            progress.advance(task)
-            speed = progress.tasks[0].finished_speed or progress.tasks[0].speed
-            progress.update(task, rate=f"{speed:.1f} images/s" if speed else "")
-
-        yield advance
-
-
-def _print_failures(failures: list[str]) -> None:
-    if not failures:
-        return
-    print(f"{len(failures)} frames could not be worked on:", file=sys.stderr)
-    for line in failures[:_SHOWN_FAILURES]:
-        print(f"  {line}", file=sys.stderr)
-    if len(failures) > _SHOWN_FAILURES:
-        print(f"  and {len(failures) - _SHOWN_FAILURES} more", file=sys.stderr)

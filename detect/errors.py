@@ -12,3 +12,7 @@ class DetectError(ValueError):
 
 class FrameError(ValueError):
     """One image that cannot be worked on; it costs its frame only."""
+
+
+class WorkerError(RuntimeError):
+    """The processes or machines that should do the work cannot; one line says what is missing."""

@@ -6,12 +6,34 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera
+from detect.circles import CircleDetections
 from detect.tilt import level_rotation
+from landmarks import FrameTilt
 
 FloatArray = NDArray[np.float64]
 
 _STEP_M = 1e-4
 _STEP_RAD = 1e-6
+
+
+def levelled(found: CircleDetections, camera: Camera, tilt: FrameTilt) -> CircleDetections:
+    """The same discs, their positions and covariances corrected for the tilt of their frame.
+
+    Discs that the levelled camera would see above the horizon are left out.
+    """
+    tilt_covariance = np.array([[tilt.cpp, tilt.cpr], [tilt.cpr, tilt.crr]])
+    floor_xy = level_positions(camera, found.floor_xy, tilt.pitch, tilt.roll)
+    covariance = level_covariances(
+        camera, found.floor_xy, found.covariance, tilt.pitch, tilt.roll, tilt_covariance
+    )
+    down = np.all(np.isfinite(floor_xy), axis=-1) & np.all(np.isfinite(covariance), axis=(-1, -2))
+    return CircleDetections(
+        pixels=found.pixels[down],
+        floor_xy=floor_xy[down],
+        covariance=covariance[down],
+        quality=found.quality[down],
+        evidence=found.evidence[down],
+    )
 
 
 def level_positions(

@@ -3,11 +3,16 @@
 Either a run folder of the data set (``images/``, ``<run>.cam``, ``<run>.txt``, ``map.circles``),
 or any folder of images with a ``.cam`` in it. A frame is a STEP row with its image; without
 odometry, an image with a STEP row of zeros.
+
+A run may be long. All that is kept of it are the names of its images, some 20 bytes each; the
+odometry is read along with the frames, and once before, so that what is wrong with it is told
+before any work is done.
 """
 
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,19 +21,43 @@ from numpy.typing import NDArray
 
 from camera import Camera, read_camera
 from detect.errors import DetectError, FrameError
-from landmarks import Step, read_steps
-
-IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".pgm", ".ppm", ".tif", ".tiff", ".bmp"})
+from detect.image_names import IMAGE_SUFFIXES, ImageNames
+from landmarks import Step, read_rows
 
 _JPEG_BEGIN, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class RunFrame:
     """One frame of a run: its STEP row, and the image taken after it (None where there is none)."""
 
     step: Step
     image: Path | None
+
+
+class RunFrames:
+    """The frames of a run, made as they are asked for: in the order of the odometry, or of names.
+
+    Iterating again begins anew.
+    """
+
+    def __init__(self, images: ImageNames, odometry: Path | None, count: int) -> None:
+        self._images = images
+        self._odometry = odometry
+        self._count = count
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __iter__(self) -> Iterator[RunFrame]:
+        if self._odometry is None:
+            for place in range(len(self._images)):
+                path = self._images.path(place)
+                yield RunFrame(_standing_still(path.stem), path)
+            return
+        for step in _steps(self._odometry):
+            found = self._images.find(_base_name(step.prefix))
+            yield RunFrame(step, None if found is None else self._images.path(found))
 
 
 @dataclass(frozen=True)
@@ -39,19 +68,19 @@ class Run:
     ----------
     folder : path
     camera : Camera
-    frames : tuple of RunFrame
+    frames : RunFrames
         In the order of the odometry, or of the images' names.
     odometry : path or None
         Where the STEP rows come from.
-    images_without_step : tuple of path
-        Images that the odometry does not name: they are not part of the run.
+    images_without_step : int
+        How many images the odometry does not name: they are not part of the run.
     """
 
     folder: Path
     camera: Camera
-    frames: tuple[RunFrame, ...]
+    frames: RunFrames
     odometry: Path | None
-    images_without_step: tuple[Path, ...]
+    images_without_step: int
 
     @property
     def name(self) -> str:
@@ -85,26 +114,23 @@ def open_run(folder: Path, camera_path: Path | None = None) -> Run:
         raise DetectError(f"{folder}: no such folder: expected a run folder or a folder of images")
     camera = read_camera(camera_path if camera_path is not None else _only_camera(folder))
     images = _images(folder)
-    if not images:
-        kinds = " ".join(sorted(IMAGE_SUFFIXES))
-        raise DetectError(f"{folder}: no images: expected {kinds} in it or in {folder / 'images'}")
     odometry = _odometry(folder)
     if odometry is None:
-        frames = tuple(RunFrame(_standing_still(path.stem), path) for path in images)
-        return Run(folder, camera, frames, None, ())
-    by_name: dict[str, Path] = {}
-    for path in images:
-        by_name.setdefault(path.stem, path)
-        by_name.setdefault(path.name, path)
-    frames = tuple(
-        RunFrame(step, by_name.get(_base_name(step.prefix))) for step in read_steps(odometry)
-    )
-    named = {frame.image for frame in frames}
-    without = tuple(path for path in images if path not in named)
-    return Run(folder, camera, frames, odometry, without)
+        return Run(folder, camera, RunFrames(images, None, len(images)), None, 0)
+    named = np.zeros(len(images), bool)
+    count = 0
+    for step in _steps(odometry):
+        count += 1
+        found = images.find(_base_name(step.prefix))
+        if found is not None:
+            named[found] = True
+    frames = RunFrames(images, odometry, count)
+    return Run(folder, camera, frames, odometry, int(np.count_nonzero(~named)))
 
 
-def read_image(frame: RunFrame, camera: Camera) -> NDArray[np.uint8]:
+def read_image(
+    frame: RunFrame, camera: Camera, working_folder: Path | None = None
+) -> NDArray[np.uint8]:
     """The grey image of a frame.
 
     Colour images are converted, 16-bit images brought to 8 bits.
@@ -114,6 +140,8 @@ def read_image(frame: RunFrame, camera: Camera) -> NDArray[np.uint8]:
     frame : RunFrame
     camera : Camera
         Whose size the image must have.
+    working_folder : path, optional
+        What relative paths are relative to, if not the process's own working folder.
 
     Returns
     -------
@@ -129,7 +157,7 @@ def read_image(frame: RunFrame, camera: Camera) -> NDArray[np.uint8]:
     if frame.image is None:
         raise FrameError(f"{frame.step.prefix}: no image of that name in the run")
     try:
-        content = frame.image.read_bytes()
+        content = (working_folder or Path()).joinpath(frame.image).read_bytes()
     except OSError as error:
         raise FrameError(f"{frame.image}: cannot be read: {error.strerror}") from None
     if not content:
@@ -165,19 +193,19 @@ def _only_camera(folder: Path) -> Path:
     return cameras[0]
 
 
-def _images(folder: Path) -> list[Path]:
-    """Images in ``images/`` or, failing that, in the folder; by name, numbers by value."""
+def _images(folder: Path) -> ImageNames:
+    """Images in ``images/`` or, failing that, in the folder."""
     for place in (folder / "images", folder):
         if place.is_dir():
-            found = [path for path in place.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES]
-            if found:
-                return sorted(found, key=_natural_order)
-    return []
+            found = ImageNames(place)
+            if len(found):
+                return found
+    kinds = " ".join(sorted(IMAGE_SUFFIXES))
+    raise DetectError(f"{folder}: no images: expected {kinds} in it or in {folder / 'images'}")
 
 
-def _natural_order(path: Path) -> tuple[list[tuple[int, str]], str]:
-    parts = re.findall(r"\d+|\D+", path.name)
-    return [(int(p), "") if p.isdigit() and p.isascii() else (-1, p) for p in parts], path.name
+def _steps(odometry: Path) -> Iterator[Step]:
+    return (row.record for row in read_rows(odometry) if isinstance(row.record, Step))
 
 
 def _odometry(folder: Path) -> Path | None:

@@ -36,8 +36,14 @@ from landmarks.records import (
     Row,
     Step,
 )
-from landmarks.tilts import FrameTilt, format_no_tilt, format_tilt, read_tilts
-from landmarks.writing import format_record, write_frames, write_rows
+from landmarks.tilts import (
+    FrameTilt,
+    format_no_tilt,
+    format_tilt,
+    read_tilts,
+    tilt_as_written,
+)
+from landmarks.writing import format_frame, format_head, format_record, write_frames, write_rows
 
 __all__ = [
     "Association",
@@ -61,6 +67,8 @@ __all__ = [
     "associate_within_covariance",
     "circle_arrays",
     "circle_landmarks",
+    "format_frame",
+    "format_head",
     "format_no_tilt",
     "format_record",
     "format_tilt",
@@ -73,6 +81,7 @@ __all__ = [
     "read_steps",
     "read_tilts",
     "squared_mahalanobis",
+    "tilt_as_written",
     "wrap_angle",
     "write_frames",
     "write_rows",

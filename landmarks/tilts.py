@@ -61,6 +61,12 @@ def format_no_tilt(prefix: str, lines: int) -> str:
     return f"NOTILT {prefix} {lines}"
 
 
+def tilt_as_written(tilt: FrameTilt) -> FrameTilt:
+    """The tilt as whoever reads its row will know it: with the row's digits."""
+    _, _, *numbers, lines = format_tilt(tilt).split()
+    return FrameTilt(tilt.prefix, *map(float, numbers), int(lines))
+
+
 def read_tilts(path: str | os.PathLike[str]) -> dict[str, FrameTilt]:
     """Read a tilt file.
 

@@ -51,6 +51,18 @@ def format_record(record: Record) -> str:
     return " ".join([text, *(f"{identifier:d}" for identifier in record.ids)])
 
 
+def format_head(head: str, line_end: LineEnd = "\n") -> bytes:
+    """A text as the comments at the head of a file: a ``#`` before each of its lines."""
+    lines = head.split("\n") if head else []
+    return b"".join(_encode(f"# {line}".rstrip() + line_end) for line in lines)
+
+
+def format_frame(frame: Frame, line_end: LineEnd = "\n") -> bytes:
+    """The rows of a frame as they stand in a file: its STEP and its landmarks."""
+    records = (frame.step, *frame.landmarks)
+    return b"".join(_encode(format_record(record) + line_end) for record in records)
+
+
 def write_frames(
     path: str | os.PathLike[str],
     frames: Iterable[Frame],
@@ -82,11 +94,9 @@ def write_frames(
         If the folder cannot be written to.
     """
     with write_whole(path, overwrite=overwrite) as stream:
-        for line in head.split("\n") if head else []:
-            stream.write(_encode(f"# {line}".rstrip() + line_end))
+        stream.write(format_head(head, line_end))
         for frame in frames:
-            for record in (frame.step, *frame.landmarks):
-                stream.write(_encode(format_record(record) + line_end))
+            stream.write(format_frame(frame, line_end))
 
 
 def write_rows(

@@ -8,12 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from camera import Camera
-from detect.circles import CircleDetections
 from detect.circles_run import detect_circles_run
-from detect.run import RunFrame, open_run
+from detect.run import open_run
 from detect.settings import PUBLISHED, CircleSettings
 from landmarks import read_frames, read_rows, read_steps
 from lut import TableError
@@ -100,12 +98,8 @@ def test_without_odometry_steps_are_zeros(small_run: Path) -> None:
 def test_bad_images_cost_their_frames_only(small_run: Path, tmp_path: Path) -> None:
     (small_run / "images" / "s.0001.png").write_bytes(b"no image")
     (small_run / "images" / "s.0002.png").unlink()
-    output, as_json = small_run / "out.circles", tmp_path / "out.json"
-    seen: list[str] = []
-
-    def look(frame: RunFrame, image: NDArray[np.uint8], found: CircleDetections) -> None:
-        seen.append(f"{frame.step.prefix} {image.shape} {len(found)}")
-
+    output, as_json, pictures = small_run / "out.circles", tmp_path / "out.json", tmp_path / "drawn"
+    pictures.mkdir()
     ticks = [0]
 
     def tick() -> None:
@@ -117,15 +111,16 @@ def test_bad_images_cost_their_frames_only(small_run: Path, tmp_path: Path) -> N
         output,
         version="1",
         json_output=as_json,
-        on_frame=look,
+        pictures=pictures,
         on_progress=tick,
     )
     assert summary.frames == ticks[0] == 3
+    assert summary.failed == 2
     assert summary.discs == 2
     broken, missing = summary.failures
     assert broken.startswith(str(small_run / "images" / "s.0001.png"))
     assert missing.startswith("s.0002: no image")
-    assert seen == ["s.0000 (288, 768) 2"]
+    assert [path.name for path in pictures.iterdir()] == ["s.0000.png"]
     frames = list(read_frames(output))
     assert [len(frame.circles) for frame in frames] == [2, 0, 0]
     assert [frame.step for frame in frames] == list(read_steps(small_run / "s.txt"))

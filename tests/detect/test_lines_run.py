@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from detect.cli import main
+from detect.line_identity import carry_ids
 from detect.line_settings import LineSettings
-from detect.lines_run import carry_ids, detect_lines_run
+from detect.lines_run import detect_lines_run
 from detect.run import open_run
 from landmarks import LineLandmark, read_frames, read_tilts
 

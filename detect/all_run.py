@@ -1,0 +1,72 @@
+"""Verticals, tilt and discs over a whole run in one pass: three files out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from detect.circles_run import circles_file
+from detect.dispatch import Workers
+from detect.frame import FramePlan
+from detect.line_settings import LineSettings
+from detect.lines_run import lines_file, tilt_file
+from detect.run import Run
+from detect.settings import CircleSettings
+from detect.stream import RunSummary, detect_run
+
+
+def detect_all_run(
+    run: Run,
+    lines: LineSettings,
+    circles: CircleSettings,
+    lines_output: Path,
+    tilt_output: Path,
+    circles_output: Path,
+    *,
+    version: str,
+    overwrite: bool = False,
+    workers: Workers | None = None,
+    on_progress: Callable[[], None] | None = None,
+) -> RunSummary:
+    """Detect the verticals, the tilt and the discs of a run, each image decoded once.
+
+    The files are those of `detect.lines_run.detect_lines_run`, followed by
+    `detect.circles_run.detect_circles_run` with the tilts that it wrote.
+
+    Parameters
+    ----------
+    run : Run
+        The run.
+    lines : LineSettings
+        Which verticals to look for.
+    circles : CircleSettings
+        Which discs to look for.
+    lines_output, tilt_output, circles_output : path
+        The files.
+    version : str
+        The program's version, for the files' heads.
+    overwrite : bool
+        Whether existing files may be replaced.
+    workers, on_progress
+        As in `detect.stream.detect_run`.
+
+    Returns
+    -------
+    RunSummary
+
+    Raises
+    ------
+    lut.TableError
+        If there can be no table for the camera.
+    storage.OutputExistsError
+        If an output exists and must not be replaced.
+    """
+    plan = FramePlan(run.camera, lines=lines, circles=circles, working_folder=Path.cwd())
+    files = [
+        tilt_file(tilt_output, version),
+        lines_file(lines_output, lines, version, run),
+        circles_file(circles_output, circles, version, run),
+    ]
+    return detect_run(
+        run, plan, files, overwrite=overwrite, workers=workers, on_progress=on_progress
+    )

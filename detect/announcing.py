@@ -1,0 +1,52 @@
+"""What takes long, once, is said while it does: compiled kernels and tables.
+
+Said through the logger ``redetect``, so that a program that uses the detectors decides who hears
+it; the command line shows it on stderr.
+"""
+
+from __future__ import annotations
+
+import logging
+import sys
+from functools import cache
+
+_log = logging.getLogger("redetect")
+
+
+class _ToStderr(logging.Handler):
+    def emit(self, record: logging.LogRecord) -> None:
+        print(record.getMessage(), file=sys.stderr, flush=True)
+
+
+_to_stderr = _ToStderr()
+
+
+def show_announcements() -> None:
+    """Show announcements on stderr."""
+    _log.setLevel(logging.INFO)
+    if _to_stderr not in _log.handlers:
+        _log.addHandler(_to_stderr)
+
+
+def announcements_are_shown() -> bool:
+    """Whether announcements go to stderr."""
+    return _to_stderr in _log.handlers
+
+
+@cache
+def announce_compiling() -> None:
+    """Have it announced when the first kernel is compiled instead of loaded."""
+    from numba.core import event
+
+    class FirstCompilation(event.Listener):
+        said = False
+
+        def on_start(self, _: object) -> None:
+            if not self.said:
+                self.said = True
+                _log.info("compiling kernels, once: about a minute")
+
+        def on_end(self, _: object) -> None:
+            pass
+
+    event.register("numba:compile", FirstCompilation())

@@ -1,0 +1,182 @@
+"""One frame of a run: its image in, its verticals, its tilt and its discs out.
+
+The way of one frame, top to bottom, is `detect_frame`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from camera import Camera
+from detect.circles import CircleDetections, detect_circles, disc_shape
+from detect.levelling import levelled
+from detect.line_settings import LineSettings
+from detect.lines import LineDetections, detect_lines
+from detect.run import RunFrame, read_image
+from detect.settings import CircleSettings
+from landmarks import FrameTilt, tilt_as_written
+from lut import DiscShape, DiscTable, VerticalTable, cached_disc_table, cached_vertical_table
+
+
+@dataclass(frozen=True)
+class FramePlan:
+    """What is done with every frame of a run. Small: it travels with every task.
+
+    Attributes
+    ----------
+    camera : Camera
+        The calibrated camera.
+    lines : LineSettings or None
+        Which verticals are looked for, if any.
+    circles : CircleSettings or None
+        Which discs are looked for, if any.
+    json : bool
+        Whether the discs are wanted as JSON as well.
+    drawing : {"discs", "lines", "tracks"} or None
+        What is drawn into the image; "tracks" are all tracks of lines, with the reason of those
+        that are no lines.
+    draw_response : bool
+        Whether the filter's response of the lines is drawn as well.
+    working_folder : path or None
+        What relative image paths are relative to, on whatever machine; by default a process's own.
+    """
+
+    camera: Camera
+    lines: LineSettings | None = None
+    circles: CircleSettings | None = None
+    json: bool = False
+    drawing: Literal["discs", "lines", "tracks"] | None = None
+    draw_response: bool = False
+    working_folder: Path | None = None
+
+
+@dataclass(frozen=True)
+class Tables:
+    """What the calibration decides before the first image, as far as a plan needs it."""
+
+    verticals: VerticalTable | None
+    discs: DiscTable | None
+
+
+@dataclass(frozen=True)
+class FrameDetections:
+    """What was found in one image; None is what was not looked for.
+
+    Attributes
+    ----------
+    image : (H, W) uint8
+    lines : LineDetections or None
+    tilt : FrameTilt or None
+        None also where too few lines tell.
+    discs : CircleDetections or None
+        Corrected for the tilt, where there is one.
+    """
+
+    image: NDArray[np.uint8]
+    lines: LineDetections | None
+    tilt: FrameTilt | None
+    discs: CircleDetections | None
+
+
+def detect_frame(
+    frame: RunFrame, plan: FramePlan, tables: Tables, tilt: FrameTilt | None = None
+) -> FrameDetections:
+    """Find what a plan asks for in the image of a frame, which is decoded once.
+
+    Parameters
+    ----------
+    frame : RunFrame
+        The frame.
+    plan : FramePlan
+        What to look for.
+    tables : Tables
+        See `tables_of`.
+    tilt : FrameTilt, optional
+        The frame's tilt, where it is known and no lines are looked for.
+
+    Returns
+    -------
+    FrameDetections
+
+    Raises
+    ------
+    FrameError
+        If there is no such image, or none of the calibration's size.
+    """
+    image = read_image(frame, plan.camera, plan.working_folder)
+
+    lines = None
+    if plan.lines is not None:
+        assert tables.verticals is not None
+        lines = detect_lines(image, tables.verticals, plan.lines)
+        tilt = tilt_of_lines(frame.step.prefix, lines)
+
+    discs = None
+    if plan.circles is not None:
+        assert tables.discs is not None
+        discs = detect_circles(image, plan.camera, tables.discs, plan.circles)
+        if tilt is not None:
+            discs = levelled(discs, plan.camera, tilt)
+
+    return FrameDetections(image, lines, tilt, discs)
+
+
+def tilt_of_lines(prefix: str, lines: LineDetections) -> FrameTilt | None:
+    """The tilt that lines show, in the digits of its file: one pass finds what two passes do."""
+    if lines.tilt is None:
+        return None
+    c = lines.tilt.covariance
+    return tilt_as_written(
+        FrameTilt(
+            prefix,
+            lines.tilt.pitch_rad,
+            lines.tilt.roll_rad,
+            float(c[0, 0]),
+            float(c[0, 1]),
+            float(c[1, 1]),
+            lines.tilt.lines,
+        )
+    )
+
+
+def tables_of(plan: FramePlan) -> Tables:
+    """The tables that a plan needs: a process makes them or takes them from the cache once.
+
+    Raises
+    ------
+    lut.TableError
+        If there can be none for the camera and the settings.
+    """
+    shape = None if plan.circles is None else disc_shape(plan.circles)
+    return _tables(plan.camera, plan.lines is not None, shape)
+
+
+@lru_cache(maxsize=1)
+def _tables(camera: Camera, verticals: bool, shape: DiscShape | None) -> Tables:
+    return Tables(
+        verticals=cached_vertical_table(camera) if verticals else None,
+        discs=None if shape is None else cached_disc_table(camera, shape),
+    )
+
+
+def rehearse(plan: FramePlan) -> None:
+    """Work on a made-up image, so that all tables and kernels that a plan needs are there."""
+    tables = tables_of(plan)
+    column = np.arange(plan.camera.width)
+    bars = np.where(column // 40 % 2, 180, 60).astype(np.uint8)
+    image = np.repeat(bars[None, :], plan.camera.height, axis=0)
+    if plan.circles is not None and tables.discs is not None:
+        pitch = 6.0 * plan.circles.radius_m
+        seen = tables.discs.floor_xy
+        floor = np.isfinite(seen).all(axis=-1)
+        off = np.hypot(*(np.mod(seen[floor], pitch) - 0.5 * pitch).T)
+        image[floor] = np.where(off < plan.circles.radius_m, 200, 60)
+        detect_circles(image, plan.camera, tables.discs, plan.circles)
+    if plan.lines is not None and tables.verticals is not None:
+        detect_lines(image, tables.verticals, plan.lines)

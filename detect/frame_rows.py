@@ -1,0 +1,186 @@
+"""What is written of one frame: rows, JSON and pictures, as bytes.
+
+This is all that a worker sends back, whichever process or machine it runs on: some kilobytes.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from textwrap import indent
+
+import numpy as np
+from numpy.typing import NDArray
+
+from detect.circles import CircleDetections
+from detect.errors import FrameError
+from detect.frame import FrameDetections, FramePlan, Tables, detect_frame
+from detect.line_identity import carry_ids
+from detect.run import RunFrame
+from landmarks import (
+    Frame,
+    FrameTilt,
+    LineLandmark,
+    circle_landmarks,
+    format_frame,
+    format_no_tilt,
+    format_tilt,
+)
+
+
+@dataclass(frozen=True, slots=True)
+class FrameTask:
+    """A frame to be worked on, and what is known about it beforehand. Small.
+
+    Attributes
+    ----------
+    frame : RunFrame
+        STEP row and path of the image.
+    tilt : FrameTilt or None
+        Its tilt, where it is known: the discs are corrected for it.
+    reference : tuple of LineLandmark or None
+        Its lines with IDs, which are carried over.
+    """
+
+    frame: RunFrame
+    tilt: FrameTilt | None = None
+    reference: tuple[LineLandmark, ...] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class FrameRows:
+    """What came of a frame.
+
+    Attributes
+    ----------
+    circles, lines, tilt, json : bytes
+        The frame's rows in each of the files.
+    pictures : tuple of (name, PNG)
+        Drawings.
+    disc_count, line_count : int
+        How many were found.
+    error : str or None
+        Why the frame could not be worked on: its STEP stays, without landmarks.
+    """
+
+    circles: bytes = b""
+    lines: bytes = b""
+    tilt: bytes = b""
+    json: bytes = b""
+    pictures: tuple[tuple[str, bytes], ...] = ()
+    disc_count: int = 0
+    line_count: int = 0
+    has_tilt: bool = False
+    error: str | None = None
+
+
+def rows_of_frame(task: FrameTask, plan: FramePlan, tables: Tables) -> FrameRows:
+    """Work on a frame; an image that cannot be worked on costs its frame only."""
+    try:
+        found = detect_frame(task.frame, plan, tables, task.tilt)
+    except FrameError as error:
+        return rows_of_failure(task, str(error))
+    except (ArithmeticError, np.linalg.LinAlgError, MemoryError) as error:
+        name = task.frame.image or task.frame.step.prefix
+        return rows_of_failure(task, f"{name}: {type(error).__name__}: {error}")
+
+    step = task.frame.step
+    circles = lines = tilt = record = b""
+    verticals: tuple[LineLandmark, ...] = ()
+    if found.lines is not None:
+        verticals = found.lines.landmarks()
+        if task.reference is not None:
+            verticals = carry_ids(verticals, task.reference)
+        lines = format_frame(Frame(step, verticals))
+        if found.tilt is None:
+            tilt = _line(format_no_tilt(step.prefix, len(verticals)))
+        else:
+            tilt = _line(format_tilt(found.tilt))
+    if found.discs is not None:
+        discs = found.discs
+        unknown = np.full(len(discs), -1)
+        landmarks = circle_landmarks(discs.floor_xy, discs.quality, discs.covariance, unknown)
+        circles = format_frame(Frame(step, landmarks))
+        if plan.json:
+            record = _json({"frame": step.prefix, "discs": _disc_records(discs)})
+    return FrameRows(
+        circles=circles,
+        lines=lines,
+        tilt=tilt,
+        json=record,
+        pictures=tuple(_pictures(step.prefix, found, plan, tables)),
+        disc_count=0 if found.discs is None else len(found.discs),
+        line_count=len(verticals),
+        has_tilt=found.lines is not None and found.tilt is not None,
+    )
+
+
+def rows_of_failure(task: FrameTask, reason: str) -> FrameRows:
+    """What is written of a frame that could not be worked on."""
+    step = task.frame.step
+    rows = format_frame(Frame(step))
+    return FrameRows(
+        circles=rows,
+        lines=rows,
+        tilt=_line(format_no_tilt(step.prefix, 0)),
+        json=_json({"frame": step.prefix, "error": reason}),
+        error=reason,
+    )
+
+
+def _line(text: str) -> bytes:
+    return f"{text}\n".encode("utf-8", "surrogateescape")
+
+
+def _json(record: dict[str, object]) -> bytes:
+    """A record as it stands in the list of frames of an indented document."""
+    return b"\n" + indent(json.dumps(record, indent=1), "  ").encode()
+
+
+def _disc_records(found: CircleDetections) -> list[dict[str, object]]:
+    return [
+        {
+            "pixel": [int(u), int(v)],
+            "x_m": float(x),
+            "y_m": float(y),
+            "quality": float(quality),
+            "evidence": float(evidence) if np.isfinite(evidence) else None,
+            "covariance_m2": [float(c[0, 0]), float(c[0, 1]), float(c[1, 1])],
+        }
+        for (u, v), (x, y), c, quality, evidence in zip(
+            found.pixels, found.floor_xy, found.covariance, found.quality, found.evidence
+        )
+    ]
+
+
+def _pictures(
+    prefix: str, found: FrameDetections, plan: FramePlan, tables: Tables
+) -> Iterator[tuple[str, bytes]]:
+    from detect.drawing import draw_circles
+    from detect.line_drawing import draw_lines, draw_response, draw_tracks
+
+    name = Path(prefix).name
+    if plan.drawing == "discs" and found.discs is not None and plan.circles is not None:
+        picture = draw_circles(found.image, plan.camera, found.discs, plan.circles)
+        yield f"{name}.png", _png(picture)
+    if found.lines is None or tables.verticals is None:
+        return
+    if plan.drawing == "lines":
+        picture = draw_lines(found.image, plan.camera, tables.verticals, found.lines)
+        yield f"{name}.png", _png(picture)
+    elif plan.drawing == "tracks":
+        picture = draw_tracks(
+            found.image, tables.verticals, found.lines, rejected=True, reasons=True
+        )
+        yield f"{name}.png", _png(picture)
+    if plan.draw_response:
+        yield f"{name}.response.png", _png(draw_response(found.lines.response, tables.verticals))
+
+
+def _png(picture: NDArray[np.uint8]) -> bytes:
+    import cv2
+
+    _, encoded = cv2.imencode(".png", picture)
+    return encoded.tobytes()

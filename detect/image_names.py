@@ -1,0 +1,81 @@
+"""The images of a folder, as compact as they can be looked up in.
+
+A run may have a million frames, so a name costs its bytes and eight more, whatever is asked of it.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".pgm", ".ppm", ".tif", ".tiff", ".bmp"})
+
+_DIGITS = re.compile(r"[0-9]+")
+
+
+class ImageNames:
+    """Names of image files, in natural order: numbers by value.
+
+    Parameters
+    ----------
+    folder : path
+        Where the images are. It is listed once.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        suffixes = set()
+        keys = []
+        with os.scandir(folder) as entries:
+            for entry in entries:
+                suffix = os.path.splitext(entry.name)[1]  # noqa: PTH122 - a Path for each is slow
+                if suffix.lower() in IMAGE_SUFFIXES:
+                    suffixes.add(os.fsencode(suffix))
+                    keys.append(_natural_order(entry.name))
+        keys.sort()
+        self._names: NDArray[np.bytes_] = np.array(
+            [os.fsencode(key.rpartition("/")[2]) for key in keys], dtype=np.bytes_
+        )
+        self._by_bytes = np.argsort(self._names).astype(np.uint32)
+        self._suffixes = (b"", *sorted(suffixes))
+
+    def __len__(self) -> int:
+        return len(self._names)
+
+    def path(self, index: int) -> Path:
+        """The image at a place in the order."""
+        return self.folder / os.fsdecode(self._names[index])
+
+    def find(self, name: str) -> int | None:
+        """The place of the image of a name, with or without its ending; the first of several."""
+        stem = name.encode("utf-8", "surrogateescape")
+        found = [self._place(stem + suffix) for suffix in self._suffixes]
+        return min((place for place in found if place is not None), default=None)
+
+    def _place(self, name: bytes) -> int | None:
+        # A longer needle would make numpy copy the whole haystack to its width.
+        if not len(self._names) or len(name) > self._names.itemsize:
+            return None
+        at = int(np.searchsorted(self._names, np.bytes_(name), sorter=self._by_bytes))
+        if at == len(self._names):
+            return None
+        place = int(self._by_bytes[at])
+        return place if self._names[place] == name else None
+
+
+def _natural_order(name: str) -> str:
+    """What sorts names with numbers by value, then by the name itself, which follows the last /.
+
+    A number becomes NUL, how many digits it has, and the digits: longer numbers are larger ones.
+    """
+
+    def by_value(match: re.Match[str]) -> str:
+        digits = match.group().lstrip("0")
+        return f"\0{chr(1 + len(digits))}{digits}"
+
+    begins_with_number = "1" if name[0].isdigit() else "0"
+    return f"{begins_with_number}{_DIGITS.sub(by_value, name)}\0\0/{name}"

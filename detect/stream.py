@@ -1,0 +1,200 @@
+"""The way of a run: frames in, files out, neither ever in memory as a whole.
+
+    frames of the run  ->  tasks  ->  workers (`detect.dispatch`)  ->  rows in order  ->  files
+
+The files are the same bytes whoever worked on the frames; they appear together at the end, or not
+at all.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, closing
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import BinaryIO, Literal, Protocol
+
+from detect.dispatch import Workers, detect_frames
+from detect.frame import FramePlan, tables_of
+from detect.frame_rows import FrameRows, FrameTask
+from detect.run import Run
+from detect.workers import local_workers
+from landmarks import FrameTilt, LineLandmark
+from storage import write_whole
+
+#: So many failures are kept word for word.
+KEPT_FAILURES = 100
+
+
+class TiltSource(Protocol):
+    """Tilts by image prefix: a dict, or a file that is looked into."""
+
+    def get(self, prefix: str, /) -> FrameTilt | None: ...
+
+
+class LineSource(Protocol):
+    """Lines with IDs by image prefix: a dict, or a file that is looked into."""
+
+    def get(self, prefix: str, /) -> Sequence[LineLandmark] | None: ...
+
+
+@dataclass(frozen=True)
+class Output:
+    """A file that a run is written to.
+
+    Attributes
+    ----------
+    path : path
+    part : str
+        Which part of `FrameRows` goes into it.
+    head, tail : bytes
+        What stands before and after the rows of all frames.
+    between : bytes
+        What stands between those of two frames.
+    """
+
+    path: Path
+    part: Literal["circles", "lines", "tilt", "json"]
+    head: bytes = b""
+    tail: bytes = b""
+    between: bytes = b""
+
+
+@dataclass
+class RunSummary:
+    """What came of a run.
+
+    Attributes
+    ----------
+    frames, discs, lines, tilts : int
+        Frames looked at, discs and lines found in them, and frames whose tilt could be told.
+    failed : int
+        Frames that could not be worked on.
+    failures : list of str
+        A line for each of the first `KEPT_FAILURES` of them.
+    images_without_step : int
+        Images that the odometry does not name.
+    """
+
+    frames: int = 0
+    discs: int = 0
+    lines: int = 0
+    tilts: int = 0
+    failed: int = 0
+    failures: list[str] = field(default_factory=list)
+    images_without_step: int = 0
+
+    def add(self, rows: FrameRows) -> None:
+        """Count a frame."""
+        self.frames += 1
+        self.discs += rows.disc_count
+        self.lines += rows.line_count
+        self.tilts += rows.has_tilt
+        if rows.error is not None:
+            self.failed += 1
+            if len(self.failures) < KEPT_FAILURES:
+                self.failures.append(rows.error)
+
+
+def detect_run(
+    run: Run,
+    plan: FramePlan,
+    outputs: Sequence[Output],
+    *,
+    overwrite: bool = False,
+    tilts: TiltSource | None = None,
+    reference: LineSource | None = None,
+    pictures: Path | None = None,
+    workers: Workers | None = None,
+    on_progress: Callable[[], None] | None = None,
+) -> RunSummary:
+    """Do with every frame of a run what a plan says, and write what comes of it.
+
+    Parameters
+    ----------
+    run : Run
+        The run.
+    plan : FramePlan
+        What to look for.
+    outputs : sequence of Output
+        The files to write.
+    overwrite : bool
+        Whether existing files may be replaced.
+    tilts : mapping, optional
+        Tilts by image prefix, for frames whose verticals are not looked for.
+    reference : mapping, optional
+        Lines with IDs by image prefix: carried over where the match is unambiguous.
+    pictures : path, optional
+        Folder for what the plan has drawn.
+    workers : Workers, optional
+        Who does the work; by default this process (see `detect.workers`).
+    on_progress : callable, optional
+        Called once after every frame.
+
+    Returns
+    -------
+    RunSummary
+
+    Raises
+    ------
+    lut.TableError
+        If there can be no table for the camera.
+    storage.OutputExistsError
+        If an output exists and must not be replaced.
+    WorkerError
+        If there is nobody to do the work.
+    """
+    tables_of(plan)  # whatever is wrong with them is wrong with every frame
+    workers = local_workers(1) if workers is None else workers
+    summary = RunSummary(images_without_step=run.images_without_step)
+    with ExitStack() as stack:
+        streams: list[tuple[Output, BinaryIO]] = []
+        for output in outputs:
+            stream = stack.enter_context(write_whole(output.path, overwrite=overwrite))
+            stream.write(output.head)
+            streams.append((output, stream))
+        tasks = _tasks(run, tilts, reference)
+        found = stack.enter_context(closing(detect_frames(tasks, plan, workers)))
+        for rows in found:
+            for output, stream in streams:
+                if summary.frames:
+                    stream.write(output.between)
+                stream.write(getattr(rows, output.part))
+            if pictures is not None:
+                for name, picture in rows.pictures:
+                    with write_whole(pictures / name, overwrite=overwrite) as stream:
+                        stream.write(picture)
+            summary.add(rows)
+            if on_progress is not None:
+                on_progress()
+        for output, stream in streams:
+            stream.write(output.tail)
+        # A full disk is to be noticed before the first of the files has its name.
+        for _, stream in streams:
+            stream.flush()
+    return summary
+
+
+def json_file(path: Path, plan: FramePlan, version: str) -> Output:
+    """The file of the discs as JSON: what `json.dumps` with an indent of 1 gives."""
+    assert plan.circles is not None
+    document = {
+        "version": version,
+        "settings": dataclasses.asdict(plan.circles),
+        "camera": plan.camera.content_hash,
+        "frames": [],
+    }
+    head, tail = json.dumps(document, indent=1).rsplit("]", 1)
+    return Output(path, "json", head.encode(), f"\n ]{tail}\n".encode(), b",")
+
+
+def _tasks(run: Run, tilts: TiltSource | None, reference: LineSource | None) -> Iterator[FrameTask]:
+    for frame in run.frames:
+        prefix = frame.step.prefix
+        yield FrameTask(
+            frame,
+            tilt=None if tilts is None else tilts.get(prefix),
+            reference=None if reference is None else tuple(reference.get(prefix) or ()),
+        )

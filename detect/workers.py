@@ -1,0 +1,251 @@
+"""Who works on the frames of a run: this process, processes of this machine, or a cluster.
+
+Each is a standard executor with its number of frames per task, put together as
+`detect.dispatch.Workers`.
+
+Processes are spawned, not forked: compiled kernels, OpenCV and the libraries of linear algebra
+have threads of their own, which no fork survives. They take no notice of an interrupt from the
+keyboard; the process that started them does, and ends them after the task that each is working on.
+If that process is killed, they end by themselves.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import CancelledError, Executor, Future, ProcessPoolExecutor
+from contextlib import contextmanager
+from multiprocessing.connection import wait
+from multiprocessing.synchronize import Event, Lock
+from typing import TYPE_CHECKING, ParamSpec, TypeVar
+
+from detect.announcing import (
+    announce_compiling,
+    announcements_are_shown,
+    show_announcements,
+)
+from detect.dispatch import Workers
+from detect.errors import WorkerError
+from detect.frame import FramePlan, rehearse
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+#: Fewer frames than this are not worth another process's start.
+FRAMES_PER_PROCESS = 200
+
+_LOCAL_CHUNK = 8
+_CLUSTER_CHUNK = 16
+_WINDOW_PER_WORKER = 3
+_CLUSTER_PATIENCE_S = 30.0
+_CLUSTER_LOOK_S = 5.0
+
+
+def default_jobs(frames: int) -> int:
+    """As many processes as there are cores, but none for a handful of frames."""
+    affinity = getattr(os, "sched_getaffinity", None)
+    cores = len(affinity(0)) if affinity is not None else os.cpu_count() or 1
+    return max(1, min(cores, frames // FRAMES_PER_PROCESS))
+
+
+def local_workers(jobs: int, *, pictures: bool = False) -> Workers:
+    """Workers on this machine.
+
+    Parameters
+    ----------
+    jobs : int
+        How many processes; 1 is this process itself.
+    pictures : bool
+        Whether frames give pictures: tasks are kept small then.
+
+    Raises
+    ------
+    WorkerError
+        If `jobs` is less than 1.
+    """
+    if jobs < 1:
+        raise WorkerError(f"jobs is {jobs}: expected 1 or more")
+    if jobs == 1:
+        return Workers(_in_process, chunk=1, window=lambda: 1)
+    window = 2 + _WINDOW_PER_WORKER * jobs
+    return Workers(
+        lambda plan: _processes(jobs, plan),
+        chunk=1 if pictures else _LOCAL_CHUNK,
+        window=lambda: window,
+    )
+
+
+def cluster_workers(address: str, *, pictures: bool = False) -> Workers:
+    """The workers of a dask cluster.
+
+    They have this program installed, in the same version, and see the images under the same
+    paths.
+
+    Parameters
+    ----------
+    address : str
+        The scheduler's, as ``tcp://host:8786``.
+    pictures : bool
+        Whether frames give pictures: tasks are kept small then.
+
+    Raises
+    ------
+    WorkerError
+        If the package that speaks to clusters is not installed.
+    """
+    try:
+        from distributed import KilledWorker
+    except ImportError:
+        raise WorkerError(
+            "a cluster needs the package distributed: install it by pip install 'redetect[cluster]'"
+        ) from None
+    size = _ClusterSize()
+    return Workers(
+        lambda plan: _cluster(address, size),
+        chunk=1 if pictures else _CLUSTER_CHUNK,
+        window=size.window,
+        died=(KilledWorker,),
+    )
+
+
+# -- this process ---------------------------------------------------------------------------
+
+
+class _InProcess(Executor):
+    """Does what it is given at once, before it gives the future back."""
+
+    def submit(self, fn: Callable[P, R], /, *args: P.args, **kwargs: P.kwargs) -> Future[R]:
+        future: Future[R] = Future()
+        future.set_result(fn(*args, **kwargs))
+        return future
+
+
+@contextmanager
+def _in_process(plan: FramePlan) -> Iterator[Executor]:
+    announce_compiling()
+    yield _InProcess()
+
+
+# -- processes ------------------------------------------------------------------------------
+
+
+class _SpawnedProcesses(ProcessPoolExecutor):
+    """Processes that inherit a blocked interrupt: it would reach them even while they start."""
+
+    def submit(self, fn: Callable[P, R], /, *args: P.args, **kwargs: P.kwargs) -> Future[R]:
+        with _interrupts_blocked():
+            return super().submit(_unless_stopped, fn, *args, **kwargs)
+
+
+@contextmanager
+def _processes(jobs: int, plan: FramePlan) -> Iterator[Executor]:
+    context = multiprocessing.get_context("spawn")
+    stop, first, ready = context.Event(), context.Lock(), context.Event()
+    pool = _SpawnedProcesses(
+        jobs,
+        mp_context=context,
+        initializer=_begin,
+        initargs=(plan, stop, first, ready, announcements_are_shown()),
+    )
+    try:
+        yield pool
+    finally:
+        stop.set()
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _unless_stopped(fn: Callable[P, R], /, *args: P.args, **kwargs: P.kwargs) -> R:
+    """Do a task, unless its result is no longer waited for."""
+    if _stopped is not None and _stopped.is_set():
+        raise CancelledError
+    return fn(*args, **kwargs)
+
+
+#: Set in a worker process when the run ends early.
+_stopped: Event | None = None
+
+
+def _begin(plan: FramePlan, stop: Event, first: Lock, ready: Event, show: bool) -> None:
+    """Make a new process a worker; one of them compiles what is to be compiled, for all."""
+    global _stopped
+    _stopped = stop
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    if show:
+        show_announcements()
+    import cv2
+
+    cv2.setNumThreads(1)
+    announce_compiling()
+    if first.acquire(block=False):
+        rehearse(plan)
+        ready.set()
+    else:
+        ready.wait()
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        wait([parent.sentinel])
+        os._exit(1)
+
+
+@contextmanager
+def _interrupts_blocked() -> Iterator[None]:
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+# -- a cluster ------------------------------------------------------------------------------
+
+
+class _ClusterSize:
+    """How many tasks a cluster may have under way; looked at now and then."""
+
+    def __init__(self) -> None:
+        self._client: Client | None = None
+        self._threads = 1
+        self._looked_s = 0.0
+
+    def watch(self, client: Client) -> None:
+        self._client = client
+        self._looked_s = 0.0
+
+    def window(self) -> int:
+        now_s = time.monotonic()
+        if self._client is not None and now_s - self._looked_s > _CLUSTER_LOOK_S:
+            self._looked_s = now_s
+            self._threads = max(1, sum(self._client.nthreads().values()))
+        return 2 + _WINDOW_PER_WORKER * self._threads
+
+
+@contextmanager
+def _cluster(address: str, size: _ClusterSize) -> Iterator[Executor]:
+    from distributed import Client
+
+    try:
+        client = Client(address, timeout=_CLUSTER_PATIENCE_S, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise WorkerError(f"{address}: no dask scheduler answers there: {error}") from None
+    with client:
+        try:
+            client.wait_for_workers(1, timeout=_CLUSTER_PATIENCE_S)
+        except TimeoutError:
+            raise WorkerError(f"{address}: the cluster has no workers") from None
+        size.watch(client)
+        # The same frame twice is not the same task: nothing is kept between runs.
+        yield client.get_executor(pure=False)
