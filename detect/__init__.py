@@ -1,10 +1,13 @@
 """From one image to landmarks, their comparison with a reference, the command line."""
 
-from importlib.metadata import PackageNotFoundError, version
 
-try:
-    __version__ = version("redetect")
-except PackageNotFoundError:  # a checkout that was never installed
-    __version__ = "unknown"
+def __getattr__(name: str) -> str:
+    """The version, looked up when it is asked for: that takes longer than all else here."""
+    if name != "__version__":
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from importlib.metadata import PackageNotFoundError, version
 
-__all__ = ["__version__"]
+    try:
+        return version("redetect")
+    except PackageNotFoundError:  # a checkout that was never installed
+        return "unknown"

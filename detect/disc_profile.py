@@ -27,15 +27,16 @@ def disc_profile() -> NDArray[np.float64]:
     (41, 361) float64 array
         Rows t = 0 ... `T_LIMIT`, columns z = -`Z_LIMIT` ... `Z_LIMIT`. Read-only.
     """
-    from scipy.stats import ncx2, norm
+    # Not scipy.stats: importing it takes more than a second.
+    from scipy.special import chndtr, ndtr
 
     z = np.linspace(-Z_LIMIT, Z_LIMIT, _Z_NODES)
     t = np.linspace(0.0, T_LIMIT, _T_NODES)
     table = np.empty((_T_NODES, _Z_NODES))
-    table[0] = norm.cdf(-z)
+    table[0] = ndtr(-z)
     blur = t[1:, None]
     # Inside the centre (1 + z t < 0) there is no point: the profile goes on by symmetry.
     distance = np.abs(1.0 + z * blur)
-    table[1:] = ncx2.cdf(1.0 / blur**2, 2, (distance / blur) ** 2)
+    table[1:] = chndtr(1.0 / blur**2, 2, (distance / blur) ** 2)
     table.setflags(write=False)
     return table

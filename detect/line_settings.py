@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from detect.errors import DetectError
-from detect.tilt import ConsensusSettings
+
+if TYPE_CHECKING:
+    from detect.tilt import ConsensusSettings
 
 BearingConvention = Literal["level", "published"]
 
@@ -203,6 +205,8 @@ class LineSettings:
     @property
     def consensus(self) -> ConsensusSettings:
         """What of this the estimation of the tilt is told."""
+        from detect.tilt import ConsensusSettings  # numpy is too much for `--help`
+
         return ConsensusSettings(
             largest_rad=math.radians(self.largest_tilt_deg),
             prior_rad=math.radians(self.tilt_prior_deg),

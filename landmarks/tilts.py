@@ -63,8 +63,9 @@ def format_no_tilt(prefix: str, lines: int) -> str:
 
 def tilt_as_written(tilt: FrameTilt) -> FrameTilt:
     """The tilt as whoever reads its row will know it: with the row's digits."""
-    _, _, *numbers, lines = format_tilt(tilt).split()
-    return FrameTilt(tilt.prefix, *map(float, numbers), int(lines))
+    _, _, *numbers, _ = format_tilt(tilt).split()
+    pitch, roll, cpp, cpr, crr = map(float, numbers)
+    return FrameTilt(tilt.prefix, pitch, roll, cpp, cpr, crr, tilt.lines)
 
 
 def read_tilts(path: str | os.PathLike[str]) -> dict[str, FrameTilt]:

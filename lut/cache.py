@@ -11,6 +11,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import io
+import logging
 import os
 from pathlib import Path
 from typing import TypeVar
@@ -27,6 +28,8 @@ from storage import write_whole
 TABLE_VERSION = 4
 
 Table = TypeVar("Table", DiscTable, VerticalTable)
+
+_log = logging.getLogger("redetect")
 
 _DIGEST_BYTES = hashlib.sha256().digest_size
 
@@ -66,6 +69,7 @@ def cached_disc_table(camera: Camera, shape: DiscShape, folder: Path | None = No
     path = folder / f"discs-{_key(camera, shape)}.table"
     table = _read(path, DiscTable)
     if table is None:
+        _log.info("computing the table of discs, once for this calibration")
         table = build_disc_table(camera, shape)
         _keep(path, table)
     return table
@@ -89,6 +93,7 @@ def cached_vertical_table(camera: Camera, folder: Path | None = None) -> Vertica
     path = (cache_folder() if folder is None else folder) / f"verticals-{_key(camera)}.table"
     table = _read(path, VerticalTable)
     if table is None:
+        _log.info("computing the table of verticals, once for this calibration")
         table = build_vertical_table(camera)
         _keep(path, table)
     return table
