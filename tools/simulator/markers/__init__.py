@@ -1,0 +1,1 @@
+"""Rendered photographs of square markers with exact truth: single frames and whole sessions."""

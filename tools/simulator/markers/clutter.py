@@ -1,0 +1,198 @@
+"""Things that are no markers but look as if they might be: windows, posters, boards, text."""
+
+from __future__ import annotations
+
+import string
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from detect.markers.dictionaries import MarkerDictionary
+from tools.simulator.markers.prints import BLACK, WHITE, near_pattern, pattern_texture
+from tools.simulator.markers.surface import Texture
+
+Grey = NDArray[np.float32]
+
+
+def checkerboard(columns: int, rows: int, black: float = BLACK, white: float = WHITE) -> Texture:
+    """A board of columns x rows squares, the upper left one black, with a white rim."""
+    r, c = np.mgrid[0 : rows + 2, 0 : columns + 2]
+    values = np.where((r + c) % 2 == 0, black, white).astype(np.float32)
+    values[[0, -1], :] = white
+    values[:, [0, -1]] = white
+    return Texture(values)
+
+
+def window(rng: np.random.Generator) -> Texture:
+    """Panes in a frame: light outside or dark, the frame the other way round."""
+    across, down = rng.integers(1, 4), rng.integers(1, 4)
+    pane, bar, rim = rng.integers(4, 10), 1, int(rng.integers(1, 4))
+    rows = down * pane + (down - 1) * bar + 2 * rim
+    columns = across * pane + (across - 1) * bar + 2 * rim
+    dark, light = rng.uniform(0.03, 0.25), rng.uniform(0.6, 1.1)
+    frame, glass = (dark, light) if rng.random() < 0.7 else (light, dark)
+    values = np.full((rows, columns), frame, dtype=np.float32)
+    for i in range(down):
+        for j in range(across):
+            top, left = rim + i * (pane + bar), rim + j * (pane + bar)
+            shade = glass * rng.uniform(0.9, 1.05)
+            values[top : top + pane, left : left + pane] = shade
+            if rng.random() < 0.2:  # something stands on the sill
+                values[top + pane // 2 :, left : left + pane // 3] = frame
+    return Texture(values)
+
+
+def text(rng: np.random.Generator) -> Texture:
+    """Lines of letters."""
+    import cv2
+
+    height, width = 160, int(rng.integers(160, 320))
+    dark_on_light = rng.random() < 0.75
+    page, ink = (225, 20) if dark_on_light else (20, 215)
+    image = np.full((height, width), page, dtype=np.uint8)
+    size = rng.uniform(0.4, 2.2)
+    letters = list(string.ascii_uppercase + string.digits + "OB8DQ0#")
+    y = int(28 * size) + 4
+    while y < height:
+        line = "".join(rng.choice(letters, 24))
+        cv2.putText(
+            image, line, (6, y), int(rng.choice([0, 2, 3, 4])), size, int(ink),
+            max(1, round(2.5 * size)), cv2.LINE_AA,
+        )  # fmt: skip
+        y += int(34 * size)
+    return _smooth(image)
+
+
+def poster(rng: np.random.Generator) -> Texture:
+    """A picture, a heading and columns of small print."""
+    import cv2
+
+    height, width = 256, 192
+    page = int(rng.integers(120, 245))
+    image = np.full((height, width), page, dtype=np.uint8)
+    left, right, top, bottom = (
+        10,
+        width - 10,
+        int(rng.integers(34, 60)),
+        int(rng.integers(120, 190)),
+    )
+    picture = blotches(rng, (bottom - top, right - left), octaves=3)
+    image[top:bottom, left:right] = np.clip(255 * picture, 0, 255).astype(np.uint8)
+    for _ in range(int(rng.integers(1, 6))):
+        centre = int(rng.integers(left, right)), int(rng.integers(top, bottom))
+        shade = int(rng.integers(0, 256))
+        if rng.random() < 0.5:
+            cv2.circle(image, centre, int(rng.integers(5, 40)), shade, -1, cv2.LINE_AA)
+        else:
+            corner = centre[0] + int(rng.integers(10, 60)), centre[1] + int(rng.integers(10, 60))
+            cv2.rectangle(image, centre, corner, shade, -1)
+    ink = 20 if page > 90 else 230
+    heading = "".join(rng.choice(list(string.ascii_uppercase), 9))
+    cv2.putText(image, heading, (10, 27), 3, 0.95, ink, 2, cv2.LINE_AA)
+    for y in range(bottom + 8, height - 8, 7):
+        for x in range(left, right, 62):
+            cv2.line(image, (x, y), (x + int(rng.integers(30, 56)), y), ink, 2)
+    if rng.random() < 0.4:  # a dark frame round it
+        cv2.rectangle(image, (0, 0), (width - 1, height - 1), int(rng.integers(0, 60)), 14)
+    return _smooth(image)
+
+
+def barcode(rng: np.random.Generator) -> Texture:
+    """Upright bars of random widths on white."""
+    bars = np.where(rng.random(40) < 0.5, BLACK, WHITE).astype(np.float32)
+    values = np.full((12, 46), WHITE, dtype=np.float32)
+    values[1:-1, 3:-3] = bars
+    return Texture(values)
+
+
+def matrix_code(rng: np.random.Generator) -> Texture:
+    """A code of 21 x 21 cells with three nested squares in its corners."""
+    values = np.where(rng.random((21, 21)) < 0.5, BLACK, WHITE).astype(np.float32)
+    finder = np.full((8, 8), WHITE, dtype=np.float32)
+    finder[:7, :7] = BLACK
+    finder[1:6, 1:6] = WHITE
+    finder[2:5, 2:5] = BLACK
+    values[:8, :8] = finder
+    values[:8, -8:] = finder[:, ::-1]
+    values[-8:, :8] = finder[::-1]
+    return Texture(np.pad(values, 2, constant_values=np.float32(WHITE)))
+
+
+def frames_in_frames(rng: np.random.Generator) -> Texture:
+    """Nested squares, or a black square with one hole: a marker's outline and no more."""
+    side = int(rng.integers(8, 15))
+    values = np.full((side, side), WHITE, dtype=np.float32)
+    values[1:-1, 1:-1] = BLACK
+    if rng.random() < 0.4:
+        inset = 2
+        white = True
+        while side - 2 * inset >= 2:
+            values[inset:-inset, inset:-inset] = WHITE if white else BLACK
+            white = not white
+            inset += int(rng.integers(1, 4))
+    else:
+        top, left = rng.integers(2, side - 3, 2)
+        values[top : min(top + rng.integers(1, 5), side - 2), left : side - 2] = WHITE
+    return Texture(values)
+
+
+def hole_grid(rng: np.random.Generator) -> Texture:
+    """Regular holes in a dark plate, as keyboards, grilles and lamps have them."""
+    across, down = rng.integers(2, 9, 2)
+    pitch = int(rng.integers(2, 4))
+    values = np.full((down * pitch + 1, across * pitch + 1), BLACK, dtype=np.float32)
+    for r in range(1, len(values), pitch):
+        for c in range(1, values.shape[1], pitch):
+            values[r : r + pitch - 1, c : c + pitch - 1] = WHITE
+    values = np.pad(values, int(rng.integers(0, 3)), constant_values=np.float32(BLACK))
+    return Texture(np.pad(values, 1, constant_values=np.float32(rng.uniform(0.4, 0.9))))
+
+
+def near_marker(rng: np.random.Generator, dictionary: MarkerDictionary) -> Texture:
+    """A black square laid out as a marker of the dictionary, but of no marker in it."""
+    pattern, _ = near_pattern(dictionary, rng)
+    return pattern_texture(dictionary, pattern, int(rng.integers(1, 3)))
+
+
+def board(rng: np.random.Generator) -> Texture:
+    """A checkerboard of any size."""
+    columns, rows = rng.integers(2, 10, 2)
+    return checkerboard(int(columns), int(rows))
+
+
+#: Things that need no dictionary.
+THINGS: tuple[Callable[[np.random.Generator], Texture], ...] = (
+    window, text, poster, barcode, matrix_code, frames_in_frames, hole_grid, board,
+)  # fmt: skip
+
+
+def blotches(rng: np.random.Generator, shape: tuple[int, int], octaves: int = 4) -> Grey:
+    """Smooth noise of several scales, some 0 to 1.
+
+    Parameters
+    ----------
+    rng : numpy Generator
+        Source of chance.
+    shape : (rows, columns)
+        Of the result.
+    octaves : int
+        How many scales, each half the one before.
+    """
+    import cv2
+
+    rows, columns = shape
+    result = np.full(shape, 0.5, dtype=np.float32)
+    strength = 0.25
+    across = 3
+    for _ in range(octaves):
+        down = max(2, round(across * rows / columns))
+        coarse = (strength * rng.standard_normal((down, across))).astype(np.float32)
+        result += cv2.resize(coarse, (columns, rows), interpolation=cv2.INTER_CUBIC)
+        across *= 2
+        strength *= 0.6
+    return result
+
+
+def _smooth(image: NDArray[np.uint8]) -> Texture:
+    return Texture(image.astype(np.float32) / np.float32(255.0), smooth=True)

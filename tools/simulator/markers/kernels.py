@@ -1,0 +1,408 @@
+"""Numba kernels of the marker renderer: where edges run, and the light of every pixel.
+
+A surface is a rectangle of R x C texels. Its row of `from_texel` (3x3) takes (column, row, 1), in
+texels from the upper left *corner* of the texture, to a point in the camera frame; the inverse
+takes a ray (x, y, 1) to (column, row, 1) / depth.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+
+#: Side of the square tiles for which the surfaces that may be seen are gathered, pixels.
+TILE = 16
+
+#: A quarter of a pixel whose border comes nearer than this to an edge is taken to be crossed by it,
+#: in half pixels, as the step in which edges are followed.
+_MARGIN = 0.3
+_STEP = 0.5
+_NEAREST = 1e-3
+
+
+@nb.njit(cache=True, error_model="numpy")
+def project_point(
+    numbers: NDArray[np.float64], x: float, y: float, z: float
+) -> tuple[float, float]:
+    """Pixel of a point in the camera frame; both NaN where it is not seen.
+
+    `numbers` as `camera.kernels.camera_numbers` gives them.
+    """
+    if z < _NEAREST:
+        return math.nan, math.nan
+    x /= z
+    y /= z
+    r = math.sqrt(x * x + y * y)
+    if not r <= numbers[9]:
+        return math.nan, math.nan
+    factor = 1.0 + r * (numbers[4] + r * numbers[5]) / (
+        1.0 + r * (numbers[6] + r * (numbers[7] + r * numbers[8]))
+    )
+    return numbers[0] * x * factor + numbers[2], numbers[1] * y * factor + numbers[3]
+
+
+@nb.njit(cache=True, error_model="numpy")
+def _texel_point(
+    numbers: NDArray[np.float64], from_texel: NDArray[np.float64], a: float, b: float
+) -> tuple[float, float]:
+    return project_point(
+        numbers,
+        from_texel[0, 0] * a + from_texel[0, 1] * b + from_texel[0, 2],
+        from_texel[1, 0] * a + from_texel[1, 1] * b + from_texel[1, 2],
+        from_texel[2, 0] * a + from_texel[2, 1] * b + from_texel[2, 2],
+    )
+
+
+@nb.njit(cache=True, error_model="numpy")
+def _mark_segment(
+    crossed: NDArray[np.uint8],
+    box: NDArray[np.int64],
+    numbers: NDArray[np.float64],
+    from_texel: NDArray[np.float64],
+    a0: float,
+    b0: float,
+    a1: float,
+    b1: float,
+    pieces: int,
+) -> None:
+    """Mark the quarters of pixels that a segment crosses, and widen the box (in pixels) by it."""
+    rows, columns = crossed.shape
+    height, width = rows // 2, columns // 2
+    u0, v0 = _texel_point(numbers, from_texel, a0, b0)
+    for piece in range(pieces):
+        t = (piece + 1.0) / pieces
+        u1, v1 = _texel_point(numbers, from_texel, a0 + t * (a1 - a0), b0 + t * (b1 - b0))
+        known0, known1 = not math.isnan(u0), not math.isnan(u1)
+        if not (known0 and known1):
+            # Part of it is behind the camera: nothing is known of where the surface ends.
+            box[0], box[1], box[2], box[3] = 0, 0, width - 1, height - 1
+        if known0 and known1 and max(abs(u0), abs(v0), abs(u1), abs(v1)) < 1e5:
+            # On the grid of half pixels the first one's centre is at -0.25.
+            p0, q0 = 2.0 * u0 + 0.5, 2.0 * v0 + 0.5
+            dp, dq = 2.0 * (u1 - u0), 2.0 * (v1 - v0)
+            steps = int(max(abs(dp), abs(dq)) / _STEP) + 1
+            box[0] = min(box[0], max(math.floor(min(u0, u1)) - 1, 0))
+            box[1] = min(box[1], max(math.floor(min(v0, v1)) - 1, 0))
+            box[2] = max(box[2], min(math.ceil(max(u0, u1)) + 1, width - 1))
+            box[3] = max(box[3], min(math.ceil(max(v0, v1)) + 1, height - 1))
+            for step in range(steps + 1):
+                p = p0 + dp * step / steps
+                q = q0 + dq * step / steps
+                for row in range(
+                    max(math.ceil(q - 0.5 - _MARGIN), 0),
+                    min(math.floor(q + 0.5 + _MARGIN), rows - 1) + 1,
+                ):
+                    for column in range(
+                        max(math.ceil(p - 0.5 - _MARGIN), 0),
+                        min(math.floor(p + 0.5 + _MARGIN), columns - 1) + 1,
+                    ):
+                        crossed[row, column] = 1
+        elif known0 or known1:
+            box[0], box[1], box[2], box[3] = 0, 0, width - 1, height - 1
+        u0, v0 = u1, v1
+
+
+@nb.njit(cache=True, error_model="numpy")
+def mark_edges(
+    crossed: NDArray[np.uint8],
+    boxes: NDArray[np.int64],
+    numbers: NDArray[np.float64],
+    from_texel: NDArray[np.float64],
+    sizes: NDArray[np.int64],
+    starts: NDArray[np.int64],
+    texels: NDArray[np.float32],
+    smooth: NDArray[np.uint8],
+) -> None:
+    """Mark where any edge between unequal texels runs; find each surface's box.
+
+    Parameters
+    ----------
+    crossed : (2 H, 2 W) uint8
+        Set to 1 where an edge runs; else left alone.
+    boxes : (S, 4) int64
+        Filled with the first and last columns and rows that may see the surface: u0, v0, u1, v1.
+    numbers : (22,) float64
+        The camera.
+    from_texel : (S, 3, 3) float64
+        Of each surface.
+    sizes : (S, 2) int64
+        Rows and columns of each texture.
+    starts : (S,) int64
+        Where each texture begins in `texels`.
+    texels : float32
+        All textures, row by row; NaN is a hole.
+    smooth : (S,) uint8
+        Whether the texture is interpolated: then only its outline is an edge.
+    """
+    height, width = crossed.shape[0] // 2, crossed.shape[1] // 2
+    for s in range(len(sizes)):
+        rows, columns = sizes[s, 0], sizes[s, 1]
+        box = boxes[s]
+        box[0], box[1], box[2], box[3] = width, height, -1, -1
+        matrix = from_texel[s]
+        for k in range(2):
+            # Long edges bend under distortion, so they go in pieces.
+            _mark_segment(crossed, box, numbers, matrix, 0.0, k * rows, columns, k * rows, 64)
+            _mark_segment(crossed, box, numbers, matrix, k * columns, 0.0, k * columns, rows, 64)
+        if smooth[s] or box[2] < box[0] or box[3] < box[1]:
+            continue
+        start = starts[s]
+        for r in range(rows):
+            for c in range(columns):
+                here = texels[start + r * columns + c]
+                hole = math.isnan(here)
+                if c + 1 < columns:
+                    right = texels[start + r * columns + c + 1]
+                    if right != here and not (hole and math.isnan(right)):
+                        _mark_segment(
+                            crossed, box, numbers, matrix, c + 1.0, r, c + 1.0, r + 1.0, 4
+                        )
+                if r + 1 < rows:
+                    below = texels[start + (r + 1) * columns + c]
+                    if below != here and not (hole and math.isnan(below)):
+                        _mark_segment(
+                            crossed, box, numbers, matrix, c, r + 1.0, c + 1.0, r + 1.0, 4
+                        )
+
+
+@nb.njit(cache=True, error_model="numpy")
+def _smooth_texel(
+    texels: NDArray[np.float32], start: int, rows: int, columns: int, a: float, b: float
+) -> float:
+    x = min(max(a - 0.5, 0.0), columns - 1.0)
+    y = min(max(b - 0.5, 0.0), rows - 1.0)
+    c, r = min(int(x), max(columns - 2, 0)), min(int(y), max(rows - 2, 0))
+    p, q = x - c, y - r
+    c1, r1 = min(c + 1, columns - 1), min(r + 1, rows - 1)
+    upper = (1.0 - p) * texels[start + r * columns + c] + p * texels[start + r * columns + c1]
+    lower = (1.0 - p) * texels[start + r1 * columns + c] + p * texels[start + r1 * columns + c1]
+    return float((1.0 - q) * upper + q * lower)
+
+
+@nb.njit(cache=True, error_model="numpy", inline="always")
+def nearest_surface(
+    x: float,
+    y: float,
+    candidates: NDArray[np.int64],
+    count: int,
+    to_texel: NDArray[np.float64],
+    sizes: NDArray[np.int64],
+    starts: NDArray[np.int64],
+    texels: NDArray[np.float32],
+    smooth: NDArray[np.uint8],
+) -> tuple[int, float]:
+    """The surface that a ray (x, y, 1) meets first, and its texel's value; -1 and 0 if none."""
+    best = 0.0
+    found = -1
+    value = 0.0
+    for k in range(count):
+        s = candidates[k]
+        # Entry by entry: views of an array would be counted, which costs more than the sums.
+        inverse_depth = to_texel[s, 2, 0] * x + to_texel[s, 2, 1] * y + to_texel[s, 2, 2]
+        if inverse_depth <= best:
+            continue
+        rows, columns = sizes[s, 0], sizes[s, 1]
+        a = to_texel[s, 0, 0] * x + to_texel[s, 0, 1] * y + to_texel[s, 0, 2]
+        if not (0.0 <= a < columns * inverse_depth):
+            continue
+        b = to_texel[s, 1, 0] * x + to_texel[s, 1, 1] * y + to_texel[s, 1, 2]
+        if not (0.0 <= b < rows * inverse_depth):
+            continue
+        # Rounding may reach the texture's end.
+        a = min(a / inverse_depth, columns - 1e-9)
+        b = min(b / inverse_depth, rows - 1e-9)
+        if smooth[s]:
+            light = _smooth_texel(texels, starts[s], rows, columns, a, b)
+        else:
+            light = float(texels[starts[s] + int(b) * columns + int(a)])
+            if math.isnan(light):
+                continue
+        best = inverse_depth
+        found = s
+        value = light
+    return found, value
+
+
+@nb.njit(cache=True, error_model="numpy")
+def _shift(row: int, column: int) -> tuple[float, float]:
+    """Two numbers in [0, 1) that differ from cell to cell without a pattern."""
+    h = np.uint64(row) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(column) * np.uint64(
+        0xC2B2AE3D27D4EB4F
+    )
+    h ^= h >> np.uint64(29)
+    h *= np.uint64(0xBF58476D1CE4E5B9)
+    h ^= h >> np.uint64(32)
+    mask = np.uint64(0xFFFF)
+    return float(h & mask) / 65536.0, float((h >> np.uint64(16)) & mask) / 65536.0
+
+
+@nb.njit(cache=True, error_model="numpy")
+def shade(
+    light: NDArray[np.float32],
+    weight: float,
+    crossed: NDArray[np.uint8],
+    rays: NDArray[np.float64],
+    boxes: NDArray[np.int64],
+    to_texel: NDArray[np.float64],
+    sizes: NDArray[np.int64],
+    starts: NDArray[np.int64],
+    texels: NDArray[np.float32],
+    smooth: NDArray[np.uint8],
+    samples: int,
+    background: NDArray[np.float32],
+) -> None:
+    """Let the surfaces of one exposure take the background's place.
+
+    Parameters
+    ----------
+    light : (2 H, 2 W) or (H, W) float32
+        At first the background; becomes the mean reflectance of what each quarter of a pixel, or
+        each pixel, sees.
+    weight : float
+        Of this exposure; those of all exposures add up to 1.
+    crossed : (2 H, 2 W) uint8
+        1 where a quarter of a pixel may see more than one texel: there `samples` rays are cast.
+    rays : (H, W, 6) float64
+        x, y of the ray through the pixel's centre, and dx/du, dx/dv, dy/du, dy/dv.
+    boxes, to_texel, sizes, starts, texels, smooth
+        The surfaces; see `mark_edges`. `to_texel` is the inverse of `from_texel`.
+    samples : int
+        A power of two.
+    background : (H, W) float32
+        What is seen where no surface is.
+    """
+    height, width = background.shape
+    coarse = light.shape[0] == height
+    if coarse:
+        weight *= 0.25
+    surfaces = len(sizes)
+    candidates = np.empty(surfaces, np.int64)
+    here = np.empty(surfaces, np.int64)
+    # Hammersley's points: equally spaced in either direction.
+    point_x, point_y = np.empty(samples), np.empty(samples)
+    for k in range(samples):
+        reverse, bit, rest = 0.0, 0.5, k
+        while rest > 0:
+            reverse += bit * (rest & 1)
+            rest >>= 1
+            bit *= 0.5
+        point_x[k], point_y[k] = k / samples, reverse
+    for top in range(0, height, TILE):
+        bottom = min(top + TILE, height)
+        for left in range(0, width, TILE):
+            right = min(left + TILE, width)
+            count = 0
+            for s in range(surfaces):
+                across = boxes[s, 0] < right and boxes[s, 2] >= left
+                if across and boxes[s, 1] < bottom and boxes[s, 3] >= top:
+                    candidates[count] = s
+                    count += 1
+            if count == 0:
+                continue
+            for row in range(top, bottom):
+                for column in range(left, right):
+                    x, y = rays[row, column, 0], rays[row, column, 1]
+                    near = 0
+                    for k in range(count):
+                        s = candidates[k]
+                        across = boxes[s, 0] <= column and boxes[s, 2] >= column
+                        if across and boxes[s, 1] <= row and boxes[s, 3] >= row:
+                            here[near] = s
+                            near += 1
+                    if near == 0:
+                        continue
+                    xu, xv = rays[row, column, 2], rays[row, column, 3]
+                    yu, yv = rays[row, column, 4], rays[row, column, 5]
+                    behind = background[row, column]
+                    a, b = 2 * row, 2 * column
+                    if not (
+                        crossed[a, b]
+                        or crossed[a, b + 1]
+                        or crossed[a + 1, b]
+                        or crossed[a + 1, b + 1]
+                    ):
+                        found, value = nearest_surface(
+                            x, y, here, near, to_texel, sizes, starts, texels, smooth
+                        )
+                        if found < 0:
+                            continue
+                        if not smooth[found]:
+                            change = np.float32(weight * (value - behind))
+                            if coarse:
+                                light[row, column] += np.float32(4.0) * change
+                            else:
+                                light[a, b] += change
+                                light[a, b + 1] += change
+                                light[a + 1, b] += change
+                                light[a + 1, b + 1] += change
+                            continue
+                    for i in range(2):
+                        for j in range(2):
+                            r, c = 2 * row + i, 2 * column + j
+                            total = 0.0
+                            cast = samples if crossed[r, c] else 1
+                            shift_x, shift_y = 0.0, 0.0
+                            if cast > 1:
+                                shift_x, shift_y = _shift(r, c)
+                            for k in range(cast):
+                                du = 0.5 * j - 0.25
+                                dv = 0.5 * i - 0.25
+                                if cast > 1:
+                                    # Turned round the quarter, so that no direction is favoured.
+                                    p, q = point_x[k] + shift_x, point_y[k] + shift_y
+                                    du += 0.5 * (p - int(p)) - 0.25
+                                    dv += 0.5 * (q - int(q)) - 0.25
+                                found, value = nearest_surface(
+                                    x + xu * du + xv * dv, y + yu * du + yv * dv,
+                                    here, near, to_texel, sizes, starts, texels, smooth,
+                                )  # fmt: skip
+                                if found >= 0:
+                                    total += value - behind
+                            change = np.float32(weight * total / cast)
+                            if coarse:
+                                light[row, column] += change
+                            else:
+                                light[r, c] += change
+
+
+@nb.njit(cache=True, error_model="numpy")
+def count_visible(
+    x: NDArray[np.float64],
+    y: NDArray[np.float64],
+    surface: int,
+    to_texel: NDArray[np.float64],
+    sizes: NDArray[np.int64],
+    starts: NDArray[np.int64],
+    texels: NDArray[np.float32],
+    smooth: NDArray[np.uint8],
+) -> int:
+    """How many of the rays (x, y, 1) meet the given surface before any other."""
+    surfaces = len(sizes)
+    candidates = np.arange(surfaces)
+    seen = 0
+    for k in range(len(x)):
+        found, _ = nearest_surface(
+            x[k], y[k], candidates, surfaces, to_texel, sizes, starts, texels, smooth
+        )
+        if found == surface:
+            seen += 1
+    return seen
+
+
+@nb.njit(cache=True, error_model="numpy")
+def grey_values(
+    grey: NDArray[np.float32], noise: NDArray[np.float32], sigma: float
+) -> NDArray[np.uint8]:
+    """Grey values with noise, rounded (halves up) and cut to 8 bits; all arrays are (H, W)."""
+    rows, columns = grey.shape
+    result = np.empty((rows, columns), np.uint8)
+    s = np.float32(sigma)
+    half = np.float32(0.5)
+    for r in range(rows):
+        for c in range(columns):
+            value = grey[r, c] + s * noise[r, c] + half
+            result[r, c] = np.uint8(min(max(value, np.float32(0.0)), np.float32(255.0)))
+    return result
