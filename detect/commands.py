@@ -39,9 +39,9 @@ def carry_out(command: Circles | Lines | All | Compare) -> int:
 
 def _circles(command: Circles) -> int:
     from detect import __version__
+    from detect.by_image import TiltsByImage
     from detect.circles_run import detect_circles_run
     from detect.run import open_run
-    from landmarks import read_tilts
 
     run = open_run(command.run, command.camera)
     output = command.output if command.output is not None else command.run / "detected.circles"
@@ -56,7 +56,7 @@ def _circles(command: Circles) -> int:
             version=__version__,
             overwrite=command.force,
             json_output=command.json,
-            tilts=None if command.tilt is None else read_tilts(command.tilt),
+            tilts=None if command.tilt is None else TiltsByImage(command.tilt),
             pictures=command.draw,
             workers=_workers(command, run),
             on_progress=advance,
@@ -67,10 +67,9 @@ def _circles(command: Circles) -> int:
 
 def _lines(command: Lines) -> int:
     from detect import __version__
-    from detect.compare_pairing import image_name
+    from detect.by_image import LinesByImage
     from detect.lines_run import detect_lines_run
     from detect.run import open_run
-    from landmarks import read_frames
 
     run = open_run(command.run, command.camera)
     output = command.output if command.output is not None else command.run / "detected.lines"
@@ -82,11 +81,7 @@ def _lines(command: Lines) -> int:
         settings = replace(settings, join_px=command.join_threshold * run.camera.scale_x)
     reference = None
     if command.ids_from is not None:
-        by_name = {image_name(f.step.prefix): f.lines for f in read_frames(command.ids_from)}
-        reference = {
-            frame.step.prefix: by_name.get(image_name(frame.step.prefix), ())
-            for frame in run.frames
-        }
+        reference = LinesByImage(command.ids_from)
     if command.draw is not None:
         command.draw.mkdir(parents=True, exist_ok=True)
     with progress_bar("lines", len(run.frames)) as advance:

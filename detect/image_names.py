@@ -1,6 +1,6 @@
 """The images of a folder, as compact as they can be looked up in.
 
-A run may have a million frames, so a name costs its bytes and eight more, whatever is asked of it.
+A run may have a million frames: what is kept of one is the name of its image, twice, and 4 bytes.
 """
 
 from __future__ import annotations
@@ -11,6 +11,8 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+
+from detect.name_index import NameIndex
 
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".pgm", ".ppm", ".tif", ".tiff", ".bmp"})
 
@@ -40,7 +42,7 @@ class ImageNames:
         self._names: NDArray[np.bytes_] = np.array(
             [os.fsencode(key.rpartition("/")[2]) for key in keys], dtype=np.bytes_
         )
-        self._by_bytes = np.argsort(self._names).astype(np.uint32)
+        self._index = NameIndex(bytes(name) for name in self._names)
         self._suffixes = (b"", *sorted(suffixes))
 
     def __len__(self) -> int:
@@ -53,18 +55,8 @@ class ImageNames:
     def find(self, name: str) -> int | None:
         """The place of the image of a name, with or without its ending; the first of several."""
         stem = name.encode("utf-8", "surrogateescape")
-        found = [self._place(stem + suffix) for suffix in self._suffixes]
+        found = [self._index.find(stem + suffix) for suffix in self._suffixes]
         return min((place for place in found if place is not None), default=None)
-
-    def _place(self, name: bytes) -> int | None:
-        # A longer needle would make numpy copy the whole haystack to its width.
-        if not len(self._names) or len(name) > self._names.itemsize:
-            return None
-        at = int(np.searchsorted(self._names, np.bytes_(name), sorter=self._by_bytes))
-        if at == len(self._names):
-            return None
-        place = int(self._by_bytes[at])
-        return place if self._names[place] == name else None
 
 
 def _natural_order(name: str) -> str:

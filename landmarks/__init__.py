@@ -40,6 +40,7 @@ from landmarks.tilts import (
     FrameTilt,
     format_no_tilt,
     format_tilt,
+    iterate_tilts,
     read_tilts,
     tilt_as_written,
 )
@@ -74,6 +75,7 @@ __all__ = [
     "format_tilt",
     "frames_of_rows",
     "is_positive_definite",
+    "iterate_tilts",
     "parse_record",
     "parse_rows",
     "read_frames",

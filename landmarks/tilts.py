@@ -86,12 +86,13 @@ def read_tilts(path: str | os.PathLike[str]) -> dict[str, FrameTilt]:
     LandmarkFileError
         If the file cannot be read or a row is malformed; names file and line.
     """
-    return {tilt.prefix: tilt for tilt in _rows(Path(path))}
+    return {tilt.prefix: tilt for tilt in iterate_tilts(path)}
 
 
-def _rows(path: Path) -> Iterator[FrameTilt]:
+def iterate_tilts(path: str | os.PathLike[str]) -> Iterator[FrameTilt]:
+    """Read a tilt file row by row; parameters and errors are those of `read_tilts`."""
     try:
-        with path.open(encoding="utf-8", errors="surrogateescape") as stream:
+        with Path(path).open(encoding="utf-8", errors="surrogateescape") as stream:
             for number, line in enumerate(stream, start=1):
                 if len(line) > _LARGEST_ROW:
                     raise LandmarkFileError(str(path), number, "the row is too long")
