@@ -11,6 +11,8 @@ from tyro.conf import OmitArgPrefixes
 
 from tools.benchmark.suite import Settings
 
+_FILE_WIDTH = 110
+
 
 @dataclass(frozen=True)
 class Benchmark:
@@ -26,6 +28,8 @@ class Benchmark:
         Draw the ratios and the growth curves into a PNG.
     markdown : Path
         Write the main tables as Markdown.
+    readme : Path
+        Put a short table between the two benchmark marks of this document.
     force : bool
         Replace existing files.
     """
@@ -33,6 +37,7 @@ class Benchmark:
     json: Path | None = None
     plot: Path | None = None
     markdown: Path | None = None
+    readme: Path | None = None
     force: bool = False
     settings: OmitArgPrefixes[Settings] = field(default_factory=Settings)
 
@@ -52,16 +57,19 @@ def _carry_out(command: Benchmark) -> int:
 
     from storage import OutputExistsError, write_whole
     from tools.benchmark.plot import plot_png
-    from tools.benchmark.report import format_markdown, result_tables
+    from tools.benchmark.report import format_headline, format_markdown, result_tables, spliced
     from tools.benchmark.result import format_json
     from tools.benchmark.suite import benchmark
 
     for path in (command.json, command.plot, command.markdown):
         if path is not None and path.exists() and not command.force:
             raise OutputExistsError(path)
-    with Console(stderr=True).status("") as status:
-        result = benchmark(command.settings, status.update)
-    Console().print(result_tables(result))
+    if command.readme is not None:
+        spliced(command.readme.read_text(), "")  # that there are marks is known before any work
+    # No moving display: its thread would be measured as well.
+    result = benchmark(command.settings, lambda stage: print(stage, file=sys.stderr, flush=True))
+    # Where there is no terminal, tables need not fold.
+    Console(width=None if sys.stdout.isatty() else _FILE_WIDTH).print(result_tables(result))
     for path, content in (
         (command.json, format_json(result).encode()),
         (command.markdown, format_markdown(result).encode()),
@@ -70,4 +78,8 @@ def _carry_out(command: Benchmark) -> int:
         if path is not None:
             with write_whole(path, overwrite=command.force) as stream:
                 stream.write(plot_png(result) if content is None else content)
+    if command.readme is not None:
+        document = spliced(command.readme.read_text(), format_headline(result))
+        with write_whole(command.readme, overwrite=True) as stream:
+            stream.write(document.encode())
     return 0

@@ -9,13 +9,13 @@ import numpy as np
 
 from camera import Camera
 from detect.circles import detect_circles, disc_shape, quality_of_centres
-from detect.circles_run import levelled
 from detect.disc_fit import estimate_noise
+from detect.frame import tilt_of_lines
+from detect.levelling import levelled
 from detect.line_settings import DEFAULT as LINES_DEFAULT
 from detect.line_tracks import line_response
-from detect.lines import LineDetections, detect_lines
+from detect.lines import detect_lines
 from detect.settings import PUBLISHED, CircleSettings
-from landmarks import FrameTilt
 from lut import cached_disc_table, cached_vertical_table
 from tools.benchmark.material import Picture, decode
 from tools.benchmark.plain_gather import gather_table, plain_quality_of_centres
@@ -100,7 +100,7 @@ def both_detectors(camera: Camera) -> Measured:
     def detect(picture: Picture) -> object:
         lines = detect_lines(picture.grey, verticals, LINES_DEFAULT)
         circles = detect_circles(picture.grey, camera, discs, settings)
-        tilt = _frame_tilt(lines)
+        tilt = tilt_of_lines("image", lines)
         return lines, circles if tilt is None else levelled(circles, camera, tilt)
 
     return Measured(ALL, "all", detect)
@@ -168,13 +168,3 @@ def by_picture_number(
         return lambda number: function.call(pictures[number])
 
     return {function.name: bound(function) for function in measured}
-
-
-def _frame_tilt(found: LineDetections) -> FrameTilt | None:
-    if found.tilt is None:
-        return None
-    c = found.tilt.covariance
-    return FrameTilt(
-        "", found.tilt.pitch_rad, found.tilt.roll_rad,
-        float(c[0, 0]), float(c[0, 1]), float(c[1, 1]), found.tilt.lines,
-    )  # fmt: skip

@@ -8,8 +8,17 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
-from tools.benchmark.result import KindTimes, Result, RunTimes
+from tools.benchmark.errors import BenchmarkError
+from tools.benchmark.result import (
+    KindTimes,
+    Result,
+    RunTimes,
+    costs_per_landmark,
+    growth_powers,
+)
 from tools.benchmark.timing import Spread
+
+_BEGIN, _END = "<!-- benchmark begins -->", "<!-- benchmark ends -->"
 
 
 def result_tables(result: Result) -> Group:
@@ -31,6 +40,7 @@ def result_tables(result: Result) -> Group:
         for point in points:
             table.add_row(f"{point.amount:.3g}", *(number(t.ms.median) for t in point.functions))
         parts.append(table)
+    parts += [Text(line) for line in growth_lines(result)]
     parts.append(_runs_table("Growth with the frames", result.by_frames))
     return Group(*parts)
 
@@ -50,7 +60,7 @@ def format_markdown(result: Result) -> str:
     kinds = result.kinds
     lines = [
         *(f"- {line}" for line in description_lines(result)),
-        *(f"- {kind.kind}: {kind.pictures} {kind.description}" for kind in kinds),
+        *(f"- {kind.kind}: {kind.pictures} images, {kind.description}" for kind in kinds),
         "",
         "Median time per image, one core, in times that decoding the same image takes (quartiles; "
         "milliseconds):",
@@ -93,7 +103,66 @@ def format_markdown(result: Result) -> str:
                 spread(passes.share_of_decoding),
             ]
         )
+    lines += ["", "Growth, fitted to the medians:", "", *(f"- {t}" for t in growth_lines(result))]
     return "\n".join(lines) + "\n"
+
+
+def format_headline(result: Result) -> str:
+    """The medians alone, as one short Markdown table and a line on whole runs."""
+    kinds = result.kinds
+    lines = _markdown_row(["x decoding (ms)", *(kind.kind for kind in kinds)], head=True)
+    for row in zip(*(kind.functions for kind in kinds)):
+        cells = [f"{number(t.decodings.median)} ({number(t.ms.median)})" for t in row]
+        lines += _markdown_row([row[0].name, *cells])
+    passes = "; ".join(
+        f"`{t.command}` {number(t.images_per_s.median)} images/s, "
+        f"{number(t.share_of_decoding.median)} of decoding alone"
+        for t in result.runs
+        if t.jobs == 1
+    )
+    machine = result.machine
+    return "\n".join(
+        [*lines, "", f"Whole runs, files in, files out, one job: {passes}. {machine.cpu}.", ""]
+    )
+
+
+def spliced(document: str, part: str) -> str:
+    """A document with another part between its marks.
+
+    Parameters
+    ----------
+    document : str
+        Text that has the two marks on lines of their own.
+    part : str
+        What comes between them.
+
+    Returns
+    -------
+    str
+
+    Raises
+    ------
+    BenchmarkError
+        If it has not exactly one of each, in their order.
+    """
+    before, begin, rest = document.partition(_BEGIN)
+    _, end, after = rest.partition(_END)
+    if not begin or not end or _BEGIN in rest or _END in before + after:
+        raise BenchmarkError(f"the document has no place for the table: expected {_BEGIN} {_END}")
+    return f"{before}{_BEGIN}\n{part}{_END}{after}"
+
+
+def growth_lines(result: Result) -> list[str]:
+    """How times grow, in a sentence for each function that has a curve."""
+    lines = []
+    if len(result.by_megapixels) > 1:
+        for name, power in growth_powers(result.by_megapixels).items():
+            lines.append(f"{name}: time grows as the number of pixels to the power {power:.2f}")
+    for points, landmark in ((result.by_discs, "disc"), (result.by_verticals, "vertical")):
+        if len(points) > 1:
+            for name, (bare, each) in costs_per_landmark(points).items():
+                lines.append(f"{name}: {number(bare)} ms, and {each:.3f} ms for each {landmark}")
+    return lines
 
 
 def number(value: float) -> str:
@@ -110,7 +179,9 @@ def spread(values: Spread) -> str:
 
 
 def _kind_table(kind: KindTimes) -> Table:
-    table = Table(title=f"{kind.kind}: {kind.pictures} {kind.description}", title_justify="left")
+    table = Table(
+        title=f"{kind.kind}: {kind.pictures} images, {kind.description}", title_justify="left"
+    )
     table.add_column("function", no_wrap=True)
     for column in ("x decoding", "quartiles", "ms/image", "quartiles", "calls"):
         table.add_column(column, justify="right")

@@ -8,6 +8,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from tools.benchmark.functions import DECODING, Measured
 from tools.benchmark.machine import Machine
 from tools.benchmark.timing import FloatArray, Spread, paired_ratios, spread_of
@@ -193,6 +195,30 @@ def run_times(
         spread_of(frames / seconds),
         spread_of(paired_ratios(decoding, seconds) / jobs),
     )
+
+
+def growth_powers(points: Sequence[GrowthPoint]) -> dict[str, float]:
+    """The power of the amount that each function's median time grows as (least squares of logs)."""
+    amounts = np.log([point.amount for point in points])
+    return {
+        times.name: float(
+            np.polynomial.Polynomial.fit(
+                amounts, np.log([p.functions[i].ms.median for p in points]), 1
+            ).convert().coef[1]
+        )
+        for i, times in enumerate(points[0].functions)
+    }  # fmt: skip
+
+
+def costs_per_landmark(points: Sequence[GrowthPoint]) -> dict[str, tuple[float, float]]:
+    """Each function's median time without landmarks, and for each of them (least squares; ms)."""
+    amounts = [point.amount for point in points]
+    costs = {}
+    for i, times in enumerate(points[0].functions):
+        medians = [point.functions[i].ms.median for point in points]
+        bare, each = np.polynomial.Polynomial.fit(amounts, medians, 1).convert().coef
+        costs[times.name] = (float(bare), float(each))
+    return costs
 
 
 def format_json(result: Result) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import io
 import time
 from collections.abc import Callable, Hashable, Mapping, Sequence
@@ -28,37 +27,16 @@ Key = TypeVar("Key", bound=Hashable)
 _BUDGET_S = 10.0
 
 
-def jobs_available() -> bool:
-    """Whether the commands can work on several frames at once."""
-    return "jobs" in {f.name for f in dataclasses.fields(All)}
-
-
-def commands(run: Path, output: Path) -> dict[str, Command]:
-    """The commands that are measured on a run; their files go into a folder."""
+def commands(run: Path, output: Path, jobs: int = 1) -> dict[str, Command]:
+    """The commands that are measured on a run, by name; their files go into a folder."""
     return {
         "detect circles --preset published": Circles(
-            run=run, output=output / "published.circles", force=True, settings=PUBLISHED
+            run=run, output=output / "published.circles", force=True, jobs=jobs, settings=PUBLISHED
         ),
-        "detect circles": Circles(run=run, output=output / "discs.circles", force=True),
-        "detect lines": Lines(run=run, output=output / "verticals.lines", force=True),
-        "detect all": All(run=run, output=output, force=True),
+        "detect circles": Circles(run=run, output=output / "discs.circles", force=True, jobs=jobs),
+        "detect lines": Lines(run=run, output=output / "verticals.lines", force=True, jobs=jobs),
+        "detect all": All(run=run, output=output, force=True, jobs=jobs),
     }
-
-
-def with_jobs(command: Command, jobs: int) -> Command:
-    """The same command with so many jobs.
-
-    Raises
-    ------
-    BenchmarkError
-        If there should be more than one and the command cannot.
-    """
-    if jobs_available():
-        changes: dict[str, int] = {"jobs": jobs}
-        return dataclasses.replace(command, **changes)  # type: ignore[arg-type]
-    if jobs != 1:
-        raise BenchmarkError(f"{jobs} jobs: expected 1, the commands know no others")
-    return command
 
 
 def perform(command: Command) -> None:
@@ -88,6 +66,8 @@ def measure_runs(
     run: Path,
     rounds: int,
     clock: Callable[[], float] = time.perf_counter,
+    *,
+    warm_up: bool = True,
 ) -> tuple[int, FloatArray, dict[Key, FloatArray]]:
     """Time whole passes over a run, in turn with decoding its files from memory.
 
@@ -98,9 +78,11 @@ def measure_runs(
     run : path
         The run folder.
     rounds : int
-        Passes; slow commands are measured three times at least.
+        Passes; slow commands get fewer.
     clock : callable
         Seconds.
+    warm_up : bool
+        Whether a pass of each command is made beforehand that is not measured.
 
     Returns
     -------
@@ -119,6 +101,8 @@ def measure_runs(
 
     functions: dict[str, Callable[[int], object]] = {"": lambda _: decode_run(files)}
     functions |= {str(i): performing(command) for i, command in enumerate(performed.values())}
-    seconds = measure_in_turn(functions, 1, rounds, _BUDGET_S, clock)
+    seconds = measure_in_turn(
+        functions, 1, rounds, _BUDGET_S, clock, warm_up=warm_up, least_calls=1
+    )
     by_key = {key: seconds[str(i)][:, 0] for i, key in enumerate(performed)}
     return len(paths), seconds[""][:, 0], by_key

@@ -32,7 +32,7 @@ from tools.benchmark.result import (
     function_times,
     run_times,
 )
-from tools.benchmark.runs import commands, jobs_available, measure_runs, with_jobs
+from tools.benchmark.runs import commands, measure_runs
 from tools.benchmark.timing import measure_in_turn
 
 #: Peers, and what does their work here.
@@ -124,10 +124,6 @@ def benchmark(settings: Settings, on_stage: Callable[[str], None] | None = None)
     skipped = []
     if settings.photographs is None:
         skipped.append("photographs: no folder was given")
-    jobs = settings.jobs
-    if not jobs_available():
-        jobs = (1,)
-        skipped.append("several jobs: the commands work on one frame at a time")
 
     peers, absent = f.library_peers()
     say("compiling")
@@ -160,12 +156,12 @@ def benchmark(settings: Settings, on_stage: Callable[[str], None] | None = None)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         say("whole runs")
-        runs = _runs(settings.run, list(commands(settings.run, folder)), jobs, folder, settings)
+        runs = _runs(settings.run, list(commands(settings.run, folder)), folder, settings)
         by_frames: list[RunTimes] = []
         for frames in settings.frames:
             say(f"whole runs: {frames} frames")
             long_run = repeated_run(run, folder, frames)
-            by_frames += _runs(long_run, [_ALL_COMMAND], jobs, folder, settings)
+            by_frames += _runs(long_run, [_ALL_COMMAND], folder, settings, warm_up=False)
     return Result(
         machine=this_machine(),
         settings={
@@ -192,12 +188,12 @@ def _kinds(run: Run, settings: Settings) -> Iterator[tuple[str, str, list[Pictur
     size = f"{run.camera.width}x{run.camera.height}"
     yield (
         "demo",
-        f"frames of {settings.run}, {size}, files as they are",
+        f"frames of {settings.run} of {size}, files as they are",
         run_pictures(run, settings.pictures),
     )
     yield (
         "noise",
-        f"uniform noise, {size}, JPEG quality 90",
+        f"uniform noise of {size}, JPEG quality 90",
         noise_pictures(run.camera, settings.pictures, settings.seed),
     )
     if settings.photographs is not None:
@@ -258,13 +254,14 @@ def _by_landmarks(
     return tuple(discs), tuple(verticals)
 
 
-def _runs(
-    run: Path, names: Sequence[str], jobs: Sequence[int], folder: Path, settings: Settings
-) -> list[RunTimes]:
+def _runs(run: Path, names: Sequence[str], folder: Path, settings: Settings) -> list[RunTimes]:
     """Whole passes of some commands with each number of jobs, all in turn."""
-    known = commands(run, folder)
-    performed = {(name, count): with_jobs(known[name], count) for count in jobs for name in names}
-    frames, decoding, seconds = measure_runs(performed, run, settings.run_rounds)
+    performed = {
+        (name, count): commands(run, folder, count)[name]
+        for count in settings.jobs
+        for name in names
+    }
+    frames, decoding, seconds = measure_runs(performed, run, settings.run_rounds, warm_up=warm_up)
     return [
         run_times(name, frames, count, seconds[name, count], decoding) for name, count in performed
     ]

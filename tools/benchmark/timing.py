@@ -70,11 +70,14 @@ def measure_in_turn(
     rounds: int,
     budget_s: float,
     clock: Callable[[], float] = time.perf_counter,
+    *,
+    warm_up: bool = True,
+    least_calls: int = LEAST_CALLS,
 ) -> dict[str, FloatArray]:
     """Time functions in turn: round by round, image by image, one call of each.
 
-    Every function is called once beforehand on the first image, so that compiling and first
-    touches are not measured. Which function goes first changes from image to image.
+    With `warm_up` every function is called once beforehand on the first image, so that compiling
+    and first touches are not measured. Which function goes first changes from image to image.
 
     Parameters
     ----------
@@ -83,18 +86,23 @@ def measure_in_turn(
     images, rounds : int
         Numbers of both.
     budget_s : float
-        A function that has used up this many seconds, and was called three times, is left out of
-        the rest.
+        A function that has used up this many seconds, and was called `least_calls` times, is left
+        out of the rest.
     clock : callable
         Seconds.
+    warm_up : bool
+        See above.
+    least_calls : int
+        See `budget_s`.
 
     Returns
     -------
     dict of (rounds, images) float64
         Seconds; NaN where a function was left out.
     """
-    for function in functions.values():
-        function(0)
+    if warm_up:
+        for function in functions.values():
+            function(0)
     seconds = {name: np.full((rounds, images), np.nan) for name in functions}
     spent = dict.fromkeys(functions, 0.0)
     calls = dict.fromkeys(functions, 0)
@@ -105,7 +113,7 @@ def measure_in_turn(
             first = turn % len(names)
             turn += 1
             for name in names[first:] + names[:first]:
-                if spent[name] >= budget_s and calls[name] >= LEAST_CALLS:
+                if spent[name] >= budget_s and calls[name] >= least_calls:
                     continue
                 begin = clock()
                 functions[name](image)

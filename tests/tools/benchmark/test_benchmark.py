@@ -65,11 +65,14 @@ def test_the_command_measures_everything(
     short_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     files = {kind: tmp_path / f"speed.{kind}" for kind in ("json", "png", "md")}
+    readme = tmp_path / "README.md"
+    readme.write_text("<!-- benchmark begins -->\n<!-- benchmark ends -->\n")
     arguments = [
         "--run", str(short_run), "--photographs", str(short_run / "images"),
         "--pictures", "1", "--rounds", "1", "--run-rounds", "1",
         "--factors", "0.5", "1", "--landmarks", "0", "3", "--frames", "1", "2", "--jobs", "1",
         "--json", str(files["json"]), "--plot", str(files["png"]), "--markdown", str(files["md"]),
+        "--readme", str(readme),
     ]  # fmt: skip
     assert main(arguments) == 0
     assert "decoding" in capsys.readouterr().out
@@ -92,3 +95,4 @@ def test_the_command_measures_everything(
     assert len(document["runs"]) == len(commands(short_run, tmp_path))
     assert files["png"].read_bytes().startswith(b"\x89PNG")
     assert KERNEL in files["md"].read_text()
+    assert KERNEL in readme.read_text()

@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 
+from tools.benchmark.errors import BenchmarkError
 from tools.benchmark.functions import DECODING, Measured
 from tools.benchmark.machine import Machine, cpu_model, this_machine
 from tools.benchmark.plot import plot_png
-from tools.benchmark.report import format_markdown, number
+from tools.benchmark.report import format_headline, format_markdown, number, spliced
 from tools.benchmark.result import (
     GrowthPoint,
     KindTimes,
     Result,
     comparisons,
+    costs_per_landmark,
     format_json,
     function_times,
+    growth_powers,
     run_times,
 )
 
@@ -106,6 +110,48 @@ def test_markdown_tells_ratios_first_and_what_is_missing() -> None:
     assert "| `detect all`, 10 frames | 2 | 10.0 | 0.25 (0.19 - 0.25) |" in text
     assert "not installed: something" in text
     assert "not measured: photographs: no folder was given" in text
+
+
+def test_growth_is_that_of_known_laws() -> None:
+    def points(law: Callable[[float], float]) -> list[GrowthPoint]:
+        seconds = {amount: np.full((1, 1), law(amount) / 1e3) for amount in (0.5, 1.0, 4.0)}
+        return [
+            GrowthPoint(amount, function_times(_MEASURED[:1], {DECODING: taken}))
+            for amount, taken in seconds.items()
+        ]
+
+    assert growth_powers(points(lambda n: 3.0 * n**1.5)) == {DECODING: pytest.approx(1.5)}
+    bare, each = costs_per_landmark(points(lambda n: 5.0 + 0.25 * n))[DECODING]
+    assert bare == pytest.approx(5.0)
+    assert each == pytest.approx(0.25)
+
+
+def test_the_headline_is_medians_alone() -> None:
+    text = format_headline(_result())
+    assert "| x decoding (ms) | demo |" in text
+    assert "| own | 2.50 (5.00) |" in text
+    assert "`detect all` 5.00 images/s, 0.25 of decoding alone" in text
+
+
+def test_the_table_replaces_the_one_that_stands_there() -> None:
+    document = "a\n<!-- benchmark begins -->\nold\n<!-- benchmark ends -->\nb\n"
+    once = spliced(document, "new\n")
+    assert once == "a\n<!-- benchmark begins -->\nnew\n<!-- benchmark ends -->\nb\n"
+    assert spliced(once, "new\n") == once
+
+
+@pytest.mark.parametrize(
+    "document",
+    [
+        "nothing",
+        "<!-- benchmark begins -->",
+        "<!-- benchmark ends --><!-- benchmark begins -->",
+        "<!-- benchmark begins --><!-- benchmark begins --><!-- benchmark ends -->",
+    ],
+)
+def test_a_document_without_a_place_for_the_table_is_an_error(document: str) -> None:
+    with pytest.raises(BenchmarkError, match="no place"):
+        spliced(document, "new")
 
 
 @pytest.mark.parametrize(

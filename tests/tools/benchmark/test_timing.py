@@ -92,6 +92,14 @@ def test_a_function_slower_than_its_time_is_still_called_some_times() -> None:
     assert np.count_nonzero(~np.isnan(seconds["slow"])) == LEAST_CALLS
 
 
+def test_what_needs_no_warming_up_is_measured_from_its_first_call() -> None:
+    machine = Machine()
+    functions = {"slow": machine.function("slow", 2.0)}
+    seconds = measure_in_turn(functions, 1, 10, 0.0, machine.clock, warm_up=False, least_calls=1)
+    assert machine.calls == [("slow", 0)]
+    assert np.count_nonzero(~np.isnan(seconds["slow"])) == 1
+
+
 def test_load_cancels_out_of_ratios() -> None:
     machine = Machine()
     rng = np.random.default_rng(3)
