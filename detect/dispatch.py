@@ -26,7 +26,7 @@ from detect.frame_rows import FrameRows, FrameTask, rows_of_failure, rows_of_fra
 Chunk = tuple[FrameTask, ...]
 
 #: After so many frames that killed their workers, and none between that did not, it is not them.
-_DEADLY_FRAMES = 3
+_DEADLY_FRAMES = 10
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ def detect_frames(
                 return
             chunk, future = under_way.popleft()
             try:
-                rows = crew.alone(chunk) if future is None else future.result()
+                rows = crew.alone(chunk) if future is None else crew.finished(future)
             except crew.died as error:
                 crew.bury(error)
                 under_way.appendleft((chunk, None))
@@ -133,6 +133,12 @@ class _Crew:
             failed.set_exception(error)
             return failed
 
+    def finished(self, future: Future[list[FrameRows]]) -> list[FrameRows]:
+        """The rows of a chunk that was worked on beside others."""
+        rows = future.result()
+        self._deadly = 0
+        return rows
+
     def bury(self, error: BaseException) -> None:
         """End what is left of broken workers; the next chunk gets new ones."""
         if isinstance(error, BrokenExecutor):
@@ -151,12 +157,9 @@ class _Crew:
         """The rows of a chunk during which a worker died; nothing else is under way."""
         for _ in range(2 if len(chunk) == 1 else 1):
             try:
-                rows = self.submit(chunk).result()
+                return self.finished(self.submit(chunk))
             except self.died as error:
                 self.bury(error)
-            else:
-                self._deadly = 0
-                return rows
         if len(chunk) > 1:
             return [rows for task in chunk for rows in self.alone((task,))]
         (task,) = chunk
