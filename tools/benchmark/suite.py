@@ -254,7 +254,9 @@ def _by_landmarks(
     return tuple(discs), tuple(verticals)
 
 
-def _runs(run: Path, names: Sequence[str], folder: Path, settings: Settings) -> list[RunTimes]:
+def _runs(
+    run: Path, names: Sequence[str], folder: Path, settings: Settings, *, warm_up: bool = True
+) -> list[RunTimes]:
     """Whole passes of some commands with each number of jobs, all in turn."""
     performed = {
         (name, count): commands(run, folder, count)[name]
