@@ -1,0 +1,218 @@
+"""Poses held against the truth: errors, and whether their covariances are right."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from groundtruth.errors import GroundTruthError
+from groundtruth.streams import PlanarPoses, is_positive_definite
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class PoseScore:
+    """How far poses are from the truth.
+
+    Attributes
+    ----------
+    poses : int
+        Poses held against the truth.
+    unmatched : int
+        Poses without truth at their time.
+    position_mean_m, position_sigma_m, position_rmse_m, position_max_m : float
+        Of the distances from the truth; sigma with N - 1.
+    angle_mean_rad, angle_sigma_rad, angle_max_rad : float
+        Of the signed differences of heading; the largest without sign.
+    normalised : int
+        Poses whose covariance could be inverted.
+    normalised_error : float
+        Mean of error^T covariance^-1 error over 3, the degrees of freedom: 1 if the covariances
+        are right. NaN without covariances.
+    """
+
+    poses: int
+    unmatched: int
+    position_mean_m: float
+    position_sigma_m: float
+    position_rmse_m: float
+    position_max_m: float
+    angle_mean_rad: float
+    angle_sigma_rad: float
+    angle_max_rad: float
+    normalised: int
+    normalised_error: float
+
+
+def wrapped(angle_rad: FloatArray) -> FloatArray:
+    """Angles brought to [-pi, pi)."""
+    return np.asarray((angle_rad + np.pi) % (2.0 * np.pi) - np.pi)
+
+
+def interpolate_poses(
+    poses: PlanarPoses, times_s: FloatArray, largest_gap_s: float = np.inf
+) -> tuple[PlanarPoses, BoolArray]:
+    """Poses at other times, linearly between neighbours, headings the short way round.
+
+    Parameters
+    ----------
+    poses : PlanarPoses
+    times_s : (N,) array
+        Ascending.
+    largest_gap_s : float
+        Between neighbours farther apart than this there is no pose, but at their own times.
+
+    Returns
+    -------
+    PlanarPoses
+        At those of the times that have one; covariances interpolated like the poses.
+    (N,) bool array
+        Which times those are.
+    """
+    if len(poses) == 0:
+        raise GroundTruthError("no poses to interpolate between")
+    after = np.clip(np.searchsorted(poses.times_s, times_s, side="left"), 0, len(poses) - 1)
+    before = np.where(poses.times_s[after] == times_s, after, np.maximum(after - 1, 0))
+    inside = (times_s >= poses.times_s[0]) & (times_s <= poses.times_s[-1])
+    gap = poses.times_s[after] - poses.times_s[before]
+    known = inside & (gap <= largest_gap_s)
+    before, after, gap = before[known], after[known], gap[known]
+    part = np.where(gap > 0.0, (times_s[known] - poses.times_s[before]) / np.where(gap, gap, 1), 0)
+    change = poses.poses[after] - poses.poses[before]
+    change[:, 2] = wrapped(change[:, 2])
+    between = poses.poses[before] + part[:, None] * change
+    covariances = None
+    if poses.covariances is not None:
+        a, b = poses.covariances[before], poses.covariances[after]
+        covariances = a + part[:, None, None] * (b - a)
+    return PlanarPoses(times_s[known], between, covariances), known
+
+
+def align_poses(poses: PlanarPoses, truth: PlanarPoses) -> PlanarPoses:
+    """Poses moved rigidly in the plane, without scale, so that their positions fit the truth best.
+
+    Both have the same times. Least squares in the plane (Horn 1987) cannot mirror, as alignments in
+    space can.
+    """
+    if len(poses) < 2:
+        raise GroundTruthError(f"{len(poses)} poses: expected 2 or more to align them")
+    a, b = poses.poses[:, :2], truth.poses[:, :2]
+    from_a, from_b = a - a.mean(axis=0), b - b.mean(axis=0)
+    across = np.sum(from_a[:, 0] * from_b[:, 1] - from_a[:, 1] * from_b[:, 0])
+    angle = float(np.arctan2(across, np.sum(from_a * from_b)))
+    c, s = np.cos(angle), np.sin(angle)
+    rotation = np.array([[c, -s], [s, c]])
+    turn = np.eye(3)
+    turn[:2, :2] = rotation
+    moved = np.column_stack([from_a @ rotation.T + b.mean(axis=0), poses.poses[:, 2] + angle])
+    covariances = None
+    if poses.covariances is not None:
+        covariances = turn @ poses.covariances @ turn.T
+    return PlanarPoses(poses.times_s, moved, covariances)
+
+
+def score_poses(poses: PlanarPoses, truth: PlanarPoses, unmatched: int = 0) -> PoseScore:
+    """Errors of poses whose truth is known at the same times.
+
+    Parameters
+    ----------
+    poses, truth : PlanarPoses
+        With the same times. If the truth has covariances, they count in the normalised error.
+    unmatched : int
+        Handed through.
+
+    Returns
+    -------
+    PoseScore
+
+    Raises
+    ------
+    GroundTruthError
+        If there is no pose, or the numbers differ.
+    """
+    if len(poses) == 0 or len(poses) != len(truth):
+        raise GroundTruthError(
+            f"{len(poses)} poses and {len(truth)} of the truth: expected as many, and at least one"
+        )
+    error = poses.poses - truth.poses
+    error[:, 2] = wrapped(error[:, 2])
+    distance = np.hypot(error[:, 0], error[:, 1])
+    normalised, count = float("nan"), 0
+    if poses.covariances is not None:
+        covariances = poses.covariances
+        if truth.covariances is not None:
+            covariances = covariances + truth.covariances
+        usable = is_positive_definite(covariances)
+        count = int(usable.sum())
+        if count:
+            weighted = np.linalg.solve(covariances[usable], error[usable][..., None])[..., 0]
+            normalised = float(np.mean(np.sum(error[usable] * weighted, axis=1)) / 3.0)
+    return PoseScore(
+        len(poses),
+        unmatched,
+        float(distance.mean()),
+        _sigma(distance),
+        float(np.sqrt(np.mean(distance**2))),
+        float(distance.max()),
+        float(error[:, 2].mean()),
+        _sigma(error[:, 2]),
+        float(np.abs(error[:, 2]).max()),
+        count,
+        normalised,
+    )
+
+
+def compare_streams(
+    poses: PlanarPoses,
+    truth: PlanarPoses,
+    *,
+    largest_gap_s: float = 0.5,
+    interpolate: str = "truth",
+    align: bool = False,
+) -> PoseScore:
+    """Score two streams whose times differ.
+
+    Parameters
+    ----------
+    poses, truth : PlanarPoses
+    largest_gap_s : float
+        Nothing is interpolated across longer gaps.
+    interpolate : str
+        `truth` at the poses' times, or `poses` at the truth's times (RAWSEEDS' definition).
+    align : bool
+        Move the poses rigidly onto the truth first, for solutions with a world of their own.
+
+    Returns
+    -------
+    PoseScore
+
+    Raises
+    ------
+    GroundTruthError
+        If no pose has a truth at its time.
+    """
+    still, moving = (poses, truth) if interpolate == "truth" else (truth, poses)
+    at_times, known = interpolate_poses(moving, still.times_s, largest_gap_s)
+    kept = PlanarPoses(
+        still.times_s[known],
+        still.poses[known],
+        None if still.covariances is None else still.covariances[known],
+    )
+    mine, theirs = (kept, at_times) if interpolate == "truth" else (at_times, kept)
+    if len(mine) == 0:
+        raise GroundTruthError(
+            f"no pose has the truth beside it: poses from {poses.times_s[0]:.3f} to "
+            f"{poses.times_s[-1]:.3f} s, truth from {truth.times_s[0]:.3f} to "
+            f"{truth.times_s[-1]:.3f} s, gaps of at most {largest_gap_s:g} s interpolated"
+        )
+    if align:
+        mine = align_poses(mine, theirs)
+    return score_poses(mine, theirs, int((~known).sum()))
+
+
+def _sigma(values: FloatArray) -> float:
+    return float(values.std(ddof=1)) if len(values) > 1 else 0.0
