@@ -92,3 +92,77 @@ class PoseSettings:
             raise GroundTruthError(
                 f"ambiguity_odds is {self.ambiguity_odds:g}: expected more than 1"
             )
+
+
+@dataclass(frozen=True)
+class RigSettings:
+    """Settings of the rig's estimation.
+
+    Parameters
+    ----------
+    least_support : int
+        A marker belongs to the rig only if this many times, or images, show it with another and
+        agree.
+    outlier_sigma : float
+        A marker in an image is left out, and counted, if its normalised error is larger than this
+    outlier_px : float
+        and its root mean square residual is larger than this (px).
+    corner_floor_px : float
+        Standard deviation added to each corner's own covariance (px).
+    time_tolerance_s : float
+        Images of different cameras whose times differ by at most this are used together (s).
+
+    Raises
+    ------
+    GroundTruthError
+        If a number is not finite or too small.
+    """
+
+    least_support: int = 3
+    outlier_sigma: float = 5.0
+    outlier_px: float = 1.0
+    corner_floor_px: float = 0.02
+    time_tolerance_s: float = 0.005
+
+    def __post_init__(self) -> None:
+        for name, least in (
+            ("least_support", 1),
+            ("outlier_sigma", 0.0),
+            ("outlier_px", 0.0),
+            ("corner_floor_px", 0.0),
+            ("time_tolerance_s", 0.0),
+        ):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value >= least):
+                raise GroundTruthError(f"{name} is {value:g}: expected {least:g} or more")
+
+
+@dataclass(frozen=True)
+class NetworkSettings:
+    """Settings of the network's estimation.
+
+    Parameters
+    ----------
+    corner_sigma_px : float
+        Standard deviation of a checkerboard's corners (px). Only its ratio to the sigmas of the
+        boards' offset matters: the result's covariance is scaled by the residuals.
+    outlier_sigma : float
+        A board in an image is left out, and counted, if its normalised error is larger than this
+    outlier_px : float
+        and its root mean square residual is larger than this (px).
+
+    Raises
+    ------
+    GroundTruthError
+        If a number is not finite or too small.
+    """
+
+    corner_sigma_px: float = 0.1
+    outlier_sigma: float = 10.0
+    outlier_px: float = 1.0
+
+    def __post_init__(self) -> None:
+        for name in ("corner_sigma_px", "outlier_sigma", "outlier_px"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0.0):
+                raise GroundTruthError(f"{name} is {value:g}: expected more than 0")
