@@ -13,6 +13,8 @@ import tyro
 
 from storage import OutputExistsError
 from tools.simulator.drive import DriveStyle
+from tools.simulator.markers.commands import MarkerDemo, MarkerFrames, MarkerSession
+from tools.simulator.markers.commands import perform as perform_markers
 from tools.simulator.plan import PUBLISHED_CAMERA, RunSettings
 from tools.simulator.sensor import Sensor
 
@@ -152,7 +154,10 @@ def main(arguments: list[str] | None = None) -> int:
         | Annotated[Run, tyro.conf.subcommand("run")]
         | Annotated[Rows, tyro.conf.subcommand("rows")]
         | Annotated[Reenact, tyro.conf.subcommand("reenact")]
-        | Annotated[Discs, tyro.conf.subcommand("discs")],
+        | Annotated[Discs, tyro.conf.subcommand("discs")]
+        | Annotated[MarkerFrames, tyro.conf.subcommand("marker-frames")]
+        | Annotated[MarkerSession, tyro.conf.subcommand("marker-session")]
+        | Annotated[MarkerDemo, tyro.conf.subcommand("marker-demo")],
         prog="python -m tools.simulator",
         description="Rendered runs with known truth.",
         args=arguments,
@@ -164,9 +169,13 @@ def main(arguments: list[str] | None = None) -> int:
         return 1
 
 
-def _perform(command: Demo | Run | Rows | Reenact | Discs) -> int:
+def _perform(
+    command: Demo | Run | Rows | Reenact | Discs | MarkerFrames | MarkerSession | MarkerDemo,
+) -> int:
     begin = time.perf_counter()
-    if isinstance(command, Discs):
+    if isinstance(command, MarkerFrames | MarkerSession | MarkerDemo):
+        what = perform_markers(command)
+    elif isinstance(command, Discs):
         what = _discs(command)
     elif isinstance(command, Reenact):
         what = _reenact(command)

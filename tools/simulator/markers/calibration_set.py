@@ -1,0 +1,381 @@
+"""Images from which a session's calibrations can be estimated.
+
+``rig/``: the robot turns on the spot near each camera, which so sees several markers at a time.
+``network/``: a double checkerboard, two boards fixed to each other, stands so that each of two
+cameras sees one of them; and a board on the floor, seen by the first camera, defines the world.
+
+Frame of a board, as of a marker: origin at the middle of its inner corners, x right, y up, z out of
+the printed face, the upper left square black.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from groundtruth.calibration import write_json
+from groundtruth.transforms import apply, inverse, planar_transform, quaternion_xyzw
+from tools.simulator.markers.clutter import checkerboard
+from tools.simulator.markers.errors import CalibrationErrors
+from tools.simulator.markers.imaging import Imaging, grey_image
+from tools.simulator.markers.rendering import render_light
+from tools.simulator.markers.robot import facing_pose
+from tools.simulator.markers.room import lit
+from tools.simulator.markers.session import SessionPlan, View, random_for, view_robot
+from tools.simulator.markers.session_files import (
+    NOTE,
+    ImageFormat,
+    SeenFrame,
+    write_calibrations,
+    write_image,
+    write_poses,
+    write_times,
+    write_truth,
+)
+from tools.simulator.markers.surface import FloatArray, Surface
+
+_TURN_STEPS = 24
+_PAUSE_S = 1.0
+_RIG_S, _NETWORK_S = 100.0, 500.0
+#: Placements of the double board before each pair of neighbouring cameras.
+_PLACEMENTS = 10
+_TRIES = 400
+_EDGE_PX = 12.0
+
+
+@dataclass(frozen=True)
+class Board:
+    """A checkerboard: its inner corners, columns along x and rows along y."""
+
+    columns: int
+    rows: int
+    square_m: float
+
+    def corners(self) -> FloatArray:
+        """(rows * columns, 3) inner corners in the board's frame, row by row from the top left."""
+        r, c = np.mgrid[0 : self.rows, 0 : self.columns].astype(np.float64)
+        x = (c - 0.5 * (self.columns - 1)) * self.square_m
+        y = (0.5 * (self.rows - 1) - r) * self.square_m
+        return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=-1)
+
+    def surface(self, pose: FloatArray) -> Surface:
+        """The board with its white rim, one square wide."""
+        texture = checkerboard(self.columns + 1, self.rows + 1)
+        rows, columns = texture.values.shape
+        return Surface(pose, columns * self.square_m, rows * self.square_m, texture, 0.3)
+
+
+#: Both boards of the double board. Their numbers of corners are odd and even, so that a board
+#: turned by half a turn looks different.
+DOUBLE = Board(7, 6, 0.11)
+WORLD = Board(9, 6, 0.15)
+
+
+@dataclass(frozen=True, eq=False)
+class BoardView:
+    """A board in an image."""
+
+    camera: int
+    board: str
+    placement: int
+    """Which placement of the double board; -1 for the board that defines the world."""
+    pose: FloatArray
+    """world_from_board."""
+    corners: FloatArray
+    """(N, 2) pixels of its inner corners."""
+
+
+def first_from_second(rng: np.random.Generator) -> FloatArray:
+    """(4, 4) pose of the second board in the first one's frame: like two sides of a tent."""
+    middle = np.array([0.35, 0.02, -0.45]) + rng.normal(0.0, 0.02, 3)
+    second = facing_pose(
+        np.zeros(3), np.radians(115.0) + rng.normal(0.0, 0.03), rng.normal(0.0, 0.03)
+    )
+    first = facing_pose(np.zeros(3), 0.0, 0.0)
+    transform = inverse(first) @ second
+    transform[:3, 3] = middle
+    return np.asarray(transform)
+
+
+def world_board_pose(plan: SessionPlan) -> FloatArray:
+    """(4, 4) world_from_board of the board on the floor, before the first camera.
+
+    Raises
+    ------
+    ValueError
+        If it is not in view anywhere.
+    """
+    return _world_view(plan).pose
+
+
+def _world_view(plan: SessionPlan) -> BoardView:
+    """The board on the floor as near to the first camera as it is seen whole.
+
+    Raises
+    ------
+    ValueError
+        If it is not in view anywhere.
+    """
+    middle = 0.5 * np.array(plan.settings.area_m)
+    for share in np.arange(0.4, -0.6, -0.1):
+        at = middle + share * (plan.network.world_from_camera[0, :2, 3] - middle)
+        pose = planar_transform(float(at[0]), float(at[1]), 0.3)
+        pose[2, 3] = 0.004
+        view = _seen(plan, 0, "world", -1, WORLD, pose)
+        if view is not None:
+            return view
+    raise ValueError("no place on the floor where the first camera sees a board")
+
+
+def board_views(plan: SessionPlan, offset: FloatArray) -> list[BoardView]:
+    """Placements of the double board before neighbouring cameras, and the board of the world.
+
+    Parameters
+    ----------
+    plan : SessionPlan
+        The session whose cameras look.
+    offset : (4, 4) array
+        first_from_second.
+
+    Returns
+    -------
+    list of BoardView
+        For each placement two, of the two cameras.
+
+    Raises
+    ------
+    ValueError
+        If there are cameras before which no place for a board was found.
+    """
+    count = len(plan.network.names)
+    pairs = [(c, (c + 1) % count) for c in range(count if count > 2 else count - 1)]
+    views = []
+    placement = 0
+    for number, (one, other) in enumerate(pairs):
+        rng = random_for(plan.settings.seed, "boards", number)
+        found = 0
+        for _ in range(_TRIES):
+            seen = _placed(plan, offset, one, other, placement, rng)
+            if seen is not None:
+                views += seen
+                found, placement = found + 1, placement + 1
+            if found == _PLACEMENTS:
+                break
+        if found == 0:
+            names = plan.network.names
+            raise ValueError(f"no place where {names[one]} and {names[other]} see a board each")
+    return [*views, _world_view(plan)]
+
+
+def _placed(
+    plan: SessionPlan,
+    offset: FloatArray,
+    one: int,
+    other: int,
+    placement: int,
+    rng: np.random.Generator,
+) -> list[BoardView] | None:
+    """The double board somewhere in the area, turned between two cameras; None if not seen."""
+    area = np.array(plan.settings.area_m)
+    at = np.append(area * rng.uniform(0.1, 0.9, 2), rng.uniform(0.7, 1.3))
+    toward = [plan.network.world_from_camera[c, :2, 3] - at[:2] for c in (one, other)]
+    azimuths = [float(np.arctan2(d[1], d[0])) for d in toward]
+    between = azimuths[0] + 0.5 * float(np.angle(np.exp(1j * (azimuths[1] - azimuths[0]))))
+    # The second board looks some 115 degrees to the left of the first.
+    azimuth = between + rng.normal(0.0, 0.15) - np.radians(57.5)
+    first = facing_pose(at, azimuth, rng.uniform(0.1, 0.5), rng.normal(0.0, 0.1))
+    # Whichever of the cameras is on the right sees the first board.
+    for right, left in ((one, other), (other, one)):
+        views = (
+            _seen(plan, right, "first", placement, DOUBLE, first),
+            _seen(plan, left, "second", placement, DOUBLE, first @ offset),
+        )
+        if views[0] is not None and views[1] is not None:
+            return [views[0], views[1]]
+    return None
+
+
+def _seen(
+    plan: SessionPlan, camera: int, board: str, placement: int, kind: Board, pose: FloatArray
+) -> BoardView | None:
+    """The board in the image, if all of it is in view and not too slanted."""
+    model = plan.network.cameras[camera]
+    to_camera = plan.camera_from_world[camera] @ pose
+    middle = to_camera[:3, 3]
+    if -(to_camera[:3, 2] @ middle) < 0.5 * np.linalg.norm(middle):
+        return None
+    outline = model.project(kind.surface(to_camera).corners())
+    size = np.array([model.width, model.height])
+    if not np.all((outline > _EDGE_PX) & (outline < size - 1.0 - _EDGE_PX)):
+        return None
+    return BoardView(
+        camera, board, placement, pose, model.project(apply(to_camera, kind.corners()))
+    )
+
+
+def _render(plan: SessionPlan, view: BoardView, boards: list[Surface], noise: int) -> View:
+    settings, model = plan.settings, plan.network.cameras[view.camera]
+    imaging = Imaging(settings.blur_px, 6.0, 280.0, settings.noise_grey)
+    seen = [lit(b).moved(plan.camera_from_world[view.camera]) for b in boards]
+    light = render_light(
+        model, [seen], plan.background(view.camera), fine=imaging.fine, samples=settings.samples
+    )
+    rng = random_for(settings.seed, "frame", view.camera, noise)
+    return View(grey_image(light, plan.illumination(view.camera), imaging, rng), ())
+
+
+def write_calibration_set(
+    plan: SessionPlan,
+    folder: Path,
+    *,
+    errors: CalibrationErrors | None = None,
+    image_format: ImageFormat = "jpg",
+    quality: int = 92,
+    overwrite: bool = False,
+    on_frame: Callable[[], None] | None = None,
+) -> int:
+    """Write ``rig/`` and ``network/`` below a folder; parameters as in `write_session`.
+
+    Returns
+    -------
+    int
+        Number of images.
+    """
+    errors = CalibrationErrors() if errors is None else errors
+    count = _write_rig_images(
+        plan, errors, folder / "rig", image_format, quality, overwrite, on_frame
+    )
+    return count + _write_network_images(
+        plan, errors, folder / "network", image_format, quality, overwrite, on_frame
+    )
+
+
+def turning_poses(plan: SessionPlan, camera: int) -> FloatArray:
+    """(24, 3) poses of the robot as it turns on the spot where a camera sees it well and near."""
+    model, area = plan.network.cameras[camera], np.array(plan.settings.area_m)
+    start = plan.network.world_from_camera[camera, :2, 3]
+    ticks = np.linspace(0.0, 1.0, 41)[:, None]
+    places = start + ticks * (area / 2.0 - start)
+    # The robot with its boards fits into a cylinder.
+    a = np.linspace(0.0, 2.0 * np.pi, 12, endpoint=False)
+    rim = np.concatenate(
+        [np.column_stack([0.6 * np.cos(a), 0.6 * np.sin(a), np.full(12, z)]) for z in (0.0, 0.8)]
+    )
+    nearest = area / 2.0
+    for place in places:
+        seen = apply(plan.camera_from_world[camera], rim + np.append(place, 0.0))
+        pixels = model.project(seen)
+        size = np.array([model.width, model.height])
+        if np.all((pixels > 0.0) & (pixels < size - 1.0)):
+            nearest = place
+            break
+    turn = np.linspace(-np.pi, np.pi, _TURN_STEPS, endpoint=False) + 0.07 * camera
+    return np.column_stack([np.tile(nearest, (_TURN_STEPS, 1)), turn])
+
+
+def _write_rig_images(
+    plan: SessionPlan,
+    errors: CalibrationErrors,
+    folder: Path,
+    image_format: ImageFormat,
+    quality: int,
+    overwrite: bool,
+    on_frame: Callable[[], None] | None,
+) -> int:
+    write_calibrations(plan, errors, folder, overwrite=overwrite)
+    seen: list[SeenFrame] = []
+    times: list[float] = []
+    poses: list[FloatArray] = []
+    for camera, name in enumerate(plan.network.names):
+        own = []
+        for pose in turning_poses(plan, camera):
+            number = len(times)
+            view = view_robot(plan, camera, pose, np.zeros(3), 1_000_000 + number)
+            prefix = f"rig.{number:04d}"
+            write_image(
+                folder / name / "images" / f"{prefix}.{image_format}", view, quality,
+                overwrite=overwrite,
+            )  # fmt: skip
+            times.append(_RIG_S + _PAUSE_S * number)
+            poses.append(pose)
+            own.append(SeenFrame(name, prefix, times[-1], view.markers))
+            if on_frame is not None:
+                on_frame()
+        write_times(folder / name / f"{name}.times", own, overwrite=overwrite)
+        seen += own
+    write_poses(folder / "truth.csv", np.array(times), np.stack(poses), overwrite=overwrite)
+    write_truth(folder / "truth.json", plan, errors, seen, overwrite=overwrite)
+    return len(seen)
+
+
+def _write_network_images(
+    plan: SessionPlan,
+    errors: CalibrationErrors,
+    folder: Path,
+    image_format: ImageFormat,
+    quality: int,
+    overwrite: bool,
+    on_frame: Callable[[], None] | None,
+) -> int:
+    write_calibrations(plan, errors, folder, overwrite=overwrite)
+    offset = first_from_second(random_for(plan.settings.seed, "boards", 99))
+    views = board_views(plan, offset)
+    names = plan.network.names
+    rows, truth = [], []
+    seen: list[SeenFrame] = []
+    for number, view in enumerate(views):
+        if view.board == "world":
+            boards = [WORLD.surface(view.pose)]
+        else:
+            first = view.pose if view.board == "first" else view.pose @ inverse(offset)
+            boards = [DOUBLE.surface(first), DOUBLE.surface(first @ offset)]
+        name = names[view.camera]
+        place = view.placement if view.placement >= 0 else max(v.placement for v in views) + 1
+        prefix, time_s = f"network.{place:04d}", _NETWORK_S + _PAUSE_S * place
+        image = f"{name}/images/{prefix}.{image_format}"
+        write_image(
+            folder / image, _render(plan, view, boards, 2_000_000 + number), quality,
+            overwrite=overwrite,
+        )  # fmt: skip
+        seen.append(SeenFrame(name, prefix, time_s, ()))
+        rows.append({"camera": name, "image": image, "placement": place, "board": view.board})
+        truth.append(
+            {"image": image, "board": view.board, "world_from_board": _pose_json(view.pose),
+             "corners": np.round(view.corners, 4).tolist()}
+        )  # fmt: skip
+        if on_frame is not None:
+            on_frame()
+    for name in names:
+        own = sorted((s for s in seen if s.camera == name), key=lambda s: s.time_s)
+        write_times(folder / name / f"{name}.times", own, overwrite=overwrite)
+    content: dict[str, Any] = {
+        "note": NOTE,
+        "boards": {
+            "first": _board_json(DOUBLE),
+            "second": _board_json(DOUBLE),
+            "world": _board_json(WORLD),
+        },
+        "first_from_second": _pose_json(offset),
+        "world_from_board": _pose_json(world_board_pose(plan)),
+        "images": rows,
+    }
+    write_json(folder / "boards.json", content, overwrite=overwrite)
+    write_truth(
+        folder / "truth.json", plan, errors, (), overwrite=overwrite, extra={"boards": truth}
+    )
+    return len(views)
+
+
+def _board_json(board: Board) -> dict[str, float]:
+    return {"columns": board.columns, "rows": board.rows, "square_m": board.square_m}
+
+
+def _pose_json(pose: FloatArray) -> dict[str, list[float]]:
+    return {
+        "translation_m": pose[:3, 3].tolist(),
+        "quaternion_xyzw": quaternion_xyzw(pose).tolist(),
+    }
