@@ -14,6 +14,7 @@ from scipy.stats import chi2
 from camera import parse_camera, read_camera
 from groundtruth.calibration import read_network, read_rig
 from groundtruth.chain import ChainPoints, project_chain
+from groundtruth.checkerboard import Checkerboard, find_checkerboard
 from groundtruth.streams import read_planar_poses, read_times
 from groundtruth.transforms import (
     apply,
@@ -36,7 +37,9 @@ from tools.simulator.markers.errors import (
     disturbed_network,
     disturbed_rig,
 )
-from tools.simulator.markers.robot import robot_rig
+from tools.simulator.markers.imaging import Imaging, grey_image
+from tools.simulator.markers.rendering import render_light
+from tools.simulator.markers.robot import facing_pose, robot_rig
 from tools.simulator.markers.session import (
     SessionPlan,
     SessionSettings,
@@ -328,3 +331,22 @@ def test_demo_session_comes_out_again(project_root: Path) -> None:
     pixels, projected = _corners_by_files(folder, truth)
     assert np.abs(projected - pixels).max() < 2e-3
     assert len(truth["frames"]) == 36
+
+
+def test_boards_have_the_frame_of_those_that_are_looked_for(full_plan: SessionPlan) -> None:
+    """What the simulator calls a board is what `groundtruth` finds in an image."""
+    for board, pose in ((DOUBLE, 0.3), (WORLD, -0.4)):
+        same = Checkerboard(board.columns, board.rows, board.square_m)
+        np.testing.assert_allclose(board.corners(), same.points, atol=1e-12)
+        camera = full_plan.network.cameras[0]
+        camera_from_board = facing_pose(np.zeros(3), pose, 0.2, 0.5)
+        # From the world's axes to the camera's, three metres before it.
+        axes = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])
+        camera_from_board[:3, :3] = axes @ camera_from_board[:3, :3]
+        camera_from_board[:3, 3] = [0.1, 0.2, 3.0]
+        empty = np.full((camera.height, camera.width), 0.4, np.float32)
+        imaging = Imaging(blur_px=0.8)
+        light = render_light(camera, [[board.surface(camera_from_board)]], empty)
+        image = grey_image(light, 1.0, imaging, np.random.default_rng(0))
+        truth = camera.project(apply(camera_from_board, board.corners()))
+        assert np.abs(find_checkerboard(image, same) - truth).max() < 0.5
