@@ -160,6 +160,7 @@ def _pictures(
 ) -> Iterator[tuple[str, bytes]]:
     from detect.drawing import draw_circles
     from detect.line_drawing import draw_lines, draw_response, draw_tracks
+    from detect.line_tracks import line_response
 
     name = Path(prefix).name
     if plan.drawing == "discs" and found.discs is not None and plan.circles is not None:
@@ -175,8 +176,9 @@ def _pictures(
             found.image, tables.verticals, found.lines, rejected=True, reasons=True
         )
         yield f"{name}.png", _png(picture)
-    if plan.draw_response:
-        yield f"{name}.response.png", _png(draw_response(found.lines.response, tables.verticals))
+    if plan.draw_response and plan.lines is not None:
+        response = line_response(found.image, tables.verticals, plan.lines)
+        yield f"{name}.response.png", _png(draw_response(response, tables.verticals))
 
 
 def _png(picture: NDArray[np.uint8]) -> bytes:

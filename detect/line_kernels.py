@@ -1,8 +1,7 @@
-"""Compiled loops that follow edges: response along verticals, starts, tracks.
+"""Compiled loops that follow edges through the strip image: starts and tracks.
 
-A *strip* image has a pixel (v, c) for row v of the vertical that crosses the horizon at column c
-(see `lut.verticals`): the building's verticals are its columns, whatever the camera's pose and
-distortion.
+The strip image is that of `detect.line_response_kernels`. Tracks evaluate the filter where they go:
+first its moments across the vertical, which are kept, then along it.
 """
 
 from __future__ import annotations
@@ -15,215 +14,74 @@ from numpy.typing import NDArray
 
 
 @njit(cache=True, error_model="numpy")
-def _cut_response(
-    mean_strip: NDArray[np.float32],
-    cov_strip: NDArray[np.float32],
-    square_strip: NDArray[np.float32],
-    along: NDArray[np.float32],
-    noise: np.float32,
-    v: int,
-    c: int,
-    first: int,
-    last: int,
-) -> np.float32:
-    """Response in a window that is cut off at a vertical's ends."""
-    s = (len(along) - 1) // 2
-    share = np.float32(0.0)
-    mean = np.float32(0.0)
-    cov = np.float32(0.0)
-    square = np.float32(0.0)
-    for k in range(max(-s, first - v), min(s, last - v) + 1):
-        w = along[k + s]
-        share += w
-        mean += w * mean_strip[v + k, c]
-        cov += w * cov_strip[v + k, c]
-        square += w * square_strip[v + k, c]
-    mean /= share
-    cov /= share
-    return cov * abs(cov) / (abs(square / share - mean * mean) + noise)
-
-
-@njit(cache=True, error_model="numpy")
-def strip_response(
-    image: NDArray[np.uint8],
-    column: NDArray[np.float32],
-    first_row: NDArray[np.int32],
-    last_row: NDArray[np.int32],
-    across: NDArray[np.float32],
-    lever: NDArray[np.float32],
-    along: NDArray[np.float32],
-    regulariser: float,
-    response: NDArray[np.float32],
-) -> None:
-    """Signed squared correlation of grey value and column, in a window along each vertical.
-
-    Parameters
-    ----------
-    image : (H, W) uint8
-        Grey values.
-    column, first_row, last_row
-        The table (see `lut.verticals.VerticalTable`).
-    across, lever : (2r + 1,) float32
-        Weights across the line, of sum 1, and the coordinate that is correlated with the grey
-        value, of weighted mean 0 and variance 1.
-    along : (2s + 1,) float32
-        Weights along the line, of sum 1; cut off and made up for where the vertical ends.
-    regulariser : float
-        Added to the window's variance (grey values squared).
-    response : (H, W) float32
-        Result: ``cov |cov| / (variance + regulariser)``, in [-1, 1]; positive where the image is
-        brighter on the right; 0 where the window leaves the image.
-    """
-    height, width = image.shape
-    r = (len(across) - 1) // 2
-    s = (len(along) - 1) // 2
-    mean_strip = np.zeros((height, width), np.float32)
-    cov_strip = np.zeros((height, width), np.float32)
-    square_strip = np.zeros((height, width), np.float32)
-    grey = np.empty(width, np.float32)
-    mean = np.zeros(width, np.float32)
-    cov = np.zeros(width, np.float32)
-    square = np.zeros(width, np.float32)
-    leftmost = np.float32(r)
-    rightmost = np.float32(width - 1 - r)
-    for v in range(height):
-        # Grey values about 0 keep the small variances exact in single precision.
-        for u in range(width):
-            grey[u] = np.float32(image[v, u]) - np.float32(128.0)
-        centre = across[r]
-        for u in range(r, width - r):
-            g = grey[u]
-            mean[u] = centre * g
-            cov[u] = np.float32(0.0)
-            square[u] = centre * g * g
-        for k in range(1, r + 1):
-            w = across[r + k]
-            h = across[r + k] * lever[r + k]
-            for u in range(r, width - r):
-                left = grey[u - k]
-                right = grey[u + k]
-                mean[u] += w * (left + right)
-                cov[u] += h * (right - left)
-                square[u] += w * (left * left + right * right)
-        for c in range(width):
-            x = column[v, c]
-            if x >= leftmost and x < rightmost:
-                j = int(x)
-                f = x - np.float32(j)
-                mean_strip[v, c] = mean[j] + f * (mean[j + 1] - mean[j])
-                cov_strip[v, c] = cov[j] + f * (cov[j + 1] - cov[j])
-                square_strip[v, c] = square[j] + f * (square[j + 1] - square[j])
-    noise = np.float32(regulariser)
-    for v in range(height):
-        mean[:] = 0.0
-        cov[:] = 0.0
-        square[:] = 0.0
-        for k in range(max(-s, -v), min(s, height - 1 - v) + 1):
-            w = along[k + s]
-            for c in range(width):
-                mean[c] += w * mean_strip[v + k, c]
-            for c in range(width):
-                cov[c] += w * cov_strip[v + k, c]
-            for c in range(width):
-                square[c] += w * square_strip[v + k, c]
-        for c in range(width):
-            # Rounding can make a vanishing variance negative.
-            variance = square[c] - mean[c] * mean[c]
-            grey[c] = cov[c] * abs(cov[c]) / (abs(variance) + noise)
-        for c in range(width):
-            x = column[v, c]
-            response[v, c] = grey[c] if (x >= leftmost) & (x < rightmost) else np.float32(0.0)
-    # Near a vertical's ends the window is cut off.
-    for c in range(width):
-        first = first_row[c]
-        last = last_row[c]
-        for end in range(2):
-            lowest = first if end == 0 else max(last - s + 1, first + s)
-            highest = min(first + s - 1, last) if end == 0 else last
-            for v in range(lowest, highest + 1):
-                x = column[v, c]
-                if x >= leftmost and x < rightmost:
-                    response[v, c] = _cut_response(
-                        mean_strip, cov_strip, square_strip, along, noise, v, c, first, last
-                    )
-
-
-@njit(cache=True, error_model="numpy")
 def find_starts(
-    response: NDArray[np.float32],
-    horizon_row: NDArray[np.float64],
-    first_row: NDArray[np.int32],
-    last_row: NDArray[np.int32],
-    band_rows: int,
-    spacing_rows: int,
-    threshold: float,
-    border_rows: int,
-) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float32]]:
-    """Maxima of the response across the strip, on the horizon and on rows above and below it.
+    response: NDArray[np.float32], band_row: NDArray[np.int32], threshold: float
+) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float32], NDArray[np.float32]]:
+    """Maxima of the response along rows parallel to the horizon.
 
     Parameters
     ----------
-    response : (H, W) float32
-        See `strip_response`.
-    horizon_row, first_row, last_row
-        The table.
-    band_rows, spacing_rows : int
-        Rows at the horizon and every `spacing_rows` up to `band_rows` from it are looked at.
+    response : (K, W) float32
+        See `band_response`.
+    band_row : (K, W) int32
+        Image rows of these; -1 where tracks may not start.
     threshold : float
         Least absolute response.
-    border_rows : int
-        Rows at the image's border that are left out.
 
     Returns
     -------
     row, column : (N,) int32
         Strip pixels of the maxima.
+    sign : (N,) float32
+        1 where the response is positive, else -1.
     score : (N,) float32
         Absolute response there.
     """
-    height, width = response.shape
-    steps = band_rows // spacing_rows
-    row = np.empty(width * (2 * steps + 1), np.int32)
+    steps, width = response.shape
+    row = np.empty(steps * width, np.int32)
     column = np.empty(len(row), np.int32)
+    signs = np.empty(len(row), np.float32)
     score = np.empty(len(row), np.float32)
+    least = np.float32(threshold)
     n = 0
-    for c in range(1, width - 1):
-        if first_row[c] > last_row[c]:
-            continue
-        horizon = math.floor(horizon_row[c] + 0.5)
-        lowest = max(first_row[c], border_rows)
-        highest = min(last_row[c], height - 1 - border_rows)
-        for k in range(-steps, steps + 1):
-            v = horizon + k * spacing_rows
-            if v < lowest or v > highest:
+    for k in range(steps):
+        for c in range(1, width - 1):
+            here = abs(response[k, c])
+            if here < least or band_row[k, c] < 0:
                 continue
-            here = abs(response[v, c])
-            if here < threshold:
-                continue
-            sign = 1.0 if response[v, c] > 0.0 else -1.0
-            if sign * response[v, c - 1] < here and sign * response[v, c + 1] <= here:
-                row[n] = v
+            sign = np.float32(1.0) if response[k, c] > 0.0 else np.float32(-1.0)
+            if sign * response[k, c - 1] < here and sign * response[k, c + 1] <= here:
+                row[n] = band_row[k, c]
                 column[n] = c
+                signs[n] = sign
                 score[n] = here
                 n += 1
-    return row[:n], column[:n], score[:n]
+    return row[:n], column[:n], signs[:n], score[:n]
 
 
 @njit(cache=True, error_model="numpy")
-def _top_of_parabola(left: float, centre: float, right: float) -> float:
+def _top_of_parabola(left: np.float32, centre: np.float32, right: np.float32) -> float:
     """Offset of the maximum of the parabola through three neighbours."""
     bend = left - 2.0 * centre + right
-    return 0.5 * (left - right) / bend if bend < 0.0 else 0.0
+    return float(0.5 * (left - right) / bend) if bend < 0.0 else 0.0
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
 def _follow(
-    response: NDArray[np.float32],
+    image: NDArray[np.uint8],
+    table_column: NDArray[np.float32],
+    first_row: NDArray[np.int32],
+    last_row: NDArray[np.int32],
     bearing: NDArray[np.float64],
     elevation_tan: NDArray[np.float32],
-    sign: float,
-    start_row: int,
-    start_column: float,
+    weights: NDArray[np.float32],
+    along: NDArray[np.float32],
+    regulariser: np.float32,
+    moments: NDArray[np.float32],
+    known: NDArray[np.int32],
+    sign: np.float32,
+    row: int,
+    column: float,
     direction: int,
     pitch: float,
     roll: float,
@@ -236,62 +94,170 @@ def _follow(
     out_column: NDArray[np.float64],
     out_score: NDArray[np.float32],
 ) -> int:
-    """Follow an edge row by row, one way; return how many points were written."""
-    height, width = response.shape
-    v = start_row
-    here = start_column
+    """Follow an edge from a row on, that one included; return how many points were written.
+
+    0 if there is none in the first row. All in one piece: Numba counts references to each array in
+    each call, which would take longer than evaluating the filter.
+    """
+    height, width = table_column.shape
+    taps = weights.shape[1]
+    across = weights[0]
+    lever = weights[1]
+    grey_values = image.reshape(-1)
+    flat_moments = moments.reshape(-1)
+    r = taps // 2
+    s = len(along) // 2
+    leftmost = np.float32(r)
+    rightmost = np.float32(width - 1 - r)
+    zero = np.float32(0.0)
+    middle = np.float32(128.0)
+    v = row
+    here = column
     n = 0
     gap = 0
+    lean_column = -1
+    columns_per_rise = 0.0
     while gap <= max_gap:
-        v += direction
-        if v < border or v > height - 1 - border:
-            break
-        j = math.floor(here + 0.5)
-        if j < 1 or j > width - 2:
-            break
-        # A vertical leans by this much in the strip of a tilted camera.
-        lean = pitch * math.sin(bearing[j]) - roll * math.cos(bearing[j])
-        rise = elevation_tan[v, j] - elevation_tan[v - direction, j]
-        if not math.isfinite(rise):
-            break
-        here += 2.0 * lean * rise / (bearing[j + 1] - bearing[j - 1])
+        if n > 0:
+            v += direction
+            if v < border or v > height - 1 - border:
+                break
+            j = math.floor(here + 0.5)
+            if j < 1 or j > width - 2:
+                break
+            rise = elevation_tan[v, j] - elevation_tan[v - direction, j]
+            if not math.isfinite(rise):
+                break
+            if j != lean_column:
+                # A vertical leans by this much in the strip of a tilted camera.
+                lean = pitch * math.sin(bearing[j]) - roll * math.cos(bearing[j])
+                columns_per_rise = 2.0 * lean / (bearing[j + 1] - bearing[j - 1])
+                lean_column = j
+            here += columns_per_rise * rise
         j = math.floor(here + 0.5)
         if j < 2 or j > width - 3:
             break
-        left = sign * response[v, j - 1]
-        centre = sign * response[v, j]
-        right = sign * response[v, j + 1]
-        if left > centre and left > right:
-            j -= 1
-            right = centre
-            centre = left
-            left = sign * response[v, j - 1]
-        elif right > centre:
-            j += 1
+        left = zero
+        centre = zero
+        right = zero
+        # Three neighbours, and a fourth if the highest of them is not the one in the middle.
+        for k in range(4):
+            c = j - 1 + k
+            if k == 3:
+                if left > centre and left > right:
+                    c = j - 2
+                elif not right > centre:
+                    break
+            response = zero
+            x = table_column[v, c]
+            if x >= leftmost and x < rightmost:
+                top = max(first_row[c], v - s)
+                bottom = min(last_row[c], v + s)
+                begin = known[0, c]
+                end = known[1, c]
+                if begin >= end:
+                    begin = top
+                    end = top
+                if top < begin or bottom >= end:
+                    for y in range(min(top, begin), max(bottom + 1, end)):
+                        if begin <= y < end:
+                            continue
+                        mean = zero
+                        cov = zero
+                        square = zero
+                        x = table_column[y, c]
+                        if x >= leftmost and x < rightmost:
+                            f = x - np.float32(int(x))
+                            u = np.uint64(y * width + int(x) - r)
+                            # Moments between two pixels are those of both, interpolated; so are
+                            # the weights. Grey values about 0 keep small variances exact.
+                            w_before = zero
+                            h_before = zero
+                            for i in range(taps):
+                                w_here = across[np.uint64(i)]
+                                h_here = lever[np.uint64(i)]
+                                grey = np.float32(grey_values[u + np.uint64(i)]) - middle
+                                weighted = (w_here + f * (w_before - w_here)) * grey
+                                mean += weighted
+                                square += weighted * grey
+                                cov += (h_here + f * (h_before - h_here)) * grey
+                                w_before = w_here
+                                h_before = h_here
+                            grey = np.float32(grey_values[u + np.uint64(taps)]) - middle
+                            weighted = f * w_before * grey
+                            mean += weighted
+                            square += weighted * grey
+                            cov += f * h_before * grey
+                        moments[c, 0, y] = mean
+                        moments[c, 1, y] = cov
+                        moments[c, 2, y] = square
+                    known[0, c] = min(top, begin)
+                    known[1, c] = max(bottom + 1, end)
+                mean = zero
+                cov = zero
+                square = zero
+                share = zero
+                first_weight = np.uint64(top - v + s)
+                first_mean = np.uint64(3 * c * height + top)
+                first_cov = np.uint64((3 * c + 1) * height + top)
+                first_square = np.uint64((3 * c + 2) * height + top)
+                for i in range(bottom + 1 - top):
+                    k8 = np.uint64(i)
+                    w = along[first_weight + k8]
+                    share += w
+                    mean += w * flat_moments[first_mean + k8]
+                    cov += w * flat_moments[first_cov + k8]
+                    square += w * flat_moments[first_square + k8]
+                mean /= share
+                cov /= share
+                # Rounding can make a vanishing variance negative.
+                variance = abs(square / share - mean * mean)
+                response = sign * cov * abs(cov) / (variance + regulariser)
+            if c == j - 2:
+                right = centre
+                centre = left
+                left = response
+                j -= 1
+                break
+            if k == 3:
+                j += 1
             left = centre
             centre = right
-            right = sign * response[v, j + 1]
+            right = response
         seen = False
         if centre >= threshold and centre >= left and centre >= right:
             offset = j + _top_of_parabola(left, centre, right) - here
-            seen = abs(offset) <= reach
+            # A start is known to a column only.
+            seen = n == 0 or abs(offset) <= reach
             if seen:
                 out_row[n] = v
                 out_column[n] = here + offset
                 out_score[n] = centre
+                # The start counts as the expected position, not as a point that confirms it.
+                here += (max(pull, 1.0 / (n + 1.0)) if n > 0 else 1.0) * offset
                 n += 1
-                here += max(pull, 1.0 / (n + 1.0)) * offset
+        if n == 0:
+            break
         gap = 0 if seen else gap + 1
     return n
 
 
 @njit(cache=True, error_model="numpy")
 def follow_edges(
-    response: NDArray[np.float32],
+    image: NDArray[np.uint8],
+    table_column: NDArray[np.float32],
+    first_row: NDArray[np.int32],
+    last_row: NDArray[np.int32],
     bearing: NDArray[np.float64],
     elevation_tan: NDArray[np.float32],
+    weights: NDArray[np.float32],
+    along: NDArray[np.float32],
+    regulariser: np.float32,
+    moments: NDArray[np.float32],
+    known: NDArray[np.int32],
     start_row: NDArray[np.int32],
     start_column: NDArray[np.int32],
+    start_sign: NDArray[np.float32],
     pitch: float,
     roll: float,
     threshold: float,
@@ -310,12 +276,20 @@ def follow_edges(
 
     Parameters
     ----------
-    response : (H, W) float32
-        See `strip_response`.
-    bearing, elevation_tan
-        The table.
+    image : (H, W) uint8
+        Grey values.
+    table_column, first_row, last_row, bearing, elevation_tan
+        The table (see `lut.verticals.VerticalTable`).
+    weights, along, regulariser
+        The filter (see `detect.line_filter.LineFilter`).
+    moments : (W, 3, H) float32
+        Mean, covariance and mean square across the vertical, in the rows that are known.
+    known : (2, W) int32
+        First of the known rows and the one after the last, of each column; extended as needed.
     start_row, start_column : (N,) int32
         Strip pixels to start from, in this order.
+    start_sign : (N,) float32
+        Polarity of the edges there.
     pitch, roll : float
         Tilt that the edges are expected to show (rad); 0 for none.
     threshold : float
@@ -339,9 +313,15 @@ def follow_edges(
     row, column, score : (P,) int32, float64, float32
         The points: row and sub-pixel column in the strip, absolute response.
     """
-    height, width = response.shape
-    followed = np.zeros((2, height, width), np.bool_)
-    capacity = 64 * height
+    height, width = table_column.shape
+    lowest = height
+    highest = 0
+    for v in start_row:
+        lowest = min(lowest, v)
+        highest = max(highest, v)
+    # Only rows on which there are starts matter.
+    followed = np.zeros((2, max(highest - lowest + 1, 0), width), np.bool_)
+    capacity = 16 * height
     row = np.empty(capacity, np.int32)
     column = np.empty(capacity, np.float64)
     score = np.empty(capacity, np.float32)
@@ -354,10 +334,9 @@ def follow_edges(
     n = 0
     for start in range(len(start_row)):
         v = start_row[start]
-        c = start_column[start]
-        polarity = 1.0 if response[v, c] > 0.0 else -1.0
+        polarity = start_sign[start]
         layer = 0 if polarity > 0.0 else 1
-        if followed[layer, v, c]:
+        if followed[layer, v - lowest, start_column[start]]:
             continue
         if n + height > capacity:
             capacity *= 2
@@ -370,31 +349,29 @@ def follow_edges(
             grown_score = np.empty(capacity, np.float32)
             grown_score[:n] = score[:n]
             score = grown_score
-        centre = polarity * response[v, c]
-        at = c + _top_of_parabola(
-            polarity * response[v, c - 1], centre, polarity * response[v, c + 1]
-        )
         above = _follow(
-            response, bearing, elevation_tan, polarity, v, at, -1, pitch, roll,
+            image, table_column, first_row, last_row, bearing, elevation_tan, weights, along,
+            regulariser, moments, known, polarity, v, float(start_column[start]), -1, pitch, roll,
             threshold, max_gap, border, pull, reach, up_row, up_column, up_score,
         )  # fmt: skip
+        if above == 0:
+            # Starts were looked for with less care.
+            continue
         for i in range(above):
             row[n + i] = up_row[above - 1 - i]
             column[n + i] = up_column[above - 1 - i]
             score[n + i] = up_score[above - 1 - i]
-        n += above
-        row[n] = v
-        column[n] = at
-        score[n] = centre
-        n += 1
+        n += above - 1
         n += _follow(
-            response, bearing, elevation_tan, polarity, v, at, 1, pitch, roll,
+            image, table_column, first_row, last_row, bearing, elevation_tan, weights, along,
+            regulariser, moments, known, polarity, v, up_column[0], 1, pitch, roll,
             threshold, max_gap, border, pull, reach, row[n:], column[n:], score[n:],
         )  # fmt: skip
         for i in range(bounds[tracks], n):
-            j = math.floor(column[i] + 0.5)
-            for k in range(max(0, j - 1), min(width, j + 2)):
-                followed[layer, row[i], k] = True
+            if lowest <= row[i] <= highest:
+                j = math.floor(column[i] + 0.5)
+                for k in range(max(0, j - 1), min(width, j + 2)):
+                    followed[layer, row[i] - lowest, k] = True
         sign[tracks] = polarity
         tracks += 1
         bounds[tracks] = n

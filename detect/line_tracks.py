@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from detect.line_filter import FilteredColumns, StartBand, line_filter, start_band
 from detect.line_settings import LineSettings
 from detect.tilt import TiltEstimate
 from lut.verticals import VerticalTable
@@ -22,12 +23,15 @@ class LineStarts:
     ----------
     row, column : (N,) int32
         Strip pixels.
+    polarity : (N,) float32
+        1 where the image is brighter on the right, -1 on the left.
     score : (N,) float32
         Absolute response there.
     """
 
     row: NDArray[np.int32]
     column: NDArray[np.int32]
+    polarity: NDArray[np.float32]
     score: NDArray[np.float32]
 
 
@@ -83,13 +87,6 @@ class LineTracks:
         return np.add.reduceat(self.score.astype(np.float64), self.bounds[:-1])
 
 
-def gaussian_window(sigma: float) -> FloatArray:
-    """Weights of sum 1 at whole pixels within three standard deviations of the middle."""
-    reach = int(np.ceil(3.0 * sigma))
-    weight = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
-    return np.asarray(weight / weight.sum())
-
-
 def line_response(
     image: NDArray[np.uint8], table: VerticalTable, settings: LineSettings
 ) -> NDArray[np.float32]:
@@ -102,6 +99,8 @@ def line_response(
 
     the squared correlation of grey value and distance (DLR Spatial Cognition data set report, line
     detection). Affine changes of brightness change it only through the regulariser.
+
+    The detector evaluates it only where tracks go.
 
     Parameters
     ----------
@@ -117,39 +116,36 @@ def line_response(
     (H, W) float32
         In [-1, 1], positive where the image is brighter on the right; 0 where it is not defined.
     """
-    from detect.line_kernels import strip_response
+    from detect.line_response_kernels import strip_response
 
-    across = gaussian_window(settings.sigma_across_px)
-    distance = np.arange(len(across)) - 0.5 * (len(across) - 1)
-    lever = distance / np.sqrt(across @ distance**2)
     response = np.empty(image.shape, np.float32)
+    window = line_filter(settings)
     strip_response(
         image,
         table.column,
         table.first_row,
         table.last_row,
-        across.astype(np.float32),
-        lever.astype(np.float32),
-        gaussian_window(settings.sigma_along_rows).astype(np.float32),
-        settings.regulariser,
+        window.weights,
+        window.along,
+        window.regulariser,
         response,
     )
     return response
 
 
 def line_starts(
-    response: NDArray[np.float32], table: VerticalTable, settings: LineSettings
+    image: NDArray[np.uint8], table: VerticalTable, settings: LineSettings
 ) -> LineStarts:
     """Maxima of the response on the horizon and on rows near it.
 
     Parameters
     ----------
-    response : (H, W) float32
-        See `line_response`.
+    image : (H, W) uint8
+        Grey values.
     table : VerticalTable
         Of the image's camera.
     settings : LineSettings
-        Band round the horizon, threshold.
+        Band round the horizon, threshold; the filter.
 
     Returns
     -------
@@ -158,33 +154,57 @@ def line_starts(
     """
     from detect.line_kernels import find_starts
 
-    row, column, score = find_starts(
-        response,
-        table.horizon_row,
-        table.first_row,
-        table.last_row,
-        settings.start_band_rows,
-        settings.start_spacing_rows,
-        settings.threshold,
-        settings.border_rows,
-    )
+    response, band = start_response(image, table, settings)
+    row, column, polarity, score = find_starts(response, band.row, settings.threshold)
     order = np.argsort(-score, kind="stable")
-    return LineStarts(row[order], column[order], score[order])
+    return LineStarts(row[order], column[order], polarity[order], score[order])
+
+
+def start_response(
+    image: NDArray[np.uint8], table: VerticalTable, settings: LineSettings
+) -> tuple[NDArray[np.float32], StartBand]:
+    """The response on the rows on which tracks start, as `line_response` up to a few percent.
+
+    Returns
+    -------
+    response : (K, W) float32
+        In the rows of the band.
+    band : StartBand
+        Which rows these are.
+    """
+    from detect.line_response_kernels import band_response
+
+    window, band = line_filter(settings), start_band(table, settings)
+    response = np.empty(band.row.shape, np.float32)
+    band_response(
+        np.ascontiguousarray(image),
+        band.pixel,
+        band.part,
+        band.scale,
+        band.visible,
+        band.spacing,
+        window.weights,
+        window.along,
+        window.regulariser,
+        response,
+    )
+    return response, band
 
 
 def line_tracks(
-    response: NDArray[np.float32],
+    image: NDArray[np.uint8],
     starts: LineStarts,
     table: VerticalTable,
     settings: LineSettings,
     tilt: TiltEstimate | None = None,
+    filtered: FilteredColumns | None = None,
 ) -> LineTracks:
     """Follow the edges through the starts up and down.
 
     Parameters
     ----------
-    response : (H, W) float32
-        See `line_response`.
+    image : (H, W) uint8
+        Grey values.
     starts : LineStarts
         Where to start; those on an edge already followed are left out.
     table : VerticalTable
@@ -194,6 +214,8 @@ def line_tracks(
     tilt : TiltEstimate, optional
         If given, edges are only followed along the verticals that it predicts; else wherever they
         go.
+    filtered : FilteredColumns, optional
+        What has been filtered of this very image when its edges were followed before; extended.
 
     Returns
     -------
@@ -202,13 +224,25 @@ def line_tracks(
     """
     from detect.line_kernels import follow_edges
 
+    window = line_filter(settings)
+    if filtered is None:
+        filtered = FilteredColumns.none_yet(table)
     return LineTracks(
         *follow_edges(
-            response,
+            np.ascontiguousarray(image),
+            table.column,
+            table.first_row,
+            table.last_row,
             table.bearing_rad,
             table.elevation_tan,
+            window.weights,
+            window.along,
+            window.regulariser,
+            filtered.moments,
+            filtered.known,
             starts.row,
             starts.column,
+            starts.polarity,
             tilt.pitch_rad if tilt is not None else 0.0,
             tilt.roll_rad if tilt is not None else 0.0,
             settings.threshold,

@@ -26,11 +26,11 @@ from detect.line_bearing import (
     inclinations,
     join_bearings,
 )
+from detect.line_filter import FilteredColumns
 from detect.line_fit import LineFits, fit_lines, lean_onto_tilt, plane_normals_of_lines
 from detect.line_settings import DEFAULT, LineSettings
 from detect.line_tracks import (
     LineTracks,
-    line_response,
     line_starts,
     line_tracks,
 )
@@ -62,8 +62,6 @@ class LineDetections:
         The tracks that each line was made of, the strongest first; its ends are that one's.
     tilt : TiltEstimate or None
         None where too few lines agree.
-    response : (H, W) float32
-        See `detect.line_tracks.line_response`.
     tracks : LineTracks
         All tracks.
     fits : LineFits
@@ -81,7 +79,6 @@ class LineDetections:
     noise_rad: FloatArray
     members: tuple[tuple[int, ...], ...]
     tilt: TiltEstimate | None
-    response: NDArray[np.float32]
     tracks: LineTracks
     fits: LineFits
     evidence: FloatArray
@@ -134,16 +131,16 @@ def detect_lines(
             f"image is {image.dtype} of shape {image.shape}: expected uint8 of the table's shape "
             f"{table.column.shape}"
         )
-    response = line_response(image, table, settings)
-    starts = line_starts(response, table, settings)
+    starts = line_starts(image, table, settings)
+    filtered = FilteredColumns.none_yet(table)
 
-    tracks = line_tracks(response, starts, table, settings)
+    tracks = line_tracks(image, starts, table, settings, filtered=filtered)
     fits = fit_lines(image, tracks, table, settings)
     evidence = line_evidence(tracks, fits, table)
     fate = judge_lines(tracks, fits, evidence, table, settings)
     tilt = agree_on_tilt(fits, evidence, fate, settings)
     if settings.guided and tilt is not None:
-        tracks = line_tracks(response, starts, table, settings, tilt)
+        tracks = line_tracks(image, starts, table, settings, tilt, filtered)
         fits = fit_lines(image, tracks, table, settings)
         evidence = line_evidence(tracks, fits, table)
         fate = judge_lines(tracks, fits, evidence, table, settings)
@@ -162,7 +159,6 @@ def detect_lines(
         noise_rad=noise[strongest],
         members=tuple(tuple(int(t) for t in g) for g in groups),
         tilt=tilt,
-        response=response,
         tracks=tracks,
         fits=fits,
         evidence=evidence,

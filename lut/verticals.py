@@ -23,9 +23,9 @@ _NEWTON_STEPS = 6
 _NEWTON_TOLERANCE_PX = 1e-7
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class VerticalTable:
-    """The horizon and the verticals of a calibration.
+    """The horizon and the verticals of a calibration; hashed and compared by identity.
 
     Attributes
     ----------

@@ -10,12 +10,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from detect.line_settings import DEFAULT, PUBLISHED
+from detect.line_filter import FilteredColumns, gaussian_window
+from detect.line_settings import DEFAULT, PUBLISHED, LineSettings
 from detect.line_tracks import (
-    gaussian_window,
     line_response,
     line_starts,
     line_tracks,
+    start_response,
 )
 from detect.tilt import TiltEstimate
 from lut.verticals import build_vertical_table
@@ -84,13 +85,12 @@ def test_filter_goes_up_to_where_the_verticals_end() -> None:
 
 def test_starts_lie_on_the_horizon_band_highest_first() -> None:
     image = render(CAMERA, [Edge(0.2, 40.0), Edge(-0.1, 90.0)], grey=60.0)
-    response = line_response(image, TABLE, DEFAULT)
-    on_horizon = line_starts(response, TABLE, replace(DEFAULT, start_band_rows=0))
+    on_horizon = line_starts(image, TABLE, replace(DEFAULT, start_band_rows=0))
     np.testing.assert_array_equal(
         on_horizon.row, np.rint(TABLE.horizon_row[on_horizon.column]).astype(int)
     )
     assert len(on_horizon.row) == 2
-    band = line_starts(response, TABLE, replace(DEFAULT, start_band_rows=8))
+    band = line_starts(image, TABLE, replace(DEFAULT, start_band_rows=8))
     assert set(np.unique(band.row - np.rint(TABLE.horizon_row[band.column]))) == {-8, -4, 0, 4, 8}
     assert np.all(np.diff(band.score) <= 0.0)
     assert np.all(band.score >= DEFAULT.threshold)
@@ -102,9 +102,8 @@ def test_tracks_bridge_gaps_up_to_a_length(gap: int) -> None:
     below = int(TABLE.horizon_row[48]) + 6
     # A bright block hides the edge; the filter sees it from a few rows away.
     image[below : below + gap] = 110
-    response = line_response(image, TABLE, DEFAULT)
-    starts = line_starts(response, TABLE, replace(DEFAULT, start_band_rows=0))
-    tracks = line_tracks(response, starts, TABLE, DEFAULT)
+    starts = line_starts(image, TABLE, replace(DEFAULT, start_band_rows=0))
+    tracks = line_tracks(image, starts, TABLE, DEFAULT)
     assert len(tracks) == 1
     assert tracks.top_row[0] == DEFAULT.border_rows
     if gap == 5:
@@ -116,8 +115,7 @@ def test_tracks_bridge_gaps_up_to_a_length(gap: int) -> None:
 def test_tracks_know_polarity_and_follow_subpixel() -> None:
     camera = tilted(CAMERA, 0.0, np.radians(4.0))
     image = render(camera, [Edge(0.1, 80.0), Edge(-0.15, -60.0)], grey=100.0)
-    response = line_response(image, TABLE, DEFAULT)
-    tracks = line_tracks(response, line_starts(response, TABLE, DEFAULT), TABLE, DEFAULT)
+    tracks = line_tracks(image, line_starts(image, TABLE, DEFAULT), TABLE, DEFAULT)
     assert sorted(tracks.polarity) == [-1.0, 1.0]
     for t in range(2):
         part = slice(tracks.bounds[t], tracks.bounds[t + 1])
@@ -131,12 +129,11 @@ def test_tracks_know_polarity_and_follow_subpixel() -> None:
 
 def test_guided_tracks_leave_edges_that_lean_otherwise() -> None:
     leaning = render(tilted(CAMERA, 0.0, np.radians(5.0)), [Edge(0.0, 90.0)])
-    response = line_response(leaning, TABLE, DEFAULT)
-    starts = line_starts(response, TABLE, replace(DEFAULT, start_band_rows=0))
+    starts = line_starts(leaning, TABLE, replace(DEFAULT, start_band_rows=0))
     none, right = (TiltEstimate(0.0, np.radians(roll), np.eye(2), 3) for roll in (0.0, 5.0))
-    assert line_tracks(response, starts, TABLE, DEFAULT).points[0] == 60
-    assert line_tracks(response, starts, TABLE, DEFAULT, right).points[0] == 60
-    assert line_tracks(response, starts, TABLE, DEFAULT, none).points[0] < 45
+    assert line_tracks(leaning, starts, TABLE, DEFAULT).points[0] == 60
+    assert line_tracks(leaning, starts, TABLE, DEFAULT, right).points[0] == 60
+    assert line_tracks(leaning, starts, TABLE, DEFAULT, none).points[0] < 45
 
 
 def test_no_horizon_no_tracks() -> None:
@@ -144,6 +141,62 @@ def test_no_horizon_no_tracks() -> None:
     image = step_image(50, 180)
     response = line_response(image, table, DEFAULT)
     assert not response.any()
-    tracks = line_tracks(response, line_starts(response, table, DEFAULT), table, DEFAULT)
+    tracks = line_tracks(image, line_starts(image, table, DEFAULT), table, DEFAULT)
     assert len(tracks) == 0
     assert len(tracks.total_score) == 0
+
+
+# -- evaluated only where needed: against the filter evaluated everywhere -------------------------
+
+
+@pytest.mark.parametrize("preset", [DEFAULT, PUBLISHED], ids=["default", "published"])
+@pytest.mark.parametrize("tilt_deg", [0.0, 4.0, -9.0])
+def test_tracks_see_the_same_response_as_the_whole_strip(
+    preset: LineSettings, tilt_deg: float
+) -> None:
+    camera = pinhole(160, 120, 150.0, pitch_deg=15.0, roll_deg=0.5 * tilt_deg)
+    table = build_vertical_table(camera)
+    preset = replace(preset, border_rows=2, threshold=min(preset.threshold, 0.2))
+    edges = [Edge(0.3, 60.0), Edge(0.1, -80.0), Edge(-0.2, 50.0)]
+    seen = tilted(camera, 0.0, np.radians(tilt_deg))
+    image = render(seen, edges, noise=4.0, rng=np.random.default_rng(1))
+    response = line_response(image, table, preset)
+    tracks = line_tracks(image, line_starts(image, table, preset), table, preset)
+    assert tracks.points.sum() > 100
+    for t in range(len(tracks)):
+        part = slice(tracks.bounds[t], tracks.bounds[t + 1])
+        column = np.rint(tracks.column[part]).astype(int)
+        signed = (
+            tracks.polarity[t] * response[tracks.row[part][:, None], column[:, None] + [-1, 0, 1]]
+        )
+        np.testing.assert_allclose(signed.max(axis=1), tracks.score[part], atol=2e-4)
+
+
+def test_what_was_filtered_before_gives_the_same_tracks() -> None:
+    image = render(CAMERA, [Edge(0.1, 80.0), Edge(-0.15, -60.0)], grey=100.0)
+    starts = line_starts(image, TABLE, DEFAULT)
+    filtered = FilteredColumns.none_yet(TABLE)
+    tilt = TiltEstimate(0.01, -0.02, np.eye(2), 3)
+    fresh = line_tracks(image, starts, TABLE, DEFAULT, tilt)
+    line_tracks(image, starts, TABLE, DEFAULT, filtered=filtered)
+    again = line_tracks(image, starts, TABLE, DEFAULT, tilt, filtered)
+    for name in ("row", "column", "score", "bounds", "polarity"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(fresh, name))
+
+
+@pytest.mark.parametrize("preset", [DEFAULT, PUBLISHED], ids=["default", "published"])
+def test_response_of_the_starts_is_that_of_the_whole_strip(preset: LineSettings) -> None:
+    """Exactly where the strip's columns are a pixel wide, nearly elsewhere."""
+    rng = np.random.default_rng(4)
+    edges = [
+        Edge(bearing, rng.choice([-70.0, 40.0, 90.0])) for bearing in np.linspace(-0.4, 0.4, 9)
+    ]
+    for pitch, limit in ((0.0, 2e-3), (20.0, 0.08)):
+        camera = pinhole(240, 160, 200.0, pitch_deg=pitch)
+        table = build_vertical_table(camera)
+        image = render(camera, edges, grey=120.0, noise=2.0, rng=rng)
+        whole = line_response(image, table, preset)
+        response, band = start_response(image, table, preset)
+        k, c = np.nonzero(band.row >= 0)
+        np.testing.assert_allclose(response[k, c], whole[band.row[k, c], c], atol=limit)
+        assert np.abs(response).max() > 0.4

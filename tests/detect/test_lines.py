@@ -21,6 +21,7 @@ from detect.errors import DetectError, FrameError
 from detect.line_bearing import compensated_bearings, inclinations, plane_normals
 from detect.line_drawing import draw_lines, draw_response, draw_tracks, track_pixels
 from detect.line_settings import DEFAULT, PUBLISHED, LineSettings
+from detect.line_tracks import line_response
 from detect.lines import ACCEPTED, JOINED, detect_lines
 from lut.verticals import build_vertical_table
 from tests.detect.line_scene import Edge, edge_columns, mirrored, pinhole, render, tilted
@@ -258,9 +259,9 @@ def test_drawn_tracks_name_their_fates() -> None:
 
 
 def test_drawn_response_shows_polarity() -> None:
-    found = detect_lines(scene(CAMERA), TABLE)
-    picture = draw_response(found.response, TABLE)
-    rising, falling = found.response > 0.3, found.response < -0.3
+    response = line_response(scene(CAMERA), TABLE, DEFAULT)
+    picture = draw_response(response, TABLE)
+    rising, falling = response > 0.3, response < -0.3
     assert np.all(picture[rising, 2] > 150)
     assert np.all(picture[rising, 0] == 0)
     assert np.all(picture[falling, 0] > 150)

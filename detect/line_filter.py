@@ -1,0 +1,159 @@
+"""The filter that finds edges along the verticals, and where it is evaluated."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from detect.line_settings import LineSettings
+from lut.verticals import VerticalTable
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LineFilter:
+    """Weights of the filter.
+
+    Attributes
+    ----------
+    weights : (2, 2r + 1) float32
+        Across the line: of sum 1; and the same times the distance in units of its standard
+        deviation.
+    along : (2s + 1,) float32
+        Along the line, of sum 1.
+    regulariser : float32
+        Added to the variance in the window (grey values squared).
+    """
+
+    weights: NDArray[np.float32]
+    along: NDArray[np.float32]
+    regulariser: np.float32
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StartBand:
+    """The rows parallel to the horizon on which tracks start, and what the filter needs there.
+
+    Rows of the band are counted from the horizon: row i is `first_offset` + i rows below it. The
+    filter is evaluated on its row s (half the filter's length) and every `spacing` from there.
+
+    Attributes
+    ----------
+    row : (K, W) int32
+        Image row of each position at which the filter is evaluated; -1 where tracks may not start.
+    pixel : (R, W) int32
+        Index into the flat image of the pixel on the left of each pixel of the band; -1 beyond the
+        ends of the vertical.
+    part : (R, W) float32
+        How far the pixel of the band lies to the right of it.
+    scale : (K, W) float32
+        One over the sum of the weights that lie on the vertical; 0 where there are none.
+    visible : (K, W) bool
+        Whether the filter's window lies inside the image.
+    spacing : int
+        See above.
+    """
+
+    row: NDArray[np.int32]
+    pixel: NDArray[np.int32]
+    part: NDArray[np.float32]
+    scale: NDArray[np.float32]
+    visible: NDArray[np.bool_]
+    spacing: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FilteredColumns:
+    """What of an image has been filtered across the verticals so far; tracks extend it.
+
+    Attributes
+    ----------
+    moments : (W, 3, H) float32
+        Mean, covariance and mean square, in the rows of each of the strip's columns that are known.
+    known : (2, W) int32
+        First of these rows, and the one after the last.
+    """
+
+    moments: NDArray[np.float32]
+    known: NDArray[np.int32]
+
+    @classmethod
+    def none_yet(cls, table: VerticalTable) -> FilteredColumns:
+        """Nothing has been filtered."""
+        height, width = table.column.shape
+        return cls(np.empty((width, 3, height), np.float32), np.zeros((2, width), np.int32))
+
+
+def gaussian_window(sigma: float) -> FloatArray:
+    """Weights of sum 1 at whole pixels within three standard deviations of the middle."""
+    reach = int(np.ceil(3.0 * sigma))
+    weight = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
+    return np.asarray(weight / weight.sum())
+
+
+@lru_cache(maxsize=16)
+def line_filter(settings: LineSettings) -> LineFilter:
+    """The filter that settings ask for."""
+    across = gaussian_window(settings.sigma_across_px)
+    distance = np.arange(len(across)) - 0.5 * (len(across) - 1)
+    lever = distance / np.sqrt(across @ distance**2)
+    return LineFilter(
+        weights=np.stack([across, across * lever]).astype(np.float32),
+        along=gaussian_window(settings.sigma_along_rows).astype(np.float32),
+        regulariser=np.float32(settings.regulariser),
+    )
+
+
+@lru_cache(maxsize=16)
+def start_band(table: VerticalTable, settings: LineSettings) -> StartBand:
+    """The rows near the horizon on which tracks start.
+
+    Parameters
+    ----------
+    table : VerticalTable
+        Of the images' camera.
+    settings : LineSettings
+        Band, its spacing and border; the filter's widths.
+
+    Returns
+    -------
+    StartBand
+        Computed once for each table.
+    """
+    window = line_filter(settings)
+    r, s = window.weights.shape[1] // 2, len(window.along) // 2
+    height, width = table.column.shape
+    steps = settings.start_band_rows // settings.start_spacing_rows
+    reach = steps * settings.start_spacing_rows + s
+    horizon = np.where(table.usable, np.floor(table.horizon_row + 0.5), 0.0).astype(np.intp)
+    columns = np.arange(width)
+
+    row = horizon + np.arange(-reach, reach + 1)[:, None]
+    on_vertical = (row >= table.first_row) & (row <= table.last_row)
+    x = np.where(on_vertical, table.column[np.where(on_vertical, row, 0), columns], 0.0)
+    left = np.minimum(x.astype(np.int32), max(width - 2, 0))
+    pixel = np.where(on_vertical, row * width + left, -1).astype(np.int32)
+
+    evaluated = slice(s, 2 * reach + 1 - s, settings.start_spacing_rows)
+    # Windows are cut off where the vertical ends.
+    share = np.concatenate([[0.0], np.cumsum(window.along, dtype=np.float64)])
+    middle = row[evaluated]
+    below = np.clip(table.last_row - middle + s + 1, 0, 2 * s + 1)
+    above = np.clip(table.first_row - middle + s, 0, 2 * s + 1)
+    on_it = np.maximum(share[below] - share[above], 0.0)
+    scale = np.divide(1.0, on_it, out=np.zeros_like(on_it), where=on_it > 0.0)
+    visible = on_vertical[evaluated] & (x[evaluated] >= r) & (x[evaluated] < width - 1 - r)
+    border = settings.border_rows
+    allowed = visible & (middle >= border) & (middle <= height - 1 - border)
+    return StartBand(
+        row=np.where(allowed, middle, -1).astype(np.int32),
+        pixel=pixel,
+        part=(x - left).astype(np.float32),
+        scale=scale.astype(np.float32),
+        visible=visible,
+        spacing=settings.start_spacing_rows,
+    )
