@@ -1,0 +1,393 @@
+"""The detector of square markers: one image in, markers with their corners out.
+
+The way of one image, top to bottom, is `detect_markers`: the three phases of RAWSEEDS deliverable
+D2.1 part 2 (candidates, filtering, refinement and identification), and after them, by default, the
+fit of the whole marker, which makes the corners more exact and tells false markers from true ones.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from camera import Camera
+from detect.markers import identification as identities
+from detect.markers.candidates import Mask, candidate_layers, dark_masks
+from detect.markers.identification import (
+    Identity,
+    likely_patterns,
+    nearest_pattern,
+    sampled_cells,
+    verified_identity,
+)
+from detect.markers.lens import Lens, lens_of
+from detect.markers.noise import image_noise
+from detect.markers.pattern_fit import PatternFit, fit_marker
+from detect.markers.polygon_kernels import is_convex, is_inside, same_corners, signed_area
+from detect.markers.quadrangle import (
+    NO_QUADRANGLE,
+    NOT_FOUR_CORNERS,
+    rough_corners,
+)
+from detect.markers.refinement import NO_EDGE, RefinedQuadrangle, refine_quadrangle
+from detect.markers.regions import Region, marker_regions
+from detect.markers.settings import MarkerSettings
+from detect.markers.templates import Templates, templates_of
+
+FloatArray = NDArray[np.float64]
+
+ACCEPTED = "accepted"
+SAME_MARKER = "a marker already found"
+
+#: Rough quadrangles whose corners are all this near (pixels, and in widths) are one and the same.
+_SAME_PX = 1.0
+_SAME_WIDTHS = 0.08
+#: How many rough quadrangles of the same are tried.
+_TRIES = 3
+#: How far edges may be from the rough ones: pixels of the layer, and in widths of the marker.
+_CAPTURE_LAYER_PX = 1.5
+_CAPTURE_PX = 0.7
+_CAPTURE_WIDTHS = 0.02
+#: Where edges and whole marker disagree by more than this (mean normalised squared difference; the
+#: edges' systematic error included), the marker is not what the fit takes it for: not flat, or
+#: bent by a lens that nobody calibrated. Its edges are then where they are seen.
+_MOST_DISAGREEMENT = 6.0
+_EDGE_SYSTEMATIC_PX = 0.02
+#: What is white within the border, or round the quiet zone, shines into edges that are softer than
+#: this part of the border: nothing is to be learnt from those.
+_SHARP_BLURS = 0.14
+#: Smaller markers are flat.
+_LEAST_BENT_PX = 40.0
+#: A first look may explain less than the full fit has to, by this much.
+_FIRST_LOOK_SLACK = 0.1
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A region that came as far as having corners, and what became of it.
+
+    Attributes
+    ----------
+    region : Region
+        Where it comes from.
+    rough : (4, 2) float64
+        Its rough corners, straight pixels.
+    fate : str
+        ``accepted`` or why not.
+    refined : RefinedQuadrangle or None
+        Its fitted edges, if it came so far.
+    """
+
+    region: Region
+    rough: FloatArray
+    fate: str
+    refined: RefinedQuadrangle | None = None
+
+
+@dataclass(frozen=True)
+class MarkerDetections:
+    """The markers found in one image, by ID and place, and what was not taken for one.
+
+    Attributes
+    ----------
+    dictionary : str
+        Name of the dictionary.
+    ids : (N,) int64
+        The markers' numbers.
+    corners : (N, 4, 2) float64
+        Top left, top right, bottom right, bottom left of each marker as printed; pixels (u, v) of
+        the image as it is.
+    covariance : (N, 4, 2, 2) float64
+        Of each corner, pixels squared.
+    quality : (N,) float64
+        1 less the mean absolute difference between the cells' whiteness and the pattern.
+    margin : (N,) float64
+        How much nearer the pattern is than the second best, in cells.
+    explained : (N,) float64
+        Share of the grey values' variance, noise aside, that the fit explains; NaN without
+        ``joint``.
+    candidates : tuple of Candidate
+        All regions that came as far as having corners.
+    rejected : Counter
+        How many regions and candidates were not taken, by cause.
+    masks : tuple of Mask
+        The dark pixels of phase 1, if they were to be kept.
+    """
+
+    dictionary: str
+    ids: NDArray[np.int64]
+    corners: FloatArray
+    covariance: FloatArray
+    quality: FloatArray
+    margin: FloatArray
+    explained: FloatArray
+    candidates: tuple[Candidate, ...]
+    rejected: Counter[str]
+    masks: tuple[Mask, ...]
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+
+@dataclass(frozen=True)
+class _Marker:
+    """A marker found: its corners in the printed order, straight pixels."""
+
+    id: int
+    corners: FloatArray
+    covariance: FloatArray
+    identity: Identity
+    explained: float
+
+
+def detect_markers(
+    image: NDArray[np.uint8],
+    settings: MarkerSettings,
+    camera: Camera | None = None,
+    *,
+    keep_masks: bool = False,
+) -> MarkerDetections:
+    """Find the square markers in one image.
+
+    Parameters
+    ----------
+    image : (H, W) uint8
+        Grey image.
+    settings : MarkerSettings
+        What to look for.
+    camera : Camera, optional
+        The calibration, whose distortion bends the markers' edges; without one they are taken to
+        be straight in the image.
+    keep_masks : bool
+        Whether the result holds the dark pixels of phase 1, for looking at.
+
+    Returns
+    -------
+    MarkerDetections
+
+    Raises
+    ------
+    DetectError
+        If there is no such dictionary, or it lacks an ID that is expected.
+    FrameError
+        If the image has not the camera's size.
+
+    References
+    ----------
+    RAWSEEDS deliverable D2.1 part 2: ground truth from cameras.
+    """
+    templates = templates_of(settings.dictionary, settings.ids)
+    lens = lens_of(camera, image)
+    image = np.ascontiguousarray(image)
+    noise = image_noise(image)
+    rejected: Counter[str] = Counter()
+    masks: list[Mask] = []
+
+    # Phases 1 and 2: dark regions that may be markers, and their rough corners.
+    quadrangles: list[tuple[Region, FloatArray]] = []
+    layers = candidate_layers(image, settings)
+    for layer in layers:
+        for mask in dark_masks(layer, noise, settings):
+            regions, causes = marker_regions(
+                mask, templates.dictionary, settings, last=layer is layers[-1]
+            )
+            rejected += causes
+            masks += [mask] if keep_masks else []
+            for region in regions:
+                corners = _rough_quadrangle(region, lens, settings)
+                if isinstance(corners, str):
+                    rejected[corners] += 1
+                else:
+                    quadrangles.append((region, corners))
+
+    # Phase 3: the edges in the image itself, and which marker it is.
+    markers: list[_Marker] = []
+    candidates: list[Candidate] = []
+    tried: list[FloatArray] = []
+    for region, rough in quadrangles:
+        if any(_same_place(rough, marker.corners) for marker in markers):
+            candidates.append(Candidate(region, rough, SAME_MARKER))
+            continue
+        if sum(_same_place(rough, other) for other in tried) >= _TRIES:
+            continue
+        tried.append(rough)
+        refined = refine_quadrangle(
+            image, lens, rough, capture_px=_capture(region, rough), border=templates.border,
+            noise=noise,
+        )  # fmt: skip
+        if refined is None:
+            result: _Marker | str = NO_EDGE
+        else:
+            result = _identified(image, lens, refined, templates, settings, noise)
+        fate = result if isinstance(result, str) else ACCEPTED
+        if not isinstance(result, str):
+            if any(_overlap(result.corners, marker.corners) for marker in markers):
+                fate = SAME_MARKER
+            else:
+                markers.append(result)
+        if fate not in (ACCEPTED, SAME_MARKER):
+            rejected[fate] += 1
+        candidates.append(Candidate(region, rough, fate, refined))
+    return _detections(markers, lens, settings, candidates, rejected, masks)
+
+
+def _rough_quadrangle(region: Region, lens: Lens, settings: MarkerSettings) -> FloatArray | str:
+    """Rough corners of a region at straight positions, or the cause of there being none."""
+    hull = lens.straighten(region.hull)
+    corners = rough_corners(hull, settings.corners)
+    if corners is None or not is_convex(corners):
+        return NOT_FOUR_CORNERS
+    if signed_area(corners) < settings.least_square * abs(signed_area(hull)):
+        return NO_QUADRANGLE
+    return corners
+
+
+def _identified(
+    image: NDArray[np.uint8],
+    lens: Lens,
+    refined: RefinedQuadrangle,
+    templates: Templates,
+    settings: MarkerSettings,
+    noise: float,
+) -> _Marker | str:
+    """The marker in a refined quadrangle, or the cause of there being none."""
+    contrast = refined.contrast
+    strongest = float(contrast.max())
+    least = max(settings.least_contrast * noise, settings.edge_balance * strongest)
+    if strongest <= 0.0 or contrast.min() < least:
+        return identities.NO_WHITE
+    cells = sampled_cells(image, lens, refined.corners, templates)
+    if cells is None:
+        return identities.OUTSIDE
+    if not settings.joint:
+        found = nearest_pattern(cells, templates, settings)
+        if isinstance(found, str):
+            return found
+        covariance = np.zeros((8, 8))
+        for k in range(4):
+            covariance[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = refined.covariance[k]
+        return _marker(found, refined.corners, covariance, templates, float("nan"))
+
+    blur = float(np.median(refined.blur_px))
+    side = np.sqrt(abs(signed_area(refined.corners)))
+    likely = likely_patterns(cells, templates, blur / (templates.dictionary.cell * side))
+    if not len(likely):
+        return identities.NO_PATTERN
+    levels = float(np.median(refined.dark)), float(np.median(refined.light))
+    first: PatternFit | None = None
+    template = -1
+    for other in likely:
+        look = fit_marker(
+            image, lens, refined.corners, templates, int(other), dark=levels[0], light=levels[1],
+            blur_px=blur, noise=noise, first_look=True,
+        )  # fmt: skip
+        if look is not None and (first is None or look.explained > first.explained):
+            first, template = look, int(other)
+    if first is None:
+        return identities.NOT_FITTED
+    if first.explained < settings.least_explained - _FIRST_LOOK_SLACK:
+        return identities.UNEXPLAINED
+    fit = fit_marker(
+        image, lens, first.corners, templates, template, dark=levels[0], light=levels[1],
+        blur_px=blur, noise=noise,
+    )  # fmt: skip
+    if fit is None:
+        return identities.NOT_FITTED
+    verified = verified_identity(fit, template, templates, settings)
+    if isinstance(verified, str):
+        return verified
+    covariance = np.zeros((8, 8))
+    for k in range(4):
+        covariance[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = refined.covariance[k]
+    sharp = fit.blur_px <= _SHARP_BLURS * templates.border * side
+    whole = side >= _LEAST_BENT_PX and refined.support.min() >= 1.0
+    if sharp and whole and _disagreement(refined, fit) > _MOST_DISAGREEMENT:
+        return _marker(verified, refined.corners, covariance, templates, fit.explained)
+    return _marker(verified, fit.corners, fit.covariance, templates, fit.explained)
+
+
+def _disagreement(refined: RefinedQuadrangle, fit: PatternFit) -> float:
+    """Mean normalised squared difference of the corners by the edges and by the whole marker."""
+    total = 0.0
+    for k in range(4):
+        part = fit.covariance[2 * k : 2 * k + 2, 2 * k : 2 * k + 2]
+        apart = fit.corners[k] - refined.corners[k]
+        spread = refined.covariance[k] + part + _EDGE_SYSTEMATIC_PX**2 * np.eye(2)
+        total += float(apart @ np.linalg.solve(spread, apart)) / 8.0
+    return total
+
+
+def _marker(
+    identity: Identity,
+    corners: FloatArray,
+    covariance: FloatArray,
+    templates: Templates,
+    explained: float,
+) -> _Marker:
+    """A marker with its corners in the printed order."""
+    turn = int(templates.turns[identity.template])
+    order = (np.arange(4) - turn) % 4
+    numbers = np.stack([2 * order, 2 * order + 1], axis=-1).ravel()
+    return _Marker(
+        id=int(templates.dictionary.ids[templates.marker[identity.template]]),
+        corners=corners[order],
+        covariance=covariance[np.ix_(numbers, numbers)],
+        identity=identity,
+        explained=explained,
+    )
+
+
+def _capture(region: Region, rough: FloatArray) -> float:
+    side = float(np.sqrt(abs(signed_area(rough))))
+    return _CAPTURE_LAYER_PX * region.scale + _CAPTURE_PX + _CAPTURE_WIDTHS * side
+
+
+def _same_place(first: FloatArray, second: FloatArray) -> bool:
+    """Whether two quadrangles have the same corners, in any order."""
+    return bool(same_corners(first, second, _SAME_PX, _SAME_WIDTHS))
+
+
+def _overlap(first: FloatArray, second: FloatArray) -> bool:
+    """Whether the middle of either quadrangle is inside the other."""
+    return bool(_middle_inside(first, second) or _middle_inside(second, first))
+
+
+def _middle_inside(first: FloatArray, second: FloatArray) -> bool:
+    x, y = first.mean(axis=0)
+    return bool(is_inside(x, y, second))
+
+
+def _detections(
+    markers: list[_Marker],
+    lens: Lens,
+    settings: MarkerSettings,
+    candidates: list[Candidate],
+    rejected: Counter[str],
+    masks: list[Mask],
+) -> MarkerDetections:
+    """The markers in the image as it is, by ID, then from left to right."""
+    markers = sorted(markers, key=lambda m: (m.id, m.corners[0, 0], m.corners[0, 1]))
+    count = len(markers)
+    corners, covariance = np.empty((count, 4, 2)), np.empty((count, 4, 2, 2))
+    for n, marker in enumerate(markers):
+        middle = marker.corners.mean(axis=0)
+        corners[n] = lens.bend(marker.corners, lens.bend(middle[None], middle)[0])
+        for k in range(4):
+            jacobian = lens.pixel_jacobian(corners[n, k])
+            part = marker.covariance[2 * k : 2 * k + 2, 2 * k : 2 * k + 2]
+            covariance[n, k] = jacobian @ part @ jacobian.T + settings.systematic_px**2 * np.eye(2)
+    return MarkerDetections(
+        dictionary=settings.dictionary,
+        ids=np.array([m.id for m in markers], dtype=np.int64),
+        corners=corners,
+        covariance=covariance,
+        quality=np.array([max(0.0, 1.0 - m.identity.distance) for m in markers]),
+        margin=np.array([m.identity.margin for m in markers]),
+        explained=np.array([m.explained for m in markers]),
+        candidates=tuple(candidates),
+        rejected=+rejected,
+        masks=tuple(masks),
+    )

@@ -1,0 +1,423 @@
+"""Compiled fits of a blurred step to the grey values along a marker's edges."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from detect.markers.homography_kernels import square_homography
+from detect.markers.lens_kernels import bent, straightened
+from detect.markers.solve_kernels import invert_positive, solve_positive
+
+#: What an edge's row of results holds: offset from the given line outwards in its middle and its
+#: change to the end (px), their variances and covariance (px^2), dark and light grey level, blur
+#: (px), standard deviation of what is left over, number of pixels, share of the length where the
+#: step is there.
+OFFSET, TURN, VAR_OFFSET, COVAR, VAR_TURN, DARK, LIGHT, BLUR, REST, PIXELS, SUPPORT = range(11)
+EDGE_NUMBERS = 11
+
+_PARAMETERS = 8
+_LEAST_PIXELS = 12
+_LEAST_BLUR = 0.25
+_LARGEST_BLUR = 8.0
+_WIDE_STEPS = 5
+_STEPS = 8
+_CLOSE_ENOUGH_PX = 2e-3
+#: Residuals beyond so many deviations lose weight.
+_OUTLIER = 3.0
+_ROOT_HALF = math.sqrt(0.5)
+_ROOT_2PI = math.sqrt(2.0 * math.pi)
+_MEDIAN_TO_SIGMA = 1.0 / 0.6745
+_LEAST_NOISE = 0.3
+_SEGMENTS = 8
+#: Standard deviation of the light's change across an edge, in contrasts per pixel.
+_LIGHT_SLOPE = 0.004
+_SAMPLED_RESIDUALS = 400
+
+
+@njit(cache=True, error_model="numpy")
+def _pixels_along(
+    image: NDArray[np.uint8],
+    grid: NDArray[np.float64],
+    step: float,
+    p0: NDArray[np.float64],
+    p1: NDArray[np.float64],
+    guess: NDArray[np.float64],
+    inwards: float,
+    outwards: float,
+    margin: float,
+    stride: int,
+    along: NDArray[np.float64],
+    across: NDArray[np.float64],
+    grey: NDArray[np.float64],
+) -> int:
+    """Pixels near a line from p0 to p1: where along (-1 to 1), how far out (px), grey value."""
+    height, width = image.shape
+    length = math.hypot(p1[0] - p0[0], p1[1] - p0[1])
+    tx, ty = (p1[0] - p0[0]) / length, (p1[1] - p0[1]) / length
+    u0, v0 = bent(grid, step, p0[0], p0[1], guess[0], guess[1])
+    u1, v1 = bent(grid, step, p1[0], p1[1], guess[0], guess[1])
+    if not (math.isfinite(u0 + v0) and math.isfinite(u1 + v1)):
+        return 0
+    flat = abs(u1 - u0) >= abs(v1 - v0)
+    # A rough width of the band along the other axis; the test below is exact.
+    pad = 1.5 * max(inwards, outwards) + 2.0
+    if flat:
+        begin, end = min(u0, u1), max(u0, u1)
+        slope = (v1 - v0) / (u1 - u0)
+        limit_a, limit_b = width, height
+    else:
+        begin, end = min(v0, v1), max(v0, v1)
+        slope = (u1 - u0) / (v1 - v0)
+        limit_a, limit_b = height, width
+    count = 0
+    half = 0.5 * length
+    for a in range(max(0, int(begin - pad)), min(limit_a, int(end + pad) + 2), stride):
+        middle = v0 + slope * (a - u0) if flat else u0 + slope * (a - v0)
+        for b in range(max(0, int(middle - pad)), min(limit_b, int(middle + pad) + 2)):
+            u, v = (a, b) if flat else (b, a)
+            x, y, _, _, _, _ = straightened(grid, step, float(u), float(v))
+            dx, dy = x - p0[0], y - p0[1]
+            s = dx * tx + dy * ty
+            d = dx * ty - dy * tx
+            if s < margin or s > length - margin or d < -inwards or d > outwards:
+                continue
+            if count == len(along):
+                return count
+            along[count] = (s - half) / half
+            across[count] = d
+            grey[count] = image[v, u]
+            count += 1
+    return count
+
+
+@njit(cache=True, error_model="numpy")
+def _scale_of(residual: NDArray[np.float64], count: int, least: float) -> float:
+    """Robust standard deviation of residuals."""
+    stride = max(1, count // _SAMPLED_RESIDUALS)
+    return max(least, _MEDIAN_TO_SIGMA * float(np.median(np.abs(residual[:count:stride]))))
+
+
+@njit(cache=True, error_model="numpy")
+def _fit_step(
+    along: NDArray[np.float64],
+    across: NDArray[np.float64],
+    grey: NDArray[np.float64],
+    count: int,
+    reach: float,
+    wide: float,
+    blur_guess: float,
+    noise: float,
+    out: NDArray[np.float64],
+) -> bool:
+    """Robust least squares of a blurred step; fills an edge's row of results."""
+    if count < _LEAST_PIXELS:
+        return False
+    # Levels to begin with: means of both sides.
+    low, high, n_low, n_high = 0.0, 0.0, 0, 0
+    for k in range(count):
+        if across[k] < 0.0:
+            low += grey[k]
+            n_low += 1
+        else:
+            high += grey[k]
+            n_high += 1
+    # Inside is darker, beyond what noise does.
+    if n_low < 3 or n_high < 3 or not high / n_high > low / n_low + 0.3 * noise:
+        return False
+    p = np.zeros(_PARAMETERS)
+    p[2], p[3] = low / n_low, high / n_high
+    p[5] = math.log(wide)
+    least = max(noise, _LEAST_NOISE)
+    residual = np.empty(count)
+    jacobian = np.empty(_PARAMETERS)
+    normal = np.empty((_PARAMETERS, _PARAMETERS))
+    right = np.empty(_PARAMETERS)
+    change = np.empty(_PARAMETERS)
+    inverse = np.empty((_PARAMETERS, _PARAMETERS))
+    scale = -1.0
+    converged = False
+    for iteration in range(_WIDE_STEPS + _STEPS):
+        wide_now = iteration < _WIDE_STEPS and wide > 1.2 * blur_guess
+        if iteration == _WIDE_STEPS or (iteration == 0 and not wide_now):
+            p[5] = math.log(blur_guess)
+        normal[:] = 0.0
+        right[:] = 0.0
+        blur = math.exp(p[5])
+        weight_sum = 0.0
+        rest = 0.0
+        for k in range(count):
+            z = (across[k] - p[0] - p[1] * along[k]) / blur
+            share = 0.5 * (1.0 + math.erf(z * _ROOT_HALF))
+            density = math.exp(-0.5 * z * z) / _ROOT_2PI
+            out_px = z * blur
+            top = p[3] + p[4] * along[k] + p[6] * out_px
+            bottom = p[2] + p[7] * along[k]
+            step = top - bottom
+            r = grey[k] - (bottom + step * share)
+            residual[k] = r
+            weight = 1.0
+            if scale > 0.0 and abs(r) > _OUTLIER * scale:
+                weight = (_OUTLIER * scale / r) ** 2
+            slope = -step * density / blur - p[6] * share
+            jacobian[0] = slope
+            jacobian[1] = slope * along[k]
+            jacobian[2] = 1.0 - share
+            jacobian[3] = share
+            jacobian[4] = share * along[k]
+            jacobian[5] = -step * density * z
+            jacobian[6] = share * out_px
+            jacobian[7] = (1.0 - share) * along[k]
+            for i in range(_PARAMETERS):
+                right[i] += weight * jacobian[i] * r
+                for j in range(i, _PARAMETERS):
+                    normal[i, j] += weight * jacobian[i] * jacobian[j]
+            weight_sum += weight
+            rest += weight * r * r
+        scale = _scale_of(residual, count, least)
+        for i in range(_PARAMETERS):
+            for j in range(i):
+                normal[i, j] = normal[j, i]
+        # Weak knowledge: light changes little along an edge; the blur is about what was guessed.
+        variance = scale * scale
+        contrast = max(abs(p[3] - p[2]), scale)
+        light = variance / (0.3 * contrast) ** 2
+        for i in (4, 7):
+            normal[i, i] += light
+            right[i] -= light * p[i]
+        light = variance / (_LIGHT_SLOPE * contrast) ** 2
+        normal[6, 6] += light
+        right[6] -= light * p[6]
+        prior = variance / 0.25
+        normal[5, 5] += prior
+        right[5] -= prior * (p[5] - math.log(blur_guess))
+        if wide_now:
+            normal[5, :] = 0.0
+            normal[:, 5] = 0.0
+            normal[5, 5] = 1.0
+            right[5] = 0.0
+        for i in range(2):
+            normal[i, i] += 1e-9 * (1.0 + normal[i, i])
+        if not solve_positive(normal, right, change):
+            return False
+        largest = max(abs(change[0]), abs(change[1]))
+        shrink = min(1.0, 0.6 * reach / largest) if largest > 0.0 else 1.0
+        change[0] *= shrink
+        change[1] *= shrink
+        change[5] = min(max(change[5], -0.7), 0.7)
+        p += change
+        p[5] = min(max(p[5], math.log(_LEAST_BLUR)), math.log(_LARGEST_BLUR))
+        if abs(p[0]) + abs(p[1]) > 2.0 * reach:
+            return False
+        if wide_now:
+            if iteration + 1 < _WIDE_STEPS and largest < 0.05:
+                # Close: go on with the blur free.
+                wide = blur_guess
+                p[5] = math.log(blur_guess)
+        elif largest < _CLOSE_ENOUGH_PX and iteration > 1:
+            converged = True
+            break
+    if not converged and iteration + 1 < _WIDE_STEPS + _STEPS:
+        return False
+    if not invert_positive(normal, inverse):
+        return False
+    variance = max(rest / max(weight_sum - _PARAMETERS, 1.0), least * least)
+    out[OFFSET], out[TURN] = p[0], p[1]
+    out[VAR_OFFSET] = variance * inverse[0, 0]
+    out[COVAR] = variance * inverse[0, 1]
+    out[VAR_TURN] = variance * inverse[1, 1]
+    out[DARK], out[LIGHT] = p[2], p[3]
+    out[BLUR] = math.exp(p[5])
+    out[REST] = scale
+    out[PIXELS] = count
+    out[SUPPORT] = _support(along, across, grey, count, p)
+    return bool(np.all(np.isfinite(out)))
+
+
+@njit(cache=True, error_model="numpy")
+def _support(
+    along: NDArray[np.float64],
+    across: NDArray[np.float64],
+    grey: NDArray[np.float64],
+    count: int,
+    p: NDArray[np.float64],
+) -> float:
+    """Share of the segments of an edge whose own step is at least half the fitted one."""
+    inside = np.zeros(_SEGMENTS)
+    outside = np.zeros(_SEGMENTS)
+    n_inside = np.zeros(_SEGMENTS)
+    n_outside = np.zeros(_SEGMENTS)
+    for k in range(count):
+        d = across[k] - p[0] - p[1] * along[k]
+        segment = min(int((along[k] + 1.0) * 0.5 * _SEGMENTS), _SEGMENTS - 1)
+        if d < -0.5:
+            inside[segment] += grey[k]
+            n_inside[segment] += 1.0
+        elif d > 0.5:
+            outside[segment] += grey[k]
+            n_outside[segment] += 1.0
+    there, known = 0.0, 0.0
+    for k in range(_SEGMENTS):
+        if n_inside[k] > 0.0 and n_outside[k] > 0.0:
+            known += 1.0
+            if outside[k] / n_outside[k] - inside[k] / n_inside[k] > 0.5 * (p[3] - p[2]):
+                there += 1.0
+    return there / known if known > 0.0 else 0.0
+
+
+@njit(cache=True, error_model="numpy")
+def border_thickness(corners: NDArray[np.float64], border: float) -> NDArray[np.float64]:
+    """(4,) thickness of the black border in the middle of each edge, pixels."""
+    homography = square_homography(corners)
+    result = np.empty(4)
+    for k in range(4):
+        mx = 0.5 if k % 2 == 0 else (1.0 - border if k == 1 else border)
+        my = 0.5 if k % 2 == 1 else (border if k == 0 else 1.0 - border)
+        w = homography[2, 0] * mx + homography[2, 1] * my + 1.0
+        x = (homography[0, 0] * mx + homography[0, 1] * my + homography[0, 2]) / w
+        y = (homography[1, 0] * mx + homography[1, 1] * my + homography[1, 2]) / w
+        p0 = corners[k]
+        p1 = corners[(k + 1) % 4]
+        length = math.hypot(p1[0] - p0[0], p1[1] - p0[1])
+        result[k] = abs((x - p0[0]) * (p1[1] - p0[1]) - (y - p0[1]) * (p1[0] - p0[0])) / length
+    return result
+
+
+@njit(cache=True, error_model="numpy")
+def fit_edges(
+    image: NDArray[np.uint8],
+    grid: NDArray[np.float64],
+    step: float,
+    corners: NDArray[np.float64],
+    guess: NDArray[np.float64],
+    capture: float,
+    border: float,
+    blur_guess: float,
+    noise: float,
+    most_pixels: int,
+    edges: NDArray[np.float64],
+) -> bool:
+    """Fit a blurred step to each of four edges.
+
+    Parameters
+    ----------
+    image : (H, W) uint8
+        The image.
+    grid, step
+        The lens (see `detect.markers.lens`).
+    corners : (4, 2) float64
+        Rough corners, clockwise as seen in the image, straight pixels.
+    guess : (2,) float64
+        A pixel near the marker.
+    capture : float
+        How far the edges may be from the rough ones, pixels.
+    border : float
+        Thickness of the black border, in widths of the marker.
+    blur_guess : float
+        Standard deviation of the blur, pixels.
+    noise : float
+        Standard deviation of the noise at least, grey levels.
+    most_pixels : int
+        About how many pixels are used per edge; of more, whole columns (rows) are left out.
+    edges : (4, EDGE_NUMBERS) float64
+        Result: see the module's indices.
+
+    Returns
+    -------
+    bool
+        Whether all four were fitted.
+    """
+    thickness = border_thickness(corners, border)
+    for k in range(4):
+        p0 = corners[k]
+        p1 = corners[(k + 1) % 4]
+        length = math.hypot(p1[0] - p0[0], p1[1] - p0[1])
+        reach = min(capture, max(1.2, thickness[k]))
+        inwards = min(reach, max(1.0, 0.85 * thickness[k]))
+        margin = min(max(1.0, 0.7 * reach), 0.2 * length)
+        stride = max(1, int(length * (inwards + reach) / most_pixels))
+        room = int((length + 4.0) * (inwards + reach + 2.0)) + 64
+        along = np.empty(room)
+        across = np.empty(room)
+        grey = np.empty(room)
+        count = _pixels_along(
+            image, grid, step, p0, p1, guess, inwards, reach, margin, stride, along, across, grey
+        )
+        wide = max(0.6 * reach, blur_guess)
+        if not _fit_step(along, across, grey, count, reach, wide, blur_guess, noise, edges[k]):
+            return False
+    return True
+
+
+@njit(cache=True, error_model="numpy")
+def corners_of_edges(
+    corners: NDArray[np.float64],
+    edges: NDArray[np.float64],
+    refined: NDArray[np.float64],
+    covariance: NDArray[np.float64],
+) -> bool:
+    """Intersections of the fitted edges, and their covariances.
+
+    Parameters
+    ----------
+    corners : (4, 2) float64
+        The corners that the edges' offsets are relative to.
+    edges : (4, EDGE_NUMBERS) float64
+        From `fit_edges`.
+    refined : (4, 2) float64
+        Result.
+    covariance : (4, 2, 2) float64
+        Result, pixels squared.
+
+    Returns
+    -------
+    bool
+        Whether all four edges intersect.
+    """
+    normal = np.empty((4, 2))
+    level = np.empty(4)
+    for k in range(4):
+        p0 = corners[k]
+        p1 = corners[(k + 1) % 4]
+        length = math.hypot(p1[0] - p0[0], p1[1] - p0[1])
+        tx, ty = (p1[0] - p0[0]) / length, (p1[1] - p0[1]) / length
+        # Outward normal (ty, -tx); the fitted line runs through the shifted ends.
+        b0 = edges[k, OFFSET] - edges[k, TURN]
+        b1 = edges[k, OFFSET] + edges[k, TURN]
+        ax, ay = p0[0] + b0 * ty, p0[1] - b0 * tx
+        bx, by = p1[0] + b1 * ty, p1[1] - b1 * tx
+        span = math.hypot(bx - ax, by - ay)
+        normal[k, 0] = (by - ay) / span
+        normal[k, 1] = -(bx - ax) / span
+        level[k] = normal[k, 0] * ax + normal[k, 1] * ay
+    for k in range(4):
+        j = (k + 3) % 4
+        determinant = normal[j, 0] * normal[k, 1] - normal[j, 1] * normal[k, 0]
+        if abs(determinant) < 0.05:
+            return False
+        x = (level[j] * normal[k, 1] - level[k] * normal[j, 1]) / determinant
+        y = (normal[j, 0] * level[k] - normal[k, 0] * level[j]) / determinant
+        refined[k, 0] = x
+        refined[k, 1] = y
+        # Each line's variance at the corner moves it along the other line.
+        covariance[k] = 0.0
+        for which in range(2):
+            e = j if which == 0 else k
+            o = k if which == 0 else j
+            q0 = corners[e]
+            q1 = corners[(e + 1) % 4]
+            length = math.hypot(q1[0] - q0[0], q1[1] - q0[1])
+            s = ((x - q0[0]) * (q1[0] - q0[0]) + (y - q0[1]) * (q1[1] - q0[1])) / length / (
+                0.5 * length
+            ) - 1.0
+            variance = edges[e, VAR_OFFSET] + 2.0 * s * edges[e, COVAR] + s * s * edges[e, VAR_TURN]
+            mx = normal[o, 1] / determinant
+            my = -normal[o, 0] / determinant
+            covariance[k, 0, 0] += variance * mx * mx
+            covariance[k, 0, 1] += variance * mx * my
+            covariance[k, 1, 1] += variance * my * my
+        covariance[k, 1, 0] = covariance[k, 0, 1]
+    return True

@@ -1,0 +1,192 @@
+"""Phase 3, second part: which marker it is.
+
+The homography of the refined corners tells where the cells have their middles; the grey values
+there, rescaled to 0 to 1, are compared with all patterns in all four turns. The nearest one wins if
+it is near enough (RAWSEEDS deliverable D2.1 part 2), and here also only if the second nearest is
+clearly farther away.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from detect.markers.lens import Lens
+from detect.markers.pattern_fit import PatternFit
+from detect.markers.sampling_kernels import sample_cells
+from detect.markers.settings import MarkerSettings
+from detect.markers.templates import Templates
+
+FloatArray = NDArray[np.float64]
+
+#: Causes of rejection, as they are counted.
+OUTSIDE = "partly outside the image"
+NO_PATTERN = "like no pattern"
+AMBIGUOUS = "like two patterns"
+NOT_FITTED = "fit of the marker failed"
+UNEXPLAINED = "grey values unexplained"
+WRONG_CELLS = "wrong cells"
+NO_WHITE = "edges without contrast"
+
+#: Samples of a cell are this far apart, in cells.
+_SPREAD_CELLS = 0.25
+#: Patterns whose correlation is this near the best one's are tried too, at most so many.
+_CLOSE_CORRELATION = 0.06
+_MOST_TRIED = 3
+_LEAST_CORRELATION = 0.55
+#: Natural logarithm of how much less likely the second best pattern must be.
+_LEAST_LOG_ODDS = 15.0
+#: Whiteness of cells is trusted to no better than this.
+_LEAST_CELL_SIGMA = 0.08
+
+
+@dataclass(frozen=True)
+class Identity:
+    """A marker recognised.
+
+    Attributes
+    ----------
+    template : int
+        Index of the template.
+    distance : float
+        Mean absolute difference between cells and pattern, 0 to 1.
+    margin : float
+        Squared distance to the second best pattern less that to the best, in cells.
+    """
+
+    template: int
+    distance: float
+    margin: float
+
+
+def sampled_cells(
+    image: NDArray[np.uint8], lens: Lens, corners: FloatArray, templates: Templates
+) -> FloatArray | None:
+    """(G, G) grey values of the grid's cells; None if some are outside the image."""
+    dictionary = templates.dictionary
+    cells = np.empty((len(dictionary.centres),) * 2)
+    middle = corners.mean(axis=0)
+    guess = lens.bend(middle[None], middle)[0]
+    inside = sample_cells(
+        image, lens.grid, lens.step, corners, guess, dictionary.centres,
+        _SPREAD_CELLS * dictionary.cell, cells,
+    )  # fmt: skip
+    return cells if inside else None
+
+
+def nearest_pattern(
+    cells: FloatArray, templates: Templates, settings: MarkerSettings
+) -> Identity | str:
+    """The nearest pattern as the report has it, or the cause of there being none.
+
+    Parameters
+    ----------
+    cells : (G, G) float64
+        Grey values.
+    templates : Templates
+        The patterns.
+    settings : MarkerSettings
+        ``largest_distance``, ``least_margin``.
+
+    Returns
+    -------
+    Identity or str
+    """
+    low, high = float(cells.min()), float(cells.max())
+    if high <= low:
+        return NO_PATTERN
+    whiteness = ((cells - low) / (high - low)).ravel()
+    best, distance, margin = _nearest(whiteness, templates)
+    if distance > settings.largest_distance:
+        return NO_PATTERN
+    if margin < settings.least_margin:
+        return AMBIGUOUS
+    return Identity(best, distance, margin)
+
+
+def likely_patterns(
+    cells: FloatArray, templates: Templates, blur_cells: float
+) -> NDArray[np.int64]:
+    """Templates that cells may show, the best first; none if none is anything like them.
+
+    Parameters
+    ----------
+    cells : (G, G) float64
+        Grey values.
+    templates : Templates
+        The patterns.
+    blur_cells : float
+        Standard deviation of the blur, cells: neighbours shine into each other.
+    """
+    flat = cells.ravel() - cells.mean()
+    length = float(np.linalg.norm(flat))
+    if length <= 0.0:
+        return np.empty(0, np.int64)
+    correlation = templates.nearest_blur(blur_cells) @ (flat / length).astype(np.float32)
+    count = min(_MOST_TRIED, len(correlation))
+    best = np.argpartition(-correlation, count - 1)[:count]
+    # Equal ones in the order of their numbers: the same on every machine.
+    best = best[np.lexsort((best, -correlation[best]))]
+    least = max(_LEAST_CORRELATION, float(correlation[best[0]]) - _CLOSE_CORRELATION)
+    return np.asarray(best[correlation[best] >= least], dtype=np.int64)
+
+
+def verified_identity(
+    fit: PatternFit, template: int, templates: Templates, settings: MarkerSettings
+) -> Identity | str:
+    """What a fitted marker's cells say about its identity, or the cause of rejecting it.
+
+    Parameters
+    ----------
+    fit : PatternFit
+        The fit of the template.
+    template : int
+        Which was fitted.
+    templates : Templates
+        All patterns.
+    settings : MarkerSettings
+        ``least_explained``, ``largest_cell_error``, ``least_margin``, ``largest_distance``.
+
+    Returns
+    -------
+    Identity or str
+    """
+    if fit.explained < settings.least_explained:
+        return UNEXPLAINED
+    error = np.abs(fit.cells - templates.cells[template])
+    allowed = settings.largest_cell_error
+    if error.max() > allowed or (fit.border.size and np.abs(fit.border).max() > allowed):
+        return WRONG_CELLS
+    best, distance, margin = _nearest(fit.cells, templates)
+    if best != template or margin < settings.least_margin:
+        return AMBIGUOUS
+    if distance > settings.largest_distance:
+        return NO_PATTERN
+    if _log_odds(fit, template, templates) < _LEAST_LOG_ODDS:
+        return AMBIGUOUS
+    return Identity(best, distance, margin)
+
+
+def _nearest(whiteness: FloatArray, templates: Templates) -> tuple[int, float, float]:
+    """Nearest template, mean absolute difference to it, margin of squared distance to the next."""
+    clipped = np.clip(whiteness, -0.25, 1.25)
+    # |w - t|^2 = |w|^2 + sum of t (1 - 2 w) for t in {0, 1}.
+    squared = templates.cells @ (1.0 - 2.0 * clipped).astype(np.float32)
+    best = int(np.argmin(squared))
+    distance = float(np.abs(clipped - templates.cells[best]).mean())
+    if len(squared) == 1:
+        return best, distance, float("inf")
+    others = np.delete(squared, best)
+    return best, distance, float(others.min() - squared[best])
+
+
+def _log_odds(fit: PatternFit, template: int, templates: Templates) -> float:
+    """Log-odds of a template against the likeliest other one, given the cells' precision."""
+    sigma = np.hypot(fit.cell_sigma, _LEAST_CELL_SIGMA)
+    gain = (1.0 - 2.0 * fit.cells) / (2.0 * sigma**2)
+    cost = templates.cells @ gain.astype(np.float32)
+    own = float(cost[template])
+    cost = np.delete(cost, template)
+    return float(cost.min()) - own if len(cost) else float("inf")

@@ -1,0 +1,198 @@
+"""Phase 3, last part: the whole marker fitted to the grey values.
+
+Four edges know little about a small marker: its cells have edges too. Once it is known which
+marker it may be, all of it is fitted at once (`detect.markers.pattern_kernels`): corners, light,
+blur. What each cell then shows on its own says whether it is that marker indeed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from detect.markers import pattern_kernels as kernels
+from detect.markers.homography_kernels import square_homography
+from detect.markers.lens import Lens
+from detect.markers.templates import Templates
+
+FloatArray = NDArray[np.float64]
+
+#: Pixels and steps of a fit, and of a first look.
+_MOST_PIXELS = 3000
+_MOST_STEPS = 12
+_FIRST_LOOK_PIXELS = 700
+_FIRST_LOOK_STEPS = 6
+#: Width of the seam round the marker that is fitted: blurs and pixels, at most a cell's size.
+_SEAM_BLURS = 2.5
+_SEAM_PX = 0.5
+_LEAST_SEAM_PX = 1.2
+#: How far a corner may move from where the edges meet, pixels or cells, the greater.
+_REACH_PX = 1.5
+_REACH_CELLS = 0.75
+
+
+@dataclass(frozen=True)
+class PatternFit:
+    """A marker fitted to the grey values.
+
+    Attributes
+    ----------
+    corners : (4, 2) float64
+        Straight pixels, in the order of the corners given.
+    covariance : (8, 8) float64
+        Of u0 v0 u1 ... v3, pixels squared.
+    cells : (G * G,) float64
+        Whiteness of each cell of the grid, as the grey values have it.
+    cell_sigma : (G * G,) float64
+        Its standard deviation due to noise.
+    border : (B,) float64
+        Whiteness of the other cells of the square.
+    rest : float
+        Standard deviation of what is left over, grey levels, but for outliers.
+    explained : float
+        Explained share of the grey values' variance, noise aside.
+    agree : float
+        Share of the pixels that are no outliers.
+    contrast : float
+        White less black, grey levels.
+    blur_px : float
+        Mean standard deviation of the blur.
+    inflation : float
+        By how much the covariance was increased for rests alike at neighbouring pixels.
+    """
+
+    corners: FloatArray
+    covariance: FloatArray
+    cells: FloatArray
+    cell_sigma: FloatArray
+    border: FloatArray
+    rest: float
+    explained: float
+    agree: float
+    contrast: float
+    blur_px: float
+    inflation: float
+
+
+def fit_marker(
+    image: NDArray[np.uint8],
+    lens: Lens,
+    corners: FloatArray,
+    templates: Templates,
+    template: int,
+    *,
+    dark: float,
+    light: float,
+    blur_px: float,
+    noise: float,
+    first_look: bool = False,
+) -> PatternFit | None:
+    """Fit a marker of a known pattern.
+
+    Parameters
+    ----------
+    image : (H, W) uint8
+        The image.
+    lens : Lens
+        Its lens.
+    corners : (4, 2) float64
+        Corners to begin with, straight pixels, clockwise as seen in the image.
+    templates : Templates
+        The dictionary.
+    template : int
+        Which of them.
+    dark, light, blur_px : float
+        Grey levels and blur to begin with.
+    noise : float
+        Standard deviation of the image's noise, grey levels.
+    first_look : bool
+        Use few pixels and few steps: enough to see whether it may be that marker.
+
+    Returns
+    -------
+    PatternFit or None
+        None if there is no fit near the given corners.
+    """
+    cell_px = templates.dictionary.cell * _least_side(corners)
+    seam = min(_SEAM_BLURS * blur_px + _SEAM_PX, max(_LEAST_SEAM_PX, cell_px))
+    box = _pixel_box(image, lens, corners, seam)
+    if box is None:
+        return None
+    room = int((box[1] - box[0] + 1) * (box[3] - box[2] + 1))
+    pixels = np.empty((room, 2), np.int32)
+    straight = np.empty((room, 2))
+    grey = np.empty(room)
+    most_pixels = _FIRST_LOOK_PIXELS if first_look else _MOST_PIXELS
+    count = kernels.select_pixels(
+        image, lens.grid, lens.step, corners, box, templates.lines, seam,
+        _SEAM_BLURS * blur_px + _SEAM_PX, most_pixels, pixels, straight, grey,
+    )  # fmt: skip
+    black = templates.blackness(template)
+    fitted, covariance = np.empty((4, 2)), np.empty((8, 8))
+    cells, cell_sigma = np.empty_like(black), np.empty_like(black)
+    numbers = np.empty(kernels.FIT_NUMBERS)
+    if not kernels.fit_pattern(
+        pixels, straight, grey, count, corners, templates.lines, black,
+        np.array([dark, light, blur_px]), noise, _FIRST_LOOK_STEPS if first_look else _MOST_STEPS,
+        max(_REACH_PX, _REACH_CELLS * cell_px), fitted, covariance, cells, cell_sigma, numbers,
+    ):  # fmt: skip
+        return None
+    outside = np.ones(black.shape, dtype=bool)
+    side = templates.dictionary.patterns.shape[-1]
+    outside[templates.first : templates.first + side, templates.first : templates.first + side] = 0
+    return PatternFit(
+        corners=fitted,
+        covariance=covariance,
+        cells=templates.grid_of(cells),
+        cell_sigma=templates.grid_of(cell_sigma),
+        border=cells[outside],
+        rest=float(numbers[kernels.REST]),
+        explained=float(numbers[kernels.EXPLAINED]),
+        agree=float(numbers[kernels.AGREE]),
+        contrast=float(numbers[kernels.CONTRAST]),
+        blur_px=float(np.sqrt(0.5 * (numbers[kernels.BLUR_UU] + numbers[kernels.BLUR_VV]))),
+        inflation=float(numbers[kernels.INFLATION]),
+    )
+
+
+def _least_side(corners: FloatArray) -> float:
+    """Least distance of opposite edges' middles, pixels."""
+    middles = 0.5 * (corners + np.roll(corners, -1, axis=0))
+    return float(min(np.hypot(*(middles[0] - middles[2])), np.hypot(*(middles[1] - middles[3]))))
+
+
+def _pixel_box(
+    image: NDArray[np.uint8], lens: Lens, corners: FloatArray, seam: float
+) -> NDArray[np.int64] | None:
+    """First and last column and row of a marker with its seam; None if it leaves the image."""
+    homography = square_homography(corners)
+    along = np.linspace(0.0, 1.0, 5)
+    zero, one = np.zeros(5), np.ones(5)
+    outline = np.concatenate(
+        [
+            np.stack(side, axis=-1)
+            for side in ((along, zero), (one, along), (along, one), (zero, along))
+        ]
+    )
+    straight = outline @ homography[:2, :2].T + homography[:2, 2]
+    straight /= (outline @ homography[2, :2] + 1.0)[:, None]
+    guess = lens.bend(corners.mean(axis=0)[None], corners.mean(axis=0))[0]
+    pixels = lens.bend(straight, guess)
+    if not np.all(np.isfinite(pixels)):
+        return None
+    height, width = image.shape
+    low, high = pixels.min(axis=0), pixels.max(axis=0)
+    if low.min() < 0.0 or high[0] > width - 1.0 or high[1] > height - 1.0:
+        return None
+    reach = 1.5 * seam + 2.0
+    return np.array(
+        [
+            max(0, int(low[0] - reach)),
+            min(width - 1, int(high[0] + reach)),
+            max(0, int(low[1] - reach)),
+            min(height - 1, int(high[1] + reach)),
+        ],
+        dtype=np.int64,
+    )

@@ -1,0 +1,155 @@
+"""What the detector of square markers can be told."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+from detect.errors import DetectError
+
+Darkness = Literal["ratio", "difference"]
+CornerAlgorithm = Literal["A", "B"]
+
+
+def _expect(condition: bool, name: str, value: object, expected: str) -> None:
+    if not condition:
+        raise DetectError(f"{name} is {value}: expected {expected}")
+
+
+@dataclass(frozen=True)
+class MarkerSettings:
+    """Everything that decides what the marker detector finds. The defaults are the best known.
+
+    Parameters
+    ----------
+    dictionary : str
+        What is printed on the markers: rawseeds, artoolkitplus12, artoolkitplus8, or an OpenCV
+        dictionary (4x4_50 ... 7x7_1000, aruco_original, aruco_mip_36h12, apriltag_16h5 ...).
+    ids : tuple of int
+        The markers to expect; none: all of the dictionary.
+    width_px : float
+        Expected width of the markers in the image, pixels, right to a factor of about 2; 0:
+        unknown, several scales are tried.
+    thresholds : tuple of float
+        A pixel is dark if its darkness exceeds this; each threshold gives candidates of its own.
+    darkness : "ratio" or "difference"
+        1 - I1/I2 of image I1 and its closing I2, or I2 - I1 in parts of 255.
+    disc_widths : float
+        Radius of the closing's disc in widths of the marker.
+    pyramid : bool
+        Look for large markers in reduced images.
+    dark_noise : float
+        Dark pixels are darker than the closing by at least this many standard deviations of the
+        image's noise.
+    least_width_px : float
+        Narrowest marker looked for (square root of its area), pixels, where no width is given.
+    area_factor : float
+        A candidate's area is within this factor of the expected width squared.
+    least_holes, most_holes : int
+        White patches enclosed in a candidate.
+    least_solidity : float
+        Area of a candidate, its holes filled, over that of its convex hull.
+    least_white, most_white : float
+        Area of a candidate's holes over its whole area, in parts of the dictionary's mean white
+        share (0.25 to 3 of 1/8 in the report).
+    corners : "A" or "B"
+        Rough corners: A the maxima of the distance from the barycentre, B the quadrangle of
+        largest area.
+    least_square : float
+        Area of the rough quadrangle over that of the convex hull.
+    joint : bool
+        Fit the whole marker, cells included, to the grey values; its corners are more exact than
+        those of four separate edges, and what it leaves over tells false markers from true ones.
+    least_contrast : float
+        Least contrast of each edge, in standard deviations of the image's noise.
+    edge_balance : float
+        Least contrast of an edge, in parts of the strongest edge's.
+    largest_distance : float
+        Largest mean absolute difference between a marker's cells, rescaled to 0 to 1, and the
+        pattern.
+    least_margin : float
+        Least squared distance to the second best pattern less that to the best, in cells.
+    least_explained : float
+        Least share of the grey values' variance, noise aside, explained by the fitted marker.
+    largest_cell_error : float
+        Largest difference between the whiteness of any cell and that of the pattern.
+    systematic_px : float
+        Systematic error of a corner, pixels: added to its covariance.
+    """
+
+    dictionary: str = "rawseeds"
+    ids: tuple[int, ...] = ()
+    width_px: float = 0.0
+    thresholds: tuple[float, ...] = (0.5, 0.25, 0.12, 0.06)
+    darkness: Darkness = "ratio"
+    disc_widths: float = 0.5
+    pyramid: bool = True
+    dark_noise: float = 2.0
+    least_width_px: float = 9.0
+    area_factor: float = 6.0
+    least_holes: int = 0
+    most_holes: int = 40
+    least_solidity: float = 0.75
+    least_white: float = 0.0
+    most_white: float = 3.0
+    corners: CornerAlgorithm = "B"
+    least_square: float = 0.75
+    joint: bool = True
+    least_contrast: float = 2.0
+    edge_balance: float = 0.3
+    largest_distance: float = 0.3
+    least_margin: float = 1.0
+    least_explained: float = 0.9
+    largest_cell_error: float = 0.45
+    systematic_px: float = 0.005
+
+    def __post_init__(self) -> None:
+        _expect(bool(self.thresholds), "thresholds", self.thresholds, "at least one number")
+        for value in self.thresholds:
+            _expect(0.0 < value < 1.0, "thresholds", value, "between 0 and 1")
+        for name in ("width_px", "dark_noise", "least_contrast", "least_margin", "systematic_px"):
+            value = getattr(self, name)
+            _expect(0.0 <= value < math.inf, name, value, "0 or more")
+        _expect(self.disc_widths > 0.0, "disc_widths", self.disc_widths, "above 0")
+        _expect(self.least_width_px >= 4.0, "least_width_px", self.least_width_px, "4 or more")
+        _expect(self.area_factor > 1.0, "area_factor", self.area_factor, "above 1")
+        _expect(
+            0 <= self.least_holes <= self.most_holes,
+            "least_holes",
+            self.least_holes,
+            f"0 to most_holes ({self.most_holes})",
+        )
+        for name in (
+            "least_solidity",
+            "least_square",
+            "edge_balance",
+            "largest_distance",
+            "least_explained",
+            "largest_cell_error",
+        ):
+            value = getattr(self, name)
+            _expect(0.0 <= value <= 1.0, name, value, "0 to 1")
+        _expect(
+            0.0 <= self.least_white < self.most_white,
+            "least_white",
+            self.least_white,
+            f"0 to most_white ({self.most_white:g})",
+        )
+
+
+DEFAULT = MarkerSettings()
+
+#: The report's detector; what it does not give a number for is set as by default.
+PUBLISHED = MarkerSettings(
+    thresholds=(0.5,),
+    pyramid=False,
+    dark_noise=0.0,
+    least_holes=1,
+    least_solidity=0.9,
+    least_white=0.25,
+    most_white=3.0,
+    joint=False,
+)
+
+PRESETS = {"default": DEFAULT, "published": PUBLISHED}

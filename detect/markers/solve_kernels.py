@@ -1,0 +1,75 @@
+"""Compiled solution of small positive definite systems, which says when they are not."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+#: A pivot less than this part of its diagonal entry is rounding.
+_LEAST_PIVOT = 1e-13
+
+
+@njit(cache=True, error_model="numpy")
+def _cholesky(matrix: NDArray[np.float64], lower: NDArray[np.float64]) -> bool:
+    n = matrix.shape[0]
+    for i in range(n):
+        for j in range(i + 1):
+            total = matrix[i, j]
+            for k in range(j):
+                total -= lower[i, k] * lower[j, k]
+            if i == j:
+                if not total > _LEAST_PIVOT * abs(matrix[i, i]):
+                    return False
+                lower[i, i] = math.sqrt(total)
+            else:
+                lower[i, j] = total / lower[j, j]
+    return True
+
+
+@njit(cache=True, error_model="numpy")
+def _substitute(
+    lower: NDArray[np.float64], right: NDArray[np.float64], solution: NDArray[np.float64]
+) -> None:
+    n = lower.shape[0]
+    for i in range(n):
+        total = right[i]
+        for k in range(i):
+            total -= lower[i, k] * solution[k]
+        solution[i] = total / lower[i, i]
+    for i in range(n - 1, -1, -1):
+        total = solution[i]
+        for k in range(i + 1, n):
+            total -= lower[k, i] * solution[k]
+        solution[i] = total / lower[i, i]
+
+
+@njit(cache=True, error_model="numpy")
+def solve_positive(
+    matrix: NDArray[np.float64], right: NDArray[np.float64], solution: NDArray[np.float64]
+) -> bool:
+    """Solve matrix @ solution = right for a positive definite matrix; False if it is not one."""
+    lower = np.empty_like(matrix)
+    if not _cholesky(matrix, lower):
+        return False
+    _substitute(lower, right, solution)
+    return bool(np.all(np.isfinite(solution)))
+
+
+@njit(cache=True, error_model="numpy")
+def invert_positive(matrix: NDArray[np.float64], inverse: NDArray[np.float64]) -> bool:
+    """Inverse of a positive definite matrix; False if it is not one."""
+    n = matrix.shape[0]
+    lower = np.empty_like(matrix)
+    if not _cholesky(matrix, lower):
+        return False
+    unit = np.zeros(n)
+    column = np.empty(n)
+    for j in range(n):
+        unit[:] = 0.0
+        unit[j] = 1.0
+        _substitute(lower, unit, column)
+        inverse[:, j] = column
+    return bool(np.all(np.isfinite(inverse)))
