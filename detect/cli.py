@@ -9,6 +9,8 @@ not met; 2 the command line was wrong; 3 some frames could not be worked on (the
 
 from __future__ import annotations
 
+import atexit
+import os
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -222,7 +224,12 @@ def main(arguments: list[str] | None = None) -> int:
 
         return carry_out(command)
     except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
+        print("interrupted", file=sys.stderr, flush=True)
+        if arguments is None:
+            # Left to itself, Python dies of an interrupt that passed through an `exec` of some
+            # library's, although it was caught here.
+            atexit._run_exitfuncs()
+            os._exit(EXIT_INTERRUPTED)
         return EXIT_INTERRUPTED
     except (ValueError, OSError, WorkerError) as error:
         print(f"error: {error}", file=sys.stderr)
@@ -264,7 +271,3 @@ def _preset(arguments: list[str]) -> str:
         if argument.startswith("--preset="):
             return argument.partition("=")[2]
     return "default"
-
-
-if __name__ == "__main__":
-    sys.exit(main())

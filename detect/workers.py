@@ -5,7 +5,7 @@ Each is a standard executor with its number of frames per task, put together as
 
 Processes are spawned, not forked: compiled kernels, OpenCV and the libraries of linear algebra
 have threads of their own, which no fork survives. They take no notice of an interrupt from the
-keyboard; the process that started them does, and ends them after the task that each is working on.
+keyboard; the process that started them does, and ends them.
 If that process is killed, they end by themselves.
 """
 
@@ -16,10 +16,11 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import CancelledError, Executor, Future, ProcessPoolExecutor
 from contextlib import contextmanager
 from multiprocessing.connection import wait
+from multiprocessing.process import BaseProcess
 from multiprocessing.synchronize import Event, Lock
 from typing import TYPE_CHECKING, ParamSpec, TypeVar
 
@@ -44,6 +45,7 @@ FRAMES_PER_PROCESS = 200
 _LOCAL_CHUNK = 8
 _CLUSTER_CHUNK = 16
 _WINDOW_PER_WORKER = 3
+_GRACE_S = 1.0
 _CLUSTER_PATIENCE_S = 30.0
 _CLUSTER_LOOK_S = 5.0
 
@@ -158,7 +160,22 @@ def _processes(jobs: int, plan: FramePlan) -> Iterator[Executor]:
         yield pool
     finally:
         stop.set()
-        pool.shutdown(wait=True, cancel_futures=True)
+        processes = list((pool._processes or {}).values())
+        pool.shutdown(wait=False, cancel_futures=True)
+        _end(processes)
+        pool.shutdown(wait=True)
+
+
+def _end(processes: Sequence[BaseProcess]) -> None:
+    """Let processes end, and make those that do not: they may still be starting."""
+    running = {process.sentinel: process for process in processes}
+    latest_s = time.monotonic() + _GRACE_S
+    while running and (left_s := latest_s - time.monotonic()) > 0.0:
+        for ended in wait(list(running), left_s):
+            assert isinstance(ended, int)
+            del running[ended]
+    for process in running.values():
+        process.terminate()
 
 
 def _unless_stopped(fn: Callable[P, R], /, *args: P.args, **kwargs: P.kwargs) -> R:
