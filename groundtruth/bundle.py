@@ -139,6 +139,9 @@ def adjust_bundle(
         if np.array_equal(kept, used) and used is not everything:
             break
         used = kept
+        # A body of which nothing is left to be used stays where it is.
+        seen = np.isin(np.arange(len(bundle.free_body)), bundle.seen.body[used])
+        bundle = replace(bundle, free_body=bundle.free_body & seen)
         bundle = _minimised(bundle, used, "linear")
     return _result(bundle, used)
 
@@ -200,8 +203,10 @@ def _minimised(bundle: Bundle, used: BoolArray, loss: str) -> Bundle:
         raise GeometryError(
             f"{len(first)} residuals for {layout.unknowns} unknowns: too little was seen"
         )
-    # Small steps of a robot's joint poses and of its markers differ in size: scaled by columns.
-    for _ in range(3):
+    # The robust pass only has to come near. The other is begun anew where it ended until it stays:
+    # SciPy's tolerances are relative, and steps about zero tell better.
+    robust = loss != "linear"
+    for _ in range(1 if robust else 3):
         found = least_squares(
             lambda x, at=part: _residuals(at, layout, whiten, x),
             zero,
@@ -209,15 +214,15 @@ def _minimised(bundle: Bundle, used: BoolArray, loss: str) -> Bundle:
             x_scale="jac",
             loss=loss,
             f_scale=_ROBUST_SCALE,
-            ftol=1e-14,
-            xtol=1e-12,
+            ftol=1e-7 if robust else 1e-13,
+            xtol=1e-7 if robust else 1e-11,
             gtol=1e-12,
             max_nfev=60,
             tr_solver="lsmr",
-            tr_options={"atol": 1e-14, "btol": 1e-14, "maxiter": 20 * layout.unknowns},
+            tr_options={"atol": 1e-13, "btol": 1e-13, "maxiter": 20 * layout.unknowns},
         )
         part = layout.moved(part, found.x)
-        if np.abs(found.x).max() < 1e-9:
+        if np.abs(found.x).max() < 1e-8:
             break
     return replace(part, seen=bundle.seen, view=bundle.view)
 

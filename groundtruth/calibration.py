@@ -106,7 +106,7 @@ def read_rig(path: str | os.PathLike[str]) -> Rig:
     GroundTruthError
         If the file cannot be read, or an entry is missing or impossible.
     """
-    content = _read_json(path)
+    content = read_json(path)
     dictionary = content.get("dictionary")
     if not isinstance(dictionary, str) or not dictionary:
         raise GroundTruthError(f"{path}: dictionary is {dictionary!r}: expected its name")
@@ -151,7 +151,7 @@ def read_network(path: str | os.PathLike[str]) -> Network:
     GroundTruthError, camera.CameraError
         If a file cannot be read, or an entry is missing or impossible.
     """
-    content = _read_json(path)
+    content = read_json(path)
     cameras = _entries(path, content, "cameras")
     names = tuple(sorted(cameras))
     calibrations = []
@@ -243,7 +243,14 @@ def _pose_entries(pose: FloatArray) -> dict[str, list[float]]:
     }
 
 
-def _read_json(path: str | os.PathLike[str]) -> dict[str, Any]:
+def read_json(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """Read a file that holds a JSON object.
+
+    Raises
+    ------
+    GroundTruthError
+        If it cannot be read or is none.
+    """
     try:
         if Path(path).stat().st_size > _LARGEST_FILE_BYTES:
             raise GroundTruthError(f"{path}: larger than {_LARGEST_FILE_BYTES} bytes")

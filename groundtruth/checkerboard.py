@@ -1,8 +1,8 @@
 """Checkerboards in images: their inner corners, in an order that a turned board cannot change.
 
-A board's frame is like a marker's: x right, y up, z out of the print, origin at the first inner
-corner, which is the top left one when the square beyond it is black. With one even and one odd
-number of corners this is one corner only, whichever way the board is held.
+A board's frame is like a marker's: origin at the middle of its inner corners, x right, y up, z out
+of the print, held so that the square in its top left corner is black. With one even and one odd
+number of corners only one way to hold it is like that.
 """
 
 from __future__ import annotations
@@ -53,9 +53,11 @@ class Checkerboard:
 
     @property
     def points(self) -> FloatArray:
-        """(rows * columns, 3) inner corners in the board's frame, row by row (m)."""
+        """(rows * columns, 3) inner corners in the board's frame, row by row from top left (m)."""
         down, right = np.mgrid[: self.rows, : self.columns].astype(np.float64)
-        flat = np.stack([right, -down, np.zeros_like(right)], axis=-1).reshape(-1, 3)
+        right -= 0.5 * (self.columns - 1)
+        up = 0.5 * (self.rows - 1) - down
+        flat = np.stack([right, up, np.zeros_like(right)], axis=-1).reshape(-1, 3)
         return np.asarray(self.square_m * flat)
 
 

@@ -184,8 +184,8 @@ def _estimated_offset(seen: _Seen, double: DoubleBoard) -> FloatArray:
     axes = np.array([log_se3(motion)[3:] for motion in left]).reshape(-1, 3)
     if len(left) < 2 or np.linalg.svd(axes, compute_uv=False)[1] < 0.05:
         raise GroundTruthError(
-            f"the offset of boards {double.first} and {double.second} cannot be estimated: expected "
-            "3 or more shots of two cameras with the double board turned about different axes"
+            f"the offset of boards {double.first} and {double.second} cannot be estimated: "
+            "expected 3 or more shots of two cameras with the boards turned about different axes"
         )
     return hand_eye(np.stack(left), np.stack(right))
 

@@ -9,7 +9,9 @@ from camera import Camera
 from groundtruth.calibration import Rig
 from groundtruth.chain import ChainPoints, project_chain
 from groundtruth.refinement import Floor, PoseProblem
+from groundtruth.session import MarkerFrame
 from groundtruth.transforms import apply, exp_se3, inverse, planar_transform, transform
+from landmarks import MarkerCorner, MarkerLandmark
 
 FloatArray = NDArray[np.float64]
 
@@ -157,3 +159,48 @@ def robot_pose(generator: np.random.Generator, extent_m: float = 1.0) -> FloatAr
     level = planar_transform(float(x), float(y), float(generator.uniform(-np.pi, np.pi)))
     tilt = np.concatenate([[0, 0, generator.normal(0, 0.01)], generator.normal(0, 0.01, 2), [0]])
     return np.asarray(level @ exp_se3(tilt))
+
+
+def marker_rows(
+    rig: Rig, pairs: list[tuple[int, int]], camera: int, seen: ChainPoints
+) -> tuple[MarkerLandmark, ...]:
+    """The rows that a detector would write for one camera's image."""
+    rows = []
+    for view, (c, m) in enumerate(pairs):
+        if c == camera:
+            four = slice(4 * view, 4 * view + 4)
+            a, b, d, e = (
+                MarkerCorner(
+                    float(u), float(v), float(cov[0, 0]), float(cov[0, 1]), float(cov[1, 1])
+                )
+                for (u, v), cov in zip(seen.pixels[four], seen.covariances[four])
+            )
+            rows.append(MarkerLandmark(rig.dictionary, rig.ids[m], 1.0, (a, b, d, e)))
+    return tuple(rows)
+
+
+def frames_of(
+    times_s: FloatArray,
+    poses: FloatArray,
+    *,
+    cameras: int = 4,
+    rig: Rig | None = None,
+    sigma_px: float = 0.1,
+    seed: int = 1,
+    scale_px: float = 900.0,
+) -> list[MarkerFrame]:
+    """What a detector finds in the images of all cameras while the robot stands at poses."""
+    generator = np.random.default_rng(seed)
+    rig = box_rig() if rig is None else rig
+    lenses = (lens(scale_px),) * cameras
+    world_from_camera = hall_cameras(cameras)
+    frames = []
+    for i, (time_s, pose) in enumerate(zip(times_s, poses)):
+        pairs = visible(lenses, world_from_camera, pose, rig)
+        seen, _ = points_of(
+            pairs, lenses, world_from_camera, pose, rig, sigma_px=sigma_px, noise=generator
+        )
+        for camera in range(cameras):
+            rows = marker_rows(rig, pairs, camera, seen)
+            frames.append(MarkerFrame(camera, f"{i:04d}", float(time_s), rows))
+    return frames
