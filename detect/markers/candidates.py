@@ -31,6 +31,8 @@ _LARGEST_GIVEN_RADIUS_PX = 12.0
 _PLAIN_RADII_PX = (8, 20, 50)
 #: Thresholds below this are applied to a smoothed image.
 _SMOOTH_BELOW = 0.2
+#: With more noise than this it is smoothed more, grey levels.
+_MUCH_NOISE = 2.5
 
 
 @dataclass(frozen=True)
@@ -151,7 +153,8 @@ def dark_masks(layer: Layer, noise: float, settings: MarkerSettings) -> tuple[Ma
         source, least = layer, gate
         if layer.scale == 1 and settings.pyramid and threshold < _SMOOTH_BELOW:
             if smooth is None:
-                grey = np.asarray(cv2.GaussianBlur(layer.grey, (3, 3), 0), np.uint8)
+                window = (5, 5) if noise > _MUCH_NOISE else (3, 3)
+                grey = np.asarray(cv2.GaussianBlur(layer.grey, window, 0), np.uint8)
                 smooth = Layer(1, layer.radius, grey, closing(grey, layer.radius))
             source, least = smooth, 0.5 * gate
         masks.append(

@@ -28,6 +28,8 @@ AMBIGUOUS = "like two patterns"
 NOT_FITTED = "fit of the marker failed"
 UNEXPLAINED = "grey values unexplained"
 WRONG_CELLS = "wrong cells"
+TOO_SMALL = "cells too small for the blur"
+NO_MARKER = "like a pattern that is no marker"
 NO_WHITE = "edges without contrast"
 
 #: Samples of a cell are this far apart, in cells.
@@ -40,6 +42,8 @@ _LEAST_CORRELATION = 0.55
 _LEAST_LOG_ODDS = 15.0
 #: Whiteness of cells is trusted to no better than this.
 _LEAST_CELL_SIGMA = 0.08
+#: Cells that are blurred by more than this (in cells) tell nothing for certain.
+_LARGEST_BLUR_CELLS = 0.65
 
 
 @dataclass(frozen=True)
@@ -153,6 +157,8 @@ def verified_identity(
     -------
     Identity or str
     """
+    if fit.blur_cells > _LARGEST_BLUR_CELLS:
+        return TOO_SMALL
     if fit.explained < settings.least_explained:
         return UNEXPLAINED
     error = np.abs(fit.cells - templates.cells[template])
@@ -164,8 +170,11 @@ def verified_identity(
         return AMBIGUOUS
     if distance > settings.largest_distance:
         return NO_PATTERN
-    if _log_odds(fit, template, templates) < _LEAST_LOG_ODDS:
+    others, decoys = _log_odds(fit, template, templates)
+    if others < _LEAST_LOG_ODDS:
         return AMBIGUOUS
+    if decoys < _LEAST_LOG_ODDS:
+        return NO_MARKER
     return Identity(best, distance, margin)
 
 
@@ -182,11 +191,21 @@ def _nearest(whiteness: FloatArray, templates: Templates) -> tuple[int, float, f
     return best, distance, float(others.min() - squared[best])
 
 
-def _log_odds(fit: PatternFit, template: int, templates: Templates) -> float:
-    """Log-odds of a template against the likeliest other one, given the cells' precision."""
-    sigma = np.hypot(fit.cell_sigma, _LEAST_CELL_SIGMA)
-    gain = (1.0 - 2.0 * fit.cells) / (2.0 * sigma**2)
-    cost = templates.cells @ gain.astype(np.float32)
+def _log_odds(fit: PatternFit, template: int, templates: Templates) -> tuple[float, float]:
+    """Log-odds of a template against the likeliest other one and the likeliest decoy.
+
+    Given the cells' precision, as if each cell were seen apart from its neighbours; where blur
+    mixes them they are known less well than that.
+    """
+    mixing = 1.0 + 4.0 * float(np.exp(-0.25 / fit.blur_cells**2))
+    sigma = np.hypot(mixing * fit.cell_sigma, _LEAST_CELL_SIGMA)
+    gain = ((1.0 - 2.0 * fit.cells) / (2.0 * sigma**2)).astype(np.float32)
+    cost = templates.cells @ gain
     own = float(cost[template])
-    cost = np.delete(cost, template)
-    return float(cost.min()) - own if len(cost) else float("inf")
+    others = np.delete(cost, template)
+    decoys = templates.decoys @ gain
+    infinite = float("inf")
+    return (
+        float(others.min()) - own if len(others) else infinite,
+        float(decoys.min()) - own if len(decoys) else infinite,
+    )

@@ -59,6 +59,8 @@ class PatternFit:
         White less black, grey levels.
     blur_px : float
         Mean standard deviation of the blur.
+    blur_cells : float
+        Standard deviation of the blur along the marker's axes, the greater, in cells.
     inflation : float
         By how much the covariance was increased for rests alike at neighbouring pixels.
     """
@@ -73,6 +75,7 @@ class PatternFit:
     agree: float
     contrast: float
     blur_px: float
+    blur_cells: float
     inflation: float
 
 
@@ -153,8 +156,21 @@ def fit_marker(
         agree=float(numbers[kernels.AGREE]),
         contrast=float(numbers[kernels.CONTRAST]),
         blur_px=float(np.sqrt(0.5 * (numbers[kernels.BLUR_UU] + numbers[kernels.BLUR_VV]))),
+        blur_cells=_blur_along_axes(fitted, numbers) / templates.dictionary.cell,
         inflation=float(numbers[kernels.INFLATION]),
     )
+
+
+def _blur_along_axes(corners: FloatArray, numbers: FloatArray) -> float:
+    """Standard deviation of the blur in the marker's middle, along its axes, in its widths."""
+    h = square_homography(corners)
+    w = 0.5 * (h[2, 0] + h[2, 1]) + 1.0
+    middle = (0.5 * (h[:2, 0] + h[:2, 1]) + h[:2, 2]) / w
+    px_per_width = (h[:2, :2] - np.outer(middle, h[2, :2])) / w
+    widths_per_px = np.linalg.inv(px_per_width)
+    uu, uv, vv = numbers[[kernels.BLUR_UU, kernels.BLUR_UV, kernels.BLUR_VV]]
+    blur = widths_per_px @ np.array([[uu, uv], [uv, vv]]) @ widths_per_px.T
+    return float(np.sqrt(np.diag(blur).max()))
 
 
 def _least_side(corners: FloatArray) -> float:

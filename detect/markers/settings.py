@@ -81,7 +81,7 @@ class MarkerSettings:
     dictionary: str = "rawseeds"
     ids: tuple[int, ...] = ()
     width_px: float = 0.0
-    thresholds: tuple[float, ...] = (0.5, 0.25, 0.12, 0.06)
+    thresholds: tuple[float, ...] = (0.5, 0.25, 0.12, 0.06, 0.03)
     darkness: Darkness = "ratio"
     disc_widths: float = 0.5
     pyramid: bool = True

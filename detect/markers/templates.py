@@ -26,6 +26,8 @@ class Templates:
         The markers.
     cells : (T, G * G) float32
         1 for white; T is four times the number of markers.
+    decoys : (D, G * G) float32
+        What other things show that are framed in black: nothing, or a bar, or a half.
     marker : (T,) int64
         Index of the marker in the dictionary.
     turns : (T,) int64
@@ -45,6 +47,7 @@ class Templates:
 
     dictionary: MarkerDictionary
     cells: NDArray[np.float32]
+    decoys: NDArray[np.float32]
     marker: NDArray[np.int64]
     turns: NDArray[np.int64]
     blurred: tuple[NDArray[np.float32], ...]
@@ -106,6 +109,7 @@ def templates_of(name: str, ids: tuple[int, ...]) -> Templates:
     return Templates(
         dictionary=dictionary,
         cells=np.ascontiguousarray(patterns.reshape(len(patterns), -1)),
+        decoys=_decoys(dictionary),
         marker=np.tile(np.arange(count, dtype=np.int64), 4),
         turns=np.repeat(np.arange(4, dtype=np.int64), count),
         blurred=tuple(
@@ -143,6 +147,39 @@ def _normalised(patterns: NDArray[np.float32]) -> NDArray[np.float32]:
     centred = flat - flat.mean(axis=1, keepdims=True)
     length = np.linalg.norm(centred, axis=1, keepdims=True)
     return np.ascontiguousarray(centred / np.maximum(length, 1e-6), dtype=np.float32)
+
+
+def _decoys(dictionary: MarkerDictionary) -> NDArray[np.float32]:
+    """Patterns of frames, bars, panes: all that differ from the markers' by two cells or more."""
+    varied = np.asarray(dictionary.patterns.any(axis=0))
+    rows, columns = np.flatnonzero(varied.any(axis=1)), np.flatnonzero(varied.any(axis=0))
+    top, left, height, width = rows[0], columns[0], len(rows), len(columns)
+    inner = [np.zeros((height, width), bool), np.ones((height, width), bool)]
+    for begin in range(width):
+        for end in range(begin + 1, width + 1):
+            bar = np.zeros((height, width), bool)
+            bar[:, begin:end] = True
+            inner += [bar, ~bar]
+    for begin in range(height):
+        for end in range(begin + 1, height + 1):
+            bar = np.zeros((height, width), bool)
+            bar[begin:end] = True
+            inner += [bar, ~bar]
+    j, i = np.indices((height, width))
+    for thick in range(1, max(2, width // 2)):
+        for shift in range(thick):
+            column, row = (i + shift) // thick % 2 == 0, (j + shift) // thick % 2 == 0
+            inner += [column, ~column, row, ~row, column ^ row, column == row]
+            inner += [column | row, column & row, ~(column | row), ~(column & row)]
+    side = dictionary.patterns.shape[-1]
+    decoys = np.zeros((len(inner), side, side), np.float32)
+    for k, pattern in enumerate(inner):
+        decoys[k, top : top + height, left : left + width] = pattern
+    flat = np.unique(decoys.reshape(len(decoys), -1), axis=0)
+    known = np.concatenate([np.rot90(dictionary.patterns, turn, axes=(1, 2)) for turn in range(4)])
+    known = known.reshape(len(known), -1).astype(np.float32)
+    apart = flat.sum(axis=1)[:, None] + known.sum(axis=1)[None] - 2.0 * flat @ known.T
+    return np.ascontiguousarray(flat[apart.min(axis=1) >= 2.0])
 
 
 def _border(dictionary: MarkerDictionary, first_edge: float) -> float:
