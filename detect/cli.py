@@ -21,6 +21,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg, subcommand
 
 from detect.compare_result import CompareOptions
 from detect.errors import WorkerError
+from detect.interrupts import interrupts_noted
 from detect.line_settings import PRESETS as LINE_PRESETS
 from detect.line_settings import LineSettings
 from detect.settings import PUBLISHED, CircleSettings
@@ -218,22 +219,28 @@ class Compare:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
-    try:
-        command = _parsed(sys.argv[1:] if arguments is None else arguments)
-        from detect.commands import carry_out
+    with interrupts_noted() as interrupted:
+        try:
+            command = _parsed(sys.argv[1:] if arguments is None else arguments)
+            from detect.commands import carry_out
 
-        return carry_out(command)
-    except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr, flush=True)
-        if arguments is None:
-            # Left to itself, Python dies of an interrupt that passed through an `exec` of some
-            # library's, although it was caught here.
-            atexit._run_exitfuncs()
-            os._exit(EXIT_INTERRUPTED)
-        return EXIT_INTERRUPTED
-    except (ValueError, OSError, WorkerError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return EXIT_ERROR
+            return carry_out(command)
+        except KeyboardInterrupt:
+            pass
+        except (ValueError, OSError, WorkerError) as error:
+            if not interrupted.is_set():
+                print(f"error: {error}", file=sys.stderr)
+                return EXIT_ERROR
+        except BaseException:
+            if not interrupted.is_set():
+                raise
+    print("interrupted", file=sys.stderr, flush=True)
+    if arguments is None:
+        # Left to itself, Python dies of an interrupt that passed through an `exec` of some
+        # library's, although it was caught here.
+        atexit._run_exitfuncs()
+        os._exit(EXIT_INTERRUPTED)
+    return EXIT_INTERRUPTED
 
 
 def _parsed(given: list[str]) -> Circles | Lines | All | Compare:

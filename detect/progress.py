@@ -6,6 +6,8 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
+from detect.interrupts import raise_if_interrupted
+
 _SHOWN_FAILURES = 10
 
 
@@ -13,10 +15,12 @@ _SHOWN_FAILURES = 10
 def progress_bar(label: str, total: int) -> Iterator[Callable[[], None]]:
     """A progress bar with the rate, on a terminal; yields what to call after every frame.
 
+    Calling it raises an interrupt that got lost (see `detect.interrupts`).
+
     It appears with the first frame: until then, workers may have something to say.
     """
     if not sys.stderr.isatty():
-        yield lambda: None
+        yield raise_if_interrupted
         return
     from rich.console import Console
     from rich.progress import (
@@ -40,6 +44,7 @@ def progress_bar(label: str, total: int) -> Iterator[Callable[[], None]]:
     task = progress.add_task(label, total=total, rate="")
 
     def advance() -> None:
+        raise_if_interrupted()
         progress.start()  # nothing happens if it has
         progress.advance(task)
         speed = progress.tasks[0].finished_speed or progress.tasks[0].speed

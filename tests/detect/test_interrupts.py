@@ -1,0 +1,67 @@
+"""Interrupts: also those that were swallowed or came out as something else."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+from pathlib import Path
+
+import pytest
+
+from detect import commands
+from detect.cli import main
+from detect.progress import progress_bar
+
+
+@pytest.mark.parametrize("other", [SystemError, ValueError, OSError])
+def test_what_an_interrupt_turned_into(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    other: type[Exception],
+) -> None:
+    def disguise(_: object) -> int:
+        try:
+            signal.raise_signal(signal.SIGINT)
+        except KeyboardInterrupt:
+            raise other("with an exception set") from None
+        return 0
+
+    monkeypatch.setattr(commands, "carry_out", disguise)
+    before = signal.getsignal(signal.SIGINT)
+    assert main(["compare", str(tmp_path)]) == 130
+    assert capsys.readouterr().err == "interrupted\n"
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_a_swallowed_interrupt_comes_back_after_the_frame(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    frames = []
+
+    def swallow(_: object) -> int:
+        with progress_bar("frames", 5) as advance:
+            for frame in range(5):
+                frames.append(frame)
+                if frame == 2:
+                    with contextlib.suppress(KeyboardInterrupt):
+                        signal.raise_signal(signal.SIGINT)
+                advance()
+        return 0
+
+    monkeypatch.setattr(commands, "carry_out", swallow)
+    assert main(["compare", str(tmp_path)]) == 130
+    assert frames == [0, 1, 2]
+    assert main(["compare", str(tmp_path)]) == 130  # the note of one run is none of the next
+    assert frames == [0, 1, 2, 0, 1, 2]
+
+
+def test_an_error_of_the_program_is_no_interrupt(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def slip(_: object) -> int:
+        raise SystemError("a slip")
+
+    monkeypatch.setattr(commands, "carry_out", slip)
+    with pytest.raises(SystemError, match="a slip"):
+        main(["compare", str(tmp_path)])
