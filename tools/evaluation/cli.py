@@ -18,6 +18,8 @@ from detect.line_settings import PRESETS as LINE_PRESETS
 from detect.line_settings import LineSettings
 from detect.settings import CircleSettings
 from landmarks import FrameTilt
+from tools.evaluation.markers_command import Markers, MarkersCommand
+from tools.evaluation.markers_command import perform as evaluate_markers
 
 _BLURS_PX = (0.3, 0.7, 1.2)
 _BINS_M = ((0.0, 1.5), (1.5, 2.5), (2.5, 4.0), (4.0, 7.0))
@@ -130,11 +132,14 @@ def main(arguments: list[str] | None = None) -> int:
         | Annotated[Rendered, subcommand("rendered")]
         | Annotated[Buildings, subcommand("buildings")]
         | Annotated[RenderedLines, subcommand("rendered-lines")]
-        | Annotated[Tilt, subcommand("tilt")],
+        | Annotated[Tilt, subcommand("tilt")]
+        | MarkersCommand,
         prog="python -m tools.evaluation",
         description="Prints the figures in the README.",
         args=arguments,
     )
+    if isinstance(command, Markers):
+        return evaluate_markers(command)
     if isinstance(command, Accuracy):
         return _accuracy(command)
     if isinstance(command, Photographs):

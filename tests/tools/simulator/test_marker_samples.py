@@ -13,9 +13,11 @@ import pytest
 from camera import read_camera
 from detect.markers.dictionaries import marker_dictionary
 from tools.simulator.cli import main
-from tools.simulator.markers.clutter import THINGS, near_marker
+from tools.simulator.markers.clutter import THINGS, near_marker, thing
+from tools.simulator.markers.prints import marker_texture, texture_distance
 from tools.simulator.markers.sample_files import sample_frames
 from tools.simulator.markers.sampling import SampleSettings, sample_cameras, sample_frame
+from tools.simulator.markers.surface import Texture
 from tools.simulator.markers.truth import marker_corners, mean_side_px, slant_deg
 
 SETTINGS = SampleSettings(width=320, height=240, width_px=(12.0, 90.0))
@@ -64,29 +66,32 @@ def test_truth_is_what_was_asked_for() -> None:
         assert 0.75 * high < value.max() <= high
 
 
-def test_contrast_is_the_one_in_the_image() -> None:
+@pytest.mark.parametrize("uneven", [0.0, 1.0])
+def test_contrast_is_the_one_in_the_image(uneven: float) -> None:
     """Black border against white rim, without noise and as sharp as can be."""
     settings = replace(
         SETTINGS, blur_px=(0.3, 0.31), noise_grey=(0.0, 0.0), width_px=(60.0, 90.0), empty=0.0,
-        slant_deg=(0.0, 30.0), occluded=0.0, cut=0.0, motion=0.0, markers=(1, 1),
+        slant_deg=(0.0, 30.0), occluded=0.0, cut=0.0, motion=0.0, markers=(1, 1), uneven=uneven,
+        things=(0, 0), cameras="pinhole",
     )  # fmt: skip
-    checked = 0
-    for index in range(12):
+    ratios = []
+    for index in range(14):
         frame = sample_frame(settings, 9, index)
         for marker in frame.markers:
-            if not marker.clear:
-                continue
-            # On the diagonal just inside and outside of each corner.
+            # In the middle of each side, just inside and outside of it.
             middle = marker.corners.mean(axis=0)
+            sides = 0.5 * (marker.corners + np.roll(marker.corners, 1, axis=0))
             means = []
             for factor in (0.86, 1.09):
-                u, v = np.rint(middle + factor * (marker.corners - middle)).astype(int).T
-                inside = (u >= 0) & (u < 320) & (v >= 0) & (v < 240)
-                means.append(frame.image[v[inside], u[inside]].astype(float).mean())
-            # Uneven light differs from corner to corner.
-            assert means[1] - means[0] == pytest.approx(marker.contrast_grey, rel=0.2, abs=3.0)
-            checked += 1
-    assert checked >= 8
+                u, v = np.rint(middle + factor * (sides - middle)).astype(int).T
+                means.append(frame.image[v, u].astype(float).mean())
+            ratios.append((means[1] - means[0]) / marker.contrast_grey)
+    assert len(ratios) >= 10
+    if uneven:
+        # The light differs from side to side.
+        assert np.median(ratios) == pytest.approx(1.0, abs=0.08)
+    else:
+        np.testing.assert_allclose(ratios, 1.0, atol=0.06)
 
 
 def test_motion_blurs_along_its_way_and_keeps_the_middle() -> None:
@@ -120,13 +125,28 @@ def test_pinhole_and_distorted_cameras_can_be_asked_for() -> None:
 
 def test_things_are_textures() -> None:
     rng = np.random.default_rng(0)
-    for thing in THINGS:
+    for kind in THINGS:
         for _ in range(5):
-            values = thing(rng).values
+            values = kind(rng).values
             assert values.dtype == np.float32
             assert values.ndim == 2
             assert 0.0 <= values.min() < values.max() < 1.3
     assert near_marker(rng, marker_dictionary("4x4_50")).values.shape[0] >= 8
+
+
+def test_things_are_no_markers_even_by_chance() -> None:
+    """A black square with one hole of two cells is marker 17 of 4x4_50."""
+    rng = np.random.default_rng(0)
+    for name in ("4x4_50", "rawseeds", "apriltag_16h5"):
+        dictionary = marker_dictionary(name)
+        for number in (0, 17):
+            printed = marker_texture(dictionary, number)
+            assert texture_distance(dictionary, printed) == pytest.approx(0.0, abs=1e-6)
+            turned = Texture(np.rot90(printed.values, 1))
+            assert texture_distance(dictionary, turned) == pytest.approx(0.0, abs=1e-6)
+        for _ in range(40):
+            _, texture = thing(rng, dictionary)
+            assert texture_distance(dictionary, texture) >= 3.0
 
 
 def test_photographs_become_backgrounds(tmp_path: Path) -> None:

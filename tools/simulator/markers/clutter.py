@@ -9,10 +9,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from detect.markers.dictionaries import MarkerDictionary
-from tools.simulator.markers.prints import BLACK, WHITE, near_pattern, pattern_texture
+from tools.simulator.markers.prints import (
+    BLACK,
+    LEAST_DIFFERENCE,
+    WHITE,
+    near_pattern,
+    pattern_texture,
+    texture_distance,
+)
 from tools.simulator.markers.surface import Texture
 
 Grey = NDArray[np.float32]
+
+_TRIES = 32
 
 
 def checkerboard(columns: int, rows: int, black: float = BLACK, white: float = WHITE) -> Texture:
@@ -165,6 +174,16 @@ def board(rng: np.random.Generator) -> Texture:
 THINGS: tuple[Callable[[np.random.Generator], Texture], ...] = (
     window, text, poster, barcode, matrix_code, frames_in_frames, hole_grid, board,
 )  # fmt: skip
+
+
+def thing(rng: np.random.Generator, dictionary: MarkerDictionary) -> tuple[str, Texture]:
+    """One of `THINGS` that is no marker of a dictionary even by chance: its name and texture."""
+    for _ in range(_TRIES):
+        kind = THINGS[rng.integers(len(THINGS))]
+        texture = kind(rng)
+        if texture_distance(dictionary, texture) >= LEAST_DIFFERENCE:
+            return kind.__name__, texture
+    return text.__name__, text(rng)
 
 
 def blotches(rng: np.random.Generator, shape: tuple[int, int], octaves: int = 4) -> Grey:

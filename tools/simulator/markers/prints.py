@@ -11,10 +11,12 @@ from tools.simulator.markers.surface import FloatArray, Surface, Texture
 #: Reflectance of printer's black and of paper.
 BLACK, WHITE = 0.05, 0.88
 
-#: A pattern is in no dictionary if it differs from every marker in more cells than can be put right
-#: for sure, and in at least so many.
-_LEAST_DIFFERENCE = 3
+#: What differs in fewer cells from a marker could rightly be taken for it.
+LEAST_DIFFERENCE = 3
 _TRIES = 64
+
+# Points along a cell by which a texture is looked at, and again for what is between them.
+_FINE = 4
 
 
 def marker_texture(
@@ -122,6 +124,41 @@ def pattern_distance(dictionary: MarkerDictionary, pattern: NDArray[np.bool_]) -
     return int(min(np.count_nonzero(known != t, axis=1).min() for t in turned))
 
 
+def texture_distance(dictionary: MarkerDictionary, texture: Texture) -> float:
+    """In how many cells a dark thing on a light ground differs from the nearest marker.
+
+    Parameters
+    ----------
+    dictionary : MarkerDictionary
+        The set.
+    texture : Texture
+        The thing with its light rim, if it has one.
+
+    Returns
+    -------
+    float
+        Sum over the sampled grid of the difference in whiteness, each cell taken as a whole;
+        infinite for smooth textures and those that are all light.
+    """
+    import cv2
+
+    dark = texture.values < 0.5 * (BLACK + WHITE)
+    if texture.smooth or not dark.any():
+        return float("inf")
+    rows, columns = np.flatnonzero(dark.any(axis=1)), np.flatnonzero(dark.any(axis=0))
+    square = ~dark[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    units = round(1.0 / dictionary.cell) * _FINE
+    fine = cv2.resize(
+        square.astype(np.float32), (units * _FINE, units * _FINE), interpolation=cv2.INTER_NEAREST
+    )
+    half = 0.5 * dictionary.cell
+    limits = np.rint((dictionary.centres[:, None] + [-half, half]) * len(fine)).astype(int)
+    cells = np.array([[fine[a:b, c:d].mean() for c, d in limits] for a, b in limits])
+    known = dictionary.patterns.reshape(len(dictionary), -1)
+    turned = (np.rot90(cells, k).ravel() for k in range(4))
+    return float(min(np.abs(known - t).sum(axis=1).min() for t in turned))
+
+
 def near_pattern(
     dictionary: MarkerDictionary, rng: np.random.Generator
 ) -> tuple[NDArray[np.bool_], int]:
@@ -158,7 +195,7 @@ def near_pattern(
         distance = pattern_distance(dictionary, pattern)
         if best is None or distance > best[1]:
             best = pattern, distance
-        if distance >= _LEAST_DIFFERENCE:
+        if distance >= LEAST_DIFFERENCE:
             break
     if best is None:
         raise RuntimeError("no pattern was tried")

@@ -10,9 +10,9 @@ from dataclasses import replace
 import numpy as np
 
 from camera import Camera
-from detect.markers.dictionaries import marker_dictionary
+from detect.markers.dictionaries import MarkerDictionary, marker_dictionary
 from groundtruth.transforms import planar_transform, transform
-from tools.simulator.markers.clutter import THINGS, blotches, near_marker
+from tools.simulator.markers.clutter import blotches, near_marker, thing
 from tools.simulator.markers.robot import facing_pose
 from tools.simulator.markers.surface import (
     FloatArray,
@@ -100,6 +100,7 @@ def room_surfaces(
     dictionary : str
         Set of markers to which some pictures come near.
     """
+    known = marker_dictionary(dictionary)
     low = np.full(2, -_MARGIN_M)
     high = np.array(area_m) + _MARGIN_M
     middle, size = 0.5 * (low + high), high - low
@@ -115,8 +116,8 @@ def room_surfaces(
         paint = 0.62 + 0.12 * (blotches(rng, (64, 192)) - np.float32(0.5))
         paint[-3:] = 0.2
         surfaces.append(Surface(wall, across, _HEIGHT_M, Texture(paint, smooth=True)))
-        surfaces += _on_the_wall(rng, wall, across, dictionary)
-        surfaces += _before_the_wall(rng, wall, across)
+        surfaces += _on_the_wall(rng, wall, across, known)
+        surfaces += _before_the_wall(rng, wall, across, known)
     return surfaces
 
 
@@ -168,15 +169,15 @@ def _floor(rng: np.random.Generator, size: FloatArray) -> Texture:
 
 
 def _on_the_wall(
-    rng: np.random.Generator, wall: FloatArray, across: float, dictionary: str
+    rng: np.random.Generator, wall: FloatArray, across: float, known: MarkerDictionary
 ) -> list[Surface]:
     result = []
     x = -0.5 * across + 0.4
     while x < 0.5 * across - 0.6:
         if rng.random() < 0.3:
-            texture = near_marker(rng, marker_dictionary(dictionary))
+            texture = near_marker(rng, known)
         else:
-            texture = THINGS[rng.integers(len(THINGS))](rng)
+            _, texture = thing(rng, known)
         rows, columns = texture.values.shape
         width = rng.uniform(0.25, 1.1)
         height = width * rows / columns
@@ -189,7 +190,9 @@ def _on_the_wall(
     return result
 
 
-def _before_the_wall(rng: np.random.Generator, wall: FloatArray, across: float) -> list[Surface]:
+def _before_the_wall(
+    rng: np.random.Generator, wall: FloatArray, across: float, known: MarkerDictionary
+) -> list[Surface]:
     """Cupboards, boxes and shelves."""
     result: list[Surface] = []
     x = -0.5 * across + rng.uniform(0.2, 0.8)
@@ -201,7 +204,7 @@ def _before_the_wall(rng: np.random.Generator, wall: FloatArray, across: float) 
             for side in ("front", "left", "right", "top")
         }
         if rng.random() < 0.5:
-            textures["front"] = THINGS[rng.integers(len(THINGS))](rng)
+            _, textures["front"] = thing(rng, known)
         # The wall's x is the box's y, its z the box's x.
         wall_from_box = np.eye(4)
         wall_from_box[:3, :3] = [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]

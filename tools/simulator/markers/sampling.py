@@ -17,7 +17,7 @@ from tools.simulator.markers.backgrounds import (
     photograph_files,
     shapes_background,
 )
-from tools.simulator.markers.clutter import THINGS, near_marker
+from tools.simulator.markers.clutter import near_marker, thing
 from tools.simulator.markers.imaging import Imaging, grey_image, uneven_light
 from tools.simulator.markers.placing import Placed, backing_box, place, random_pose
 from tools.simulator.markers.prints import BLACK, WHITE, marker_surface
@@ -214,8 +214,10 @@ class _Scene:
         width_px = _log_uniform(rng, (16.0, 260.0))
         placed = place(rng, self.camera, self.taken, width_px, inside=rng.random() < 0.6)
         near = rng.random() < settings.near
-        kind = THINGS[rng.integers(len(THINGS))]
-        texture = near_marker(rng, self.dictionary) if near else kind(rng)
+        if near:
+            name, texture = "near_marker", near_marker(rng, self.dictionary)
+        else:
+            name, texture = thing(rng, self.dictionary)
         slant = rng.uniform(0.0, 70.0)
         width_m = rng.uniform(0.1, 1.5)
         boxed = rng.random() < settings.boxed
@@ -226,7 +228,7 @@ class _Scene:
         surface = Surface(pose, width_m, width_m * rows / columns, texture, 0.4)
         self.taken.append(placed)
         self.surfaces.append(surface)
-        self.things.append("near_marker" if near else kind.__name__)
+        self.things.append(name)
         if boxed:
             self.surfaces += backing_box(rng, surface)
 

@@ -1,0 +1,186 @@
+"""The evaluation of markers counts and measures what it says it does."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from tools.evaluation.cli import main
+from tools.evaluation.markers import offences, score_frames, search_photographs
+from tools.evaluation.markers_detectors import OURS, PEERS, Found, detector_of, known_to_opencv
+from tools.evaluation.markers_report import bins_lines, counts_lines, statistics_picture
+from tools.evaluation.markers_scoring import (
+    COLUMNS,
+    FOUND,
+    MISIDENTIFIED,
+    MISSED,
+    Outcome,
+    ScoredFrame,
+    score_frame,
+    table_of,
+)
+from tools.evaluation.markers_statistics import BINS, binned, bins_json
+from tools.simulator.markers.sampling import SampleSettings, sample_frame
+from tools.simulator.markers.truth import MarkerTruth
+
+SQUARE = np.array([[0.0, 0.0], [40.0, 0.0], [40.0, 40.0], [0.0, 40.0]])
+
+
+def _marker(number: int, corners: np.ndarray) -> MarkerTruth:
+    return MarkerTruth("4x4_50", number, corners, np.eye(4), 0.2, 40.0, 10.0, 100.0, 1.0, 1.0)
+
+
+def test_every_kind_of_detection_is_told_apart() -> None:
+    markers = [_marker(k, SQUARE + np.array([60.0 * k, 0.0])) for k in range(4)]
+    found = Found(
+        np.array([0, 7, 2, 9, 0]),
+        np.stack(
+            [
+                markers[0].corners + np.array([0.3, -0.4]),  # right
+                markers[1].corners,  # another number
+                np.roll(markers[2].corners, 1, axis=0),  # turned
+                SQUARE + 500.0,  # nothing there
+                markers[0].corners + 1.0,  # once more
+            ]
+        ),
+        np.tile(0.25 * np.eye(2), (5, 4, 1, 1)),
+    )
+    outcome = score_frame(markers, found)
+    assert outcome.status.tolist() == [FOUND, MISIDENTIFIED, MISIDENTIFIED, MISSED]
+    np.testing.assert_allclose(outcome.errors_px[0], np.tile([0.3, -0.4], (4, 1)))
+    assert np.isnan(outcome.errors_px[1:]).all()
+    np.testing.assert_allclose(outcome.normalised[0], 0.25 / 0.25 / 2.0)
+    assert outcome.false == (9,)
+    assert outcome.repeated == 1
+
+
+def test_a_cell_inside_a_marker_is_not_the_marker() -> None:
+    inside = Found(np.array([0]), 0.3 * SQUARE[None] + 10.0)
+    outcome = score_frame([_marker(0, SQUARE)], inside)
+    assert outcome.status.tolist() == [MISSED]
+    assert outcome.false == (0,)
+
+
+def _scored(
+    widths: np.ndarray, errors: dict[str, float], found: dict[str, np.ndarray]
+) -> list[ScoredFrame]:
+    """One frame with markers of given widths, each detector off by a given distance."""
+    rows = np.column_stack(
+        [widths, *(np.full(len(widths), x) for x in (10.0, 1.0, 90.0, 2.0, 0.0)),
+         np.ones(len(widths))]
+    )  # fmt: skip
+    assert rows.shape[1] == len(COLUMNS)
+    outcomes = {}
+    for name, error in errors.items():
+        status = np.where(found[name], FOUND, MISSED)
+        off = np.where(found[name][:, None, None], [error, 0.0], np.nan) * np.ones((1, 4, 1))
+        outcomes[name] = Outcome(status, off, off[..., 0] ** 2, (), 0)
+    return [ScoredFrame(1, 0, "4x4_50", rows, (), outcomes)]
+
+
+def test_bins_compare_like_with_like() -> None:
+    widths = np.concatenate([np.full(10, 30.0), np.full(10, 150.0)])
+    every = np.ones(20, bool)
+    large = widths > 100.0
+    table = table_of(_scored(widths, {OURS: 0.1, "aruco": 0.3}, {OURS: every, "aruco": large}))
+    bins = binned(table)
+    assert bins[0].quantity == ""
+    assert bins[0].own[OURS].rate == 1.0
+    assert bins[0].own["aruco"].rate == 0.5
+    assert bins[0].own[OURS].median_px == pytest.approx(0.1)
+    ours, peer = bins[0].shared["aruco"]
+    assert (ours.found, peer.found) == (10, 10)
+    assert (ours.median_px, peer.median_px) == pytest.approx((0.1, 0.3))
+    assert bins[0].ahead_in_error
+    assert bins[0].ahead_in_rate
+    by_width = {b.low: b for b in bins if b.quantity == "width_px"}
+    assert by_width[28].own["aruco"].found == 0
+    assert by_width[28].ahead_in_error is None
+    assert by_width[130].own[OURS].markers == 10
+    behind = binned(
+        table_of(_scored(widths, {OURS: 0.4, "aruco": 0.3}, {OURS: large, "aruco": every}))
+    )
+    assert behind[0].ahead_in_error is False
+    assert not behind[0].ahead_in_rate
+    text = "\n".join(bins_lines(behind))
+    assert "BEHIND" in text
+    json.dumps(bins_json(bins), allow_nan=False)
+
+
+def test_every_marker_is_in_one_bin_of_each_quantity() -> None:
+    frames = score_frames(SampleSettings(samples=4), (OURS,), frames=4, seed=2)
+    table = table_of(frames)
+    bins = binned(table)
+    clear = table.columns["clear"] > 0.0
+    for quantity, limits in BINS.items():
+        values = table.columns[quantity][clear]
+        inside = np.count_nonzero((values >= limits[0]) & (values <= limits[-1]))
+        assert sum(b.own[OURS].markers for b in bins if b.quantity == quantity) == inside
+    assert statistics_picture(bins, "a title") == statistics_picture(bins, "a title")
+    assert counts_lines(table)[0].startswith("4 frames")
+
+
+def test_opencv_is_measured_as_it_is() -> None:
+    settings = SampleSettings(
+        dictionaries=("4x4_50",), empty=0.0, contrast_grey=(120.0, 200.0), blur_px=(0.5, 1.0),
+        width_px=(60.0, 100.0), motion=0.0, occluded=0.0, cut=0.0, slant_deg=(0.0, 40.0),
+    )  # fmt: skip
+    table = table_of(score_frames(settings, PEERS, frames=6, seed=3))
+    offsets = {}
+    for name in PEERS:
+        found = table.status[name] == FOUND
+        assert found.mean() > 0.7
+        offsets[name] = np.median(table.errors_px[name][found], axis=(0, 1))
+    # The AprilTag code's zero is half a pixel off.
+    np.testing.assert_allclose(offsets["aruco apriltag"], 0.5, atol=0.15)
+    np.testing.assert_allclose(offsets["apriltag - 0.5"], 0.0, atol=0.15)
+    np.testing.assert_allclose(offsets["aruco subpix"], 0.0, atol=0.15)
+    assert known_to_opencv("4x4_50")
+    assert not known_to_opencv("rawseeds")
+    with pytest.raises(ValueError, match="no such detector"):
+        detector_of("another")
+
+
+def test_offences_name_the_frame() -> None:
+    outcome = Outcome(
+        np.array([MISIDENTIFIED]), np.full((1, 4, 2), np.nan), np.full((1, 4), np.nan), (5,), 0
+    )
+    frame = ScoredFrame(3, 17, "rawseeds", np.ones((1, 7)), (), {OURS: outcome})
+    places = [offence.place for offence in offences([frame])]
+    assert len(places) == 2
+    assert all("seed 3 frame 17 rawseeds" in place for place in places)
+
+
+def test_photographs_are_searched(tmp_path: Path) -> None:
+    (tmp_path / "sub").mkdir()
+    settings = SampleSettings(
+        dictionaries=("4x4_50",), markers=(1, 1), empty=0.0, things=(0, 0), cameras="pinhole",
+        contrast_grey=(150.0, 150.0), blur_px=(0.6, 0.7), width_px=(80.0, 100.0), uneven=0.0,
+        occluded=0.0, cut=0.0, motion=0.0, slant_deg=(0.0, 20.0),
+    )  # fmt: skip
+    frame = sample_frame(settings, 1, 0)
+    cv2.imwrite(str(tmp_path / "sub" / "with.png"), frame.image)
+    cv2.imwrite(str(tmp_path / "without.png"), np.full((120, 160), 90, np.uint8))
+    count, found = search_photographs([tmp_path], ("aruco",), ("4x4_50",))
+    assert count == 2
+    assert [o.place for o in found] == [f"with.png 4x4_50 id {frame.markers[0].id}"]
+    with pytest.raises(ValueError, match="holds no photographs"):
+        search_photographs([tmp_path / "none"], ("aruco",), ("4x4_50",))
+
+
+@pytest.mark.long
+def test_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["markers", "--statistics", "4", "--no-spot", "--frames", "3", "--output",
+                 str(tmp_path / "out"), "--dictionary", "4x4_50"]  # fmt: skip
+    assert main(arguments) in (0, 1)
+    assert "clearly in view" in capsys.readouterr().out
+    content = json.loads((tmp_path / "out" / "markers.json").read_text())
+    assert content["search"]["frames"] == 3
+    assert len(content["statistics"]["bins"]) == 1 + sum(len(b) - 1 for b in BINS.values())
+    assert (tmp_path / "out" / "statistics.png").read_bytes().startswith(b"\x89PNG")
+    assert main(arguments) == 1
+    assert "exists already" in capsys.readouterr().err
