@@ -38,6 +38,13 @@ EXIT_ERROR = 1
 EXIT_FRAMES_FAILED = 3
 EXIT_INTERRUPTED = 130
 
+# Numba's words where neither the program's folder nor the user's cache can be written to.
+_NO_KERNEL_CACHE = "no locator available"
+_WHERE_KERNELS_GO = (
+    "compiled kernels cannot be kept, neither beside the program nor in the user's cache folder: "
+    "name a folder for them by the environment variable NUMBA_CACHE_DIR"
+)
+
 _CIRCLE_PRESETS = {"default": CircleSettings(), "published": PUBLISHED}
 
 
@@ -231,8 +238,11 @@ def main(arguments: list[str] | None = None) -> int:
             if not interrupted.is_set():
                 print(f"error: {error}", file=sys.stderr)
                 return EXIT_ERROR
-        except BaseException:
+        except BaseException as error:
             if not interrupted.is_set():
+                if _NO_KERNEL_CACHE in str(error):
+                    print(f"error: {_WHERE_KERNELS_GO}", file=sys.stderr)
+                    return EXIT_ERROR
                 raise
     print("interrupted", file=sys.stderr, flush=True)
     if arguments is None:

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Generator, Iterable
-from concurrent.futures import BrokenExecutor, Executor, Future
+from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
 from itertools import islice
@@ -75,7 +75,7 @@ def detect_frames(
     Raises
     ------
     WorkerError
-        If workers die whatever they are given.
+        If workers die whatever they are given, go away, or have not got this program.
     """
     source = iter(tasks)
     chunks = iter(lambda: tuple(islice(source, workers.chunk)), ())
@@ -135,7 +135,14 @@ class _Crew:
 
     def finished(self, future: Future[list[FrameRows]]) -> list[FrameRows]:
         """The rows of a chunk that was worked on beside others."""
-        rows = future.result()
+        try:
+            rows = future.result()
+        except ImportError as error:
+            raise WorkerError(
+                f"a worker cannot do the work: {error}: expected redetect there, the same version"
+            ) from None
+        except CancelledError:
+            raise WorkerError("the workers are gone: expected the cluster to stay") from None
         self._deadly = 0
         return rows
 

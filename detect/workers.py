@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import re
 import signal
 import threading
 import time
@@ -46,7 +47,8 @@ _LOCAL_CHUNK = 8
 _CLUSTER_CHUNK = 16
 _WINDOW_PER_WORKER = 3
 _GRACE_S = 1.0
-_CLUSTER_PATIENCE_S = 30.0
+_CLUSTER_ANSWER_S = 10.0
+_CLUSTER_PATIENCE_S = 60.0
 _CLUSTER_LOOK_S = 5.0
 
 
@@ -100,8 +102,11 @@ def cluster_workers(address: str, *, pictures: bool = False) -> Workers:
     Raises
     ------
     WorkerError
-        If the package that speaks to clusters is not installed.
+        If there can be no scheduler of that address, or the package that speaks to clusters is not
+        installed.
     """
+    if not re.fullmatch(r"[a-z]+://\S+:[0-9]+", address):
+        raise WorkerError(f"cluster is {address!r}: expected the scheduler's tcp://host:port")
     try:
         from distributed import KilledWorker
     except ImportError:
@@ -255,14 +260,16 @@ def _cluster(address: str, size: _ClusterSize) -> Iterator[Executor]:
     from distributed import Client
 
     try:
-        client = Client(address, timeout=_CLUSTER_PATIENCE_S, set_as_default=False)
+        client = Client(address, timeout=_CLUSTER_ANSWER_S, set_as_default=False)
     except (OSError, ValueError) as error:
         raise WorkerError(f"{address}: no dask scheduler answers there: {error}") from None
     with client:
         try:
             client.wait_for_workers(1, timeout=_CLUSTER_PATIENCE_S)
         except TimeoutError:
-            raise WorkerError(f"{address}: the cluster has no workers") from None
+            raise WorkerError(
+                f"{address}: no worker came within {_CLUSTER_PATIENCE_S:g} s"
+            ) from None
         size.watch(client)
         # The same frame twice is not the same task: nothing is kept between runs.
         yield client.get_executor(pure=False)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecutor
+from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, ThreadPoolExecutor
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
@@ -136,6 +136,23 @@ def test_errors_of_the_program_are_not_hidden(plan: FramePlan) -> None:
 
     hired = Hired(wrong)
     with pytest.raises(TypeError, match="a slip"):
+        list(detect_frames(tasks(10), plan, hired.workers))
+    assert hired.started == hired.ended == 1
+
+
+@pytest.mark.parametrize(
+    ("error", "told"),
+    [
+        (ModuleNotFoundError("No module named 'detect'"), "No module named 'detect': expected"),
+        (CancelledError(), "the workers are gone"),
+    ],
+)
+def test_workers_that_cannot_work_are_told(plan: FramePlan, error: Exception, told: str) -> None:
+    def work(chunk: Chunk) -> list[FrameRows]:
+        raise error
+
+    hired = Hired(work)
+    with pytest.raises(WorkerError, match=told):
         list(detect_frames(tasks(10), plan, hired.workers))
     assert hired.started == hired.ended == 1
 

@@ -56,6 +56,23 @@ def test_a_swallowed_interrupt_comes_back_after_the_frame(
     assert frames == [0, 1, 2, 0, 1, 2]
 
 
+def test_nowhere_to_keep_kernels(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What Numba says of a read-only program without a cache folder is no help to its user."""
+    from numba.core.caching import FunctionCache
+
+    def compile_one(_: object) -> int:
+        FunctionCache(compile_one)
+        return 0
+
+    monkeypatch.setattr(FunctionCache._impl_class, "_locator_classes", [])
+    monkeypatch.setattr(commands, "carry_out", compile_one)
+    assert main(["compare", str(tmp_path)]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "NUMBA_CACHE_DIR" in line
+
+
 def test_an_error_of_the_program_is_no_interrupt(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

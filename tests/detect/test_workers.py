@@ -238,6 +238,15 @@ def test_a_missing_package_is_named(
     assert not (small_run / "detected.circles").exists()
 
 
+@pytest.mark.parametrize("address", ["nonsense", "localhost:8786", "tcp://localhost", ":::"])
+def test_malformed_addresses(
+    small_run: Path, capsys: pytest.CaptureFixture[str], address: str
+) -> None:
+    assert main(["lines", str(small_run), "--cluster", address]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"cluster is {address!r}: expected the scheduler's tcp://host:port" in line
+
+
 def test_jobs_or_a_cluster(small_run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["all", str(small_run), "--jobs", "2", "--cluster", "tcp://127.0.0.1:1"]) == 1
     (line,) = capsys.readouterr().err.splitlines()
