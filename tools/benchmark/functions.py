@@ -26,7 +26,7 @@ DECODING = "decoding"
 #: What ratios of one's own parts and of peers are taken between, for the report.
 KERNEL = "quality map (published)"
 PLAIN_GATHER = "plain gather (published)"
-RESPONSE = "response"
+RESPONSE = "response (dense)"
 CIRCLES = "circles (default)"
 LINES = "lines (default)"
 ALL = "lines, tilt and discs"

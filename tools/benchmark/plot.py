@@ -42,7 +42,9 @@ def plot_png(result: Result) -> bytes:
     _curves(axes["discs"], result.by_discs, "discs in the image")
     _curves(axes["verticals"], result.by_verticals, "verticals in the image")
     _frames(axes["frames"], result.by_frames)
-    figure.suptitle(f"{result.machine.cpu}: one process, medians and quartiles", fontsize=11)
+    figure.suptitle(
+        f"{result.machine.cpu}: processor time in one process, medians and quartiles", fontsize=11
+    )
     stream = io.BytesIO()
     figure.savefig(stream, format="png", dpi=100)
     return stream.getvalue()

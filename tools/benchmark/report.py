@@ -50,6 +50,11 @@ def description_lines(result: Result) -> list[str]:
     machine = result.machine
     versions = ", ".join(f"{name} {version}" for name, version in machine.versions.items())
     lines = [f"{machine.cpu}, {machine.cores} cores, {machine.system}; {versions}"]
+    measured = ", ".join(
+        f"{key} {' '.join(map(str, value)) if isinstance(value, list | tuple) else value}"
+        for key, value in result.settings.items()
+    )
+    lines.append(f"settings: {measured}")
     lines += [f"not installed: {name}" for name in result.absent]
     lines += [f"not measured: {sentence}" for sentence in result.skipped]
     return lines
@@ -62,7 +67,7 @@ def format_markdown(result: Result) -> str:
         *(f"- {line}" for line in description_lines(result)),
         *(f"- {kind.kind}: {kind.pictures} images, {kind.description}" for kind in kinds),
         "",
-        "Median time per image, one core, in times that decoding the same image takes (quartiles; "
+        "Median processor time per image, in times that decoding the same image takes (quartiles; "
         "milliseconds):",
         "",
         *_markdown_row(["", *(kind.kind for kind in kinds)], head=True),
@@ -88,7 +93,7 @@ def format_markdown(result: Result) -> str:
         lines += _markdown_row([f"{compared.slower} / {compared.faster}", *cells])
     lines += [
         "",
-        "Whole runs, files in, files out:",
+        "Whole runs, files in, files out, by the clock on the wall:",
         "",
         *_markdown_row(
             ["", "jobs", "images/s", "per job, share of decoding alone (quartiles)"], head=True
@@ -118,11 +123,23 @@ def format_headline(result: Result) -> str:
         f"`{t.command}` {number(t.images_per_s.median)} images/s, "
         f"{number(t.share_of_decoding.median)} of decoding alone"
         for t in result.runs
-        if t.jobs == 1
     )
+    if result.by_frames:
+        last = result.by_frames[-1]
+        passes += (
+            f"; `{last.command}` of {last.frames} frames with {last.jobs} jobs "
+            f"{number(last.images_per_s.median)} images/s"
+        )
+    pictures, rounds = (result.settings[key] for key in ("pictures", "rounds"))
     machine = result.machine
     return "\n".join(
-        [*lines, "", f"Whole runs, files in, files out, one job: {passes}. {machine.cpu}.", ""]
+        [
+            *lines,
+            "",
+            f"Whole runs, files in, files out, one job each: {passes}. {machine.cpu}; {pictures} "
+            f"pictures of each kind, {rounds} rounds.",
+            "",
+        ]
     )
 
 
@@ -161,7 +178,7 @@ def growth_lines(result: Result) -> list[str]:
     for points, landmark in ((result.by_discs, "disc"), (result.by_verticals, "vertical")):
         if len(points) > 1:
             for name, (bare, each) in costs_per_landmark(points).items():
-                lines.append(f"{name}: {number(bare)} ms, and {each:.3f} ms for each {landmark}")
+                lines.append(f"{name}: {bare:.2f} ms, and {each:.3f} ms for each {landmark}")
     return lines
 
 

@@ -80,7 +80,7 @@ def measure_runs(
     rounds : int
         Passes; slow commands get fewer.
     clock : callable
-        Seconds.
+        Seconds; by default of the clock on the wall, since jobs are processes of their own.
     warm_up : bool
         Whether a pass of each command is made beforehand that is not measured.
 

@@ -77,7 +77,7 @@ class Settings:
     frames : tuple of int
         Lengths of the growing runs.
     jobs : tuple of int
-        Numbers of jobs of whole passes.
+        Numbers of jobs, for the growing runs; the demo run, which is short, gets one.
     seed : int
         Of noise and places.
     """
@@ -156,12 +156,14 @@ def benchmark(settings: Settings, on_stage: Callable[[str], None] | None = None)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         say("whole runs")
-        runs = _runs(settings.run, list(commands(settings.run, folder)), folder, settings)
+        runs = _runs(settings.run, list(commands(settings.run, folder)), (1,), folder, settings)
         by_frames: list[RunTimes] = []
         for frames in settings.frames:
             say(f"whole runs: {frames} frames")
             long_run = repeated_run(run, folder, frames)
-            by_frames += _runs(long_run, [_ALL_COMMAND], folder, settings, warm_up=False)
+            by_frames += _runs(
+                long_run, [_ALL_COMMAND], settings.jobs, folder, settings, warm_up=False
+            )
     return Result(
         machine=this_machine(),
         settings={
@@ -255,13 +257,17 @@ def _by_landmarks(
 
 
 def _runs(
-    run: Path, names: Sequence[str], folder: Path, settings: Settings, *, warm_up: bool = True
+    run: Path,
+    names: Sequence[str],
+    jobs: Sequence[int],
+    folder: Path,
+    settings: Settings,
+    *,
+    warm_up: bool = True,
 ) -> list[RunTimes]:
     """Whole passes of some commands with each number of jobs, all in turn."""
     performed = {
-        (name, count): commands(run, folder, count)[name]
-        for count in settings.jobs
-        for name in names
+        (name, count): commands(run, folder, count)[name] for count in jobs for name in names
     }
     frames, decoding, seconds = measure_runs(performed, run, settings.run_rounds, warm_up=warm_up)
     return [

@@ -69,7 +69,7 @@ def measure_in_turn(
     images: int,
     rounds: int,
     budget_s: float,
-    clock: Callable[[], float] = time.perf_counter,
+    clock: Callable[[], float] = time.process_time,
     *,
     warm_up: bool = True,
     least_calls: int = LEAST_CALLS,
@@ -89,7 +89,8 @@ def measure_in_turn(
         A function that has used up this many seconds, and was called `least_calls` times, is left
         out of the rest.
     clock : callable
-        Seconds.
+        Seconds; by default those of processors at work for this process, whatever its threads:
+        a wait for the processor costs a long call more than a short one, and would not cancel.
     warm_up : bool
         See above.
     least_calls : int

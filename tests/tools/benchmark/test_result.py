@@ -47,7 +47,7 @@ def _result() -> Result:
     points = tuple(GrowthPoint(amount, functions) for amount in (0.2, 0.9))
     return Result(
         machine=Machine("A processor", 2, "Linux", {"python": "3"}),
-        settings={"rounds": 2},
+        settings={"pictures": 2, "rounds": 7, "jobs": (1, 2)},
         absent=("something",),
         skipped=("photographs: no folder was given",),
         kinds=(kind,),
@@ -108,6 +108,7 @@ def test_markdown_tells_ratios_first_and_what_is_missing() -> None:
     assert "| own | 2.50 (1.75 - 3.25); 5.00 ms |" in text
     assert "| cv2 LSD / own | 7.50 (6.25 - 8.75) |" in text
     assert "| `detect all`, 10 frames | 2 | 10.0 | 0.25 (0.19 - 0.25) |" in text
+    assert "settings: pictures 2, rounds 7, jobs 1 2" in text
     assert "not installed: something" in text
     assert "not measured: photographs: no folder was given" in text
 
@@ -131,6 +132,8 @@ def test_the_headline_is_medians_alone() -> None:
     assert "| x decoding (ms) | demo |" in text
     assert "| own | 2.50 (5.00) |" in text
     assert "`detect all` 5.00 images/s, 0.25 of decoding alone" in text
+    assert "`detect all` of 10 frames with 2 jobs 10.0 images/s." in text
+    assert "A processor; 2 pictures of each kind, 7 rounds." in text
 
 
 def test_the_table_replaces_the_one_that_stands_there() -> None:
