@@ -29,6 +29,8 @@ BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
 
 
+#: Residuals of a view: two of each corner.
+_ROWS = 8
 _STEPS = 50
 _SMALLEST_STEP = 1e-10
 _LARGEST_DAMPING = 1e10
@@ -59,7 +61,7 @@ class PoseProblem:
     seen : ChainPoints
         Corners: `camera` and `part` point to cameras and markers, `body` is 0.
     view : (N,) int64
-        Which marker in which image each corner is of: 0 to V - 1.
+        Which marker in which image each corner is of: four of 0, four of 1, up to V - 1.
     floor : Floor or None
     """
 
@@ -71,6 +73,11 @@ class PoseProblem:
     seen: ChainPoints
     view: IntArray
     floor: Floor | None = None
+
+    def __post_init__(self) -> None:
+        expected = np.repeat(np.arange(self.views), 4)
+        if not np.array_equal(self.view, expected) or len(self.view) != len(self.seen):
+            raise ValueError("views of a pose problem: expected four corners each, in order")
 
     @property
     def views(self) -> int:
@@ -349,12 +356,11 @@ def _normalised_rms(residuals: FloatArray, covariance: FloatArray) -> float:
 
 def _view_errors(problem: PoseProblem, here: _Linearised) -> FloatArray:
     covariance = _covariance(problem, here, np.ones(problem.views))
-    errors = np.empty(problem.views)
-    for view in range(problem.views):
-        corners = np.flatnonzero(problem.view == view)
-        rows = (2 * corners[:, None] + np.arange(2)).ravel()
-        errors[view] = _normalised_rms(here.residuals[rows], covariance[np.ix_(rows, rows)])
-    return errors
+    views = np.arange(problem.views)
+    own = covariance.reshape(len(views), _ROWS, len(views), _ROWS)[views, :, views, :]
+    residuals = here.residuals.reshape(-1, _ROWS)
+    weighted = np.linalg.solve(own, residuals[..., None])[..., 0]
+    return np.asarray(np.sqrt(np.sum(residuals * weighted, axis=1) / _ROWS))
 
 
 def _view_weights(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera, read_camera
-from groundtruth.bundle import mean_pose
-from groundtruth.calibration import Network, Rig, read_network, read_rig, write_rig
+from groundtruth.calibration import Network, read_network, read_rig, write_rig
 from groundtruth.cli import Rig as RigCommand
 from groundtruth.commands import (
     check_outputs,
@@ -22,26 +20,15 @@ from groundtruth.commands import (
     provenance,
     residual_figures,
 )
-from groundtruth.covariance import inverse_covariance
 from groundtruth.errors import GroundTruthError
-from groundtruth.rig_estimation import (
-    RigEstimate,
-    estimate_rig,
-    moved_rig,
-    robot_from_known_markers,
-)
+from groundtruth.rig_estimation import RigEstimate, estimate_rig
+from groundtruth.rig_frame import rig_by_known_markers, rig_by_reference_poses
 from groundtruth.session import MarkerFrame, group_by_time, read_marker_frames
-from groundtruth.settings import PoseSettings
-from groundtruth.streams import PlanarPoses, read_planar_poses
-from groundtruth.track import track_robot
-from groundtruth.transforms import inverse, planar_transform
+from groundtruth.streams import read_planar_poses
 from storage import write_whole
 
 if TYPE_CHECKING:
     FloatArray = NDArray[np.float64]
-
-# A reference pose without covariance is taken to be this good (m, rad), and to stand this level.
-_REFERENCE_SIGMA_M, _REFERENCE_SIGMA_RAD = 0.005, 0.005
 
 
 def make_rig(command: RigCommand) -> int:
@@ -63,8 +50,10 @@ def make_rig(command: RigCommand) -> int:
             dictionary,
             command.settings,
             reference=command.reference,
+            camera_covariance=None if network is None else network.covariance,
         )
-    rig, frame = _in_robot_frame(command, estimate, groups, network)
+    estimate, frame = _in_robot_frame(command, estimate)
+    rig = estimate.rig
     table = [
         {"marker": marker, **residual_figures(estimate.adjusted, _views_of(estimate, index))}
         for index, marker in enumerate(rig.ids)
@@ -88,14 +77,14 @@ def make_rig(command: RigCommand) -> int:
     }
     from groundtruth.rig_picture import draw_rig
 
-    drawn = draw_rig(estimate, rig)
+    drawn = draw_rig(estimate)
     write_rig(command.output, rig, extra, overwrite=command.force)
     with write_whole(picture, overwrite=command.force) as stream:
         stream.write(drawn)
     for marker, reason in estimate.left_out.items():
         print(f"marker {marker}: left out: {reason}")
     print_table(table)
-    print_rig_sigmas(replace(estimate, rig=rig))
+    print_rig_sigmas(estimate)
     print(
         f"{command.output}: {len(rig.ids)} markers from {estimate.times} times, frame: {frame}, "
         f"squared residuals per degree of freedom {estimate.adjusted.reduced_cost:.2f}"
@@ -167,86 +156,14 @@ def _views_of(estimate: RigEstimate, index: int) -> list[int]:
     return [i for i, view in enumerate(estimate.views) if view.rig_index == index]
 
 
-def _in_robot_frame(
-    command: RigCommand,
-    estimate: RigEstimate,
-    groups: Sequence[Sequence[MarkerFrame]],
-    network: Network | None,
-) -> tuple[Rig, str]:
-    """The rig in the robot's frame, and what that is."""
+def _in_robot_frame(command: RigCommand, estimate: RigEstimate) -> tuple[RigEstimate, str]:
+    """The estimate in the robot's frame, and what that is."""
     if command.robot is not None:
         known = read_rig(command.robot)
-        pose, covariance, _ = robot_from_known_markers(estimate.rig, known)
-        return moved_rig(estimate.rig, pose, covariance), f"robot, by {command.robot.name}"
-    if command.reference_poses is None or network is None:
-        return estimate.rig, f"marker {estimate.reference}"
-    reference = read_planar_poses(command.reference_poses)
-    pose, covariance, used = robot_from_reference_poses(
-        estimate.rig, groups, network, reference, command.settings.time_tolerance_s
-    )
-    name = command.reference_poses.name
-    return moved_rig(estimate.rig, pose, covariance), f"robot, by {used} poses of {name}"
-
-
-def robot_from_reference_poses(
-    rig: Rig,
-    groups: Sequence[Sequence[MarkerFrame]],
-    network: Network,
-    reference: PlanarPoses,
-    tolerance_s: float,
-) -> tuple[FloatArray, FloatArray, int]:
-    """The robot's frame from times at which its pose is known and it stands level.
-
-    Parameters
-    ----------
-    rig : Rig
-        In any frame.
-    groups : sequence of sequences of MarkerFrame
-    network : Network
-    reference : PlanarPoses
-        Known poses; covariances weight them.
-    tolerance_s : float
-        By how much an image's time may differ from a pose's.
-
-    Returns
-    -------
-    (4, 4) array
-        `robot_from_rig`.
-    (6, 6) array
-        Covariance of its right perturbation, scaled by how the poses differ.
-    int
-        How many of the poses were used.
-
-    Raises
-    ------
-    GroundTruthError
-        If there is no image with the rig at the time of any of the poses.
-    """
-    near = [
-        frame
-        for group in groups
-        for frame in group
-        if np.abs(reference.times_s - frame.time_s).min() <= tolerance_s
-    ]
-    track = track_robot(near, rig, network, PoseSettings(time_tolerance_s=tolerance_s))
-    poses, covariances = [], []
-    for time_s, candidate in track.posed:
-        k = int(np.argmin(np.abs(reference.times_s - time_s)))
-        x, y, theta = reference.poses[k]
-        world_from_robot = planar_transform(float(x), float(y), float(theta))
-        poses.append(inverse(world_from_robot) @ candidate.world_from_robot)
-        # The reference's own error is in the robot's axes, which are those of the result's left.
-        own = np.diag(np.square([_REFERENCE_SIGMA_M] * 3 + [_REFERENCE_SIGMA_RAD] * 3))
-        if reference.covariances is not None:
-            turn = world_from_robot[:2, :2].T
-            planar = reference.covariances[k]
-            own[:2, :2] = turn @ planar[:2, :2] @ turn.T
-            own[:2, 5] = turn @ planar[:2, 2]
-            own[5, :2] = own[:2, 5]
-            own[5, 5] = planar[2, 2]
-        moved = inverse_covariance(inverse(poses[-1]), own)
-        covariances.append(moved + candidate.covariance)
-    if not poses:
-        raise GroundTruthError("no image shows the rig at the time of any reference pose")
-    pose, covariance, spread = mean_pose(poses, np.stack(covariances))
-    return pose, covariance * max(1.0, spread), len(poses)
+        moved = rig_by_known_markers(estimate, known, command.settings)
+        return moved, f"robot, by {command.robot.name}"
+    if command.reference_poses is not None:
+        reference = read_planar_poses(command.reference_poses)
+        moved, used = rig_by_reference_poses(estimate, reference, command.settings)
+        return moved, f"robot, by {used} poses of {command.reference_poses.name}"
+    return estimate, f"marker {estimate.reference}"

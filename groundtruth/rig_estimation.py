@@ -8,16 +8,15 @@ all times.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera
-from groundtruth.bundle import AdjustedBundle, Bundle, adjust_bundle, mean_pose
+from groundtruth.bundle import AdjustedBundle, Bundle, PosePrior, adjust_bundle
 from groundtruth.calibration import Rig
 from groundtruth.chain import project_chain
-from groundtruth.covariance import composed_covariance
 from groundtruth.errors import GeometryError, GroundTruthError
 from groundtruth.pairs import (
     MarkerPose,
@@ -31,7 +30,7 @@ from groundtruth.pnp import view_poses
 from groundtruth.refinement import PoseProblem, refine_pose
 from groundtruth.session import MarkerFrame, View, chain_points, rig_views
 from groundtruth.settings import RigSettings
-from groundtruth.transforms import adjoint, inverse
+from groundtruth.transforms import inverse
 
 FloatArray = NDArray[np.float64]
 
@@ -82,6 +81,7 @@ def estimate_rig(
     settings: RigSettings,
     *,
     reference: int | None = None,
+    camera_covariance: FloatArray | None = None,
 ) -> RigEstimate:
     """Estimate a rig.
 
@@ -98,6 +98,8 @@ def estimate_rig(
     settings : RigSettings
     reference : int, optional
         The marker whose frame is the rig's; by default the one with the most support.
+    camera_covariance : (6 C, 6 C) array, optional
+        How well the cameras are calibrated to each other: they are adjusted with it as a prior.
 
     Returns
     -------
@@ -146,6 +148,8 @@ def estimate_rig(
     bundle, views, times = _bundle(
         solved, rig, renumbered, start, cameras, world_from_camera, renumbered[root], settings
     )
+    if camera_covariance is not None and np.any(camera_covariance):
+        bundle = _with_free_cameras(bundle, camera_covariance)
     try:
         adjusted = adjust_bundle(
             bundle, outlier_sigma=settings.outlier_sigma, outlier_px=settings.outlier_px
@@ -163,77 +167,6 @@ def estimate_rig(
         times,
         left_out,
     )
-
-
-def moved_rig(rig: Rig, robot_from_rig: FloatArray, covariance: FloatArray) -> Rig:
-    """The rig in another frame, which is known with a (6, 6) covariance of right perturbations."""
-    # Each marker moves with the frame.
-    common = adjoint(inverse(rig.robot_from_marker)).reshape(-1, 6)
-    return Rig(
-        rig.dictionary,
-        rig.ids,
-        rig.widths_m,
-        robot_from_rig @ rig.robot_from_marker,
-        rig.covariance + common @ covariance @ common.T,
-    )
-
-
-def robot_from_known_markers(rig: Rig, known: Rig) -> tuple[FloatArray, FloatArray, float]:
-    """The robot's frame from markers whose poses on the robot are known.
-
-    Parameters
-    ----------
-    rig : Rig
-        In the frame of one of its markers.
-    known : Rig
-        One or more markers in the robot's frame; their covariances weight them.
-
-    Returns
-    -------
-    (4, 4) array
-        `robot_from_rig`.
-    (6, 6) array
-        Covariance of its right perturbation.
-    float
-        Squared normalised deviations of the markers over degrees of freedom.
-
-    Raises
-    ------
-    GroundTruthError
-        If the rig has none of them.
-    """
-    common = [marker for marker in rig.ids if marker in known.ids]
-    if not common:
-        raise GroundTruthError(
-            f"the rig has markers {list(rig.ids)}, none of the known {list(known.ids)}"
-        )
-    poses, covariances = [], []
-    for marker in common:
-        i, j = rig.ids.index(marker), known.ids.index(marker)
-        rig_from_marker = rig.robot_from_marker[i]
-        marker_from_rig = inverse(rig_from_marker)
-        known_part = known.covariance[6 * j : 6 * j + 6, 6 * j : 6 * j + 6]
-        own_part = rig.covariance[6 * i : 6 * i + 6, 6 * i : 6 * i + 6]
-        poses.append(known.robot_from_marker[j] @ marker_from_rig)
-        covariances.append(
-            composed_covariance(known_part + own_part, marker_from_rig, np.zeros((6, 6)))
-        )
-    if len(poses) == 1:
-        # The marker's own error in the rig is in the rig's covariance already.
-        j = known.ids.index(common[0])
-        i = rig.ids.index(common[0])
-        return (
-            poses[0],
-            composed_covariance(
-                known.covariance[6 * j : 6 * j + 6, 6 * j : 6 * j + 6],
-                inverse(rig.robot_from_marker[i]),
-                np.zeros((6, 6)),
-            ),
-            1.0,
-        )
-    # Markers that are exactly known still weigh by what the rig says of them.
-    floor = np.diag([1e-10] * 6)
-    return mean_pose(poses, np.stack(covariances) + floor)
 
 
 def _bare_rig(dictionary: str, ids: tuple[int, ...], widths_m: Mapping[int, float]) -> Rig:
@@ -378,6 +311,21 @@ def _bundle(
         np.repeat(np.arange(len(views)), 4),
     )
     return bundle, tuple(views), len(poses)
+
+
+def _with_free_cameras(bundle: Bundle, covariance: FloatArray) -> Bundle:
+    """The bundle with its cameras free, each with its own covariance as a prior."""
+    free = np.isin(np.arange(len(bundle.cameras)), bundle.seen.camera)
+    priors = tuple(
+        PosePrior(
+            "camera",
+            int(c),
+            bundle.world_from_camera[c],
+            covariance[6 * c : 6 * c + 6, 6 * c : 6 * c + 6] + 1e-12 * np.eye(6),
+        )
+        for c in np.flatnonzero(free)
+    )
+    return replace(bundle, free_camera=free, priors=priors)
 
 
 def _best_start(

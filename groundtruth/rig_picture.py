@@ -22,15 +22,13 @@ _AXES = ("x", "y", "z")
 _AGREES, _DIFFERS = "#2a78b5", "#d9822b"
 
 
-def draw_rig(estimate: RigEstimate, rig: Rig) -> bytes:
+def draw_rig(estimate: RigEstimate) -> bytes:
     """Draw a rig's estimate.
 
     Parameters
     ----------
     estimate : RigEstimate
         Its pairwise estimates are drawn where they would put a marker, seen from the other one.
-    rig : Rig
-        The same rig, in the frame that is to be drawn.
 
     Returns
     -------
@@ -40,6 +38,7 @@ def draw_rig(estimate: RigEstimate, rig: Rig) -> bytes:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
+    rig = estimate.rig
     agreeing, differing = _clouds(estimate, rig)
     figure = Figure(figsize=(13.5, 5.0), dpi=110, layout="constrained")
     FigureCanvasAgg(figure)

@@ -1,0 +1,304 @@
+"""The command line: whole sessions of exact corners, what is printed, written and refused."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from camera import write_camera
+from groundtruth.calibration import Network, Rig, read_network, read_rig, write_network, write_rig
+from groundtruth.cli import main
+from groundtruth.streams import PlanarPoses, read_planar_poses, write_planar_poses
+from groundtruth.transforms import exp_se3, inverse, log_se3, planar_transform
+from landmarks import Frame, Step, write_frames
+from tests.groundtruth.scene import box_rig, frames_of, hall_cameras, lens
+from tests.groundtruth.test_network import BOARDS, OFFSET, WORLD, shots
+
+FloatArray = NDArray[np.float64]
+Captured = pytest.CaptureFixture[str]
+
+NAMES = ("a", "b", "c", "d")
+SIGMA_PX = 0.1
+
+
+def drive(count: int) -> tuple[FloatArray, FloatArray]:
+    """Times, and x, y, theta along a circle."""
+    t = np.arange(count) / 5.0
+    angle = 0.4 * t
+    return 1000.0 + t, np.column_stack([np.cos(angle), np.sin(angle), angle + np.pi / 2])
+
+
+def write_session(
+    folder: Path,
+    *,
+    count: int = 20,
+    rig: Rig | None = None,
+    moved: bool = True,
+    seed: int = 5,
+) -> Path:
+    """A session with a calibration that is a little wrong and says so."""
+    generator = np.random.default_rng(seed)
+    rig = box_rig() if rig is None else rig
+    times, planar = drive(count)
+    poses = np.stack([planar_transform(*map(float, row)) for row in planar])
+    frames = frames_of(times, poses, rig=rig, sigma_px=SIGMA_PX, seed=seed)
+    folder.mkdir()
+    for number, name in enumerate(NAMES):
+        run = folder / name
+        run.mkdir()
+        write_camera(lens(), run / f"{name}.cam")
+        own = [f for f in frames if f.camera == number]
+        write_frames(
+            run / "detected.markers",
+            [Frame(Step(f.prefix, *[0.0] * 9), f.markers) for f in own],
+            head="made by a test",
+        )
+        rows = "".join(f"{f.prefix} {f.time_s:.6f}\n" for f in own)
+        (run / f"{name}.times").write_text("# prefix seconds\n" + rows)
+    sigmas = np.array([2e-3] * 3 + [2e-3] * 3) if moved else np.zeros(6)
+    network = Network(
+        NAMES,
+        (lens(),) * 4,
+        tuple(f"{name}/{name}.cam" for name in NAMES),
+        hall_cameras(4) @ exp_se3(sigmas * generator.normal(size=(4, 6))),
+        np.diag(np.tile(sigmas**2, 4)),
+    )
+    write_network(folder / "network.json", network)
+    believed = replace(
+        rig,
+        robot_from_marker=rig.robot_from_marker
+        @ exp_se3(sigmas * generator.normal(size=(len(rig.ids), 6))),
+        covariance=np.diag(np.tile(sigmas**2, len(rig.ids))),
+    )
+    write_rig(folder / "rig.json", believed)
+    write_planar_poses(folder / "truth.csv", PlanarPoses(times, planar))
+    return folder
+
+
+def refused(arguments: list[str], names: str, captured: Captured) -> None:
+    """Exit code 1 and one line that names the cause."""
+    assert main(arguments) == 1
+    shown = captured.readouterr()
+    (line,) = shown.err.splitlines()
+    assert line.startswith("error: ")
+    assert names in line
+
+
+def test_a_sessions_poses_and_their_score(tmp_path: Path, capsys: Captured) -> None:
+    session = write_session(tmp_path / "s")
+    report, tum = tmp_path / "report.jsonl", tmp_path / "poses.tum"
+    arguments = ["poses", str(session), "--report", str(report), "--tum", str(tum)]
+    assert main(arguments) == 0
+    assert "20 poses of 20 times: 20 clear" in capsys.readouterr().out
+    poses = read_planar_poses(session / "poses.csv")
+    assert len(poses) == 20
+    beside = json.loads((session / "poses.json").read_text())
+    assert beside["settings"]["solver"] == "sqpnp"
+    assert set(beside["files"]) == {"rig.json", "network.json"}
+    entries = [json.loads(line) for line in report.read_text().splitlines()]
+    assert len(entries) == 20
+    assert entries[0]["images"] == dict.fromkeys(NAMES, "0000")
+    assert all(marker["used"] for entry in entries for marker in entry["markers"])
+    assert len(tum.read_text().splitlines()) == 20
+
+    figures = tmp_path / "score.json"
+    truth = str(session / "truth.csv")
+    assert main(["score", str(session / "poses.csv"), truth, "--json", str(figures)]) == 0
+    assert "normalised error squared / dof" in capsys.readouterr().out
+    score = json.loads(figures.read_text())
+    assert score["poses"] == 20
+    assert score["position_mean_m"] < 0.004
+    assert abs(score["angle_mean_rad"]) < 0.005
+    # One draw of the calibration's errors moves all poses together: wide limits.
+    assert 0.02 < score["normalised_error"] < 5.0
+
+    before = (session / "poses.csv").read_bytes()
+    refused(arguments, "poses.csv: exists already", capsys)
+    assert main([*arguments, "--force"]) == 0
+    assert (session / "poses.csv").read_bytes() == before
+
+
+def test_single_runs_and_all_options(tmp_path: Path, capsys: Captured) -> None:
+    session = write_session(tmp_path / "s", count=6)
+    output = tmp_path / "out.csv"
+    arguments = [
+        "poses", str(session / "a"), str(session / "c"), "--rig", str(session / "rig.json"),
+        "--solver", "ippe", "--loss", "cauchy", "--floor", "-o", str(output),
+    ]  # fmt: skip
+    assert main(arguments) == 0
+    assert len(read_planar_poses(output)) == 6
+    beside = json.loads((tmp_path / "out.json").read_text())
+    assert beside["settings"]["floor"] is True
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize(
+    ("spoil", "names"),
+    [
+        (lambda s: (s / "network.json").unlink(), "network.json: no such file"),
+        (lambda s: (s / "rig.json").write_text("{}"), "dictionary is None"),
+        (lambda s: (s / "a" / "a.times").write_text("0000 1\n"), "a.times: no time of image 0001"),
+        (lambda s: (s / "a" / "a.times").unlink(), "a.times: no such file"),
+        (lambda s: (s / "b" / "detected.markers").write_text("STEP\n"), "detected.markers:1"),
+        (lambda s: (s / "b").rename(s / "x"), "b/b.cam"),
+    ],
+)
+def test_sessions_that_lack_something_are_refused(
+    tmp_path: Path, capsys: Captured, spoil: object, names: str
+) -> None:
+    session = write_session(tmp_path / "s", count=2)
+    spoil(session)  # type: ignore[operator]
+    refused(["poses", str(session)], names, capsys)
+    assert not (session / "poses.csv").exists()
+
+
+def test_nothing_to_work_on_is_refused(tmp_path: Path, capsys: Captured) -> None:
+    refused(["poses", str(tmp_path / "absent")], "no such folder", capsys)
+    refused(["poses", str(tmp_path)], "no detected.markers in it", capsys)
+    session = write_session(tmp_path / "s", count=2)
+    network = json.loads((session / "network.json").read_text())
+    del network["cameras"]["b"], network["covariance"]
+    (session / "network.json").write_text(json.dumps(network))
+    refused(["poses", str(session)], "b: is no camera of the network", capsys)
+
+
+def test_a_rig_that_nobody_saw_gives_no_poses(tmp_path: Path, capsys: Captured) -> None:
+    session = write_session(tmp_path / "s", count=2)
+    other = replace(box_rig(1), ids=(200,))
+    write_rig(session / "rig.json", other, overwrite=True)
+    refused(["poses", str(session)], "no pose", capsys)
+    assert not (session / "poses.csv").exists()
+
+
+def test_a_rig_from_a_session(tmp_path: Path, capsys: Captured) -> None:
+    rig = box_rig()
+    session = write_session(tmp_path / "s", count=25, moved=False)
+    known = tmp_path / "known.json"
+    write_rig(known, Rig("rawseeds", (33,), rig.widths_m[2:3], rig.robot_from_marker[2:3],
+                         np.zeros((6, 6))))  # fmt: skip
+    runs = [str(session / name) for name in NAMES]
+    output = tmp_path / "rig.json"
+    options = ["--width-m", "0.24", "-o", str(output)]
+    assert main(["rig", *runs, *options, "--robot", str(known)]) == 0
+    assert "6 markers" in capsys.readouterr().out
+    found = read_rig(output)
+    error = log_se3(inverse(rig.robot_from_marker) @ found.robot_from_marker)
+    assert np.abs(error).max() < 6e-3
+    sigmas = np.sqrt(np.diagonal(found.covariance)).reshape(6, 6)
+    assert np.all(np.abs(error) < 5.0 * sigmas + 1e-12)
+    assert output.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
+    content = json.loads(output.read_text())
+    assert content["made_by"]["settings"]["least_support"] == 3
+    assert {row["marker"] for row in content["residuals"]} == set(rig.ids)
+    refused(["rig", *runs, *options], "rig.json: exists already", capsys)
+
+    reference = tmp_path / "reference.csv"
+    times, planar = drive(25)
+    write_planar_poses(reference, PlanarPoses(times[::3], planar[::3]))
+    together = [
+        "rig", *runs, *options, "--force", "--network", str(session / "network.json"),
+        "--reference-poses", str(reference), "--ids", *map(str, rig.ids[:4]),
+        "--widths", "31=0.24",
+    ]  # fmt: skip
+    assert main(together) == 0
+    found = read_rig(output)
+    assert found.ids == rig.ids[:4]
+    error = log_se3(inverse(rig.robot_from_marker[:4]) @ found.robot_from_marker)
+    assert np.abs(error).max() < 6e-3
+
+
+@pytest.mark.parametrize(
+    ("options", "names"),
+    [
+        (["--width-m", "0"], "width_m is 0"),
+        (["--width-m", "0.2", "--widths", "31:0.2"], "'31:0.2': expected a marker and metres"),
+        (["--width-m", "0.2", "--ids", "99"], "no markers of the dictionary"),
+        (["--width-m", "0.2", "--dictionary", "aruco"], "no markers of the dictionary aruco"),
+        (["--width-m", "0.2", "--reference-poses", "x.csv"], "needs --network"),
+    ],
+)
+def test_rigs_that_cannot_be_made_are_refused(
+    tmp_path: Path, capsys: Captured, options: list[str], names: str
+) -> None:
+    session = write_session(tmp_path / "s", count=2)
+    output = tmp_path / "rig.json"
+    refused(["rig", str(session / "a"), *options, "-o", str(output)], names, capsys)
+    assert not output.exists()
+
+
+def test_settings_that_cannot_be_are_a_wrong_command_line(capsys: Captured) -> None:
+    with pytest.raises(SystemExit) as caught:
+        main(["poses", "somewhere", "--loss-scale", "0"])
+    assert caught.value.code == 2
+    assert "loss_scale is 0" in capsys.readouterr().err
+
+
+def test_a_network_from_corners(tmp_path: Path, capsys: Captured) -> None:
+    folder = tmp_path / "boards"
+    folder.mkdir()
+    for name in NAMES:
+        (folder / name).mkdir()
+        write_camera(lens(), folder / name / f"{name}.cam")
+
+    def pose(matrix: FloatArray) -> dict[str, list[float]]:
+        from groundtruth.transforms import quaternion_xyzw
+
+        return {
+            "translation_m": matrix[:3, 3].tolist(),
+            "quaternion_xyzw": quaternion_xyzw(matrix).tolist(),
+        }
+
+    content = {
+        "boards": {
+            name: {"columns": b.columns, "rows": b.rows, "square_m": b.square_m}
+            for name, b in BOARDS.items()
+        },
+        "world_from_board": pose(WORLD),
+        "first_from_second": pose(OFFSET),
+        "images": [
+            {
+                "camera": view.camera,
+                "board": view.board,
+                "placement": number,
+                "corners": view.corners.tolist(),
+            }
+            for number, shot in enumerate(shots(0.1, 8))
+            for view in shot
+        ],
+    }
+    (folder / "boards.json").write_text(json.dumps(content))
+    (tmp_path / "out").mkdir()
+    output = tmp_path / "out" / "network.json"
+    for options in ([], ["--estimate-offset", "--force"]):
+        assert main(["network", str(folder), "-o", str(output), *options]) == 0
+        assert "4 cameras" in capsys.readouterr().out
+        network = read_network(output)  # finds the calibrations from where it stands
+        assert network.names == NAMES
+        error = log_se3(inverse(hall_cameras(4)) @ network.world_from_camera)
+        assert np.abs(error).max() < 0.02
+        sigmas = np.sqrt(np.diagonal(network.covariance)).reshape(4, 6)
+        assert np.all(np.abs(error) < 5.0 * sigmas)
+    refused(["network", str(folder), "-o", str(output)], "exists already", capsys)
+
+
+def test_help_needs_nothing_heavy() -> None:
+    program = (
+        "import sys\n"
+        "from groundtruth.cli import main\n"
+        "try:\n    main(['poses', '--help'])\n"
+        "except SystemExit as error:\n    assert error.code == 0\n"
+        "heavy = {'numpy', 'scipy', 'cv2', 'pycolmap', 'matplotlib', 'numba'} & set(sys.modules)\n"
+        "assert not heavy, heavy\n"
+    )
+    finished = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=False
+    )
+    assert finished.returncode == 0, finished.stderr
+    assert "--solver" in finished.stdout
