@@ -24,6 +24,8 @@ from detect.errors import WorkerError
 from detect.interrupts import interrupts_noted
 from detect.line_settings import PRESETS as LINE_PRESETS
 from detect.line_settings import LineSettings
+from detect.markers.settings import PRESETS as MARKER_PRESETS
+from detect.markers.settings import MarkerSettings
 from detect.settings import PUBLISHED, CircleSettings
 
 Preset = Literal["default", "published"]
@@ -146,6 +148,45 @@ class Lines:
 
 
 @dataclass(frozen=True)
+class Markers:
+    """Detect the square markers of a run and write them to a .markers file.
+
+    Example: detect markers images/m/a --dictionary rawseeds
+
+    Parameters
+    ----------
+    run : Path
+        Run folder of the data set's layout, or a folder of images. With a .cam in it, the lens's
+        distortion is taken off; without one, edges are taken to be straight in the images.
+    preset : str
+        Values that the other flags start from: `published` is the report's detector.
+    camera : Path
+        Calibration, if it is not the one in the run folder.
+    output : Path
+        The file to write; by default detected.markers in the run folder.
+    force : bool
+        Replace existing files.
+    draw : Path
+        Folder for images with the markers drawn in, and with what was rejected.
+    jobs : int
+        Processes that share the work, 1 for none beside this one; by default as many as there are
+        cores, for runs of hundreds of frames. What is written is the same.
+    cluster : str
+        Address of a dask scheduler (tcp://host:8786) whose workers do the work instead.
+    """
+
+    run: Positional[Path]
+    preset: Preset = "default"
+    camera: MaybePath = None
+    output: Annotated[MaybePath, arg(aliases=["-o"])] = None
+    force: bool = False
+    draw: MaybePath = None
+    jobs: MaybeInt = None
+    cluster: MaybeStr = None
+    settings: OmitArgPrefixes[MarkerSettings] = field(default_factory=MarkerSettings)
+
+
+@dataclass(frozen=True)
 class All:
     """Detect verticals, tilt and discs of a run; the discs' positions are corrected for the tilt.
 
@@ -253,10 +294,11 @@ def main(arguments: list[str] | None = None) -> int:
     return EXIT_INTERRUPTED
 
 
-def _parsed(given: list[str]) -> Circles | Lines | All | Compare:
+def _parsed(given: list[str]) -> Circles | Lines | Markers | All | Compare:
     preset = _preset(given)
     circles = _CIRCLE_PRESETS.get(preset, CircleSettings())
     lines = LINE_PRESETS.get(preset, LineSettings())
+    markers = MARKER_PRESETS.get(preset, MarkerSettings())
     return tyro.cli(
         Annotated[
             Annotated[
@@ -266,6 +308,10 @@ def _parsed(given: list[str]) -> Circles | Lines | All | Compare:
             | Annotated[
                 Lines,
                 subcommand("lines", default=Lines(run=tyro.MISSING, settings=lines)),
+            ]
+            | Annotated[
+                Markers,
+                subcommand("markers", default=Markers(run=tyro.MISSING, settings=markers)),
             ]
             | Annotated[
                 All,

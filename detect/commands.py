@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from detect.announcing import show_announcements
-from detect.cli import EXIT_ERROR, EXIT_FRAMES_FAILED, All, Circles, Compare, Lines
+from detect.cli import EXIT_ERROR, EXIT_FRAMES_FAILED, All, Circles, Compare, Lines, Markers
 from detect.errors import WorkerError
 from detect.progress import print_failures, progress_bar
 
@@ -21,17 +21,19 @@ if TYPE_CHECKING:
 
     from detect.compare_result import Rates
     from detect.dispatch import Workers
-    from detect.run import Run
+    from detect.run import ImageRun
     from detect.stream import RunSummary
 
 
-def carry_out(command: Circles | Lines | All | Compare) -> int:
+def carry_out(command: Circles | Lines | Markers | All | Compare) -> int:
     """Carry out a command; returns the exit code."""
     show_announcements()
     if isinstance(command, Circles):
         return _circles(command)
     if isinstance(command, Lines):
         return _lines(command)
+    if isinstance(command, Markers):
+        return _markers(command)
     if isinstance(command, All):
         return _all(command)
     return _compare(command)
@@ -104,6 +106,34 @@ def _lines(command: Lines) -> int:
     return _exit_code(summary)
 
 
+def _markers(command: Markers) -> int:
+    from detect import __version__
+    from detect.markers_run import detect_markers_run
+    from detect.run import open_images
+
+    run = open_images(command.run, command.camera)
+    output = command.output if command.output is not None else command.run / "detected.markers"
+    _demand_new([output], command.force)
+    if command.draw is not None:
+        command.draw.mkdir(parents=True, exist_ok=True)
+    with progress_bar("markers", len(run.frames)) as advance:
+        summary = detect_markers_run(
+            run,
+            command.settings,
+            output,
+            version=__version__,
+            overwrite=command.force,
+            pictures=command.draw,
+            workers=_workers(command, run),
+            on_progress=advance,
+        )
+    print(f"{output}: {summary.markers} markers in {summary.frames} frames")
+    if summary.rejected:
+        causes = ", ".join(f"{cause} {count}" for cause, count in sorted(summary.rejected.items()))
+        print(f"rejected: {causes}")
+    return _exit_code(summary)
+
+
 def _all(command: All) -> int:
     from detect import __version__
     from detect.all_run import detect_all_run
@@ -132,7 +162,7 @@ def _all(command: All) -> int:
     return _exit_code(summary)
 
 
-def _workers(command: Circles | Lines | All, run: Run) -> Workers:
+def _workers(command: Circles | Lines | Markers | All, run: ImageRun) -> Workers:
     """Who does the work of a command."""
     from detect.workers import cluster_workers, default_jobs, local_workers
 

@@ -1,4 +1,4 @@
-"""One frame of a run: its image in, its verticals, its tilt and its discs out.
+"""One frame of a run: its image in, its verticals, its tilt, its discs and its markers out.
 
 The way of one frame, top to bottom, is `detect_frame`.
 """
@@ -18,6 +18,9 @@ from detect.circles import CircleDetections, detect_circles, disc_shape
 from detect.levelling import levelled
 from detect.line_settings import LineSettings
 from detect.lines import LineDetections, detect_lines
+from detect.markers.detect import MarkerDetections, detect_markers
+from detect.markers.settings import MarkerSettings
+from detect.markers.specimen import specimen_image
 from detect.run import RunFrame, read_image
 from detect.settings import CircleSettings
 from landmarks import FrameTilt, tilt_as_written
@@ -30,15 +33,17 @@ class FramePlan:
 
     Attributes
     ----------
-    camera : Camera
-        The calibrated camera.
+    camera : Camera or None
+        The calibrated camera; only markers can be looked for without one.
     lines : LineSettings or None
         Which verticals are looked for, if any.
     circles : CircleSettings or None
         Which discs are looked for, if any.
+    markers : MarkerSettings or None
+        Which square markers are looked for, if any.
     json : bool
         Whether the discs are wanted as JSON as well.
-    drawing : {"discs", "lines", "tracks"} or None
+    drawing : {"discs", "lines", "tracks", "markers"} or None
         What is drawn into the image; "tracks" are all tracks of lines, with the reason of those
         that are no lines.
     draw_response : bool
@@ -47,11 +52,12 @@ class FramePlan:
         What relative image paths are relative to, on whatever machine; by default a process's own.
     """
 
-    camera: Camera
+    camera: Camera | None
     lines: LineSettings | None = None
     circles: CircleSettings | None = None
+    markers: MarkerSettings | None = None
     json: bool = False
-    drawing: Literal["discs", "lines", "tracks"] | None = None
+    drawing: Literal["discs", "lines", "tracks", "markers"] | None = None
     draw_response: bool = False
     working_folder: Path | None = None
 
@@ -76,12 +82,14 @@ class FrameDetections:
         None also where too few lines tell.
     discs : CircleDetections or None
         Corrected for the tilt, where there is one.
+    markers : MarkerDetections or None
     """
 
     image: NDArray[np.uint8]
     lines: LineDetections | None
     tilt: FrameTilt | None
     discs: CircleDetections | None
+    markers: MarkerDetections | None = None
 
 
 def detect_frame(
@@ -120,11 +128,16 @@ def detect_frame(
     discs = None
     if plan.circles is not None:
         assert tables.discs is not None
+        assert plan.camera is not None
         discs = detect_circles(image, plan.camera, tables.discs, plan.circles)
         if tilt is not None:
             discs = levelled(discs, plan.camera, tilt)
 
-    return FrameDetections(image, lines, tilt, discs)
+    markers = None
+    if plan.markers is not None:
+        markers = detect_markers(image, plan.markers, plan.camera)
+
+    return FrameDetections(image, lines, tilt, discs, markers)
 
 
 def tilt_of_lines(prefix: str, lines: LineDetections) -> FrameTilt | None:
@@ -158,7 +171,9 @@ def tables_of(plan: FramePlan) -> Tables:
 
 
 @lru_cache(maxsize=1)
-def _tables(camera: Camera, verticals: bool, shape: DiscShape | None) -> Tables:
+def _tables(camera: Camera | None, verticals: bool, shape: DiscShape | None) -> Tables:
+    if camera is None:
+        return Tables(None, None)
     return Tables(
         verticals=cached_vertical_table(camera) if verticals else None,
         discs=None if shape is None else cached_disc_table(camera, shape),
@@ -168,6 +183,10 @@ def _tables(camera: Camera, verticals: bool, shape: DiscShape | None) -> Tables:
 def rehearse(plan: FramePlan) -> None:
     """Work on a made-up image, so that all tables and kernels that a plan needs are there."""
     tables = tables_of(plan)
+    if plan.markers is not None:
+        detect_markers(specimen_image(plan.markers), plan.markers)
+    if plan.camera is None:
+        return
     column = np.arange(plan.camera.width)
     bars = np.where(column // 40 % 2, 180, 60).astype(np.uint8)
     image = np.repeat(bars[None, :], plan.camera.height, axis=0)

@@ -55,12 +55,14 @@ class FrameRows:
 
     Attributes
     ----------
-    circles, lines, tilt, json : bytes
+    circles, lines, tilt, markers, json : bytes
         The frame's rows in each of the files.
     pictures : tuple of (name, PNG)
         Drawings.
-    disc_count, line_count : int
+    disc_count, line_count, marker_count : int
         How many were found.
+    rejected : tuple of (cause, int)
+        How many candidates for markers were rejected, by cause.
     error : str or None
         Why the frame could not be worked on: its STEP stays, without landmarks.
     """
@@ -68,11 +70,14 @@ class FrameRows:
     circles: bytes = b""
     lines: bytes = b""
     tilt: bytes = b""
+    markers: bytes = b""
     json: bytes = b""
     pictures: tuple[tuple[str, bytes], ...] = ()
     disc_count: int = 0
     line_count: int = 0
+    marker_count: int = 0
     has_tilt: bool = False
+    rejected: tuple[tuple[str, int], ...] = ()
     error: str | None = None
 
 
@@ -87,7 +92,7 @@ def rows_of_frame(task: FrameTask, plan: FramePlan, tables: Tables) -> FrameRows
         return rows_of_failure(task, f"{name}: {type(error).__name__}: {error}")
 
     step = task.frame.step
-    circles = lines = tilt = record = b""
+    circles = lines = tilt = markers = record = b""
     verticals: tuple[LineLandmark, ...] = ()
     if found.lines is not None:
         verticals = found.lines.landmarks()
@@ -105,14 +110,19 @@ def rows_of_frame(task: FrameTask, plan: FramePlan, tables: Tables) -> FrameRows
         circles = format_frame(Frame(step, landmarks))
         if plan.json:
             record = _json({"frame": step.prefix, "discs": _disc_records(discs)})
+    if found.markers is not None:
+        markers = format_frame(Frame(step, found.markers.landmarks()))
     return FrameRows(
         circles=circles,
         lines=lines,
         tilt=tilt,
+        markers=markers,
         json=record,
         pictures=tuple(_pictures(step.prefix, found, plan, tables)),
         disc_count=0 if found.discs is None else len(found.discs),
         line_count=len(verticals),
+        marker_count=0 if found.markers is None else len(found.markers),
+        rejected=() if found.markers is None else tuple(sorted(found.markers.rejected.items())),
         has_tilt=found.lines is not None and found.tilt is not None,
     )
 
@@ -125,6 +135,7 @@ def rows_of_failure(task: FrameTask, reason: str) -> FrameRows:
         circles=rows,
         lines=rows,
         tilt=_line(format_no_tilt(step.prefix, 0)),
+        markers=rows,
         json=_json({"frame": step.prefix, "error": reason}),
         error=reason,
     )
@@ -163,6 +174,12 @@ def _pictures(
     from detect.line_tracks import line_response
 
     name = Path(prefix).name
+    if plan.drawing == "markers" and found.markers is not None:
+        from detect.markers.drawing import draw_markers
+
+        yield f"{name}.png", _png(draw_markers(found.image, found.markers))
+    if plan.camera is None:
+        return
     if plan.drawing == "discs" and found.discs is not None and plan.circles is not None:
         picture = draw_circles(found.image, plan.camera, found.discs, plan.circles)
         yield f"{name}.png", _png(picture)

@@ -61,13 +61,12 @@ class RunFrames:
 
 
 @dataclass(frozen=True)
-class Run:
-    """A run folder that was looked through.
+class ImageRun:
+    """A run folder that was looked through, whether or not there is a calibration.
 
     Attributes
     ----------
     folder : path
-    camera : Camera
     frames : RunFrames
         In the order of the odometry, or of the images' names.
     odometry : path or None
@@ -77,7 +76,6 @@ class Run:
     """
 
     folder: Path
-    camera: Camera
     frames: RunFrames
     odometry: Path | None
     images_without_step: int
@@ -86,6 +84,18 @@ class Run:
     def name(self) -> str:
         """The folder's own name."""
         return self.folder.resolve().name
+
+
+@dataclass(frozen=True)
+class Run(ImageRun):
+    """A run folder with a calibration.
+
+    Attributes
+    ----------
+    camera : Camera
+    """
+
+    camera: Camera
 
 
 def open_run(folder: Path, camera_path: Path | None = None) -> Run:
@@ -110,13 +120,46 @@ def open_run(folder: Path, camera_path: Path | None = None) -> Run:
     camera.CameraError, landmarks.LandmarkFileError
         If the calibration or the odometry cannot be read.
     """
+    _demand_folder(folder)
+    camera = read_camera(camera_path if camera_path is not None else _only_camera(folder))
+    run = _image_run(folder)
+    return Run(folder, run.frames, run.odometry, run.images_without_step, camera)
+
+
+def open_images(folder: Path, camera_path: Path | None = None) -> ImageRun:
+    """Look through a run folder that may be without a calibration.
+
+    Parameters
+    ----------
+    folder, camera_path
+        As in `open_run`.
+
+    Returns
+    -------
+    ImageRun
+        A `Run` if there is a calibration.
+
+    Raises
+    ------
+    DetectError, camera.CameraError, landmarks.LandmarkFileError
+        As `open_run` does, but for a missing calibration.
+    """
+    _demand_folder(folder)
+    if camera_path is None and not any(folder.glob("*.cam")):
+        return _image_run(folder)
+    return open_run(folder, camera_path)
+
+
+def _demand_folder(folder: Path) -> None:
     if not folder.is_dir():
         raise DetectError(f"{folder}: no such folder: expected a run folder or a folder of images")
-    camera = read_camera(camera_path if camera_path is not None else _only_camera(folder))
+
+
+def _image_run(folder: Path) -> ImageRun:
     images = _images(folder)
     odometry = _odometry(folder)
     if odometry is None:
-        return Run(folder, camera, RunFrames(images, None, len(images)), None, 0)
+        return ImageRun(folder, RunFrames(images, None, len(images)), None, 0)
     named = np.zeros(len(images), bool)
     count = 0
     for step in _steps(odometry):
@@ -125,11 +168,11 @@ def open_run(folder: Path, camera_path: Path | None = None) -> Run:
         if found is not None:
             named[found] = True
     frames = RunFrames(images, odometry, count)
-    return Run(folder, camera, frames, odometry, int(np.count_nonzero(~named)))
+    return ImageRun(folder, frames, odometry, int(np.count_nonzero(~named)))
 
 
 def read_image(
-    frame: RunFrame, camera: Camera, working_folder: Path | None = None
+    frame: RunFrame, camera: Camera | None, working_folder: Path | None = None
 ) -> NDArray[np.uint8]:
     """The grey image of a frame.
 
@@ -138,8 +181,8 @@ def read_image(
     Parameters
     ----------
     frame : RunFrame
-    camera : Camera
-        Whose size the image must have.
+    camera : Camera or None
+        Whose size the image must have, if any.
     working_folder : path, optional
         What relative paths are relative to, if not the process's own working folder.
 
@@ -170,7 +213,7 @@ def read_image(
         image = None
     if image is None:
         raise FrameError(f"{frame.image}: cannot be decoded: expected an image")
-    if image.shape != (camera.height, camera.width):
+    if camera is not None and image.shape != (camera.height, camera.width):
         raise FrameError(
             f"{frame.image}: is {image.shape[1]}x{image.shape[0]} px: "
             f"expected {camera.width}x{camera.height}, the calibration's size"

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
@@ -19,7 +20,7 @@ from typing import BinaryIO, Literal, Protocol
 from detect.dispatch import Workers, detect_frames
 from detect.frame import FramePlan, tables_of
 from detect.frame_rows import FrameRows, FrameTask
-from detect.run import Run
+from detect.run import ImageRun
 from detect.workers import local_workers
 from landmarks import FrameTilt, LineLandmark
 from storage import write_whole
@@ -56,7 +57,7 @@ class Output:
     """
 
     path: Path
-    part: Literal["circles", "lines", "tilt", "json"]
+    part: Literal["circles", "lines", "tilt", "markers", "json"]
     head: bytes = b""
     tail: bytes = b""
     between: bytes = b""
@@ -68,8 +69,11 @@ class RunSummary:
 
     Attributes
     ----------
-    frames, discs, lines, tilts : int
-        Frames looked at, discs and lines found in them, and frames whose tilt could be told.
+    frames, discs, lines, tilts, markers : int
+        Frames looked at, discs and lines found in them, frames whose tilt could be told, and
+        markers found.
+    rejected : Counter
+        How many candidates for markers were rejected, by cause.
     failed : int
         Frames that could not be worked on.
     failures : list of str
@@ -82,6 +86,8 @@ class RunSummary:
     discs: int = 0
     lines: int = 0
     tilts: int = 0
+    markers: int = 0
+    rejected: Counter[str] = field(default_factory=Counter)
     failed: int = 0
     failures: list[str] = field(default_factory=list)
     images_without_step: int = 0
@@ -92,6 +98,8 @@ class RunSummary:
         self.discs += rows.disc_count
         self.lines += rows.line_count
         self.tilts += rows.has_tilt
+        self.markers += rows.marker_count
+        self.rejected.update(dict(rows.rejected))
         if rows.error is not None:
             self.failed += 1
             if len(self.failures) < KEPT_FAILURES:
@@ -99,7 +107,7 @@ class RunSummary:
 
 
 def detect_run(
-    run: Run,
+    run: ImageRun,
     plan: FramePlan,
     outputs: Sequence[Output],
     *,
@@ -114,7 +122,7 @@ def detect_run(
 
     Parameters
     ----------
-    run : Run
+    run : ImageRun
         The run.
     plan : FramePlan
         What to look for.
@@ -180,6 +188,7 @@ def detect_run(
 def json_file(path: Path, plan: FramePlan, version: str) -> Output:
     """The file of the discs as JSON: what `json.dumps` with an indent of 1 gives."""
     assert plan.circles is not None
+    assert plan.camera is not None
     document = {
         "version": version,
         "settings": dataclasses.asdict(plan.circles),
@@ -190,7 +199,9 @@ def json_file(path: Path, plan: FramePlan, version: str) -> Output:
     return Output(path, "json", head.encode(), f"\n ]{tail}\n".encode(), b",")
 
 
-def _tasks(run: Run, tilts: TiltSource | None, reference: LineSource | None) -> Iterator[FrameTask]:
+def _tasks(
+    run: ImageRun, tilts: TiltSource | None, reference: LineSource | None
+) -> Iterator[FrameTask]:
     for frame in run.frames:
         prefix = frame.step.prefix
         yield FrameTask(

@@ -36,6 +36,7 @@ from detect.markers.refinement import NO_EDGE, RefinedQuadrangle, refine_quadran
 from detect.markers.regions import Region, marker_regions
 from detect.markers.settings import MarkerSettings
 from detect.markers.templates import Templates, templates_of
+from landmarks import MarkerCorner, MarkerLandmark
 
 FloatArray = NDArray[np.float64]
 
@@ -75,6 +76,8 @@ class Candidate:
         Where it comes from.
     rough : (4, 2) float64
         Its rough corners, straight pixels.
+    outline : (4, 2) float64
+        The same as pixels of the image.
     fate : str
         ``accepted`` or why not.
     refined : RefinedQuadrangle or None
@@ -83,6 +86,7 @@ class Candidate:
 
     region: Region
     rough: FloatArray
+    outline: FloatArray
     fate: str
     refined: RefinedQuadrangle | None = None
 
@@ -130,6 +134,35 @@ class MarkerDetections:
 
     def __len__(self) -> int:
         return len(self.ids)
+
+    def landmarks(self) -> tuple[MarkerLandmark, ...]:
+        """The markers as rows of a file."""
+        return tuple(
+            MarkerLandmark(
+                self.dictionary,
+                int(number),
+                float(quality),
+                (
+                    _corner(corners[0], covariance[0]),
+                    _corner(corners[1], covariance[1]),
+                    _corner(corners[2], covariance[2]),
+                    _corner(corners[3], covariance[3]),
+                ),
+            )
+            for number, quality, corners, covariance in zip(
+                self.ids, self.quality, self.corners, self.covariance
+            )
+        )
+
+
+def _corner(place: FloatArray, covariance: FloatArray) -> MarkerCorner:
+    return MarkerCorner(
+        float(place[0]),
+        float(place[1]),
+        float(covariance[0, 0]),
+        float(covariance[0, 1]),
+        float(covariance[1, 1]),
+    )
 
 
 @dataclass(frozen=True)
@@ -209,14 +242,14 @@ def detect_markers(
     tried: list[FloatArray] = []
     for region, rough in quadrangles:
         if any(_same_place(rough, marker.corners) for marker in markers):
-            candidates.append(Candidate(region, rough, SAME_MARKER))
+            candidates.append(Candidate(region, rough, _bent(rough, lens), SAME_MARKER))
             continue
         if sum(_same_place(rough, other) for other in tried) >= _TRIES:
             continue
         tried.append(rough)
         refined = refine_quadrangle(
             image, lens, rough, capture_px=_capture(region, rough), border=templates.border,
-            noise=noise,
+            noise=noise, quick=settings.joint,
         )  # fmt: skip
         if refined is None:
             result: _Marker | str = NO_EDGE
@@ -230,8 +263,13 @@ def detect_markers(
                 markers.append(result)
         if fate not in (ACCEPTED, SAME_MARKER):
             rejected[fate] += 1
-        candidates.append(Candidate(region, rough, fate, refined))
+        candidates.append(Candidate(region, rough, _bent(rough, lens), fate, refined))
     return _detections(markers, lens, settings, candidates, rejected, masks)
+
+
+def _bent(corners: FloatArray, lens: Lens) -> FloatArray:
+    middle = corners.mean(axis=0)
+    return lens.bend(corners, lens.bend(middle[None], middle)[0])
 
 
 def _rough_quadrangle(region: Region, lens: Lens, settings: MarkerSettings) -> FloatArray | str:
@@ -266,10 +304,7 @@ def _identified(
         found = nearest_pattern(cells, templates, settings)
         if isinstance(found, str):
             return found
-        covariance = np.zeros((8, 8))
-        for k in range(4):
-            covariance[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = refined.covariance[k]
-        return _marker(found, refined.corners, covariance, templates, float("nan"))
+        return _marker(found, refined.corners, _block_diagonal(refined), templates, float("nan"))
 
     blur = float(np.median(refined.blur_px))
     side = np.sqrt(abs(signed_area(refined.corners)))
@@ -299,13 +334,16 @@ def _identified(
     verified = verified_identity(fit, template, templates, settings)
     if isinstance(verified, str):
         return verified
-    covariance = np.zeros((8, 8))
-    for k in range(4):
-        covariance[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = refined.covariance[k]
-    sharp = fit.blur_px <= _SHARP_BLURS * templates.border * side
-    whole = side >= _LEAST_BENT_PX and refined.support.min() >= 1.0
-    if sharp and whole and _disagreement(refined, fit) > _MOST_DISAGREEMENT:
-        return _marker(verified, refined.corners, covariance, templates, fit.explained)
+    if side >= _LEAST_BENT_PX and fit.blur_px <= _SHARP_BLURS * templates.border * side:
+        edges = refine_quadrangle(
+            image, lens, fit.corners, capture_px=_CAPTURE_PX + 2.0 * fit.blur_px,
+            border=templates.border, noise=noise,
+        )  # fmt: skip
+        whole = edges is not None and edges.support.min() >= 1.0
+        if edges is not None and whole and _disagreement(edges, fit) > _MOST_DISAGREEMENT:
+            return _marker(
+                verified, edges.corners, _block_diagonal(edges), templates, fit.explained
+            )
     return _marker(verified, fit.corners, fit.covariance, templates, fit.explained)
 
 
@@ -318,6 +356,14 @@ def _disagreement(refined: RefinedQuadrangle, fit: PatternFit) -> float:
         spread = refined.covariance[k] + part + _EDGE_SYSTEMATIC_PX**2 * np.eye(2)
         total += float(apart @ np.linalg.solve(spread, apart)) / 8.0
     return total
+
+
+def _block_diagonal(refined: RefinedQuadrangle) -> FloatArray:
+    """(8, 8) covariance of the corners by the edges, as if the corners were independent."""
+    covariance = np.zeros((8, 8))
+    for k in range(4):
+        covariance[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = refined.covariance[k]
+    return covariance
 
 
 def _marker(
@@ -373,8 +419,7 @@ def _detections(
     count = len(markers)
     corners, covariance = np.empty((count, 4, 2)), np.empty((count, 4, 2, 2))
     for n, marker in enumerate(markers):
-        middle = marker.corners.mean(axis=0)
-        corners[n] = lens.bend(marker.corners, lens.bend(middle[None], middle)[0])
+        corners[n] = _bent(marker.corners, lens)
         for k in range(4):
             jacobian = lens.pixel_jacobian(corners[n, k])
             part = marker.covariance[2 * k : 2 * k + 2, 2 * k : 2 * k + 2]

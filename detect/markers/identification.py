@@ -37,7 +37,9 @@ _SPREAD_CELLS = 0.25
 #: Patterns whose correlation is this near the best one's are tried too, at most so many.
 _CLOSE_CORRELATION = 0.06
 _MOST_TRIED = 3
-_LEAST_CORRELATION = 0.55
+#: Where cells are blurred by less than this (in cells), only a quarter as near.
+_CLEAR_BLUR_CELLS = 0.3
+_LEAST_CORRELATION = 0.6
 #: Natural logarithm of how much less likely the second best pattern must be.
 _LEAST_LOG_ODDS = 15.0
 #: Whiteness of cells is trusted to no better than this.
@@ -133,7 +135,8 @@ def likely_patterns(
     best = np.argpartition(-correlation, count - 1)[:count]
     # Equal ones in the order of their numbers: the same on every machine.
     best = best[np.lexsort((best, -correlation[best]))]
-    least = max(_LEAST_CORRELATION, float(correlation[best[0]]) - _CLOSE_CORRELATION)
+    close = _CLOSE_CORRELATION if blur_cells > _CLEAR_BLUR_CELLS else 0.25 * _CLOSE_CORRELATION
+    least = max(_LEAST_CORRELATION, float(correlation[best[0]]) - close)
     return np.asarray(best[correlation[best] >= least], dtype=np.int64)
 
 

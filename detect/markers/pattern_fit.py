@@ -22,8 +22,8 @@ FloatArray = NDArray[np.float64]
 #: Pixels and steps of a fit, and of a first look.
 _MOST_PIXELS = 3000
 _MOST_STEPS = 12
-_FIRST_LOOK_PIXELS = 700
-_FIRST_LOOK_STEPS = 6
+_FIRST_LOOK_PIXELS = 450
+_FIRST_LOOK_STEPS = 5
 #: Width of the seam round the marker that is fitted: blurs and pixels, at most a cell's size.
 _SEAM_BLURS = 2.5
 _SEAM_PX = 0.5

@@ -24,10 +24,14 @@ from detect.markers.homography_kernels import (
 from detect.markers.lens_kernels import straightened
 from detect.markers.solve_kernels import invert_positive, solve_positive
 
-#: Parameters: 8 of the homography, 3 of white and 3 of black (level, change along x, along y), 3 of
-#: the blur's covariance (uu, uv, vv; px^2), 1 of the tone curve.
-PARAMETERS = 18
-_WHITE, _BLACK, _BLUR, _TONE = 8, 11, 14, 17
+#: Parameters: 8 of the homography, 6 of white and 6 of black (level, along x, along y, x^2, xy,
+#: y^2), 3 of the blur's covariance (uu, uv, vv; px^2), 1 of the tone curve.
+PARAMETERS = 24
+_LIGHT = 6
+_WHITE, _BLACK, _BLUR, _TONE = 8, 14, 20, 23
+#: Standard deviations of the light's slope and bend over half a marker, in contrasts.
+_SLOPE_SIGMA = 0.3
+_BEND_SIGMA = 0.15
 
 #: What `fit_pattern` returns beside corners and covariance: robust standard deviation of what is
 #: left over, explained share of variance (of all but the noise), share of the pixels that agree,
@@ -303,6 +307,28 @@ def _place(
     return mx, my, ax, ay, bx, by, sx, sy, rho
 
 
+@njit(cache=True, error_model="numpy", inline="always")
+def _level(p: NDArray[np.float64], first: int, x: float, y: float) -> float:
+    """Grey level of white or black at a place."""
+    along_x = x * (p[first + 1] + x * p[first + 3] + y * p[first + 4])
+    along_y = y * (p[first + 2] + y * p[first + 5])
+    return float(p[first] + along_x + along_y)
+
+
+@njit(cache=True, error_model="numpy")
+def _accumulate_squares(rows: NDArray[np.float64], squares: NDArray[np.float64]) -> None:
+    """rows.T @ rows; a library's product would wake threads that cost more than they give."""
+    n = rows.shape[1]
+    squares[:] = 0.0
+    for k in range(rows.shape[0]):
+        row = rows[k]
+        for i in range(n):
+            factor = row[i]
+            into = squares[i]
+            for j in range(n):
+                into[j] += factor * row[j]
+
+
 @njit(cache=True, error_model="numpy")
 def _confine_blur(p: NDArray[np.float64]) -> None:
     """Keep the blur's covariance between what a pixel does and what is still an image."""
@@ -404,6 +430,7 @@ def fit_pattern(
     change = np.empty(PARAMETERS)
     inverse_normal = np.empty((PARAMETERS, PARAMETERS))
     rows = np.zeros((count, PARAMETERS + 1))
+    squares = np.empty((PARAMETERS + 1, PARAMETERS + 1))
     scale = -1.0
     steps = 0
     last_move = math.inf
@@ -421,8 +448,8 @@ def fit_pattern(
             )
             lx = x / size
             ly = y / size
-            white = p[_WHITE] + p[_WHITE + 1] * lx + p[_WHITE + 2] * ly
-            dark = p[_BLACK] + p[_BLACK + 1] * lx + p[_BLACK + 2] * ly
+            white = _level(p, _WHITE, lx, ly)
+            dark = _level(p, _BLACK, lx, ly)
             light = 1.0 - d
             toned = light + p[_TONE] * light * d
             value = dark + (white - dark) * toned
@@ -455,26 +482,27 @@ def fit_pattern(
             moved = (gu * x + gv * y) / w
             g[6] = moved * mx
             g[7] = moved * my
-            g[8] = toned
-            g[9] = toned * lx
-            g[10] = toned * ly
-            g[11] = 1.0 - toned
-            g[12] = (1.0 - toned) * lx
-            g[13] = (1.0 - toned) * ly
+            for first, share in ((_WHITE, toned), (_BLACK, 1.0 - toned)):
+                g[first] = share
+                g[first + 1] = share * lx
+                g[first + 2] = share * ly
+                g[first + 3] = share * lx * lx
+                g[first + 4] = share * lx * ly
+                g[first + 5] = share * ly * ly
             # sx^2, sy^2 and rho sx sy are linear in the blur's covariance.
             fx = slope * (d_sx - d_rho * rho / sx) / (2.0 * sx)
             fy = slope * (d_sy - d_rho * rho / sy) / (2.0 * sy)
             fxy = slope * d_rho / (sx * sy)
-            g[14] = fx * ax * ax + fy * bx * bx + fxy * ax * bx
-            g[15] = 2.0 * (fx * ax * ay + fy * bx * by) + fxy * (ax * by + ay * bx)
-            g[16] = fx * ay * ay + fy * by * by + fxy * ay * by
-            g[17] = (white - dark) * light * d
-            g[18] = r
+            g[_BLUR] = fx * ax * ax + fy * bx * bx + fxy * ax * bx
+            g[_BLUR + 1] = 2.0 * (fx * ax * ay + fy * bx * by) + fxy * (ax * by + ay * bx)
+            g[_BLUR + 2] = fx * ay * ay + fy * by * by + fxy * ay * by
+            g[_TONE] = (white - dark) * light * d
+            g[PARAMETERS] = r
             if weight != 1.0:
                 root = math.sqrt(weight)
                 for i in range(PARAMETERS + 1):
                     g[i] *= root
-        squares = rows.T @ rows
+        _accumulate_squares(rows, squares)
         normal[:] = squares[:PARAMETERS, :PARAMETERS]
         right[:] = squares[:PARAMETERS, PARAMETERS]
         stride = max(1, count // _SAMPLED_RESIDUALS)
@@ -483,20 +511,22 @@ def fit_pattern(
         contrast = max(abs(p[_WHITE] - p[_BLACK]), scale)
         # Weak knowledge, in the same measure as the grey values: light changes little over a
         # marker, the blur is round and about what was guessed, the tone curve nearly straight.
-        for i in (9, 10, 12, 13):
-            prior = variance / (0.3 * contrast) ** 2
-            normal[i, i] += prior
-            right[i] -= prior * p[i]
-        for i in (14, 16):
+        for first in (_WHITE, _BLACK):
+            for i in range(first + 1, first + _LIGHT):
+                sigma = _SLOPE_SIGMA if i < first + 3 else _BEND_SIGMA
+                prior = variance / (sigma * contrast) ** 2
+                normal[i, i] += prior
+                right[i] -= prior * p[i]
+        for i in (_BLUR, _BLUR + 2):
             prior = variance / (1.0 * blur_guess + 0.1) ** 2
             normal[i, i] += prior
             right[i] -= prior * (p[i] - blur_guess)
         prior = variance / (0.5 * blur_guess + 0.05) ** 2
-        normal[15, 15] += prior
-        right[15] -= prior * p[15]
+        normal[_BLUR + 1, _BLUR + 1] += prior
+        right[_BLUR + 1] -= prior * p[_BLUR + 1]
         prior = variance / 0.15**2
-        normal[17, 17] += prior
-        right[17] -= prior * p[17]
+        normal[_TONE, _TONE] += prior
+        right[_TONE] -= prior * p[_TONE]
         for i in range(PARAMETERS):
             normal[i, i] *= 1.0 + 1e-10
         if final:
@@ -603,8 +633,8 @@ def _cell_values(
         mx, my, _, _, _, _, sx, sy, _ = _place(inverse, x, y, p)
         x0, x1 = _profile(mx, sx, lines, work[0], work[1], work[2])
         y0, y1 = _profile(my, sy, lines, work[3], work[4], work[5])
-        white = p[_WHITE] + (p[_WHITE + 1] * x + p[_WHITE + 2] * y) / size
-        dark = p[_BLACK] + (p[_BLACK + 1] * x + p[_BLACK + 2] * y) / size
+        white = _level(p, _WHITE, x / size, y / size)
+        dark = _level(p, _BLACK, x / size, y / size)
         for j in range(y0, y1):
             wy = (work[4, j + 1] - work[4, j]) * (white - dark)
             for i in range(x0, x1):

@@ -36,8 +36,11 @@ _PASSES = 3
 _CLOSE_ENOUGH_PX = 0.05
 _FIRST_BLUR_PX = 0.9
 #: Pixels per edge in the first pass, and later.
-_FIRST_PIXELS = 400
+_FIRST_PIXELS = 160
 _MOST_PIXELS = 1500
+#: Pixels per edge in later passes if the edges are not the last word.
+_QUICK_PIXELS = 300
+_QUICK_PASSES = 2
 #: In the last passes an edge is looked for within this many of its blurs, and this many pixels.
 _REACH_BLURS = 2.5
 _REACH_PX = 0.8
@@ -88,6 +91,7 @@ def refine_quadrangle(
     capture_px: float,
     border: float,
     noise: float,
+    quick: bool = False,
 ) -> RefinedQuadrangle | None:
     """Fit the edges of a quadrangle to the image.
 
@@ -105,6 +109,8 @@ def refine_quadrangle(
         Thickness of the marker's black border, in its widths.
     noise : float
         Standard deviation of the image's noise, grey levels.
+    quick : bool
+        Use few pixels and two passes: enough to begin the fit of the whole marker with.
 
     Returns
     -------
@@ -116,10 +122,11 @@ def refine_quadrangle(
     edges = np.empty((4, EDGE_NUMBERS))
     covariance = np.empty((4, 2, 2))
     capture, blur = capture_px, _FIRST_BLUR_PX
-    for attempt in range(_PASSES):
+    pixels = _QUICK_PIXELS if quick else _MOST_PIXELS
+    for attempt in range(_QUICK_PASSES if quick else _PASSES):
         if not fit_edges(
             image, lens.grid, lens.step, corners, guess, capture, border, blur, noise,
-            _FIRST_PIXELS if attempt == 0 else _MOST_PIXELS, edges,
+            _FIRST_PIXELS if attempt == 0 else pixels, edges,
         ):  # fmt: skip
             return None
         refined = np.empty((4, 2))

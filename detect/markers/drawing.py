@@ -1,0 +1,98 @@
+"""Detected markers, and what was not taken for one, drawn for people."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from detect.markers.detect import ACCEPTED, SAME_MARKER, MarkerDetections
+
+FloatArray = NDArray[np.float64]
+Colour = tuple[int, int, int]
+
+_SUBPIXEL_BITS = 4
+_EDGE_COLOUR: Colour = (60, 220, 60)
+_TOP_LEFT_COLOUR: Colour = (0, 0, 255)
+_TEXT_COLOUR: Colour = (0, 230, 255)
+_CANDIDATE_COLOUR: Colour = (255, 150, 40)
+#: Ellipses of the corners show so many standard deviations.
+_SIGMAS = 20.0
+
+
+def draw_markers(
+    image: NDArray[np.uint8], found: MarkerDetections, *, rejected: bool = True
+) -> NDArray[np.uint8]:
+    """Draw markers with their numbers, and below the image why candidates were rejected.
+
+    The edges of markers are green, with a red circle at the top left corner; ellipses show 20
+    standard deviations of the corners. Rejected candidates that came as far as having corners are
+    drawn in blue.
+
+    Parameters
+    ----------
+    image : (H, W) uint8
+        The grey image.
+    found : MarkerDetections
+        What was found in it.
+    rejected : bool
+        Whether to draw candidates that are no markers.
+
+    Returns
+    -------
+    (H + h, W, 3) uint8
+        In OpenCV's order blue, green, red; h is the height of the legend.
+    """
+    import cv2
+
+    canvas = np.repeat(image[:, :, None], 3, axis=2)
+    if rejected:
+        for candidate in found.candidates:
+            if candidate.fate not in (ACCEPTED, SAME_MARKER):
+                _draw_quadrangle(canvas, candidate.outline, _CANDIDATE_COLOUR)
+    for number, corners, covariance in zip(found.ids, found.corners, found.covariance):
+        _draw_quadrangle(canvas, corners, _EDGE_COLOUR)
+        for place, spread in zip(corners, covariance):
+            _draw_ellipse(canvas, place, spread, _EDGE_COLOUR)
+        cv2.circle(
+            canvas, _fixed(corners[0]), 3 << _SUBPIXEL_BITS, _TOP_LEFT_COLOUR, 1, cv2.LINE_AA,
+            _SUBPIXEL_BITS,
+        )  # fmt: skip
+        middle = corners.mean(axis=0)
+        cv2.putText(
+            canvas, f"{number}", (round(float(middle[0])) - 8, round(float(middle[1])) + 5),
+            cv2.FONT_HERSHEY_SIMPLEX, 0.45, _TEXT_COLOUR, 1, cv2.LINE_AA,
+        )  # fmt: skip
+    per_row = max(1, image.shape[1] // 210)
+    causes = sorted(found.rejected.items())
+    rows = -(-len(causes) // per_row)
+    legend = np.zeros((14 * rows + 4, image.shape[1], 3), np.uint8)
+    for k, (cause, count) in enumerate(causes):
+        origin = (4 + 210 * (k % per_row), 13 + 14 * (k // per_row))
+        cv2.putText(
+            legend, f"{cause}: {count}", origin, cv2.FONT_HERSHEY_SIMPLEX, 0.36,
+            _CANDIDATE_COLOUR, 1, cv2.LINE_AA,
+        )  # fmt: skip
+    return np.concatenate([canvas, legend])
+
+
+def _fixed(place: FloatArray) -> tuple[int, int]:
+    at = np.rint(place * (1 << _SUBPIXEL_BITS)).astype(np.int32)
+    return int(at[0]), int(at[1])
+
+
+def _draw_quadrangle(canvas: NDArray[np.uint8], corners: FloatArray, colour: Colour) -> None:
+    import cv2
+
+    if np.all(np.isfinite(corners)):
+        fixed = np.rint(corners * (1 << _SUBPIXEL_BITS)).astype(np.int32)
+        cv2.polylines(canvas, [fixed], True, colour, 1, cv2.LINE_AA, _SUBPIXEL_BITS)
+
+
+def _draw_ellipse(
+    canvas: NDArray[np.uint8], place: FloatArray, covariance: FloatArray, colour: Colour
+) -> None:
+    values, vectors = np.linalg.eigh(covariance)
+    angle = np.linspace(0.0, 2.0 * np.pi, 33)
+    circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    ellipse = place + _SIGMAS * (circle * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
+    _draw_quadrangle(canvas, ellipse, colour)
