@@ -31,7 +31,7 @@ def shapes_background(rng: np.random.Generator, width: int, height: int) -> Grey
     """
     import cv2
 
-    base = 0.15 + 0.6 * rng.random() + 0.35 * (blotches(rng, (height // 2, width // 2)) - 0.5)
+    base = 0.15 + 0.6 * rng.random() + 0.35 * (blotches(rng, (height // 4, width // 4)) - 0.5)
     image = np.clip(255.0 * base, 8, 250).astype(np.uint8)
     image = np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_LINEAR))
     for _ in range(int(rng.integers(3, 22))):

@@ -256,6 +256,9 @@ def shade(
 ) -> None:
     """Let the surfaces of one exposure take the background's place.
 
+    Surfaces may touch but should not pass through each other: where they do, the border between
+    them is no edge, and may be found up to a tile's width beside its place.
+
     Parameters
     ----------
     light : (2 H, 2 W) or (H, W) float32
@@ -303,42 +306,52 @@ def shade(
             if count == 0:
                 continue
             for row in range(top, bottom):
+                # Between two edges nothing changes, so that one ray is enough.
+                known = False
+                found, value = -1, 0.0
                 for column in range(left, right):
-                    x, y = rays[row, column, 0], rays[row, column, 1]
-                    near = 0
-                    for k in range(count):
-                        s = candidates[k]
-                        across = boxes[s, 0] <= column and boxes[s, 2] >= column
-                        if across and boxes[s, 1] <= row and boxes[s, 3] >= row:
-                            here[near] = s
-                            near += 1
-                    if near == 0:
+                    a, b = 2 * row, 2 * column
+                    behind = background[row, column]
+                    on_edge = (
+                        crossed[a, b]
+                        | crossed[a, b + 1]
+                        | crossed[a + 1, b]
+                        | crossed[a + 1, b + 1]
+                    )
+                    if not on_edge and not known:
+                        found, value = nearest_surface(
+                            rays[row, column, 0], rays[row, column, 1],
+                            candidates, count, to_texel, sizes, starts, texels, smooth,
+                        )  # fmt: skip
+                        known = True
+                    if on_edge:
+                        known = False
+                    elif found < 0:
                         continue
+                    elif not smooth[found]:
+                        change = np.float32(weight * (value - behind))
+                        if coarse:
+                            light[row, column] += np.float32(4.0) * change
+                        else:
+                            light[a, b] += change
+                            light[a, b + 1] += change
+                            light[a + 1, b] += change
+                            light[a + 1, b + 1] += change
+                        continue
+                    near = 0
+                    if on_edge:
+                        for k in range(count):
+                            s = candidates[k]
+                            across = boxes[s, 0] <= column and boxes[s, 2] >= column
+                            if across and boxes[s, 1] <= row and boxes[s, 3] >= row:
+                                here[near] = s
+                                near += 1
+                    else:
+                        here[0] = found
+                        near = 1
+                    x, y = rays[row, column, 0], rays[row, column, 1]
                     xu, xv = rays[row, column, 2], rays[row, column, 3]
                     yu, yv = rays[row, column, 4], rays[row, column, 5]
-                    behind = background[row, column]
-                    a, b = 2 * row, 2 * column
-                    if not (
-                        crossed[a, b]
-                        or crossed[a, b + 1]
-                        or crossed[a + 1, b]
-                        or crossed[a + 1, b + 1]
-                    ):
-                        found, value = nearest_surface(
-                            x, y, here, near, to_texel, sizes, starts, texels, smooth
-                        )
-                        if found < 0:
-                            continue
-                        if not smooth[found]:
-                            change = np.float32(weight * (value - behind))
-                            if coarse:
-                                light[row, column] += np.float32(4.0) * change
-                            else:
-                                light[a, b] += change
-                                light[a, b + 1] += change
-                                light[a + 1, b] += change
-                                light[a + 1, b + 1] += change
-                            continue
                     for i in range(2):
                         for j in range(2):
                             r, c = 2 * row + i, 2 * column + j
@@ -355,12 +368,12 @@ def shade(
                                     p, q = point_x[k] + shift_x, point_y[k] + shift_y
                                     du += 0.5 * (p - int(p)) - 0.25
                                     dv += 0.5 * (q - int(q)) - 0.25
-                                found, value = nearest_surface(
+                                hit, seen = nearest_surface(
                                     x + xu * du + xv * dv, y + yu * du + yv * dv,
                                     here, near, to_texel, sizes, starts, texels, smooth,
                                 )  # fmt: skip
-                                if found >= 0:
-                                    total += value - behind
+                                if hit >= 0:
+                                    total += seen - behind
                             change = np.float32(weight * total / cast)
                             if coarse:
                                 light[row, column] += change

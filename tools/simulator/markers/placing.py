@@ -9,7 +9,14 @@ import numpy as np
 
 from camera import Camera
 from tools.simulator.markers.clutter import blotches
-from tools.simulator.markers.surface import FloatArray, Surface, Texture, box_sides, plain
+from tools.simulator.markers.surface import (
+    FloatArray,
+    Surface,
+    Texture,
+    box_sides,
+    cross,
+    plain,
+)
 from tools.simulator.markers.truth import marker_corners, mean_side_px
 
 _TRIES = 12
@@ -76,19 +83,19 @@ def random_pose(
     ray = camera.unproject(pixel)
     ray /= np.linalg.norm(ray)
     toward = -ray
-    across = np.cross(toward, [0.0, 1.0, 0.0])
+    across = cross(toward, np.array([0.0, 1.0, 0.0]))
     across /= np.linalg.norm(across)
-    upward = np.cross(toward, across)
+    upward = cross(toward, across)
     direction = rng.uniform(0.0, 2.0 * np.pi)
     sideways = np.cos(direction) * across + np.sin(direction) * upward
     slant = np.radians(slant_deg)
     normal = np.cos(slant) * toward + np.sin(slant) * sideways
     turn = rng.uniform(0.0, 2.0 * np.pi)
-    other = np.cross(normal, toward if slant > 0.1 else across)
+    other = cross(normal, toward if slant > 0.1 else across)
     other /= np.linalg.norm(other)
-    x = np.cos(turn) * other + np.sin(turn) * np.cross(normal, other)
+    x = np.cos(turn) * other + np.sin(turn) * cross(normal, other)
     pose = np.eye(4)
-    pose[:3, 0], pose[:3, 1], pose[:3, 2] = x, np.cross(normal, x), normal
+    pose[:3, 0], pose[:3, 1], pose[:3, 2] = x, cross(normal, x), normal
     distance = camera.scale_x * width_m / width_px
     for _ in range(4):
         pose[:3, 3] = distance * ray

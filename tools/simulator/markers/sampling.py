@@ -21,7 +21,7 @@ from tools.simulator.markers.clutter import near_marker, thing
 from tools.simulator.markers.imaging import Imaging, grey_image, uneven_light
 from tools.simulator.markers.placing import Placed, backing_box, place, random_pose
 from tools.simulator.markers.prints import BLACK, WHITE, marker_surface
-from tools.simulator.markers.rendering import SAMPLES, render_light
+from tools.simulator.markers.rendering import SAMPLES, SurfaceArrays, render_light
 from tools.simulator.markers.surface import FloatArray, Surface, plain
 from tools.simulator.markers.truth import (
     MarkerTruth,
@@ -167,7 +167,10 @@ def sample_frame(settings: SampleSettings, seed: int, index: int) -> SampleFrame
     exposures = [[surface.moved(move) for surface in scene.surfaces] for move in moves]
     light = render_light(camera, exposures, background, fine=imaging.fine, samples=settings.samples)
     image = grey_image(light, illumination, imaging, rng)
-    markers = tuple(_truth(scene, card, illumination, imaging.gain, name) for card in scene.cards)
+    arrays = SurfaceArrays(camera, scene.surfaces)
+    markers = tuple(
+        _truth(scene, card, arrays, illumination, imaging.gain, name) for card in scene.cards
+    )
     return SampleFrame(
         seed, index, image, camera, name, markers, tuple(scene.things), imaging, motion_px
     )
@@ -304,12 +307,17 @@ def _occluder(rng: np.random.Generator, card: Surface) -> Surface:
 
 
 def _truth(
-    scene: _Scene, card: tuple[int, int], illumination: Any, gain: float, dictionary: str
+    scene: _Scene,
+    card: tuple[int, int],
+    arrays: SurfaceArrays,
+    illumination: Any,
+    gain: float,
+    dictionary: str,
 ) -> MarkerTruth:
     which, marker_id = card
     pose = scene.surfaces[which].pose
     camera = scene.camera
-    visible, rim = visible_shares(camera, scene.surfaces, which, _MARKER_M)
+    visible, rim = visible_shares(camera, scene.surfaces, which, _MARKER_M, arrays)
     corners = marker_corners(camera, pose, _MARKER_M)
     u, v = np.rint(camera.project(pose[:3, 3])).astype(int)
     light = 1.0

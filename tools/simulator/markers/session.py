@@ -15,7 +15,7 @@ from groundtruth.transforms import apply, inverse, planar_transform
 from tools.simulator.markers.clutter import Grey
 from tools.simulator.markers.imaging import Imaging, grey_image, uneven_light
 from tools.simulator.markers.prints import BLACK, WHITE
-from tools.simulator.markers.rendering import render_light
+from tools.simulator.markers.rendering import SurfaceArrays, render_light
 from tools.simulator.markers.robot import FOOTPRINT_M, robot_rig, robot_surfaces
 from tools.simulator.markers.room import (
     CAMERA_NAMES,
@@ -348,9 +348,10 @@ def _markers(
     plan: SessionPlan, model: Camera, surfaces: list[Surface], illumination: Grey, gain: float
 ) -> tuple[MarkerTruth, ...]:
     result = []
+    arrays = SurfaceArrays(model, surfaces)
     for which, (marker, width) in enumerate(zip(plan.rig.ids, plan.rig.widths_m)):
         card = surfaces[which]
-        visible, rim = visible_shares(model, surfaces, which, float(width))
+        visible, rim = visible_shares(model, surfaces, which, float(width), arrays)
         corners = marker_corners(model, card.pose, float(width))
         if visible == 0.0 or np.isnan(corners).any():
             continue

@@ -83,11 +83,18 @@ def square_corners(width_m: float, height_m: float | None = None) -> FloatArray:
     return np.array([[-x, y, 0.0], [x, y, 0.0], [x, -y, 0.0], [-x, -y, 0.0]])
 
 
+def cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Cross product of two single vectors, many times as quick as NumPy's."""
+    a0, a1, a2 = a.tolist()
+    b0, b1, b2 = b.tolist()
+    return np.array([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0])
+
+
 def pose_of(x_axis: ArrayLike, y_axis: ArrayLike, origin: ArrayLike) -> FloatArray:
     """parent_from_surface of a surface whose x and y axes are given as unit vectors."""
     x, y = np.asarray(x_axis, dtype=np.float64), np.asarray(y_axis, dtype=np.float64)
     pose = np.eye(4)
-    pose[:3, 0], pose[:3, 1], pose[:3, 2] = x, y, np.cross(x, y)
+    pose[:3, 0], pose[:3, 1], pose[:3, 2] = x, y, cross(x, y)
     pose[:3, 3] = origin
     return pose
 
@@ -118,7 +125,7 @@ def box_sides(
     result = []
     for side, texture in textures.items():
         x_axis, y_axis = np.array(_SIDES[side][0]), np.array(_SIDES[side][1])
-        outward = np.cross(x_axis, y_axis)
+        outward = cross(x_axis, y_axis)
         local = pose_of(x_axis, y_axis, centre + outward * half)
         across = 2.0 * float(np.abs(x_axis) @ half)
         upward = 2.0 * float(np.abs(y_axis) @ half)

@@ -104,7 +104,11 @@ def slant_deg(camera_from_marker: FloatArray) -> float:
 
 
 def visible_shares(
-    camera: Camera, surfaces: Sequence[Surface], which: int, width_m: float
+    camera: Camera,
+    surfaces: Sequence[Surface],
+    which: int,
+    width_m: float,
+    arrays: SurfaceArrays | None = None,
 ) -> tuple[float, float]:
     """How much of a marker is in the image and not hidden.
 
@@ -118,6 +122,8 @@ def visible_shares(
         The marker's card among them.
     width_m : float
         Width of its black square.
+    arrays : SurfaceArrays, optional
+        Of the same surfaces, if they are at hand.
 
     Returns
     -------
@@ -127,7 +133,8 @@ def visible_shares(
     card = surfaces[which]
     if slant_deg(card.pose) >= 90.0:
         return 0.0, 0.0
-    arrays = SurfaceArrays(camera, surfaces)
+    if arrays is None:
+        arrays = SurfaceArrays(camera, surfaces)
     if which not in arrays.index:
         return 0.0, 0.0
     ticks = (np.arange(_POINTS) + 0.5) / _POINTS - 0.5
