@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from detect.tilt import TiltEstimate, level_rotation
-from landmarks import wrap_angle
 
 FloatArray = NDArray[np.float64]
 
@@ -109,14 +108,13 @@ def join_bearings(
     alpha_rad, sigma_rad : float
         Of the mixture (rad).
     """
-    alpha = np.asarray(alpha_rad, dtype=np.float64)
-    sigma = np.asarray(sigma_rad, dtype=np.float64)
-    share = np.asarray(weight, dtype=np.float64)
-    share = share / share.sum()
-    offset = wrap_angle(alpha - alpha[0])
-    mean = float(share @ offset)
-    variance = float(share @ (sigma**2 + (offset - mean) ** 2))
-    return float(wrap_angle(alpha[0] + mean)), float(np.sqrt(variance))
+    from detect.line_bearing_kernels import join_mixture
+
+    return join_mixture(
+        np.asarray(alpha_rad, dtype=np.float64),
+        np.asarray(sigma_rad, dtype=np.float64),
+        np.asarray(weight, dtype=np.float64),
+    )
 
 
 def close_groups(alpha_rad: ArrayLike, distance_rad: ArrayLike) -> NDArray[np.int64]:
@@ -134,11 +132,10 @@ def close_groups(alpha_rad: ArrayLike, distance_rad: ArrayLike) -> NDArray[np.in
     (N,) int64
         The group of each, counted from 0 at the largest bearing (leftmost in the image).
     """
-    alpha = np.asarray(alpha_rad, dtype=np.float64)
-    distance = np.asarray(distance_rad, dtype=np.float64)
-    order = np.argsort(-alpha, kind="stable")
-    step = -np.diff(alpha[order])
-    apart = step >= np.minimum(distance[order][1:], distance[order][:-1])
-    group = np.zeros(len(alpha), np.int64)
-    group[order] = np.concatenate([[0], np.cumsum(apart)])[: len(alpha)]
-    return group
+    from detect.line_bearing_kernels import chain_neighbours
+
+    return np.asarray(
+        chain_neighbours(
+            np.asarray(alpha_rad, dtype=np.float64), np.asarray(distance_rad, dtype=np.float64)
+        )
+    )

@@ -23,14 +23,23 @@ class LineFilter:
     weights : (2, 2r + 1) float32
         Across the line: of sum 1; and the same times the distance in units of its standard
         deviation.
-    along : (2s + 1,) float32
-        Along the line, of sum 1.
+    weights_between : (4, 8 n) float32
+        For a window between two pixels, from `reach_across` pixels left of the left one on: both
+        weights if it is on the left one, each followed by what is to be added for a whole pixel to
+        the right. Filled up with zeros.
+    along : (4 n,) float32
+        Along the line, of sum 1, and zeros behind.
+    reach_across, reach_along : int
+        r and s: how far the window reaches.
     regulariser : float32
         Added to the variance in the window (grey values squared).
     """
 
     weights: NDArray[np.float32]
+    weights_between: NDArray[np.float32]
     along: NDArray[np.float32]
+    reach_across: int
+    reach_along: int
     regulariser: np.float32
 
 
@@ -72,7 +81,7 @@ class FilteredColumns:
 
     Attributes
     ----------
-    moments : (W, 3, H) float32
+    moments : (W * 3 * (H + 4),) float32
         Mean, covariance and mean square, in the rows of each of the strip's columns that are known.
     known : (2, W) int32
         First of these rows, and the one after the last.
@@ -85,7 +94,7 @@ class FilteredColumns:
     def none_yet(cls, table: VerticalTable) -> FilteredColumns:
         """Nothing has been filtered."""
         height, width = table.column.shape
-        return cls(np.empty((width, 3, height), np.float32), np.zeros((2, width), np.int32))
+        return cls(np.empty(width * 3 * (height + 4), np.float32), np.zeros((2, width), np.int32))
 
 
 def gaussian_window(sigma: float) -> FloatArray:
@@ -101,9 +110,18 @@ def line_filter(settings: LineSettings) -> LineFilter:
     across = gaussian_window(settings.sigma_across_px)
     distance = np.arange(len(across)) - 0.5 * (len(across) - 1)
     lever = distance / np.sqrt(across @ distance**2)
+    weights = np.stack([across, across * lever])
+    # Moments between two pixels are those of both, interpolated; so are the weights.
+    left = np.pad(weights, [(0, 0), (0, 1)])
+    step = np.pad(weights, [(0, 0), (1, 0)]) - left
+    between = np.stack([left[0], step[0], left[1], step[1]])
+    along = gaussian_window(settings.sigma_along_rows)
     return LineFilter(
-        weights=np.stack([across, across * lever]).astype(np.float32),
-        along=gaussian_window(settings.sigma_along_rows).astype(np.float32),
+        weights=weights.astype(np.float32),
+        weights_between=np.pad(between, [(0, 0), (0, -between.shape[1] % 8)]).astype(np.float32),
+        along=np.pad(along, (0, -len(along) % 4)).astype(np.float32),
+        reach_across=len(across) // 2,
+        reach_along=len(along) // 2,
         regulariser=np.float32(settings.regulariser),
     )
 
@@ -125,7 +143,7 @@ def start_band(table: VerticalTable, settings: LineSettings) -> StartBand:
         Computed once for each table.
     """
     window = line_filter(settings)
-    r, s = window.weights.shape[1] // 2, len(window.along) // 2
+    r, s = window.reach_across, window.reach_along
     height, width = table.column.shape
     steps = settings.start_band_rows // settings.start_spacing_rows
     reach = steps * settings.start_spacing_rows + s
@@ -140,7 +158,7 @@ def start_band(table: VerticalTable, settings: LineSettings) -> StartBand:
 
     evaluated = slice(s, 2 * reach + 1 - s, settings.start_spacing_rows)
     # Windows are cut off where the vertical ends.
-    share = np.concatenate([[0.0], np.cumsum(window.along, dtype=np.float64)])
+    share = np.concatenate([[0.0], np.cumsum(window.along[: 2 * s + 1], dtype=np.float64)])
     middle = row[evaluated]
     below = np.clip(table.last_row - middle + s + 1, 0, 2 * s + 1)
     above = np.clip(table.first_row - middle + s, 0, 2 * s + 1)

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from detect.line_settings import LineSettings
+from detect.line_step_filters import step_filters
 from detect.line_tracks import LineTracks
 from lut.verticals import VerticalTable
 
@@ -99,85 +100,46 @@ def fit_lines(
     Returns
     -------
     LineFits
-        One for each track. Without refinement the covariance is that of independent points with the
-        scatter that the track shows.
+        One for each track; tracks too short to be lines are not refined. Without refinement the
+        covariance is that of independent points with the scatter that the track shows.
     """
     from detect.line_fit_kernels import fit_eigenlines, refine_lines
 
-    count = len(tracks)
-    reference, pixel = np.empty(count), np.empty(count)
-    line, scatter = np.empty((count, 2)), np.empty(count)
-    middle, spread = np.empty(count), np.empty(count)
-    fit_eigenlines(
-        table.bearing_rad, table.elevation_tan, tracks.bounds, tracks.row, tracks.column,
-        reference, pixel, line, scatter, middle, spread,
-    )  # fmt: skip
+    reference, pixel, line, scatter_px, middle, spread = fit_eigenlines(
+        table.bearing_rad, table.elevation_tan, tracks.bounds, tracks.row, tracks.column
+    )
     if not settings.refine_steps_px:
+        count = len(tracks)
         return LineFits(
             reference_rad=reference,
             pixel_rad=pixel,
             line=line,
-            covariance=_regression_covariance(scatter, tracks.points, middle, spread),
-            scatter_px=scatter / pixel,
+            covariance=_regression_covariance(scatter_px * pixel, tracks.points, middle, spread),
+            scatter_px=scatter_px,
             shift_px=np.zeros(count),
             spread=spread,
             contrast=np.full(count, np.nan),
             sharpness=np.ones(count),
         )
-    scales, farthest = np.array(settings.refine_steps_px).T
-    refined_line = line.copy()
-    covariance = np.empty((count, 2, 2))
-    contrast, sharpness = np.empty(count), np.empty(count)
-    refined = np.empty(count, np.bool_)
-    refine_lines(
-        image, table.column, table.bearing_rad, table.elevation_tan,
-        tracks.polarity, tracks.bounds, tracks.row, tracks.column,
-        reference, pixel, middle, np.ascontiguousarray(scales), np.ascontiguousarray(farthest),
-        settings.fine_scale_px, settings.coarse_scale_px,
-        refined_line, covariance, contrast, sharpness, refined,
+    scales, farthest = zip(*settings.refine_steps_px)
+    filters = step_filters((*scales, settings.fine_scale_px, settings.coarse_scale_px))
+    line, covariance, shift_px, contrast, sharpness = refine_lines(
+        np.ascontiguousarray(image), table.column, table.bearing_rad, table.elevation_tan,
+        tracks.polarity, tracks.bounds, tracks.row, tracks.column, reference, pixel, middle,
+        settings.least_points(table.row_aspect), filters.half, filters.begin,
+        filters.height, filters.first, filters.second, np.array(farthest), line,
     )  # fmt: skip
-    shift = np.abs(refined_line[:, 0] - line[:, 0] + (refined_line[:, 1] - line[:, 1]) * middle)
     return LineFits(
         reference_rad=reference,
         pixel_rad=pixel,
-        line=np.where(refined[:, None], refined_line, np.nan),
+        line=line,
         covariance=covariance,
-        scatter_px=scatter / pixel,
-        shift_px=shift / pixel,
+        scatter_px=scatter_px,
+        shift_px=shift_px,
         spread=spread,
         contrast=contrast,
-        sharpness=np.clip(sharpness, 0.0, 1.0),
+        sharpness=sharpness,
     )
-
-
-def lean_onto_tilt(
-    fits: LineFits, expected_lean: FloatArray, building_rad: float
-) -> tuple[FloatArray, FloatArray]:
-    """Bearings at the horizon when lines may lean only as verticals do.
-
-    The measured lean b is replaced by its best estimate given that it should be `expected_lean` up
-    to a standard deviation, and a, which is correlated with it, follows.
-
-    Parameters
-    ----------
-    fits : LineFits
-        N lines.
-    expected_lean : (N,) float64
-        Lean of a vertical there (see `detect.tilt.lean`).
-    building_rad : float
-        Standard deviation of real verticals about the vertical.
-
-    Returns
-    -------
-    intercept : (N,) float64
-        a of the constrained lines.
-    variance : (N,) float64
-        Of these, due to noise.
-    """
-    with_lean = fits.covariance[:, 0, 1]
-    gain = with_lean / (fits.covariance[:, 1, 1] + building_rad**2)
-    intercept = fits.line[:, 0] - gain * (fits.line[:, 1] - expected_lean)
-    return intercept, np.asarray(fits.covariance[:, 0, 0] - gain * with_lean)
 
 
 def _regression_covariance(

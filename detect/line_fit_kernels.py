@@ -15,19 +15,40 @@ from numpy.typing import NDArray
 
 
 @njit(cache=True, error_model="numpy")
+def _tan_and_secant(angle: float) -> tuple[float, float]:
+    """Tangent and inverse cosine; by their series for the small angles of a chart."""
+    if abs(angle) > 0.1:
+        return math.tan(angle), 1.0 / math.cos(angle)
+    q = angle * angle
+    tangent = angle * (1.0 + q * (1.0 / 3.0 + q * (2.0 / 15.0 + q * (17.0 / 315.0))))
+    secant = 1.0 + q * (0.5 + q * (5.0 / 24.0 + q * (61.0 / 720.0 + q * (277.0 / 8064.0))))
+    return tangent, secant
+
+
+@njit(cache=True, error_model="numpy")
+def _arctan(x: float) -> float:
+    """Arc tangent; by its series for small arguments."""
+    if abs(x) > 0.1:
+        return math.atan(x)
+    q = x * x
+    return x * (1.0 - q * (1.0 / 3.0 - q * (0.2 - q * (1.0 / 7.0 - q * (1.0 / 9.0)))))
+
+
+@njit(cache=True, error_model="numpy")
 def fit_eigenlines(
     bearing: NDArray[np.float64],
     elevation_tan: NDArray[np.float32],
     bounds: NDArray[np.int64],
     row: NDArray[np.int32],
     column: NDArray[np.float64],
-    reference: NDArray[np.float64],
-    pixel: NDArray[np.float64],
-    line: NDArray[np.float64],
-    straightness: NDArray[np.float64],
-    middle: NDArray[np.float64],
-    spread: NDArray[np.float64],
-) -> None:
+) -> tuple[
+    NDArray[np.float64],
+    NDArray[np.float64],
+    NDArray[np.float64],
+    NDArray[np.float64],
+    NDArray[np.float64],
+    NDArray[np.float64],
+]:
     """Straight lines through tracks, by the eigen-decomposition of their points' scatter.
 
     Parameters
@@ -36,18 +57,28 @@ def fit_eigenlines(
         The table.
     bounds, row, column
         The tracks (see `follow_edges`).
+
+    Returns
+    -------
     reference : (T,) float64
-        Result: bearing round which each line's chart lies (rad).
+        Bearing round which each line's chart lies (rad).
     pixel : (T,) float64
-        Result: width of a column there (rad).
+        Width of a column there (rad).
     line : (T, 2) float64
-        Result: a, b of X = a + b Z along the larger eigenvalue's eigenvector; NaN for tracks of
-        less than 3 points.
-    straightness : (T,) float64
-        Result: root of the smaller eigenvalue of the points' covariance, chart units.
+        a, b of X = a + b Z along the larger eigenvalue's eigenvector; NaN for tracks of less than 3
+        points.
+    scatter_px : (T,) float64
+        Root of the smaller eigenvalue of the points' covariance, pixels.
     middle, spread : (T,) float64
-        Result: mean of the points' Z, and its variance.
+        Mean of the points' Z, and its variance.
     """
+    count = len(bounds) - 1
+    reference = np.empty(count)
+    pixel = np.empty(count)
+    line = np.empty((count, 2))
+    scatter_px = np.empty(count)
+    middle = np.empty(count)
+    spread = np.empty(count)
     width = bearing.shape[0]
     for t in range(len(bounds) - 1):
         begin, end = bounds[t], bounds[t + 1]
@@ -61,7 +92,7 @@ def fit_eigenlines(
         pixel[t] = 0.5 * abs(bearing[j + 1] - bearing[j - 1])
         line[t, 0] = np.nan
         line[t, 1] = np.nan
-        straightness[t] = np.nan
+        scatter_px[t] = np.nan
         sum_x = 0.0
         sum_z = 0.0
         sum_xx = 0.0
@@ -72,8 +103,8 @@ def fit_eigenlines(
             f = column[i] - j
             off = (1.0 - f) * bearing[j] + f * bearing[j + 1] - phi
             rise = (1.0 - f) * elevation_tan[row[i], j] + f * elevation_tan[row[i], j + 1]
-            x = math.tan(off)
-            z = rise / math.cos(off)
+            x, secant = _tan_and_secant(off)
+            z = rise * secant
             sum_x += x
             sum_z += z
             sum_xx += x * x
@@ -93,86 +124,11 @@ def fit_eigenlines(
         b = xz / (zz - smaller)
         line[t, 0] = mean_x - b * mean_z
         line[t, 1] = b
-        straightness[t] = math.sqrt(max(smaller, 0.0))
+        scatter_px[t] = math.sqrt(max(smaller, 0.0)) / pixel[t]
+    return reference, pixel, line, scatter_px, middle, spread
 
 
-@njit(cache=True, error_model="numpy")
-def _cross_row(
-    table_column: NDArray[np.float32],
-    bearing: NDArray[np.float64],
-    elevation_tan: NDArray[np.float32],
-    phi: float,
-    a: float,
-    b: float,
-    v: int,
-    near: float,
-) -> tuple[float, float, float, float]:
-    """Where a line crosses a row, from a strip column near it.
-
-    Returns
-    -------
-    column : float
-        In the strip.
-    u : float
-        In the image; NaN outside.
-    by_a, by_b : float
-        Derivatives of u by the line's a and b.
-    """
-    width = bearing.shape[0]
-    j = min(max(int(near), 0), width - 2)
-    f = near - j
-    rise = (1.0 - f) * elevation_tan[v, j] + f * elevation_tan[v, j + 1]
-    # Z depends on X in second order only: one repetition settles it.
-    x = a + b * rise
-    z = rise * math.sqrt(1.0 + x * x)
-    x = a + b * z
-    wanted = phi + math.atan(x)
-    column = j + (wanted - bearing[j]) / (bearing[j + 1] - bearing[j])
-    if not (0.0 <= column <= width - 1.0):
-        return near, math.nan, 0.0, 0.0
-    j = min(int(column), width - 2)
-    per_column = bearing[j + 1] - bearing[j]
-    column = j + (wanted - bearing[j]) / per_column
-    du_dc = table_column[v, j + 1] - table_column[v, j]
-    by_a = du_dc / (per_column * (1.0 + x * x))
-    return column, table_column[v, j] + (column - j) * du_dc, by_a, by_a * z
-
-
-@njit(cache=True, error_model="numpy")
-def _gaussian(sigma: float) -> NDArray[np.float64]:
-    """(reach + 1,) exp(-k^2 / 2 sigma^2) for k = 0, 1, ... as far as it counts."""
-    reach = math.ceil(3.5 * sigma) + 1
-    weight = np.empty(reach + 1)
-    for k in range(reach + 1):
-        weight[k] = math.exp(-0.5 * (k / sigma) ** 2)
-    return weight
-
-
-@njit(cache=True, error_model="numpy")
-def _step_height(
-    image: NDArray[np.uint8], v: int, u: float, sigma: float, gaussian: NDArray[np.float64]
-) -> float:
-    """Height of a step at (u, v), brighter on the right, as a derivative of Gaussian sees it."""
-    nearest = math.floor(u + 0.5)
-    base = float(image[v, nearest])
-    inverse = 1.0 / (sigma * sigma)
-    off = u - nearest
-    # exp(-(k - off)^2 / 2 sigma^2) = exp(-off^2 / 2 sigma^2) exp(off / sigma^2)^k gaussian[k]
-    ratio = math.exp(off * inverse)
-    right = math.exp(-0.5 * off * off * inverse)
-    left = right
-    total = 0.0
-    for k in range(1, len(gaussian)):
-        right *= ratio
-        left /= ratio
-        total += gaussian[k] * (
-            (k - off) * right * (image[v, nearest + k] - base)
-            - (k + off) * left * (image[v, nearest - k] - base)
-        )
-    return total * inverse
-
-
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
 def refine_lines(
     image: NDArray[np.uint8],
     table_column: NDArray[np.float32],
@@ -185,16 +141,21 @@ def refine_lines(
     reference: NDArray[np.float64],
     pixel: NDArray[np.float64],
     middle: NDArray[np.float64],
-    scales: NDArray[np.float64],
+    least_points: int,
+    half: NDArray[np.int64],
+    begin_of: NDArray[np.int64],
+    height_weights: NDArray[np.float32],
+    first_weights: NDArray[np.float32],
+    second_weights: NDArray[np.float32],
     farthest: NDArray[np.float64],
-    fine: float,
-    coarse: float,
-    line: NDArray[np.float64],
-    covariance: NDArray[np.float64],
-    contrast: NDArray[np.float64],
-    sharpness: NDArray[np.float64],
-    refined: NDArray[np.bool_],
-) -> None:
+    tracked_line: NDArray[np.float64],
+) -> tuple[
+    NDArray[np.float64],
+    NDArray[np.float64],
+    NDArray[np.float64],
+    NDArray[np.float64],
+    NDArray[np.float64],
+]:
     """Move lines to where the grey values are steepest along all of their rows together.
 
     Newton's method on the sum, over a track's rows, of the derivative-of-Gaussian response at the
@@ -202,6 +163,9 @@ def refine_lines(
     interpolated: no maximum is drawn towards whole pixels. The covariance is that of the maximum
     under noise that is independent from row to row, taken from the rows' own gradients (a sandwich
     estimator), so it needs no model of the noise.
+
+    Where a line crosses the rows is computed once; the steps move the crossings in proportion to
+    their derivatives.
 
     Parameters
     ----------
@@ -213,46 +177,74 @@ def refine_lines(
         The tracks (see `follow_edges`).
     reference, pixel, middle
         See `fit_eigenlines`.
-    scales : (K,) float64
-        Width of the Gaussian in each step of Newton's method, pixels.
+    least_points : int
+        Tracks with fewer points are left alone.
+    half, begin_of, height_weights, first_weights, second_weights
+        Filters (see `detect.line_step_filters.StepFilters`): of each step of Newton's method, and
+        two whose contrasts are compared, a fine and a coarse one.
     farthest : (K,) float64
         How far a step may take the middle of a line, pixels; one that would go farther is not made,
         nor any after it.
-    fine, coarse : float
-        Widths of the Gaussians whose contrasts are compared, pixels.
+    tracked_line : (T, 2) float64
+        a, b of the lines to begin with.
+
+    Returns
+    -------
     line : (T, 2) float64
-        a, b of the lines; changed.
+        a, b; NaN where no step was made.
     covariance : (T, 2, 2) float64
-        Result: of a, b.
+        Of a, b; NaN as above.
+    shift_px : (T,) float64
+        How far the steps took the middle of the line, pixels.
     contrast : (T,) float64
-        Result: height of the step, grey values, as the fine filter sees it.
+        Height of the step, grey values, as the fine filter sees it; NaN as above.
     sharpness : (T,) float64
-        Result: that contrast relative to the one that the coarse filter sees.
-    refined : (T,) bool
-        Result: whether at least one step was made.
+        That contrast relative to the one that the coarse filter sees, at most 1; 1 as above.
     """
-    width = image.shape[1]
-    at = np.empty(image.shape[0], np.float64)
-    fine_gaussian = _gaussian(fine)
-    coarse_gaussian = _gaussian(coarse)
-    margin = len(coarse_gaussian) - 1
+    count = len(sign)
+    line = np.full((count, 2), np.nan)
+    covariance = np.full((count, 2, 2), np.nan)
+    shift_px = np.full(count, np.nan)
+    contrast = np.full(count, np.nan)
+    sharpness = np.ones(count)
+    height, width = image.shape
+    subpixels = len(height_weights) // (2 * np.sum(half))
+    grey_values = image.reshape(-1)
+    crossing = np.empty(height)
+    by_a = np.empty(height)
+    by_b = np.empty(height)
     for t in range(len(sign)):
         begin, end = bounds[t], bounds[t + 1]
-        refined[t] = False
-        covariance[t] = np.nan
-        contrast[t] = np.nan
-        sharpness[t] = np.nan
-        a = line[t, 0]
-        b = line[t, 1]
-        if not math.isfinite(a):
+        a = tracked_line[t, 0]
+        b = tracked_line[t, 1]
+        refined = False
+        if end - begin < least_points or not math.isfinite(a):
             continue
         phi = reference[t]
-        for i in range(begin, end):
-            at[i - begin] = column[i]
-        for step in range(len(scales)):
-            inverse = 1.0 / (scales[step] * scales[step])
-            gaussian = _gaussian(scales[step])
-            reach = len(gaussian) - 1
+        n = end - begin
+        for i in range(n):
+            v = row[begin + i]
+            near = column[begin + i]
+            j = min(max(int(near), 0), width - 2)
+            f = near - j
+            rise = (1.0 - f) * elevation_tan[v, j] + f * elevation_tan[v, j + 1]
+            # Z depends on X in second order only: one repetition settles it.
+            x = a + b * rise
+            z = rise * math.sqrt(1.0 + x * x)
+            x = a + b * z
+            wanted = phi + _arctan(x)
+            at = j + (wanted - bearing[j]) / (bearing[j + 1] - bearing[j])
+            crossing[i] = math.nan
+            if 0.0 <= at <= width - 1.0:
+                j = min(int(at), width - 2)
+                per_column = bearing[j + 1] - bearing[j]
+                at = (wanted - bearing[j]) / per_column
+                du_dc = table_column[v, j + 1] - table_column[v, j]
+                crossing[i] = table_column[v, j] + at * du_dc
+                by_a[i] = du_dc / (per_column * (1.0 + x * x))
+                by_b[i] = by_a[i] * z
+        for step in range(len(farthest)):
+            reach = half[step]
             hessian_aa = 0.0
             hessian_ab = 0.0
             hessian_bb = 0.0
@@ -262,45 +254,32 @@ def refine_lines(
             meat_ab = 0.0
             meat_bb = 0.0
             used = 0
-            for i in range(begin, end):
-                v = row[i]
-                at[i - begin], u, by_a, by_b = _cross_row(
-                    table_column, bearing, elevation_tan, phi, a, b, v, at[i - begin]
-                )
+            for i in range(n):
+                u = crossing[i]
                 if not (u > reach and u < width - 1 - reach):
                     continue
-                nearest = math.floor(u + 0.5)
-                base = float(image[v, nearest])
-                off = u - nearest
-                # The Gaussian's values as in `_step_height`.
-                ratio = math.exp(off * inverse)
-                right = math.exp(-0.5 * off * off * inverse)
-                left = right
-                first = 0.0
-                second = 0.0
-                for k in range(1, reach + 1):
-                    right *= ratio
-                    left /= ratio
-                    above = gaussian[k] * right * (image[v, nearest + k] - base)
-                    below = gaussian[k] * left * (image[v, nearest - k] - base)
-                    d = k - off
-                    q = d * d * inverse
-                    first += (q - 1.0) * above
-                    second += (q - 3.0) * d * inverse * above
-                    d = k + off
-                    q = d * d * inverse
-                    first += (q - 1.0) * below
-                    second -= (q - 3.0) * d * inverse * below
-                first *= sign[t]
-                second *= sign[t]
-                hessian_aa += second * by_a * by_a
-                hessian_ab += second * by_a * by_b
-                hessian_bb += second * by_b * by_b
-                gradient_a += first * by_a
-                gradient_b += first * by_b
-                meat_aa += first * first * by_a * by_a
-                meat_ab += first * first * by_a * by_b
-                meat_bb += first * first * by_b * by_b
+                whole = int(u)
+                node = int((u - whole) * subpixels)
+                at_pixel = np.uint64(row[begin + i] * width + whole - reach + 1)
+                at_weight = np.uint64(begin_of[step] + node * 2 * reach)
+                first_sum = np.float32(0.0)
+                second_sum = np.float32(0.0)
+                for k in range(2 * reach):
+                    grey = np.float32(grey_values[at_pixel + np.uint64(k)]) - np.float32(128.0)
+                    first_sum += first_weights[at_weight + np.uint64(k)] * grey
+                    second_sum += second_weights[at_weight + np.uint64(k)] * grey
+                second = sign[t] * second_sum
+                # From the tabulated position to the crossing.
+                off = u - whole - (node + 0.5) / subpixels
+                first = sign[t] * first_sum + off * second
+                hessian_aa += second * by_a[i] * by_a[i]
+                hessian_ab += second * by_a[i] * by_b[i]
+                hessian_bb += second * by_b[i] * by_b[i]
+                gradient_a += first * by_a[i]
+                gradient_b += first * by_b[i]
+                meat_aa += first * first * by_a[i] * by_a[i]
+                meat_ab += first * first * by_a[i] * by_b[i]
+                meat_bb += first * first * by_b[i] * by_b[i]
                 used += 1
             determinant = hessian_aa * hessian_bb - hessian_ab * hessian_ab
             # No maximum here at this scale: what the coarser ones found stands.
@@ -315,6 +294,8 @@ def refine_lines(
                 break
             a += change_a
             b += change_b
+            for i in range(n):
+                crossing[i] += change_a * by_a[i] + change_b * by_b[i]
             left_aa = inverse_aa * meat_aa + inverse_ab * meat_ab
             left_ab = inverse_aa * meat_ab + inverse_ab * meat_bb
             left_ba = inverse_ab * meat_aa + inverse_bb * meat_ab
@@ -325,22 +306,37 @@ def refine_lines(
             covariance[t, 0, 1] = scale * (left_aa * inverse_ab + left_ab * inverse_bb)
             covariance[t, 1, 0] = covariance[t, 0, 1]
             covariance[t, 1, 1] = scale * (left_ba * inverse_ab + left_bb * inverse_bb)
-            refined[t] = True
+            refined = True
+        if not refined:
+            continue
         line[t, 0] = a
         line[t, 1] = b
-        if not refined[t]:
-            continue
+        moved = a - tracked_line[t, 0] + (b - tracked_line[t, 1]) * middle[t]
+        shift_px[t] = abs(moved) / pixel[t]
         fine_height = 0.0
         coarse_height = 0.0
         used = 0
-        for i in range(begin, end):
-            v = row[i]
-            at[i - begin], u, by_a, by_b = _cross_row(
-                table_column, bearing, elevation_tan, phi, a, b, v, at[i - begin]
-            )
-            if u > margin and u < width - 1 - margin:
-                fine_height += _step_height(image, v, u, fine, fine_gaussian)
-                coarse_height += _step_height(image, v, u, coarse, coarse_gaussian)
-                used += 1
+        margin = max(half[-2], half[-1])
+        for i in range(n):
+            u = crossing[i]
+            if not (u > margin and u < width - 1 - margin):
+                continue
+            whole = int(u)
+            node = int((u - whole) * subpixels)
+            for which in range(2):
+                reach = half[len(farthest) + which]
+                at_pixel = np.uint64(row[begin + i] * width + whole - reach + 1)
+                at_weight = np.uint64(begin_of[len(farthest) + which] + node * 2 * reach)
+                total = np.float32(0.0)
+                for k in range(2 * reach):
+                    grey = np.float32(grey_values[at_pixel + np.uint64(k)]) - np.float32(128.0)
+                    total += height_weights[at_weight + np.uint64(k)] * grey
+                if which == 0:
+                    fine_height += float(total)
+                else:
+                    coarse_height += float(total)
+            used += 1
         contrast[t] = sign[t] * fine_height / used if used > 0 else 0.0
-        sharpness[t] = fine_height / coarse_height if sign[t] * coarse_height > 0.0 else 1.0
+        sharp = fine_height / coarse_height if sign[t] * coarse_height > 0.0 else 1.0
+        sharpness[t] = min(max(sharp, 0.0), 1.0)
+    return line, covariance, shift_px, contrast, sharpness

@@ -12,6 +12,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+#: Rows that are filtered ahead of a track.
+_AHEAD = 8
+
 
 @njit(cache=True, error_model="numpy")
 def find_starts(
@@ -66,7 +69,7 @@ def _top_of_parabola(left: np.float32, centre: np.float32, right: np.float32) ->
     return float(0.5 * (left - right) / bend) if bend < 0.0 else 0.0
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _follow(
     image: NDArray[np.uint8],
     table_column: NDArray[np.float32],
@@ -76,6 +79,8 @@ def _follow(
     elevation_tan: NDArray[np.float32],
     weights: NDArray[np.float32],
     along: NDArray[np.float32],
+    reach_across: int,
+    reach_along: int,
     regulariser: np.float32,
     moments: NDArray[np.float32],
     known: NDArray[np.int32],
@@ -100,13 +105,16 @@ def _follow(
     each call, which would take longer than evaluating the filter.
     """
     height, width = table_column.shape
-    taps = weights.shape[1]
-    across = weights[0]
-    lever = weights[1]
+    pixels = weights.shape[1]
+    w_left = weights[0]
+    w_step = weights[1]
+    h_left = weights[2]
+    h_step = weights[3]
     grey_values = image.reshape(-1)
-    flat_moments = moments.reshape(-1)
-    r = taps // 2
-    s = len(along) // 2
+    last_pixel = np.uint64(height * width - 1)
+    stride = len(moments) // (3 * width)
+    r = reach_across
+    s = reach_along
     leftmost = np.float32(r)
     rightmost = np.float32(width - 1 - r)
     zero = np.float32(0.0)
@@ -153,13 +161,20 @@ def _follow(
             if x >= leftmost and x < rightmost:
                 top = max(first_row[c], v - s)
                 bottom = min(last_row[c], v + s)
+                column_moments = np.uint64(3 * c * stride)
                 begin = known[0, c]
                 end = known[1, c]
                 if begin >= end:
                     begin = top
                     end = top
+                    known[0, c] = top
                 if top < begin or bottom >= end:
-                    for y in range(min(top, begin), max(bottom + 1, end)):
+                    # Some rows more than needed: the next ones will be.
+                    if top < begin:
+                        known[0, c] = max(first_row[c], top - _AHEAD)
+                    if bottom >= end:
+                        known[1, c] = min(last_row[c], bottom + _AHEAD) + 1
+                    for y in range(known[0, c], known[1, c]):
                         if begin <= y < end:
                             continue
                         mean = zero
@@ -168,50 +183,61 @@ def _follow(
                         x = table_column[y, c]
                         if x >= leftmost and x < rightmost:
                             f = x - np.float32(int(x))
-                            u = np.uint64(y * width + int(x) - r)
-                            # Moments between two pixels are those of both, interpolated; so are
-                            # the weights. Grey values about 0 keep small variances exact.
-                            w_before = zero
-                            h_before = zero
-                            for i in range(taps):
-                                w_here = across[np.uint64(i)]
-                                h_here = lever[np.uint64(i)]
-                                grey = np.float32(grey_values[u + np.uint64(i)]) - middle
-                                weighted = (w_here + f * (w_before - w_here)) * grey
-                                mean += weighted
-                                square += weighted * grey
-                                cov += (h_here + f * (h_before - h_here)) * grey
-                                w_before = w_here
-                                h_before = h_here
-                            grey = np.float32(grey_values[u + np.uint64(taps)]) - middle
-                            weighted = f * w_before * grey
-                            mean += weighted
-                            square += weighted * grey
-                            cov += f * h_before * grey
-                        moments[c, 0, y] = mean
-                        moments[c, 1, y] = cov
-                        moments[c, 2, y] = square
-                    known[0, c] = min(top, begin)
-                    known[1, c] = max(bottom + 1, end)
+                            at_pixel = np.uint64(y * width + int(x) - r)
+                            for chunk in range(pixels // 8):
+                                for i in range(8):
+                                    tap = np.uint64(8 * chunk + i)
+                                    # Beyond the window, and perhaps the image, weights are 0.
+                                    u = min(at_pixel + tap, last_pixel)
+                                    grey = np.float32(grey_values[u]) - middle
+                                    weighted = (w_left[tap] + f * w_step[tap]) * grey
+                                    mean += weighted
+                                    square += weighted * grey
+                                    cov += (h_left[tap] + f * h_step[tap]) * grey
+                        place = column_moments + np.uint64(y)
+                        moments[place] = mean
+                        moments[place + np.uint64(stride)] = cov
+                        moments[place + np.uint64(2 * stride)] = square
+                    # What the last chunk of weights, which are 0, may meet.
+                    for i in range(np.int64(known[1, c]), np.int64(known[1, c]) + 4):
+                        place = column_moments + np.uint64(i)
+                        moments[place] = zero
+                        moments[place + np.uint64(stride)] = zero
+                        moments[place + np.uint64(2 * stride)] = zero
                 mean = zero
                 cov = zero
                 square = zero
-                share = zero
-                first_weight = np.uint64(top - v + s)
-                first_mean = np.uint64(3 * c * height + top)
-                first_cov = np.uint64((3 * c + 1) * height + top)
-                first_square = np.uint64((3 * c + 2) * height + top)
-                for i in range(bottom + 1 - top):
-                    k8 = np.uint64(i)
-                    w = along[first_weight + k8]
-                    share += w
-                    mean += w * flat_moments[first_mean + k8]
-                    cov += w * flat_moments[first_cov + k8]
-                    square += w * flat_moments[first_square + k8]
-                mean /= share
-                cov /= share
+                if bottom - top == 2 * s:
+                    place = column_moments + np.uint64(top)
+                    for chunk in range(len(along) // 4):
+                        # Sums of their own need not wait for each other.
+                        mean_part = zero
+                        cov_part = zero
+                        square_part = zero
+                        for i in range(4):
+                            tap = np.uint64(4 * chunk + i)
+                            w = along[tap]
+                            at = place + tap
+                            mean_part += w * moments[at]
+                            cov_part += w * moments[at + np.uint64(stride)]
+                            square_part += w * moments[at + np.uint64(2 * stride)]
+                        mean += mean_part
+                        cov += cov_part
+                        square += square_part
+                else:
+                    share = zero
+                    for y in range(top, bottom + 1):
+                        w = along[y - v + s]
+                        at = column_moments + np.uint64(y)
+                        share += w
+                        mean += w * moments[at]
+                        cov += w * moments[at + np.uint64(stride)]
+                        square += w * moments[at + np.uint64(2 * stride)]
+                    mean /= share
+                    cov /= share
+                    square /= share
                 # Rounding can make a vanishing variance negative.
-                variance = abs(square / share - mean * mean)
+                variance = abs(square - mean * mean)
                 response = sign * cov * abs(cov) / (variance + regulariser)
             if c == j - 2:
                 right = centre
@@ -252,6 +278,8 @@ def follow_edges(
     elevation_tan: NDArray[np.float32],
     weights: NDArray[np.float32],
     along: NDArray[np.float32],
+    reach_across: int,
+    reach_along: int,
     regulariser: np.float32,
     moments: NDArray[np.float32],
     known: NDArray[np.int32],
@@ -280,10 +308,11 @@ def follow_edges(
         Grey values.
     table_column, first_row, last_row, bearing, elevation_tan
         The table (see `lut.verticals.VerticalTable`).
-    weights, along, regulariser
-        The filter (see `detect.line_filter.LineFilter`).
-    moments : (W, 3, H) float32
-        Mean, covariance and mean square across the vertical, in the rows that are known.
+    weights, along, reach_across, reach_along, regulariser
+        The filter (see `detect.line_filter.LineFilter`): `weights_between`, `along`.
+    moments : (W * 3 * (H + 4),) float32
+        Mean, covariance and mean square across the vertical, in the rows that are known; 4 more
+        rows for each column.
     known : (2, W) int32
         First of the known rows and the one after the last, of each column; extended as needed.
     start_row, start_column : (N,) int32
@@ -351,8 +380,9 @@ def follow_edges(
             score = grown_score
         above = _follow(
             image, table_column, first_row, last_row, bearing, elevation_tan, weights, along,
-            regulariser, moments, known, polarity, v, float(start_column[start]), -1, pitch, roll,
-            threshold, max_gap, border, pull, reach, up_row, up_column, up_score,
+            reach_across, reach_along, regulariser, moments, known, polarity, v,
+            float(start_column[start]), -1, pitch, roll, threshold, max_gap, border, pull, reach,
+            up_row, up_column, up_score,
         )  # fmt: skip
         if above == 0:
             # Starts were looked for with less care.
@@ -364,8 +394,8 @@ def follow_edges(
         n += above - 1
         n += _follow(
             image, table_column, first_row, last_row, bearing, elevation_tan, weights, along,
-            regulariser, moments, known, polarity, v, up_column[0], 1, pitch, roll,
-            threshold, max_gap, border, pull, reach, row[n:], column[n:], score[n:],
+            reach_across, reach_along, regulariser, moments, known, polarity, v, up_column[0], 1,
+            pitch, roll, threshold, max_gap, border, pull, reach, row[n:], column[n:], score[n:],
         )  # fmt: skip
         for i in range(bounds[tracks], n):
             if lowest <= row[i] <= highest:

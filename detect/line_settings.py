@@ -202,6 +202,10 @@ class LineSettings:
             _expect(0.3 <= scale < 20.0, "refine_steps_px", scale, "a width of 0.3 to 20")
             _expect(farthest >= 0.0, "refine_steps_px", farthest, "a distance of 0 or more")
 
+    def least_points(self, row_aspect: float) -> int:
+        """Least number of points of a line, given the height of a row in widths of a pixel."""
+        return max(self.least_rows, math.ceil(self.least_length_px / row_aspect))
+
     @property
     def consensus(self) -> ConsensusSettings:
         """What of this the estimation of the tilt is told."""

@@ -122,11 +122,11 @@ def line_response(
     window = line_filter(settings)
     strip_response(
         image,
-        table.column,
+        np.ascontiguousarray(table.column),
         table.first_row,
         table.last_row,
         window.weights,
-        window.along,
+        window.along[: 2 * window.reach_along + 1],
         window.regulariser,
         response,
     )
@@ -184,7 +184,7 @@ def start_response(
         band.visible,
         band.spacing,
         window.weights,
-        window.along,
+        window.along[: 2 * window.reach_along + 1],
         window.regulariser,
         response,
     )
@@ -235,8 +235,10 @@ def line_tracks(
             table.last_row,
             table.bearing_rad,
             table.elevation_tan,
-            window.weights,
+            window.weights_between,
             window.along,
+            window.reach_across,
+            window.reach_along,
             window.regulariser,
             filtered.moments,
             filtered.known,

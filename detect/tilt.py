@@ -100,39 +100,26 @@ def consensus(
     consistent : (N,) bool
         Lines that are vertical under that tilt; without an estimate, under no tilt.
     """
-    from detect.tilt_kernels import vote_for_tilt
+    from detect.tilt_kernels import refine_tilt, vote_for_tilt
 
     strongest = np.argsort(-weight, kind="stable")[: settings.proposers]
-    tilt = np.array(
-        vote_for_tilt(
-            normal, tolerance, weight, strongest, settings.largest_rad, settings.prior_rad
-        )
+    limit, prior = settings.largest_rad, settings.prior_rad
+    pitch, roll = vote_for_tilt(normal, tolerance, weight, strongest, limit, prior)
+    variance = settings.building_rad**2 + inclination_variance
+    pitch, roll, covariance, consistent = refine_tilt(
+        normal, variance, tolerance, pitch, roll, prior, _SOFTENING, _REFINEMENTS
     )
-    deviation = np.sqrt(settings.building_rad**2 + inclination_variance)
-    prior = np.eye(2) / settings.prior_rad**2
-    covariance = np.linalg.inv(prior)
-    for _ in range(_REFINEMENTS):
-        turned = normal @ level_rotation(tilt[0], tilt[1]).T
-        agrees = np.abs(turned[:, 2]) <= tolerance
-        # Cauchy's weights: a line of furniture or a shadow among few lines must not pull.
-        softened = deviation * np.sqrt(1.0 + (turned[:, 2] / (_SOFTENING * deviation)) ** 2)
-        turned = (turned / softened[:, None])[agrees]
-        design = np.stack([turned[:, 1], -turned[:, 0]], axis=-1)
-        covariance = np.linalg.inv(design.T @ design + prior)
-        tilt = tilt - covariance @ (design.T @ turned[:, 2] + prior @ tilt)
-    turned = normal @ level_rotation(tilt[0], tilt[1]).T
-    consistent = np.abs(turned[:, 2]) <= tolerance
-    lines = int(consistent.sum())
-    if lines < settings.least_lines or np.any(np.abs(tilt) > settings.largest_rad):
+    lines = int(np.count_nonzero(consistent))
+    if lines < settings.least_lines or abs(pitch) > limit or abs(roll) > limit:
         return None, np.abs(normal[:, 2]) <= tolerance
-    return TiltEstimate(float(tilt[0]), float(tilt[1]), np.asarray(covariance), lines), consistent
+    return TiltEstimate(pitch, roll, covariance, lines), consistent
 
 
 def level_rotation(pitch_rad: float, roll_rad: float) -> FloatArray:
     """(3, 3) rotation exp([pitch, roll, 0]x) that turns measured directions level."""
-    from scipy.spatial.transform import Rotation
+    from detect.tilt_kernels import level_matrix
 
-    return np.asarray(Rotation.from_rotvec([pitch_rad, roll_rad, 0.0]).as_matrix())
+    return np.asarray(level_matrix(pitch_rad, roll_rad))
 
 
 def lean(bearing_rad: ArrayLike, pitch_rad: float, roll_rad: float) -> FloatArray:

@@ -72,3 +72,105 @@ def vote_for_tilt(
                 best_pitch = pitch
                 best_roll = roll
     return best_pitch, best_roll
+
+
+@njit(cache=True, error_model="numpy")
+def level_matrix(pitch: float, roll: float) -> NDArray[np.float64]:
+    """(3, 3) rotation exp([pitch, roll, 0]x)."""
+    squared = pitch * pitch + roll * roll
+    angle = math.sqrt(squared)
+    # sin(x) / x and (1 - cos(x)) / x^2.
+    first = 1.0 - squared / 6.0
+    second = 0.5 - squared / 24.0
+    if angle > 1e-3:
+        first = math.sin(angle) / angle
+        second = 2.0 * (math.sin(0.5 * angle) / angle) ** 2
+    rotation = np.empty((3, 3))
+    rotation[0, 0] = 1.0 - second * roll * roll
+    rotation[0, 1] = second * pitch * roll
+    rotation[0, 2] = first * roll
+    rotation[1, 0] = second * pitch * roll
+    rotation[1, 1] = 1.0 - second * pitch * pitch
+    rotation[1, 2] = -first * pitch
+    rotation[2, 0] = -first * roll
+    rotation[2, 1] = first * pitch
+    rotation[2, 2] = 1.0 - second * squared
+    return rotation
+
+
+@njit(cache=True, error_model="numpy")
+def refine_tilt(
+    normal: NDArray[np.float64],
+    variance: NDArray[np.float64],
+    tolerance: NDArray[np.float64],
+    pitch: float,
+    roll: float,
+    prior: float,
+    softening: float,
+    repetitions: int,
+) -> tuple[float, float, NDArray[np.float64], NDArray[np.bool_]]:
+    """Least squares of a tilt over the lines that agree with it, repeated.
+
+    Parameters
+    ----------
+    normal, tolerance
+        See `vote_for_tilt`.
+    variance : (N,) float64
+        Of the inclinations that verticals show (rad^2).
+    pitch, roll : float
+        To begin with (rad).
+    prior : float
+        Standard deviation of the tilt (rad).
+    softening : float
+        Standard deviations from which on a line's pull no longer grows (Cauchy's weights).
+    repetitions : int
+        How often.
+
+    Returns
+    -------
+    pitch, roll : float
+        The tilt (rad).
+    covariance : (2, 2) float64
+        Of it (rad^2).
+    agrees : (N,) bool
+        Lines that are vertical under it.
+    """
+    count = len(variance)
+    covariance = np.zeros((2, 2))
+    covariance[0, 0] = prior * prior
+    covariance[1, 1] = prior * prior
+    agrees = np.empty(count, np.bool_)
+    for repetition in range(repetitions + 1):
+        rotation = level_matrix(pitch, roll)
+        pp = 1.0 / (prior * prior)
+        pr = 0.0
+        rr = pp
+        gradient_p = pitch / (prior * prior)
+        gradient_r = roll / (prior * prior)
+        for i in range(count):
+            x = 0.0
+            y = 0.0
+            z = 0.0
+            for k in range(3):
+                x += rotation[0, k] * normal[i, k]
+                y += rotation[1, k] * normal[i, k]
+                z += rotation[2, k] * normal[i, k]
+            agrees[i] = abs(z) <= tolerance[i]
+            if agrees[i]:
+                # A line of furniture or a shadow among few lines must not pull.
+                weight = 1.0 / (variance[i] + (z / softening) ** 2)
+                pp += weight * y * y
+                pr -= weight * y * x
+                rr += weight * x * x
+                gradient_p += weight * y * z
+                gradient_r -= weight * x * z
+        if repetition == repetitions:
+            break
+        determinant = pp * rr - pr * pr
+        covariance[0, 0] = rr / determinant
+        covariance[0, 1] = -pr / determinant
+        covariance[1, 0] = -pr / determinant
+        covariance[1, 1] = pp / determinant
+        pitch -= covariance[0, 0] * gradient_p + covariance[0, 1] * gradient_r
+        roll -= covariance[1, 0] * gradient_p + covariance[1, 1] * gradient_r
+    return pitch, roll, covariance, agrees

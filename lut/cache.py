@@ -25,7 +25,7 @@ from lut.verticals import VerticalTable, build_vertical_table
 from storage import write_whole
 
 #: Raised with every change of what tables hold or how they are computed.
-TABLE_VERSION = 4
+TABLE_VERSION = 5
 
 Table = TypeVar("Table", DiscTable, VerticalTable)
 

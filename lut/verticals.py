@@ -39,7 +39,7 @@ class VerticalTable:
         45 deg of the image's vertical; ``first_row > last_row`` where there are none.
     column : (H, W) float32
         Column at which the vertical named by its second index crosses each row; NaN outside those
-        rows.
+        rows. In Fortran's order: whoever follows a vertical reads memory in sequence.
     elevation_tan : (H, W) float32
         Tangent of the elevation above the horizon at which it does so; NaN as `column`.
     robot_from_camera : (3, 3) float64
@@ -102,8 +102,10 @@ def build_vertical_table(camera: Camera) -> VerticalTable:
         bearing_rad=bearing,
         first_row=first,
         last_row=last,
-        column=np.where(seen, column, np.nan).astype(np.float32),
-        elevation_tan=np.where(seen, np.tan(elevation), np.nan).astype(np.float32),
+        column=np.asfortranarray(np.where(seen, column, np.nan), dtype=np.float32),
+        elevation_tan=np.asfortranarray(
+            np.where(seen, np.tan(elevation), np.nan), dtype=np.float32
+        ),
         robot_from_camera=camera.rotation,
         row_aspect=camera.scale_x / camera.scale_y,
     )
