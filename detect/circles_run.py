@@ -8,7 +8,6 @@ from pathlib import Path
 
 from detect.dispatch import Workers
 from detect.frame import FramePlan
-from detect.levelling import levelled as levelled
 from detect.run import Run
 from detect.settings import CircleSettings
 from detect.stream import Output, RunSummary, TiltSource, detect_run, json_file

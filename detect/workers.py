@@ -41,7 +41,7 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 #: Fewer frames than this are not worth another process's start.
-FRAMES_PER_PROCESS = 200
+FRAMES_PER_PROCESS = 500
 
 _LOCAL_CHUNK = 8
 _CLUSTER_CHUNK = 16
@@ -168,7 +168,6 @@ def _processes(jobs: int, plan: FramePlan) -> Iterator[Executor]:
         processes = list((pool._processes or {}).values())
         pool.shutdown(wait=False, cancel_futures=True)
         _end(processes)
-        pool.shutdown(wait=True)
 
 
 def _end(processes: Sequence[BaseProcess]) -> None:
@@ -181,6 +180,11 @@ def _end(processes: Sequence[BaseProcess]) -> None:
             del running[ended]
     for process in running.values():
         process.terminate()
+    for process in processes:
+        process.join(_GRACE_S)
+        if process.is_alive():
+            process.kill()
+            process.join()
 
 
 def _unless_stopped(fn: Callable[P, R], /, *args: P.args, **kwargs: P.kwargs) -> R:
