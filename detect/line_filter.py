@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -63,6 +64,9 @@ class StartBand:
         One over the sum of the weights that lie on the vertical; 0 where there are none.
     visible : (K, W) bool
         Whether the filter's window lies inside the image.
+    weights : (K, 2, 2r + 1) float32
+        The filter's weights across the vertical, for the strip's columns, which are a pixel apart
+        on the horizon only.
     spacing : int
         See above.
     """
@@ -72,6 +76,7 @@ class StartBand:
     part: NDArray[np.float32]
     scale: NDArray[np.float32]
     visible: NDArray[np.bool_]
+    weights: NDArray[np.float32]
     spacing: int
 
 
@@ -99,18 +104,24 @@ class FilteredColumns:
 
 def gaussian_window(sigma: float) -> FloatArray:
     """Weights of sum 1 at whole pixels within three standard deviations of the middle."""
-    reach = int(np.ceil(3.0 * sigma))
+    reach = math.ceil(3.0 * sigma)
     weight = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
     return np.asarray(weight / weight.sum())
+
+
+def _weights_across(sigma_px: float, spacing_px: float) -> FloatArray:
+    """(2, 2r + 1) weights of samples that are a distance apart, and the same times the lever."""
+    reach = math.ceil(3.0 * sigma_px)
+    distance = spacing_px * np.arange(-reach, reach + 1)
+    weight = np.exp(-0.5 * (distance / sigma_px) ** 2)
+    weight /= weight.sum()
+    return np.stack([weight, weight * distance / np.sqrt(weight @ distance**2)])
 
 
 @lru_cache(maxsize=16)
 def line_filter(settings: LineSettings) -> LineFilter:
     """The filter that settings ask for."""
-    across = gaussian_window(settings.sigma_across_px)
-    distance = np.arange(len(across)) - 0.5 * (len(across) - 1)
-    lever = distance / np.sqrt(across @ distance**2)
-    weights = np.stack([across, across * lever])
+    weights = _weights_across(settings.sigma_across_px, 1.0)
     # Moments between two pixels are those of both, interpolated; so are the weights.
     left = np.pad(weights, [(0, 0), (0, 1)])
     step = np.pad(weights, [(0, 0), (1, 0)]) - left
@@ -120,7 +131,7 @@ def line_filter(settings: LineSettings) -> LineFilter:
         weights=weights.astype(np.float32),
         weights_between=np.pad(between, [(0, 0), (0, -between.shape[1] % 8)]).astype(np.float32),
         along=np.pad(along, (0, -len(along) % 4)).astype(np.float32),
-        reach_across=len(across) // 2,
+        reach_across=weights.shape[1] // 2,
         reach_along=len(along) // 2,
         regulariser=np.float32(settings.regulariser),
     )
@@ -167,11 +178,20 @@ def start_band(table: VerticalTable, settings: LineSettings) -> StartBand:
     visible = on_vertical[evaluated] & (x[evaluated] >= r) & (x[evaluated] < width - 1 - r)
     border = settings.border_rows
     allowed = visible & (middle >= border) & (middle <= height - 1 - border)
+    spacing_px = [_typical_spacing(x[i], on_vertical[i]) for i in range(*evaluated.indices(len(x)))]
+    weights = [_weights_across(settings.sigma_across_px, px) for px in spacing_px]
     return StartBand(
         row=np.where(allowed, middle, -1).astype(np.int32),
         pixel=pixel,
         part=(x - left).astype(np.float32),
         scale=scale.astype(np.float32),
         visible=visible,
+        weights=np.array(weights, np.float32),
         spacing=settings.start_spacing_rows,
     )
+
+
+def _typical_spacing(x: FloatArray, shown: NDArray[np.bool_]) -> float:
+    """Median distance of neighbouring verticals in a row, pixels; 1 where there are none."""
+    both = shown[1:] & shown[:-1]
+    return float(np.median(np.abs(np.diff(x)[both]))) if both.any() else 1.0

@@ -183,13 +183,15 @@ def band_response(
         Where the result is to be other than 0.
     spacing : int
         Rows of the strip from one row of the result to the next; the first of them is row s.
-    weights, along, regulariser
+    weights : (K, 2, 2r + 1) float32
+        Weights across the vertical, as those of the filter, for each row of the result.
+    along, regulariser
         The filter (see `detect.line_filter.LineFilter`).
     response : (K, W) float32
         Result: as `strip_response`.
     """
     width = image.shape[1]
-    r = weights.shape[1] // 2
+    r = weights.shape[2] // 2
     s = len(along) // 2
     inner = width - 2 * r
     grey = np.empty(pixel.shape, np.float32)
@@ -240,8 +242,8 @@ def band_response(
         cov[:] = _ZERO
         mean_square[:] = _ZERO
         for t in range(2 * r + 1):
-            w = weights[0, t]
-            h = weights[1, t]
+            w = weights[k, 0, t]
+            h = weights[k, 1, t]
             near = grey_sum[t : t + inner]
             near_square = square_sum[t : t + inner]
             for c in range(inner):

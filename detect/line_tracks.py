@@ -183,7 +183,7 @@ def start_response(
         band.scale,
         band.visible,
         band.spacing,
-        window.weights,
+        band.weights,
         window.along[: 2 * window.reach_along + 1],
         window.regulariser,
         response,
