@@ -1,4 +1,17 @@
-"""Compiled loops of the disc detector: the quality of every centre and its local maxima."""
+"""Compiled loops of the disc detector: the quality of every centre; no two discs in one place.
+
+quality = between-class variance / total variance of the grey values that vote. With n = n_inner +
+n_outer votes,
+
+    difference = n_outer sum(inner) - n_inner sum(outer)
+    spread     = n sum(x^2) - (sum x)^2
+    quality    = difference^2 / (n_inner n_outer spread)
+
+All of these are whole numbers, so the only rounding is that of the one final division.
+
+Numba's cache notices a change of this file, but not one of `detect.vector_kernels`, which is
+compiled into these: whoever changes that one has to touch this file as well.
+"""
 
 from __future__ import annotations
 
@@ -6,156 +19,207 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from detect.vector_kernels import (
+    gather,
+    lowest_bit,
+    promising,
+    promising_all_vote,
+    sum_and_gather,
+)
+from lut.kernels import BLOCK, GROUP, LEAST_COPIES
 
-@njit(cache=True, error_model="numpy")
-def quality_map(
-    padded: NDArray[np.uint8],
-    margin: int,
+_ONE = np.uint64(1)
+
+#: The first comparison of a quality with the threshold lets through a little more than the second:
+#: its numbers have 24 bits.
+_FIRST_COMPARISON = 1.0 - 4e-6
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _sum_block(
+    pixels: NDArray[np.uint8],
     samples: int,
-    row_begin: NDArray[np.int32],
-    row_end: NDArray[np.int32],
-    usable: NDArray[np.bool_],
-    run_bounds: NDArray[np.int32],
-    run_start: NDArray[np.int32],
-    run_du: NDArray[np.int32],
-    run_dv: NDArray[np.int32],
-    votes_inner: NDArray[np.uint8],
-    votes_outer: NDArray[np.uint8],
+    copies: NDArray[np.uint32],
+    block_copies: NDArray[np.int64],
+    gathered: NDArray[np.uint8],
+    sums: NDArray[np.uint16],
+    products: NDArray[np.uint32],
+    block: int,
+    fresh: bool,
+) -> None:
+    """Sums of a block, which is already gathered unless `fresh`, and gather the next.
+
+    There are two places for grey values, used by turns: what was just written cannot be read at
+    once.
+    """
+    groups = -(-samples // GROUP)
+    size = len(gathered) // 2
+    here = (block & 1) * size
+    if fresh:
+        gather(pixels, copies, block_copies[block], block_copies[block + 1], gathered, here)
+    # Behind the last block that one comes again.
+    following = min(block + 1, len(block_copies) - 2)
+    first = block_copies[following]
+    place = sum_and_gather(
+        pixels, copies, first, gathered, size - here, here, groups, sums, products
+    )
+    rest = first + groups * LEAST_COPIES
+    gather(pixels, copies, rest, block_copies[following + 1], gathered, place)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _quality(
+    sums: NDArray[np.uint16],
+    products: NDArray[np.uint32],
+    patterns: NDArray[np.uint8],
+    pattern: int,
+    i: np.uint64,
+) -> tuple[float, float]:
+    """Quality and contrast of a block's centre from its sums and votes."""
+    # Signed: differences follow.
+    inner = np.int64(sums[0, i])
+    outer = np.int64(sums[1, i])
+    product = np.int64(products[i & _ONE, i >> _ONE])
+    n_inner = np.int64(patterns[pattern, 0, i])
+    n_outer = np.int64(patterns[pattern, 1, i])
+    n = n_inner + n_outer
+    total = inner + outer
+    spread = n * (255 * total - product) - total * total
+    difference = n_outer * inner - n_inner * outer
+    pairs = float(n_inner * n_outer)
+    quality = (difference * difference) / (pairs * spread) if spread > 0 else 0.0
+    return quality, difference / pairs
+
+
+def working_memory(
+    samples: int,
+) -> tuple[NDArray[np.uint8], NDArray[np.uint16], NDArray[np.uint32]]:
+    """Memory for the grey values of two blocks, and for the sums of one."""
+    size = 2 * (2 * -(-samples // GROUP) * GROUP * BLOCK + BLOCK)
+    # It begins where a cache line does: half of all copies then stay within one.
+    memory = np.empty(size + BLOCK, np.uint8)
+    begin = -memory.ctypes.data % BLOCK
+    return (
+        memory[begin : begin + size],
+        np.empty((2, BLOCK), np.uint16),
+        np.empty((2, BLOCK // 2), np.uint32),
+    )
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def quality_map(
+    pixels: NDArray[np.uint8],
+    samples: int,
+    copies: NDArray[np.uint32],
+    block_copies: NDArray[np.int64],
+    block_row: NDArray[np.int32],
+    block_column: NDArray[np.int32],
+    block_pattern: NDArray[np.int32],
+    patterns: NDArray[np.uint8],
+    gathered: NDArray[np.uint8],
+    sums: NDArray[np.uint16],
+    products: NDArray[np.uint32],
     quality: NDArray[np.float64],
     contrast: NDArray[np.float32],
 ) -> None:
     """Otsu's quality of the two outlines' grey values around every usable centre.
 
-    quality = between-class variance / total variance, both of the grey values that vote. All sums
-    are of integers, so the only rounding is that of the one final division.
+    Parameters
+    ----------
+    pixels : (H W + 64,) uint8
+        The image in scan order, and zeros: a zero adds nothing to any sum.
+    samples, copies, block_copies, block_row, block_column, block_pattern, patterns
+        The table (see `lut.DiscTable`).
+    gathered, sums, products
+        Memory to work in (`working_memory`).
+    quality : (H, W) float64
+        Result, in [0, 1]; written for usable centres only, 0 where all grey values are equal.
+    contrast : (H, W) float32
+        Result: mean grey value inside minus outside; written for usable centres only.
+    """
+    for b in range(len(block_row)):
+        _sum_block(pixels, samples, copies, block_copies, gathered, sums, products, b, b == 0)
+        v = block_row[b]
+        pattern = block_pattern[b]
+        for i in range(BLOCK):
+            if patterns[pattern, 0, i] > 0:
+                here, difference = _quality(sums, products, patterns, pattern, np.uint64(i))
+                quality[v, block_column[b] + i] = here
+                contrast[v, block_column[b] + i] = difference
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def centres_above(
+    pixels: NDArray[np.uint8],
+    samples: int,
+    copies: NDArray[np.uint32],
+    block_copies: NDArray[np.int64],
+    block_row: NDArray[np.int32],
+    block_column: NDArray[np.int32],
+    block_pattern: NDArray[np.int32],
+    patterns: NDArray[np.uint8],
+    threshold: float,
+    sign: float,
+    gathered: NDArray[np.uint8],
+    sums: NDArray[np.uint16],
+    products: NDArray[np.uint32],
+    block: int,
+    columns: NDArray[np.int64],
+    rows: NDArray[np.int64],
+    quality: NDArray[np.float64],
+    contrast: NDArray[np.float32],
+) -> tuple[int, int]:
+    """Centres whose quality reaches a threshold: those of `quality_map`, without the map.
+
+    It goes on from one block until the image or the room for results ends. Nothing is allocated
+    here: counting references would cost as much as all the rest.
 
     Parameters
     ----------
-    padded : (H + 2 margin, W + 2 margin) uint8
-        The image, with zeros around: a zero adds nothing to any sum.
-    margin, samples
-        `DiscTable.margin_px`, `DiscTable.samples`.
-    row_begin, row_end, usable, run_bounds, run_start, run_du, run_dv, votes_inner, votes_outer
-        The table (see `lut.DiscTable`).
-    quality : (H, W) float64
-        Result, in [0, 1]; 0 for centres that are not usable and where all grey values are equal.
-    contrast : (H, W) float32
-        Result: mean grey value inside minus outside.
-    """
-    height, width = usable.shape
-    scratch = np.empty((2 * samples, width), np.uint8)
-    for v in range(height):
-        begin = row_begin[v]
-        end = row_end[v]
-        if begin >= end:
-            continue
-        for k in range(2 * samples):
-            last = run_bounds[v, k + 1] - 1
-            for run in range(run_bounds[v, k], last + 1):
-                u0 = run_start[run]
-                u1 = run_start[run + 1] if run < last else end
-                row = padded[v + run_dv[run] + margin]
-                shift = run_du[run] + margin
-                for u in range(u0, u1):
-                    scratch[k, u] = row[u + shift]
-        for u in range(begin, end):
-            if not usable[v, u]:
-                continue
-            inner = 0
-            outer = 0
-            squares = 0
-            for k in range(samples):
-                a = int(scratch[k, u])
-                b = int(scratch[samples + k, u])
-                inner += a
-                outer += b
-                squares += a * a + b * b
-            n_inner = int(votes_inner[v, u])
-            n_outer = int(votes_outer[v, u])
-            n = n_inner + n_outer
-            total = inner + outer
-            spread = n * squares - total * total
-            difference = n_outer * inner - n_inner * outer
-            if spread > 0:
-                quality[v, u] = (difference * difference) / (float(n_inner * n_outer) * spread)
-            contrast[v, u] = difference / (n_inner * n_outer)
-
-
-@njit(cache=True, error_model="numpy")
-def local_maxima(
-    quality: NDArray[np.float64], threshold: float
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Pixels of at least `threshold` that none of their 8 neighbours exceeds, in scan order.
-
-    Connected pixels of equal quality are one maximum, at the one nearest to their centroid: a
-    plateau is neither lost nor found twice.
+    pixels, samples, copies, block_copies, block_row, block_column, block_pattern, patterns
+        As in `quality_map`.
+    threshold : float
+        Least quality, above 0.
+    sign : float
+        1 for centres lighter than what is around them, -1 for darker ones, 0 for both.
+    gathered, sums, products
+        Memory to work in (`working_memory`).
+    block : int
+        First block to look at.
+    columns, rows : (M,) int64, M >= 64
+    quality : (M,) float64
+    contrast : (M,) float32
+        Results, in scan order.
 
     Returns
     -------
-    columns, rows : (N,) int64
+    block, count : int
+        The first block that was not looked at, and the number of results.
     """
-    height, width = quality.shape
-    found_u = []
-    found_v = []
-    visited = np.zeros(quality.shape, np.bool_)
-    for v in range(height):
-        for u in range(width):
-            here = quality[v, u]
-            if not here >= threshold or here <= 0.0 or visited[v, u]:
-                continue
-            highest = True
-            level = False
-            for vn in range(max(0, v - 1), min(height, v + 2)):
-                for un in range(max(0, u - 1), min(width, u + 2)):
-                    if quality[vn, un] > here:
-                        highest = False
-                    elif quality[vn, un] == here and (vn != v or un != u):
-                        level = True
-            if not level:
-                if highest:
-                    found_u.append(u)
-                    found_v.append(v)
-                continue
-            # A plateau: gather all of it, and see whether anything around it is higher.
-            plateau = [(v, u)]
-            visited[v, u] = True
-            highest = True
-            k = 0
-            while k < len(plateau):
-                vp, up = plateau[k]
-                k += 1
-                for vn in range(max(0, vp - 1), min(height, vp + 2)):
-                    for un in range(max(0, up - 1), min(width, up + 2)):
-                        if quality[vn, un] > here:
-                            highest = False
-                        elif quality[vn, un] == here and not visited[vn, un]:
-                            visited[vn, un] = True
-                            plateau.append((vn, un))
-            if highest:
-                mean_v = 0.0
-                mean_u = 0.0
-                for vp, up in plateau:
-                    mean_v += vp / len(plateau)
-                    mean_u += up / len(plateau)
-                best = 0
-                least = np.inf
-                for k in range(len(plateau)):
-                    vp, up = plateau[k]
-                    distance = (vp - mean_v) ** 2 + (up - mean_u) ** 2
-                    if distance < least:
-                        least = distance
-                        best = k
-                found_v.append(plateau[best][0])
-                found_u.append(plateau[best][1])
-    n = len(found_u)
-    columns = np.empty(n, np.int64)
-    rows = np.empty(n, np.int64)
-    for k in range(n):
-        columns[k] = found_u[k]
-        rows[k] = found_v[k]
-    # A plateau's representative may come later in the scan than where it was met.
-    order = np.argsort(rows * width + columns)
-    return columns[order], rows[order]
+    count = 0
+    share = np.float32(threshold * _FIRST_COMPARISON)
+    blocks = len(block_row)
+    for b in range(block, blocks):
+        if count + BLOCK > len(columns):
+            return b, count
+        fresh = b == block
+        _sum_block(pixels, samples, copies, block_copies, gathered, sums, products, b, fresh)
+        pattern = block_pattern[b]
+        if pattern == 0:
+            mask = promising_all_vote(sums, products, samples, share)
+        else:
+            mask = promising(sums, products, patterns, pattern, share)
+        while mask != 0:
+            i = lowest_bit(mask)
+            mask &= mask - _ONE
+            here, difference = _quality(sums, products, patterns, pattern, i)
+            if here >= threshold and here > 0.0 and difference * sign >= 0.0:
+                columns[count] = block_column[b] + np.int64(i)
+                rows[count] = block_row[b]
+                quality[count] = here
+                contrast[count] = difference
+                count += 1
+    return blocks, count
 
 
 @njit(cache=True, error_model="numpy")

@@ -15,7 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera
-from detect.circle_kernels import local_maxima, quality_map, suppress_neighbours
+from detect.centres import best_centres
+from detect.centres import quality_of_centres as quality_of_centres
+from detect.circle_kernels import suppress_neighbours
 from detect.disc_fit import blur_ratio_of, disc_evidence, estimate_noise, fit_discs
 from detect.errors import FrameError
 from detect.settings import CircleSettings
@@ -92,18 +94,12 @@ def detect_circles(
             f"the image is {image.shape[1]}x{image.shape[0]} px: "
             f"the calibration is for {camera.width}x{camera.height}"
         )
-    quality, contrast = quality_of_centres(image, table)
-    if settings.polarity != "any":
-        wanted = 1.0 if settings.polarity == "light" else -1.0
-        quality[contrast * wanted <= 0.0] = 0.0
-    columns, rows = local_maxima(quality, settings.threshold)
-
+    pixels, found_quality, contrast = best_centres(
+        image, table, settings.threshold, settings.polarity
+    )
     noise = estimate_noise(image)
-    weakest = settings.noise_floor * max(noise, _LEAST_NOISE)
-    strong = np.abs(contrast[rows, columns]) >= weakest
-    columns, rows = columns[strong], rows[strong]
-    pixels = np.stack([columns, rows], axis=-1)
-    found_quality = quality[rows, columns]
+    strong = np.abs(contrast) >= settings.noise_floor * max(noise, _LEAST_NOISE)
+    pixels, found_quality, contrast = pixels[strong], found_quality[strong], contrast[strong]
     floor_xy = camera.floor_from_pixel(pixels.astype(np.float64))
     evidence = np.full(len(pixels), np.nan)
 
@@ -121,6 +117,7 @@ def detect_circles(
     # centres.
     keep = _alone(floor_xy, found_quality, 0.5 * settings.separation_m)
     pixels, found_quality, floor_xy = pixels[keep], found_quality[keep], floor_xy[keep]
+    contrast = contrast[keep]
     ratio = blur_ratio_of(camera)
     first = fit_discs(
         image, table.floor_xy, pixels, settings.radius_m, noise, blur_ratio=ratio, first_look=True
@@ -130,6 +127,7 @@ def detect_circles(
         promise = disc_evidence(first, settings.radius_m, settings.blur_px)
         likely &= promise >= settings.evidence - _FIRST_LOOK_SLACK
     pixels, found_quality, floor_xy = pixels[likely], found_quality[likely], floor_xy[likely]
+    contrast = contrast[likely]
     centres = _nearest_pixels(camera, first.floor_xy[likely])
     fits = fit_discs(
         image, table.floor_xy, centres, settings.radius_m, noise, blur_ratio=ratio,
@@ -138,7 +136,7 @@ def detect_circles(
     evidence = disc_evidence(fits, settings.radius_m, settings.blur_px)
     # A fit that wandered off, or turned the disc's contrast round, is about something else.
     stayed = np.hypot(*(fits.floor_xy - floor_xy).T) < settings.radius_m
-    same_sign = fits.contrast * contrast[pixels[:, 1], pixels[:, 0]] > 0.0
+    same_sign = fits.contrast * contrast > 0.0
     sound = fits.fitted & stayed & same_sign
     if settings.verify:
         sound &= evidence >= settings.evidence
@@ -169,48 +167,6 @@ def disc_shape(settings: CircleSettings) -> DiscShape:
         border_px=settings.border_px,
         far_limit_m_per_px=settings.far_limit_m_per_px,
     )
-
-
-def quality_of_centres(
-    image: NDArray[np.uint8], table: DiscTable
-) -> tuple[FloatArray, NDArray[np.float32]]:
-    """Otsu's quality, and the contrast, of the outlines around every pixel.
-
-    Parameters
-    ----------
-    image : (H, W) uint8
-        Grey image.
-    table : DiscTable
-        The camera's table.
-
-    Returns
-    -------
-    quality : (H, W) float64
-        Between-class variance / total variance of the outlines' grey values, 0 to 1; 0 where the
-        table has no usable centre.
-    contrast : (H, W) float32
-        Mean grey value of the inner outline minus that of the outer.
-    """
-    padded = np.pad(image, table.margin_px)
-    quality = np.zeros(image.shape)
-    contrast = np.zeros(image.shape, np.float32)
-    quality_map(
-        padded,
-        table.margin_px,
-        table.samples,
-        table.row_begin,
-        table.row_end,
-        table.usable,
-        table.run_bounds,
-        table.run_start,
-        table.run_du,
-        table.run_dv,
-        table.votes_inner,
-        table.votes_outer,
-        quality,
-        contrast,
-    )
-    return quality, contrast
 
 
 def published_covariance(camera: Camera, pixels: NDArray[np.int64]) -> FloatArray:

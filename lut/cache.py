@@ -13,19 +13,21 @@ import hashlib
 import io
 import logging
 import os
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 from zipfile import BadZipFile
 
 import numpy as np
 
 from camera import Camera
+from lut.floor import floor_positions
 from lut.outlines import DiscShape, DiscTable, build_disc_table
 from lut.verticals import VerticalTable, build_vertical_table
 from storage import write_whole
 
 #: Raised with every change of what tables hold or how they are computed.
-TABLE_VERSION = 5
+TABLE_VERSION = 6
 
 Table = TypeVar("Table", DiscTable, VerticalTable)
 
@@ -67,11 +69,16 @@ def cached_disc_table(camera: Camera, shape: DiscShape, folder: Path | None = No
     """
     folder = cache_folder() if folder is None else folder
     path = folder / f"discs-{_key(camera, shape)}.table"
-    table = _read(path, DiscTable)
+
+    def complete(**fields: Any) -> DiscTable:
+        return DiscTable(**fields, floor_xy=floor_positions(camera).astype(np.float32))
+
+    table = _read(path, complete)
     if table is None:
         _log.info("computing the table of discs, once for this calibration")
         table = build_disc_table(camera, shape)
-        _keep(path, table)
+        # The largest part of a table, and computed as soon as it would be read.
+        _keep(path, table, without=("floor_xy",))
     return table
 
 
@@ -106,8 +113,8 @@ def _key(camera: Camera, shape: DiscShape | None = None) -> str:
     return hashlib.sha256(" ".join(parts).encode()).hexdigest()[:32]
 
 
-def _read(path: Path, kind: type[Table]) -> Table | None:
-    """The table in a file; None if there is none or it is damaged."""
+def _read(path: Path, make: Callable[..., Table]) -> Table | None:
+    """The table made of a file's fields; None if there is no file or it is damaged."""
     try:
         content = path.read_bytes()
     except OSError:
@@ -119,14 +126,15 @@ def _read(path: Path, kind: type[Table]) -> Table | None:
         with np.load(io.BytesIO(payload), allow_pickle=False) as arrays:
             # Numbers were stored as arrays without dimensions.
             fields = {name: arrays[name] for name in arrays.files}
-        return kind(**{name: a if a.ndim else a.item() for name, a in fields.items()})
+        return make(**{name: a if a.ndim else a.item() for name, a in fields.items()})
     except (ValueError, KeyError, TypeError, EOFError, OSError, BadZipFile):
         return None
 
 
-def _keep(path: Path, table: DiscTable | VerticalTable) -> None:
+def _keep(path: Path, table: DiscTable | VerticalTable, without: Sequence[str] = ()) -> None:
     buffer = io.BytesIO()
-    fields = {f.name: getattr(table, f.name) for f in dataclasses.fields(table)}
+    names = [field.name for field in dataclasses.fields(table) if field.name not in without]
+    fields = {name: getattr(table, name) for name in names}
     np.savez(buffer, allow_pickle=False, **fields)
     payload = buffer.getvalue()
     try:

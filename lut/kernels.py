@@ -1,7 +1,7 @@
 """Compiled loops that build tables: arrays in, arrays out.
 
-Numba's cache notices a change of this file, but not one of `camera.kernels`, whose function is
-compiled into these: whoever changes that one has to touch this file as well.
+`encode_outlines` projects as `camera.kernels.project_floor_point` does, operation by operation, but
+without a branch, so that several pixels are worked on at once; a test holds the two together.
 """
 
 from __future__ import annotations
@@ -12,24 +12,139 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from camera.kernels import project_floor_point
+#: Neighbouring pixels of a row that a detector works on at once; bytes of one copy.
+BLOCK = 64
+
+#: Low bits of a copy that say how far the place that is copied to moves on.
+ADVANCE_BITS = 7
+
+#: Rows of grey values are summed, and copies carried out, in groups of so many.
+GROUP = 4
+
+#: A block has at least so many copies for every two groups of its rows, one of each outline: they
+#: are carried out while other rows are summed.
+LEAST_COPIES = 16
 
 
 @njit(cache=True, error_model="numpy")
-def _inside(us: float, vs: float, width: int, height: int) -> bool:
-    """Whether the pixel nearest to a position belongs to the image; NaN does not."""
-    return 0.0 <= us + 0.5 < width and 0.0 <= vs + 0.5 < height
+def fill_floor_positions(
+    lens: NDArray[np.float64],
+    undistortion: NDArray[np.float64],
+    per_radius: float,
+    rotation: NDArray[np.float64],
+    centre: NDArray[np.float64],
+    floor_xy: NDArray[np.float64],
+) -> None:
+    """Where the rays of all pixels meet the floor.
+
+    Parameters
+    ----------
+    lens : (4,) float64
+        Scale x, y and offset x, y, pixels.
+    undistortion : (N, 6) float64
+        Undistorted / distorted radius: coefficients, the lowest first, of polynomials in the
+        position within an interval of the distorted radius, from -1 to 1.
+    per_radius : float
+        Intervals per unit of distorted radius.
+    rotation : (3, 3) float64
+        Camera -> robot.
+    centre : (3,) float64
+        The camera's centre in the robot frame, metres.
+    floor_xy : (H, W, 2) float64
+        Result, metres; NaN where the ray does not come down to the floor.
+    """
+    height, width = floor_xy.shape[0], floor_xy.shape[1]
+    last = undistortion.shape[0] - 1
+    r00, r01, r02 = rotation[0, 0], rotation[0, 1], rotation[0, 2]
+    r10, r11, r12 = rotation[1, 0], rotation[1, 1], rotation[1, 2]
+    r20, r21, r22 = rotation[2, 0], rotation[2, 1], rotation[2, 2]
+    cx, cy, cz = centre[0], centre[1], centre[2]
+    x_seen = np.empty(width)
+    for u in range(width):
+        x_seen[u] = (u - lens[2]) / lens[0]
+    # A loop for what is looked up, and one that the compiler can do for several pixels at once.
+    ratio = np.empty(width)
+    x_robot = np.empty(width)
+    y_robot = np.empty(width)
+    for v in range(height):
+        y_seen = (v - lens[3]) / lens[1]
+        for u in range(width):
+            place = math.sqrt(x_seen[u] * x_seen[u] + y_seen * y_seen) * per_radius
+            interval = min(int(place), last)
+            t = 2.0 * (place - interval) - 1.0
+            c = undistortion[interval]
+            ratio[u] = c[0] + t * (c[1] + t * (c[2] + t * (c[3] + t * (c[4] + t * c[5]))))
+        for u in range(width):
+            x = x_seen[u] * ratio[u]
+            y = y_seen * ratio[u]
+            down = r20 * x + r21 * y + r22
+            along = -cz / down if down * cz < 0.0 else math.nan
+            x_robot[u] = cx + along * (r00 * x + r01 * y + r02)
+            y_robot[u] = cy + along * (r10 * x + r11 * y + r12)
+        for u in range(width):
+            floor_xy[v, u, 0] = x_robot[u]
+            floor_xy[v, u, 1] = y_robot[u]
 
 
 @njit(cache=True, error_model="numpy")
-def count_votes(
+def _nearest_pixels(
+    numbers: NDArray[np.float64],
+    x_robot: NDArray[np.float64],
+    y_robot: NDArray[np.float64],
+    offset: NDArray[np.float64],
+    begin: int,
+    end: int,
+    height: int,
+    width: int,
+    nearest: NDArray[np.float64],
+) -> None:
+    """Index in the image of the pixel nearest to one sample of centres' outlines; -1 outside.
+
+    `x_robot` and `y_robot` are the centres of a row, of which those from `begin` to `end` are
+    worked on, `offset` is the sample's from its centre, `nearest` the result (whole numbers). That
+    all are contiguous is what lets the compiler work on several centres at once.
+    """
+    scale_x, scale_y, offset_x, offset_y = numbers[0], numbers[1], numbers[2], numbers[3]
+    a2, a3, b1, b2, b3 = numbers[4], numbers[5], numbers[6], numbers[7], numbers[8]
+    r_max = numbers[9]
+    r00, r01, r02 = numbers[10], numbers[11], numbers[12]
+    r10, r11, r12 = numbers[13], numbers[14], numbers[15]
+    r20, r21, r22 = numbers[16], numbers[17], numbers[18]
+    cx, cy, dz = numbers[19], numbers[20], -numbers[21]
+    x_offset, y_offset = offset[0], offset[1]
+    for u in range(begin, end):
+        dx = x_robot[u] + x_offset - cx
+        dy = y_robot[u] + y_offset - cy
+        z = r20 * dx + r21 * dy + r22 * dz
+        x = (r00 * dx + r01 * dy + r02 * dz) / z
+        y = (r10 * dx + r11 * dy + r12 * dz) / z
+        r = math.sqrt(x * x + y * y)
+        factor = 1.0 + r * (a2 + r * a3) / (1.0 + r * (b1 + r * (b2 + r * b3)))
+        column = np.floor(scale_x * x * factor + offset_x + 0.5)
+        row = np.floor(scale_y * y * factor + offset_y + 0.5)
+        # NaN fails every comparison.
+        seen = (z > 0.0) & (r <= r_max)
+        inside = (column >= 0.0) & (column < width) & (row >= 0.0) & (row < height)
+        nearest[u] = row * width + column if seen & inside else -1.0
+
+
+@njit(cache=True, error_model="numpy")
+def encode_outlines(
     numbers: NDArray[np.float64],
     floor_xy: NDArray[np.float64],
     candidate: NDArray[np.bool_],
-    ring: NDArray[np.float64],
-    votes: NDArray[np.uint8],
-) -> None:
-    """Count the samples of one outline that fall inside the image, for candidate centres.
+    inner: NDArray[np.float64],
+    outer: NDArray[np.float64],
+    enough: float,
+) -> tuple[
+    NDArray[np.uint64],
+    NDArray[np.int64],
+    NDArray[np.int32],
+    NDArray[np.int32],
+    NDArray[np.int32],
+    NDArray[np.uint8],
+]:
+    """Find the usable centres, and write down how the grey values around them are gathered.
 
     Parameters
     ----------
@@ -38,96 +153,126 @@ def count_votes(
     floor_xy : (H, W, 2) float64
         Floor position of each pixel, metres.
     candidate : (H, W) bool
-        Centres to look at; the others get no votes.
-    ring : (K, 2) float64
-        The outline's samples relative to its centre, metres.
-    votes : (H, W) uint8
-        Result.
-    """
-    height, width = candidate.shape
-    for v in range(height):
-        for u in range(width):
-            if not candidate[v, u]:
-                continue
-            inside = 0
-            for k in range(ring.shape[0]):
-                us, vs = project_floor_point(
-                    numbers, floor_xy[v, u, 0] + ring[k, 0], floor_xy[v, u, 1] + ring[k, 1]
-                )
-                if _inside(us, vs, width, height):
-                    inside += 1
-            votes[v, u] = inside
-
-
-@njit(cache=True, error_model="numpy")
-def encode_runs(
-    numbers: NDArray[np.float64],
-    floor_xy: NDArray[np.float64],
-    usable: NDArray[np.bool_],
-    row_begin: NDArray[np.int32],
-    row_end: NDArray[np.int32],
-    rings: NDArray[np.float64],
-    capacity: int,
-) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32], NDArray[np.int32], int]:
-    """Run-length encode the samples' offsets along each row.
-
-    Samples outside the image, or that the camera does not see at all, get the pixel above the
-    image's first one in their centre's column: one run, and no farther outside than that.
-
-    Parameters
-    ----------
-    numbers, floor_xy
-        As in `count_votes`.
-    usable : (H, W) bool
-        Usable centres. Others between a row's ends continue the run they lie in while that stays
-        inside the image.
-    row_begin, row_end : (H,) int32
-        Columns between which a row's usable centres lie.
-    rings : (2K, 2) float64
-        Samples of the inner and then the outer outline relative to the centre, metres.
-    capacity : int
-        Room for runs.
+        Centres to look at.
+    inner, outer : (K, 2) float64
+        Samples of the outlines relative to their centre, metres.
+    enough : float
+        Samples of each outline that must be inside the image.
 
     Returns
     -------
-    run_bounds : (H, 2K + 1) int32
-    run_start, run_du, run_dv : (capacity,) int32
-    count : int
-        Number of runs needed; if larger than `capacity`, the rest was not written.
+    copies, block_copies, block_row, block_column, block_pattern, patterns
+        As in `lut.DiscTable`; copies as uint64.
     """
-    height, width = usable.shape
-    samples = rings.shape[0]
-    run_bounds = np.zeros((height, samples + 1), np.int32)
-    run_start = np.empty(capacity, np.int32)
-    run_du = np.empty(capacity, np.int32)
-    run_dv = np.empty(capacity, np.int32)
+    height, width = candidate.shape
+    samples = inner.shape[0]
+    padded = -(-samples // GROUP) * GROUP
+    nothing = height * width
+    most_blocks = height * (-(-width // BLOCK))
+
+    block_copies = np.zeros(most_blocks + 1, np.int64)
+    block_row = np.empty(most_blocks, np.int32)
+    block_column = np.empty(most_blocks, np.int32)
+    block_pattern = np.empty(most_blocks, np.int32)
+    patterns = np.zeros((most_blocks + 1, 2, BLOCK), np.uint8)
+    for i in range(BLOCK):
+        patterns[0, 0, i] = patterns[0, 1, i] = samples
+    copies = np.empty(1 << 17, np.uint64)
+    blocks = 0
+    pattern = 1
     count = 0
+
+    x_robot = np.empty(width)
+    y_robot = np.empty(width)
+    nearest = np.empty((2 * samples, width))
+    votes = np.zeros((2, width), np.int32)
+    usable = np.zeros(width, np.bool_)
     for v in range(height):
+        begin = width
+        end = 0
+        for u in range(width):
+            if candidate[v, u]:
+                begin = min(begin, u)
+                end = u + 1
+        for u in range(begin, end):
+            x_robot[u] = floor_xy[v, u, 0]
+            y_robot[u] = floor_xy[v, u, 1]
         for k in range(samples):
-            run_bounds[v, k] = count
-            du = 0
-            dv = 0
-            fresh = True
-            for u in range(row_begin[v], row_end[v]):
-                du_here = 0
-                dv_here = -1 - v
-                if usable[v, u]:
-                    us, vs = project_floor_point(
-                        numbers, floor_xy[v, u, 0] + rings[k, 0], floor_xy[v, u, 1] + rings[k, 1]
-                    )
-                    if _inside(us, vs, width, height):
-                        du_here = math.floor(us + 0.5) - u
-                        dv_here = math.floor(vs + 0.5) - v
-                elif 0 <= u + du < width:
-                    continue
-                if fresh or du_here != du or dv_here != dv:
-                    du = du_here
-                    dv = dv_here
-                    if count < capacity:
-                        run_start[count] = u
-                        run_du[count] = du
-                        run_dv[count] = dv
+            _nearest_pixels(
+                numbers, x_robot, y_robot, inner[k], begin, end, height, width, nearest[k]
+            )
+            _nearest_pixels(
+                numbers, x_robot, y_robot, outer[k], begin, end, height, width, nearest[samples + k]
+            )
+        for u in range(begin, end):
+            votes[0, u] = votes[1, u] = 0
+        for k in range(2 * samples):
+            outline = k // samples
+            for u in range(begin, end):
+                votes[outline, u] += 1 if nearest[k, u] >= 0.0 else 0
+        first = width
+        last = 0
+        for u in range(begin, end):
+            usable[u] = candidate[v, u] and votes[0, u] >= enough and votes[1, u] >= enough
+            if usable[u]:
+                first = min(first, u)
+                last = u + 1
+
+        room = count + (2 * padded + LEAST_COPIES) * (width + BLOCK)
+        if room > len(copies):
+            more = np.empty(2 * room, np.uint64)
+            for i in range(count):
+                more[i] = copies[i]
+            copies = more
+        for from_u in range(first, last, BLOCK):
+            to_u = min(last, from_u + BLOCK)
+            all_vote = True
+            for i in range(BLOCK):
+                counts = from_u + i < to_u and usable[from_u + i]
+                patterns[pattern, 0, i] = votes[0, from_u + i] if counts else 0
+                patterns[pattern, 1, i] = votes[1, from_u + i] if counts else 0
+                all_vote &= patterns[pattern, 0, i] + patterns[pattern, 1, i] == 2 * samples
+            block_row[blocks] = v
+            block_column[blocks] = from_u
+            # The place of a pattern that is not needed is taken by the next one.
+            block_pattern[blocks] = 0 if all_vote else pattern
+            pattern += 0 if all_vote else 1
+            for k in range(2 * padded):
+                outline = k // padded
+                sample = k - outline * padded
+                if sample >= samples:
+                    copies[count] = (nothing << ADVANCE_BITS) | BLOCK
                     count += 1
-                    fresh = False
-        run_bounds[v, samples] = count
-    return run_bounds, run_start, run_du, run_dv, count
+                    continue
+                here = nearest[outline * samples + sample]
+                # Centres around which the sample has the same offset: `run_source` is the pixel
+                # that the centre in column `run_u` looks at. What is not usable changes nothing.
+                run_u = from_u
+                run_source = int(here[from_u]) if here[from_u] >= 0.0 else nothing
+                for u in range(from_u + 1, to_u):
+                    along = run_source
+                    if run_source != nothing:
+                        along += u - run_u
+                    if usable[u]:
+                        source = int(here[u]) if here[u] >= 0.0 else nothing
+                        if source != along:
+                            copies[count] = (run_source << ADVANCE_BITS) | (u - run_u)
+                            count += 1
+                            run_u = u
+                            run_source = source
+                copies[count] = (run_source << ADVANCE_BITS) | (from_u + BLOCK - run_u)
+                count += 1
+            least = block_copies[blocks] + padded // GROUP * LEAST_COPIES
+            while count < least or count % GROUP != 0:
+                copies[count] = nothing << ADVANCE_BITS
+                count += 1
+            blocks += 1
+            block_copies[blocks] = count
+    return (
+        copies[:count].copy(),
+        block_copies[: blocks + 1].copy(),
+        block_row[:blocks].copy(),
+        block_column[:blocks].copy(),
+        block_pattern[:blocks].copy(),
+        patterns[:pattern].copy(),
+    )

@@ -6,19 +6,21 @@ the calibration alone, so it is computed ahead of time, for every pixel (DLR Spa
 set report, circle detection).
 
 From one pixel to the next along a row, a sample nearly always moves by one pixel as well: its
-offset from the centre stays the same for some 40 pixels. So the table stores, for each row and
-sample, the *runs* of equal offset. A detector can then copy stretches of image rows instead of
-gathering single pixels.
+offset from the centre stays the same for some 40 pixels. So what the table stores is not an offset
+for each centre and sample but a list of *copies*: 64 neighbouring bytes of the image each, which,
+put one after the other, line up the grey values of one sample for centre after centre. What a copy
+brings too much is overwritten by the next.
 
-Samples outside the image do not vote: the table sends them to the row above the image, which a
-detector pads with zeros. A centre is usable when at least half of each outline's
-samples are inside, it keeps its distance from the border, and the floor there moves by no more
-than a given length per image row.
+Samples outside the image do not vote: the table takes them from behind the image's last pixel,
+where a detector has zeros. A centre is usable when at least half of each outline's samples are
+inside, it keeps its distance from the border, and the floor there moves by no more than a given
+length per image row.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +28,8 @@ from numpy.typing import NDArray
 from camera import Camera
 from camera.kernels import camera_numbers
 from lut.errors import TableError
-from lut.kernels import count_votes, encode_runs
+from lut.floor import floor_positions
+from lut.kernels import ADVANCE_BITS, BLOCK, encode_outlines
 
 #: Part of an outline's samples that must lie inside the image.
 MIN_SHARE_INSIDE = 0.5
@@ -68,50 +71,71 @@ class DiscShape:
             raise TableError(f"far limit of {self.far_limit_m_per_px:g} m: expected more than 0")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class DiscTable:
-    """Outline pixels of every usable centre, as runs of equal offset.
+    """Usable centres, and how the grey values of their outlines are gathered.
 
-    Row v's runs of sample k (inner samples first) are ``run_bounds[v, k] : run_bounds[v, k + 1]``
-    of the three run arrays. A run reaches from its `run_start` to the next run's, the last one to
-    `row_end[v]`.
+    Hashed and compared by identity.
+
+    Centres are worked on in *blocks* of 64 neighbouring columns of a row. For each block ``2 R``
+    rows of 64 grey values are gathered, a column for each centre: R = `samples` rounded up to a
+    multiple of 4 for the inner outline, then R for the outer one; rows that are no samples are 0.
+
+    Copies fill these rows one after the other. Each is one number, ``source * 128 + advance``: 64
+    bytes of the image are copied, from the pixel with index `source` in scan order, and the next
+    copy goes `advance` bytes further. Each block has a multiple of 4 of them, and at least 4 R;
+    those that fill up copy zeros and go no further.
 
     Attributes
     ----------
     samples : int
         Samples on each of the two outlines.
-    row_begin, row_end : (H,) int32
-        Columns from and up to which a row has usable centres; equal where there are none.
-    usable : (H, W) bool
-        The usable centres. All lie between `row_begin` and `row_end`.
-    run_bounds : (H, 2 samples + 1) int32
-        See above.
-    run_start : (N,) int16 or int32
-        First column of each run.
-    run_du, run_dv : (N,) int16 or int32
-        Offset of the sample from the centre, pixels. For samples outside the image it leads to row
-        -1, straight above the centre.
-    votes_inner, votes_outer : (H, W) uint8
-        Samples of each outline inside the image, for usable centres.
-    margin_px : int
-        Padding that makes every offset of every run safe: 1 if samples lie outside the image, else
-        0.
+    copies : (N,) uint32, or uint64 for images of more than 33 Mpixel
+        See above. `source` is H * W or less: behind the image's last pixel there are 64 zeros.
+    block_copies : (B + 1,) int64
+        Block b has the copies ``block_copies[b] : block_copies[b + 1]``. Blocks are in scan order.
+    block_row, block_column : (B,) int32
+        First pixel of each block.
+    block_pattern : (B,) int32
+        Which of the `patterns` says who votes.
+    patterns : (P, 2, 64) uint8
+        Samples of the inner and of the outer outline inside the image, for the centres of a block;
+        0 for those that are not usable. In the first pattern all samples of all centres vote.
     floor_xy : (H, W, 2) float32
         Floor position (robot X, Y in metres) that each pixel sees; NaN above the horizon.
     """
 
     samples: int
-    row_begin: NDArray[np.int32]
-    row_end: NDArray[np.int32]
-    usable: NDArray[np.bool_]
-    run_bounds: NDArray[np.int32]
-    run_start: NDArray[np.int32]
-    run_du: NDArray[np.int32]
-    run_dv: NDArray[np.int32]
-    votes_inner: NDArray[np.uint8]
-    votes_outer: NDArray[np.uint8]
-    margin_px: int
+    copies: NDArray[np.uint32] | NDArray[np.uint64]
+    block_copies: NDArray[np.int64]
+    block_row: NDArray[np.int32]
+    block_column: NDArray[np.int32]
+    block_pattern: NDArray[np.int32]
+    patterns: NDArray[np.uint8]
     floor_xy: NDArray[np.float32]
+
+    @cached_property
+    def usable(self) -> NDArray[np.bool_]:
+        """(H, W) the usable centres."""
+        return np.asarray(self.votes_inner > 0)
+
+    @cached_property
+    def votes_inner(self) -> NDArray[np.uint8]:
+        """(H, W) samples of the inner outline inside the image, for usable centres."""
+        return self._votes(0)
+
+    @cached_property
+    def votes_outer(self) -> NDArray[np.uint8]:
+        """(H, W) samples of the outer outline inside the image, for usable centres."""
+        return self._votes(1)
+
+    def _votes(self, outline: int) -> NDArray[np.uint8]:
+        height, width = self.floor_xy.shape[:2]
+        # A row's last block may reach past the image's border.
+        votes = np.zeros((height, width + BLOCK), np.uint8)
+        columns = self.block_column[:, None] + np.arange(BLOCK)
+        votes[self.block_row[:, None], columns] = self.patterns[self.block_pattern, outline]
+        return votes[:, :width]
 
 
 def ring(radius_m: float, samples: int) -> NDArray[np.float64]:
@@ -144,56 +168,27 @@ def build_disc_table(camera: Camera, shape: DiscShape) -> DiscTable:
         raise TableError(
             f"the camera is {camera.centre[2]:g} m above the floor: expected more than 0"
         )
-    numbers = camera_numbers(camera)
     floor_xy = floor_positions(camera)
-    candidate = _within_limits(camera, shape, floor_xy)
-
-    inner = ring(shape.inner_radius_m, shape.samples)
-    outer = ring(shape.outer_radius_m, shape.samples)
-    votes_inner = np.zeros(candidate.shape, np.uint8)
-    votes_outer = np.zeros(candidate.shape, np.uint8)
-    count_votes(numbers, floor_xy, candidate, inner, votes_inner)
-    count_votes(numbers, floor_xy, candidate, outer, votes_outer)
-    enough = MIN_SHARE_INSIDE * shape.samples
-    usable = candidate & (votes_inner >= enough) & (votes_outer >= enough)
-
-    any_usable = usable.any(axis=1)
-    row_begin = np.where(any_usable, usable.argmax(axis=1), 0).astype(np.int32)
-    row_end = np.where(any_usable, camera.width - usable[:, ::-1].argmax(axis=1), 0)
-    row_end = row_end.astype(np.int32)
-
-    rings = np.concatenate([inner, outer])
-    # A first guess at the number of runs; the encoder tells when more room is needed.
-    capacity = 32 * len(rings) * camera.height
-    while True:
-        run_bounds, run_start, run_du, run_dv, count = encode_runs(
-            numbers, floor_xy, usable, row_begin, row_end, rings, capacity
-        )
-        if count <= capacity:
-            break
-        capacity = count
-    run_start, run_du, run_dv = run_start[:count], run_du[:count], run_dv[:count]
-    run_row = np.repeat(np.arange(camera.height), run_bounds[:, -1] - run_bounds[:, 0])
+    copies, block_copies, row, column, pattern, patterns = encode_outlines(
+        camera_numbers(camera),
+        floor_xy,
+        _within_limits(camera, shape, floor_xy),
+        ring(shape.inner_radius_m, shape.samples),
+        ring(shape.outer_radius_m, shape.samples),
+        MIN_SHARE_INSIDE * shape.samples,
+    )
+    pixels = camera.height * camera.width
+    fits = (pixels + 1) << ADVANCE_BITS <= np.iinfo(np.uint32).max + 1
     return DiscTable(
         samples=shape.samples,
-        row_begin=row_begin,
-        row_end=row_end,
-        usable=usable,
-        run_bounds=run_bounds,
-        run_start=_narrow(run_start),
-        run_du=_narrow(run_du),
-        run_dv=_narrow(run_dv),
-        votes_inner=np.where(usable, votes_inner, 0).astype(np.uint8),
-        votes_outer=np.where(usable, votes_outer, 0).astype(np.uint8),
-        margin_px=int(np.any(run_row + run_dv < 0)),
+        copies=copies.astype(np.uint32) if fits else copies,
+        block_copies=block_copies,
+        block_row=row,
+        block_column=column,
+        block_pattern=pattern,
+        patterns=patterns,
         floor_xy=floor_xy.astype(np.float32),
     )
-
-
-def floor_positions(camera: Camera) -> NDArray[np.float64]:
-    """(H, W, 2) floor position (robot X, Y, metres) that each pixel sees; NaN above the horizon."""
-    v, u = np.mgrid[0 : camera.height, 0 : camera.width]
-    return camera.floor_from_pixel(np.stack([u, v], axis=-1).astype(np.float64))
 
 
 def _within_limits(
@@ -209,10 +204,3 @@ def _within_limits(
     per_row = np.gradient(floor_xy, axis=0) if height > 1 else np.full_like(floor_xy, np.nan)
     near = np.hypot(per_row[..., 0], per_row[..., 1]) <= shape.far_limit_m_per_px
     return np.asarray(near & inside_v[:, None] & inside_u[None, :])
-
-
-def _narrow(values: NDArray[np.int32]) -> NDArray[np.int32]:
-    """The same numbers in 16 bits where they fit: tables stay in the processor's cache."""
-    if len(values) and (values.min() < -32768 or values.max() > 32767):
-        return values
-    return values.astype(np.int16)

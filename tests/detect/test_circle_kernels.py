@@ -7,14 +7,14 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from hypothesis import event, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
 
 from camera import Camera, parse_camera
-from detect.circle_kernels import local_maxima, suppress_neighbours
-from detect.circles import quality_of_centres
+from detect.centres import quality_of_centres
+from detect.circle_kernels import suppress_neighbours
 from lut import DiscShape, build_disc_table, ring
 from tests.conftest import PUBLISHED_CAM
 
@@ -95,7 +95,7 @@ KINDS = ["random", "binary", "saturated", "nearly constant", "blocks"]
 @pytest.mark.parametrize("kind", KINDS)
 def test_quality_and_contrast_are_exact_to_the_last_bit(kind: str) -> None:
     assert TABLE.usable.sum() > 500
-    assert TABLE.margin_px == 1  # outlines do reach outside the image
+    assert TABLE.block_pattern.any()  # outlines do reach outside the image
     image = random_image(1, kind)
     quality, contrast = quality_of_centres(image, TABLE)
     exact, exact_contrast = exact_quality(image, CAMERA, SHAPE, TABLE.usable)
@@ -187,102 +187,6 @@ def test_an_empty_table_finds_nothing() -> None:
     quality, contrast = quality_of_centres(random_image(4, "random"), nothing)
     assert not quality.any()
     assert not contrast.any()
-
-
-# -- local maxima ---------------------------------------------------------------------------------
-
-
-def plateaus(quality: NDArray[np.float64], threshold: float) -> list[set[tuple[int, int]]]:
-    """All 8-connected sets of equal quality that nothing next to them exceeds, as (v, u)."""
-    height, width = quality.shape
-
-    def around(v: int, u: int) -> set[tuple[int, int]]:
-        return {
-            (vn, un)
-            for vn in range(v - 1, v + 2)
-            for un in range(u - 1, u + 2)
-            if (vn, un) != (v, u) and 0 <= vn < height and 0 <= un < width
-        }
-
-    left = {(int(v), int(u)) for v, u in np.argwhere((quality >= threshold) & (quality > 0.0))}
-    found = []
-    while left:
-        start = left.pop()
-        members, front = {start}, {start}
-        while front:
-            front = {
-                p for at in front for p in around(*at) if quality[p] == quality[start]
-            } - members
-            members |= front
-        left -= members
-        if all(quality[p] <= quality[start] for at in members for p in around(*at)):
-            found.append(members)
-    return found
-
-
-MAPS = hnp.arrays(
-    np.int8, hnp.array_shapes(min_dims=2, max_dims=2, max_side=9), elements=st.integers(0, 3)
-)
-
-
-@settings(max_examples=300, deadline=None)
-@given(MAPS, st.sampled_from([0.0, 0.25, 0.5, 0.75]))
-def test_every_plateau_is_found_once_at_its_middle_in_scan_order(
-    levels: NDArray[np.int8], threshold: float
-) -> None:
-    quality = levels / 4.0
-    columns, rows = local_maxima(quality, threshold)
-    found = list(zip(rows.tolist(), columns.tolist()))
-    assert found == sorted(found)
-
-    expected = plateaus(quality, threshold)
-    event(f"maxima: {min(len(expected), 5)}, plateaus: {any(len(p) > 1 for p in expected)}")
-    assert len(found) == len(expected)
-    for members in expected:
-        (representative,) = members & set(found)
-        points = np.array(sorted(members), float)
-        from_middle = np.linalg.norm(points - points.mean(axis=0), axis=1)
-        own = np.linalg.norm(np.array(representative) - points.mean(axis=0))
-        assert own <= from_middle.min() + 1e-9
-
-
-def test_single_peaks_are_found_where_they_are() -> None:
-    quality = np.zeros((5, 7))
-    quality[0, 0], quality[4, 6], quality[2, 3], quality[2, 4] = 0.7, 0.61, 0.9, 0.8
-    columns, rows = local_maxima(quality, 0.6)
-    assert (columns.tolist(), rows.tolist()) == ([0, 3, 6], [0, 2, 4])
-
-
-def test_the_threshold_itself_is_enough_and_zero_never_is() -> None:
-    quality = np.zeros((3, 3))
-    assert len(local_maxima(quality, 0.0)[0]) == 0
-    quality[1, 1] = 0.6
-    assert len(local_maxima(quality, 0.6)[0]) == 1
-    assert len(local_maxima(quality, np.nextafter(0.6, 1.0))[0]) == 0
-
-
-def test_a_plateau_with_a_higher_point_at_its_far_end_is_none() -> None:
-    quality = np.full((1, 30), 0.7)
-    quality[0, 29] = 0.8
-    columns, _ = local_maxima(quality, 0.6)
-    assert columns.tolist() == [29]
-    quality[0, 29] = 0.7
-    columns, _ = local_maxima(quality, 0.6)
-    assert columns.tolist() in ([14], [15])
-
-
-def test_nan_is_no_maximum_and_hides_none() -> None:
-    quality = np.full((3, 3), np.nan)
-    quality[1, 1] = 0.7
-    columns, rows = local_maxima(quality, 0.6)
-    assert (columns.tolist(), rows.tolist()) == ([1], [1])
-
-
-def test_an_image_that_is_one_plateau_has_one_maximum_in_its_middle() -> None:
-    columns, rows = local_maxima(np.ones((288, 767)), 0.6)
-    assert len(columns) == 1
-    assert columns[0] == 383
-    assert rows[0] in (143, 144)
 
 
 # -- suppression ----------------------------------------------------------------------------------

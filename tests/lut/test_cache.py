@@ -182,9 +182,9 @@ def archive(**arrays: object) -> bytes:
         lambda content: signed(b"no archive"),
         lambda content: signed(pickle.dumps(Dangerous())),
         lambda content: signed(archive(samples=np.array([Dangerous()], dtype=object))),
-        lambda content: signed(archive(samples=np.array(5), margin_px=np.array(1))),
+        lambda content: signed(archive(samples=np.array(5), copies=np.zeros(3))),
         lambda content: signed(archive(unheard_of=np.zeros(3))),
-        lambda content: signed(archive(samples=np.zeros(3), margin_px=np.array(1))),
+        lambda content: signed(archive(samples=np.zeros(3), copies=np.zeros(3))),
     ],
 )
 def test_damage_of_any_kind_is_noticed_and_repaired(
@@ -284,7 +284,7 @@ while not (folder / "go").exists():
 digests = set()
 for _ in range(rounds):
     table = cached_disc_table(camera, shape, folder / "cache")
-    digests.add(hashlib.sha256(table.run_start.tobytes() + table.run_du.tobytes()).hexdigest())
+    digests.add(hashlib.sha256(table.copies.tobytes() + table.floor_xy.tobytes()).hexdigest())
     # Half of the time somebody clears the cache or damages it.
     for path in (folder / "cache").glob("*.table"):
         if sys.argv[4] == "0":
@@ -300,7 +300,7 @@ def test_concurrent_writers_all_get_right_tables(
     tmp_path: Path, camera: Camera, project_root: Path
 ) -> None:
     built = build_disc_table(camera, SHAPE)
-    right = hashlib.sha256(built.run_start.tobytes() + built.run_du.tobytes()).hexdigest()
+    right = hashlib.sha256(built.copies.tobytes() + built.floor_xy.tobytes()).hexdigest()
     write_camera(camera, tmp_path / "e.cam")
     processes = [
         subprocess.Popen(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from camera import Camera
+from camera.distortion import largest_distorted_radius
 from landmarks import read_frames
 from lut import (
     DiscShape,
@@ -21,6 +23,7 @@ from lut import (
     floor_positions,
     ring,
 )
+from lut.kernels import ADVANCE_BITS, BLOCK, GROUP, LEAST_COPIES
 from tests.camera.strategies import cameras
 
 IntArray = NDArray[np.int64]
@@ -65,35 +68,47 @@ def plain_outlines(camera: Camera, shape: DiscShape) -> Outlines:
 
 
 def decoded(table: DiscTable) -> tuple[IntArray, IntArray]:
-    """(H, W, 2 samples) column and row of every sample, as the runs say; -10**6 where none does."""
+    """What the table's copies gather, if carried out byte by byte.
+
+    Returns
+    -------
+    (B, 2 R, 64) int64
+        For each block, row and centre the index of the pixel that is copied there; H W for zeros.
+    (H, W, 2 samples) int64
+        The same around every pixel, for samples only; -1 where nothing is gathered.
+    """
     height, width = table.usable.shape
-    column = np.full((height, width, 2 * table.samples), -(10**6))
-    row = column.copy()
-    for v in range(height):
-        for k in range(2 * table.samples):
-            first, end = table.run_bounds[v, k], table.run_bounds[v, k + 1]
-            starts = [*table.run_start[first:end], table.row_end[v]]
-            for run, u0, u1 in zip(range(first, end), starts, starts[1:]):
-                column[v, u0:u1, k] = np.arange(u0, u1) + table.run_du[run]
-                row[v, u0:u1, k] = v + table.run_dv[run]
-    return column, row
+    padded = -(-table.samples // GROUP) * GROUP
+    blocks = len(table.block_row)
+    gathered = np.full((blocks, 2 * padded * BLOCK + BLOCK), -1)
+    for b in range(blocks):
+        place = 0
+        for copy in table.copies[table.block_copies[b] : table.block_copies[b + 1]].tolist():
+            source, advance = copy >> ADVANCE_BITS, copy % (1 << ADVANCE_BITS)
+            gathered[b, place : place + BLOCK] = np.arange(source, source + BLOCK)
+            place += advance
+        assert place == 2 * padded * BLOCK
+    # From behind the image come zeros, 64 of them.
+    assert gathered.max(initial=0) < height * width + BLOCK
+    values = np.minimum(gathered[:, : 2 * padded * BLOCK], height * width)
+    values = values.reshape(blocks, 2, padded, BLOCK)
+    around = np.full((height, width + BLOCK, 2 * table.samples), -1)
+    samples = values[:, :, : table.samples].reshape(blocks, 2 * table.samples, BLOCK)
+    for b in range(blocks):
+        u = table.block_column[b]
+        around[table.block_row[b], u : u + BLOCK] = samples[b].T
+    return values.reshape(blocks, 2 * padded, BLOCK), around[:, :width]
 
 
 def assert_table_is(table: DiscTable, plain: Outlines) -> None:
     """Bit for bit, for all usable centres; and safe everywhere."""
     height, width = plain.usable.shape
-    assert np.array_equal(table.usable, plain.usable)
-    column, row = decoded(table)
     usable = plain.usable
-    voting = plain.inside & usable[..., None]
-    assert np.array_equal(column[voting], plain.column[voting])
-    assert np.array_equal(row[voting], plain.row[voting])
-
-    # Samples outside: straight above the image.
-    aside = ~plain.inside & usable[..., None]
-    own_column = np.broadcast_to(np.arange(width)[None, :, None], column.shape)
-    assert np.array_equal(column[aside], own_column[aside])
-    assert np.all(row[aside] == -1)
+    assert table.usable.dtype == np.bool_
+    assert np.array_equal(table.usable, usable)
+    gathered, around = decoded(table)
+    expected = np.where(plain.inside, plain.row * width + plain.column, height * width)
+    assert np.array_equal(around[usable], expected[usable])
 
     for votes, outline in (
         (table.votes_inner, plain.inside[..., : table.samples]),
@@ -102,22 +117,29 @@ def assert_table_is(table: DiscTable, plain: Outlines) -> None:
         assert votes.dtype == np.uint8
         assert np.array_equal(votes, np.where(usable, outline.sum(axis=-1), 0))
 
-    # Whatever a run reaches, over unusable centres too, lies within the padding, and the padding
-    # is no larger than that takes.
-    reached = row != -(10**6)
-    beyond = [
-        np.max(amount[reached], initial=0)
-        for amount in (-column, column - (width - 1), -row, row - (height - 1))
-    ]
-    assert table.margin_px == max(beyond)
-    assert table.margin_px <= 1
+    # Rows that are no samples are zeros: they add nothing to any sum.
+    padded = gathered.shape[1] // 2
+    for first in (table.samples, padded + table.samples):
+        assert np.all(gathered[:, first : first + padded - table.samples] == height * width)
 
+    # Each row's blocks begin at its first usable centre, and lie side by side up to its last.
+    place = []
     for v in range(height):
         columns = np.flatnonzero(usable[v])
         if len(columns):
-            assert (table.row_begin[v], table.row_end[v]) == (columns[0], columns[-1] + 1)
-        else:
-            assert table.row_begin[v] == table.row_end[v]
+            place += [(v, u) for u in range(columns[0], columns[-1] + 1, BLOCK)]
+    assert list(zip(table.block_row.tolist(), table.block_column.tolist())) == place
+    assert np.all(table.patterns[0] == table.samples)
+    all_vote = (table.patterns[table.block_pattern] == table.samples).all(axis=(1, 2))
+    assert np.array_equal(table.block_pattern == 0, all_vote)
+    assert len(table.patterns) == 1 + np.count_nonzero(~all_vote)
+
+    # What a detector takes for granted.
+    assert table.block_copies[0] == 0
+    assert table.block_copies[-1] == len(table.copies)
+    counts = np.diff(table.block_copies)
+    assert np.all(counts % GROUP == 0)
+    assert np.all(counts >= padded // GROUP * LEAST_COPIES)
 
 
 # -- the published calibration --------------------------------------------------------------------
@@ -164,11 +186,15 @@ def test_the_floor_positions_are_the_camera_s(
     assert np.array_equal(published_table.floor_xy, floor_xy.astype(np.float32), equal_nan=True)
 
 
-def test_runs_are_long(published_table: DiscTable) -> None:
-    # What makes a detector fast: many centres for each stretch of an image row that is copied.
+def test_the_table_is_small(published_table: DiscTable) -> None:
+    # What makes a detector fast: many grey values with each copy, and a table that stays in the
+    # processor's cache.
     centres = published_table.usable.sum() * 2 * published_table.samples
-    assert centres / len(published_table.run_start) > 30
-    assert published_table.run_start.dtype == np.int16
+    assert centres / len(published_table.copies) > 24
+    assert published_table.copies.dtype == np.uint32
+    fields = [getattr(published_table, field.name) for field in dataclasses.fields(DiscTable)]
+    arrays = [value for value in fields if isinstance(value, np.ndarray)]
+    assert sum(array.nbytes for array in arrays) - published_table.floor_xy.nbytes < 700_000
 
 
 @pytest.mark.parametrize(
@@ -202,6 +228,57 @@ def shapes(draw: st.DrawFn) -> DiscShape:
         border_px=draw(st.integers(0, 6)),
         far_limit_m_per_px=draw(st.floats(0.001, 5.0)),
     )
+
+
+@settings(deadline=None)
+@given(cameras(largest_side=60))
+def test_any_camera_s_floor_is_that_of_its_pixels(camera: Camera) -> None:
+    v, u = np.mgrid[0 : camera.height, 0 : camera.width]
+    pixels = np.stack([u, v], axis=-1).astype(float)
+    expected = camera.floor_from_pixel(pixels)
+    floor_xy = floor_positions(camera)
+    assert floor_xy.dtype == np.float64
+    down = -camera.directions_robot(pixels)[..., 2]
+    assume(np.abs(down).min() > 1e-9)  # at the horizon itself rounding decides
+    assert np.array_equal(np.isnan(floor_xy), np.isnan(expected))
+    # Rounding of a direction moves its end the more, the flatter it comes down.
+    met = down > 0.0
+    tolerance = 1e-13 * np.linalg.norm(expected[met] - camera.centre[:2], axis=-1) / down[met]
+    tolerance += 1e-13 * np.abs(camera.centre).sum()
+    error = np.linalg.norm(floor_xy[met] - expected[met], axis=-1)
+    assert np.all(error <= tolerance)
+
+
+def test_close_to_the_fold_the_floor_is_right_too() -> None:
+    # The image's corner lies where the distortion all but folds: no polynomial follows it there.
+    coef = (0.0, -0.2, 0.0, 0.0, 0.0)
+    scale = math.hypot(30.0, 20.0) / largest_distorted_radius(coef) * (1.0 + 1e-9)
+    camera = Camera(
+        width=61, height=41, scale_x=scale, scale_y=scale, offset_x=30.0, offset_y=20.0, coef=coef,
+        robot_from_camera=((-1.0, 0, 0, 0.0), (0, 1.0, 0, 0.0), (0, 0, -1.0, 1.5)),
+    )  # fmt: skip
+    v, u = np.mgrid[0:41, 0:61]
+    expected = camera.floor_from_pixel(np.stack([u, v], axis=-1).astype(float))
+    assert np.isfinite(expected).all()
+    np.testing.assert_allclose(floor_positions(camera), expected, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize(("width", "height"), [(1, 1), (1, 5), (130, 1), (64, 64), (65, 3)])
+def test_images_of_any_size_have_tables(width: int, height: int) -> None:
+    camera = Camera(
+        width=width, height=height, scale_x=60.0, scale_y=60.0,
+        offset_x=(width - 1) / 2, offset_y=(height - 1) / 2, coef=(0.0, -0.1, 0.0, 0.2, 0.0),
+        robot_from_camera=((-1.0, 0, 0, 0.0), (0, 1.0, 0, 0.0), (0, 0, -1.0, 1.5)),
+    )  # fmt: skip
+    # A pixel is 25 mm: in an image of one column the outlines have to stay within it.
+    outer_m = 0.011 if width == 1 else 0.04
+    shape = DiscShape(0.01, outer_m, samples=6, border_px=0, far_limit_m_per_px=1.0)
+    table = build_disc_table(camera, shape)
+    # A single row has no row next to it from which the far limit could be told.
+    assert table.usable.any() == (height > 1)
+    assert table.floor_xy.shape == (height, width, 2)
+    if height > 1:
+        assert_table_is(table, plain_outlines(camera, shape))
 
 
 @settings(deadline=None)
@@ -246,10 +323,8 @@ def test_a_camera_that_looks_up_gets_an_empty_table(published_camera: Camera) ->
     )
     table = build_disc_table(up, DiscShape())
     assert not table.usable.any()
-    assert np.array_equal(table.row_begin, table.row_end)
-    assert len(table.run_start) == len(table.run_du) == len(table.run_dv) == 0
-    assert not table.run_bounds.any()
-    assert table.margin_px == 0
+    assert len(table.copies) == len(table.block_row) == len(table.block_column) == 0
+    assert table.block_copies.tolist() == [0]
     assert np.isnan(table.floor_xy).all()
 
 
