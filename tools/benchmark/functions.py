@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from camera import Camera
-from detect.circles import detect_circles, disc_shape, quality_of_centres
+from detect.centres import best_centres, quality_of_centres
+from detect.circles import detect_circles, disc_shape
 from detect.disc_fit import estimate_noise
 from detect.frame import tilt_of_lines
 from detect.levelling import levelled
@@ -70,6 +71,16 @@ def circle_detectors(camera: Camera, *, parts: bool = True) -> list[Measured]:
     pieces = [
         Measured(KERNEL, "circles", lambda p: quality_of_centres(p.grey, published)),
         Measured("quality map (default)", "circles", lambda p: quality_of_centres(p.grey, default)),
+        Measured(
+            "best centres (published)",
+            "circles",
+            lambda p: best_centres(p.grey, published, PUBLISHED.threshold, PUBLISHED.polarity),
+        ),
+        Measured(
+            "best centres (default)",
+            "circles",
+            lambda p: best_centres(p.grey, default, settings.threshold, settings.polarity),
+        ),
         Measured("noise estimate", "circles", lambda p: estimate_noise(p.grey)),
     ]
     whole = [
