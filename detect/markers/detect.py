@@ -60,8 +60,13 @@ _EDGE_SYSTEMATIC_PX = 0.02
 #: What is white within the border, or round the quiet zone, shines into edges that are softer than
 #: this part of the border: nothing is to be learnt from those.
 _SHARP_BLURS = 0.14
+#: Steps from or to grey levels beyond these are clipped, and seem to be where they are not.
+_UNCLIPPED = (3.0, 250.0)
 #: Smaller markers are flat.
 _LEAST_BENT_PX = 40.0
+#: Systematic error without optical blur, and the blur's variance (px^2) at which it is gone.
+_STAIRCASE_PX = 0.035
+_STAIRCASE_VARIANCE = 0.1
 #: A first look may explain less than the full fit has to, by this much.
 _FIRST_LOOK_SLACK = 0.1
 
@@ -174,6 +179,7 @@ class _Marker:
     covariance: FloatArray
     identity: Identity
     explained: float
+    blur_px: float
 
 
 def detect_markers(
@@ -304,7 +310,8 @@ def _identified(
         found = nearest_pattern(cells, templates, settings)
         if isinstance(found, str):
             return found
-        return _marker(found, refined.corners, _block_diagonal(refined), templates, float("nan"))
+        blur = float(np.median(refined.blur_px))
+        return _marker(found, refined.corners, _block_diagonal(refined), templates, blur)
 
     blur = float(np.median(refined.blur_px))
     side = np.sqrt(abs(signed_area(refined.corners)))
@@ -339,12 +346,23 @@ def _identified(
             image, lens, fit.corners, capture_px=_CAPTURE_PX + 2.0 * fit.blur_px,
             border=templates.border, noise=noise,
         )  # fmt: skip
-        whole = edges is not None and edges.support.min() >= 1.0
-        if edges is not None and whole and _disagreement(edges, fit) > _MOST_DISAGREEMENT:
+        if edges is not None and _trusted(edges) and _disagreement(edges, fit) > _MOST_DISAGREEMENT:
             return _marker(
-                verified, edges.corners, _block_diagonal(edges), templates, fit.explained
+                verified,
+                edges.corners,
+                _block_diagonal(edges),
+                templates,
+                fit.blur_px,
+                fit.explained,
             )
-    return _marker(verified, fit.corners, fit.covariance, templates, fit.explained)
+    return _marker(verified, fit.corners, fit.covariance, templates, fit.blur_px, fit.explained)
+
+
+def _trusted(edges: RefinedQuadrangle) -> bool:
+    """Whether edges are seen over their whole length, and not clipped to white or black."""
+    low, high = _UNCLIPPED
+    seen = edges.support.min() >= 1.0
+    return bool(seen and edges.light.max() < high and edges.dark.min() > low)
 
 
 def _disagreement(refined: RefinedQuadrangle, fit: PatternFit) -> float:
@@ -371,7 +389,8 @@ def _marker(
     corners: FloatArray,
     covariance: FloatArray,
     templates: Templates,
-    explained: float,
+    blur_px: float,
+    explained: float = float("nan"),
 ) -> _Marker:
     """A marker with its corners in the printed order."""
     turn = int(templates.turns[identity.template])
@@ -383,6 +402,7 @@ def _marker(
         covariance=covariance[np.ix_(numbers, numbers)],
         identity=identity,
         explained=explained,
+        blur_px=blur_px,
     )
 
 
@@ -406,6 +426,16 @@ def _middle_inside(first: FloatArray, second: FloatArray) -> bool:
     return bool(is_inside(x, y, second))
 
 
+def _staircase_px(blur_px: float) -> float:
+    """Systematic error of a corner in an image without blur, which shows edges as staircases.
+
+    A pixel's own square is taken for a Gaussian of its variance, 1/12 px^2; where there is little
+    else, a straight edge along rows or columns is up to 0.06 px beside where it seems to be.
+    """
+    optics = max(0.0, blur_px**2 - 1.0 / 12.0)
+    return _STAIRCASE_PX * max(0.0, 1.0 - optics / _STAIRCASE_VARIANCE)
+
+
 def _detections(
     markers: list[_Marker],
     lens: Lens,
@@ -420,10 +450,11 @@ def _detections(
     corners, covariance = np.empty((count, 4, 2)), np.empty((count, 4, 2, 2))
     for n, marker in enumerate(markers):
         corners[n] = _bent(marker.corners, lens)
+        systematic = np.hypot(settings.systematic_px, _staircase_px(marker.blur_px))
         for k in range(4):
             jacobian = lens.pixel_jacobian(corners[n, k])
             part = marker.covariance[2 * k : 2 * k + 2, 2 * k : 2 * k + 2]
-            covariance[n, k] = jacobian @ part @ jacobian.T + settings.systematic_px**2 * np.eye(2)
+            covariance[n, k] = jacobian @ part @ jacobian.T + systematic**2 * np.eye(2)
     return MarkerDetections(
         dictionary=settings.dictionary,
         ids=np.array([m.id for m in markers], dtype=np.int64),

@@ -33,6 +33,8 @@ _ROOT_2PI = math.sqrt(2.0 * math.pi)
 _MEDIAN_TO_SIGMA = 1.0 / 0.6745
 _LEAST_NOISE = 0.3
 _SEGMENTS = 8
+#: Places across an edge at which it may begin to be looked for.
+_SPLITS = 14
 #: Standard deviation of the light's change across an edge, in contrasts per pixel.
 _LIGHT_SLOPE = 0.004
 _SAMPLED_RESIDUALS = 400
@@ -102,6 +104,41 @@ def _scale_of(residual: NDArray[np.float64], count: int, least: float) -> float:
 
 
 @njit(cache=True, error_model="numpy")
+def _best_split(
+    across: NDArray[np.float64], grey: NDArray[np.float64], count: int, reach: float
+) -> tuple[float, float, float]:
+    """How far out the grey values are best split in two, and the means on both sides.
+
+    The split that explains most variance (Otsu's criterion), of those with the dark side inside.
+    """
+    n = np.zeros(_SPLITS)
+    total = np.zeros(_SPLITS)
+    for k in range(count):
+        b = min(max(int((across[k] / reach + 1.0) * 0.5 * _SPLITS), 0), _SPLITS - 1)
+        n[b] += 1.0
+        total[b] += grey[k]
+    all_n = n.sum()
+    all_total = total.sum()
+    best, at, low, high = 0.0, 0.0, 0.0, 0.0
+    n_in, total_in = 0.0, 0.0
+    for b in range(_SPLITS - 1):
+        n_in += n[b]
+        total_in += total[b]
+        n_out = all_n - n_in
+        if n_in < 3.0 or n_out < 3.0:
+            continue
+        inside = total_in / n_in
+        outside = (all_total - total_in) / n_out
+        between = (outside - inside) ** 2 * n_in * n_out
+        if outside > inside and between > best:
+            best = between
+            at = ((b + 1.0) * 2.0 / _SPLITS - 1.0) * reach
+            low = inside
+            high = outside
+    return at, low, high
+
+
+@njit(cache=True, error_model="numpy")
 def _fit_step(
     along: NDArray[np.float64],
     across: NDArray[np.float64],
@@ -116,20 +153,12 @@ def _fit_step(
     """Robust least squares of a blurred step; fills an edge's row of results."""
     if count < _LEAST_PIXELS:
         return False
-    # Levels to begin with: means of both sides.
-    low, high, n_low, n_high = 0.0, 0.0, 0, 0
-    for k in range(count):
-        if across[k] < 0.0:
-            low += grey[k]
-            n_low += 1
-        else:
-            high += grey[k]
-            n_high += 1
     # Inside is darker, beyond what noise does.
-    if n_low < 3 or n_high < 3 or not high / n_high > low / n_low + 0.3 * noise:
+    split, low, high = _best_split(across, grey, count, reach)
+    if not high > low + 0.3 * noise:
         return False
     p = np.zeros(_PARAMETERS)
-    p[2], p[3] = low / n_low, high / n_high
+    p[0], p[2], p[3] = split, low, high
     p[5] = math.log(wide)
     least = max(noise, _LEAST_NOISE)
     residual = np.empty(count)
@@ -160,7 +189,7 @@ def _fit_step(
             r = grey[k] - (bottom + step * share)
             residual[k] = r
             weight = 1.0
-            if scale > 0.0 and abs(r) > _OUTLIER * scale:
+            if not wide_now and scale > 0.0 and abs(r) > _OUTLIER * scale:
                 weight = (_OUTLIER * scale / r) ** 2
             slope = -step * density / blur - p[6] * share
             jacobian[0] = slope
@@ -195,10 +224,12 @@ def _fit_step(
         normal[5, 5] += prior
         right[5] -= prior * (p[5] - math.log(blur_guess))
         if wide_now:
-            normal[5, :] = 0.0
-            normal[:, 5] = 0.0
-            normal[5, 5] = 1.0
-            right[5] = 0.0
+            # Place and levels only: the rest would follow what is not the edge.
+            for i in range(4, _PARAMETERS):
+                normal[i, :] = 0.0
+                normal[:, i] = 0.0
+                normal[i, i] = 1.0
+                right[i] = 0.0
         for i in range(2):
             normal[i, i] += 1e-9 * (1.0 + normal[i, i])
         if not solve_positive(normal, right, change):

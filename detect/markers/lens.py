@@ -20,7 +20,7 @@ from detect.markers.lens_kernels import bend_points, straighten_points, straight
 FloatArray = NDArray[np.float64]
 
 #: Bilinear interpolation over so many pixels: off by an eighth of its square times the curvature.
-_STEP_PX = 4
+_STEP_PX = 2
 
 
 @dataclass(frozen=True, eq=False)

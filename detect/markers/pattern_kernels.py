@@ -52,6 +52,8 @@ _MEDIAN_TO_SIGMA = 1.0 / 0.6745
 _OUTLIER = 3.0
 _LEAST_NOISE = 0.3
 _SAMPLED_RESIDUALS = 700
+#: Clipped pixels do not count if the model is this near the limit, grey levels, or beyond.
+_CLIP_ZONE = 6.0
 _CLOSE_ENOUGH_PX = 2e-3
 _LEAST_CORRELATION = 0.02
 _LARGEST_CORRELATION = 0.96
@@ -454,7 +456,10 @@ def fit_pattern(
             toned = light + p[_TONE] * light * d
             value = dark + (white - dark) * toned
             r = grey[k] - value
-            clipped = (value > 255.0 and grey[k] > 254.0) or (value < 0.0 and grey[k] < 1.0)
+            # A clipped grey value says no more than that the light was at least (at most) that.
+            clipped = (grey[k] > 254.5 and value > 255.0 - _CLIP_ZONE) or (
+                grey[k] < 0.5 and value < _CLIP_ZONE
+            )
             if clipped:
                 r = 0.0
             residual[k] = r

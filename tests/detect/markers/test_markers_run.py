@@ -1,0 +1,103 @@
+"""The command `detect markers`: rows of a folder of images, with and without a calibration."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from camera import Camera, write_camera
+from detect.cli import main
+from detect.markers.settings import MarkerSettings
+from detect.markers_run import detect_markers_run
+from detect.run import Run, open_images
+from landmarks import read_frames
+from tests.detect.markers.rendering import View, exposed, render, view_corners
+
+POSE = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Three images: marker 5, nothing, markers 5 and 9."""
+    run = tmp_path / "run"
+    (run / "images").mkdir(parents=True)
+    for index, numbers in enumerate([[5], [], [5, 9]]):
+        drawn = [
+            (
+                "rawseeds",
+                number,
+                view_corners(View(70.0, 20.0, 30.0, 15.0), (60.0 + 100.0 * k, 60.0)),
+            )
+            for k, number in enumerate(numbers)
+        ]
+        image = exposed(render((220, 120), drawn, blur=0.7), 1.0, np.random.default_rng(index))
+        assert cv2.imwrite(str(run / "images" / f"f{index}.png"), image)
+    return run
+
+
+def test_rows_of_a_folder_without_a_calibration(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["markers", str(folder), "--draw", str(folder / "drawn")]) == 0
+    assert "3 markers in 3 frames" in capsys.readouterr().out
+    frames = list(read_frames(folder / "detected.markers"))
+    assert [[row.id for row in frame.markers] for frame in frames] == [[5], [], [5, 9]]
+    row = frames[0].markers[0]
+    assert row.dictionary == "rawseeds"
+    expected = view_corners(View(70.0, 20.0, 30.0, 15.0), (60.0, 60.0))
+    found = np.array([[corner.u, corner.v] for corner in row.corners])
+    assert np.abs(found - expected).max() < 0.05
+    assert all(0.0 < corner.cuu < 0.01 for corner in row.corners)
+    head = (folder / "detected.markers").read_text()
+    assert "# camera none" in head
+    assert "dictionary=rawseeds" in head
+    assert len(list((folder / "drawn").glob("*.png"))) == 3
+
+
+def test_existing_rows_are_kept_unless_forced(folder: Path) -> None:
+    assert main(["markers", str(folder)]) == 0
+    before = (folder / "detected.markers").read_bytes()
+    assert main(["markers", str(folder)]) == 1
+    assert main(["markers", str(folder), "--force"]) == 0
+    assert (folder / "detected.markers").read_bytes() == before
+
+
+def test_ids_and_presets_on_the_command_line(folder: Path) -> None:
+    output = folder / "only.markers"
+    assert main(["markers", str(folder), "--ids", "9", "11", "-o", str(output)]) == 0
+    assert [[m.id for m in f.markers] for f in read_frames(output)] == [[], [], [9]]
+    assert (
+        main(["markers", str(folder), "--preset", "published", "--force", "-o", str(output)]) == 0
+    )
+    assert [[m.id for m in f.markers] for f in read_frames(output)] == [[5], [], [5, 9]]
+    assert "joint=False" in output.read_text()
+
+
+def test_a_calibration_of_another_size_costs_its_frames(folder: Path) -> None:
+    camera = Camera(64, 48, 60.0, 60.0, 31.5, 23.5, (0.0, 0.0, 0.0, 0.0, 0.0), POSE)
+    write_camera(camera, folder / "run.cam")
+    assert main(["markers", str(folder)]) == 3
+    assert not any(frame.markers for frame in read_frames(folder / "detected.markers"))
+
+
+def test_a_calibration_is_used_where_there_is_one(folder: Path) -> None:
+    camera = Camera(220, 120, 200.0, 200.0, 109.5, 59.5, (0.0, 0.0, 0.0, 0.0, 0.0), POSE)
+    assert not isinstance(open_images(folder), Run)
+    write_camera(camera, folder / "run.cam")
+    run = open_images(folder)
+    assert isinstance(run, Run)
+    assert run.camera == camera
+    summary = detect_markers_run(run, MarkerSettings(), folder / "detected.markers", version="0")
+    assert summary.markers == 3
+    assert summary.frames == 3
+
+
+def test_wrong_dictionaries_are_told_before_any_work(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["markers", str(folder), "--dictionary", "9x9"]) == 1
+    assert "no such dictionary" in capsys.readouterr().err
+    assert not (folder / "detected.markers").exists()

@@ -1,0 +1,246 @@
+"""The parts of the marker detector, each against a reference of its own."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy.stats import multivariate_normal, norm
+
+from camera import Camera
+from detect.markers import pattern_kernels
+from detect.markers.candidates import Layer, closing, dark_pixels
+from detect.markers.homography_kernels import (
+    corners_by_homography,
+    inverse_3x3,
+    square_homography,
+)
+from detect.markers.lens import NO_LENS, lens_of
+from detect.markers.noise import image_noise
+from detect.markers.polygon_kernels import is_convex, pixel_area, same_corners, signed_area
+from detect.markers.quadrangle import rough_corners
+from detect.markers.quadrangle_kernels import largest_quadrangle
+from detect.markers.solve_kernels import invert_positive, solve_positive
+from detect.markers.templates import templates_of
+
+FloatArray = NDArray[np.float64]
+
+SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+SLANTED = np.array([[12.3, 8.1], [70.2, 15.7], [61.9, 66.0], [20.4, 58.8]])
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 9))
+def test_a_closing_is_above_the_image_and_stays_when_repeated(seed: int, radius: int) -> None:
+    image = np.random.default_rng(seed).integers(0, 256, (24, 31)).astype(np.uint8)
+    closed = closing(image, radius)
+    assert np.all(closed >= image)
+    np.testing.assert_array_equal(closing(closed, radius), closed)
+
+
+@pytest.mark.parametrize("radius", [4, 8, 12, 20])
+def test_a_closing_fills_what_its_disc_does_not_fit_into(radius: int) -> None:
+    v, u = np.mgrid[0:120, 0:120]
+    apart = np.hypot(u - 60, v - 60)
+    assert closing(np.where(apart < 0.8 * radius, 20, 200).astype(np.uint8), radius).min() == 200
+    wide = closing(np.where(apart < 1.3 * radius, 20, 200).astype(np.uint8), radius)
+    assert wide[60, 60] == 20
+    # An octagon whose corners are on the disc's circle.
+    narrow = np.where(np.abs(u - 60) <= radius - 1, 20, 200).astype(np.uint8)
+    assert closing(narrow, radius).min() == 200
+
+
+def test_dark_pixels_by_definition() -> None:
+    rng = np.random.default_rng(1)
+    grey = rng.integers(0, 256, (40, 50)).astype(np.uint8)
+    closed = np.maximum(grey, rng.integers(0, 256, grey.shape)).astype(np.uint8)
+    layer = Layer(1, 5, grey, closed)
+    first, second = grey.astype(float), closed.astype(float)
+    ratio = np.where(second > 0.0, 1.0 - first / np.maximum(second, 1.0), 0.0) > 0.3
+    np.testing.assert_array_equal(dark_pixels(layer, 0.3, 0.0, "ratio") == 1, ratio)
+    difference = (second - first) / 255.0 > 0.2
+    np.testing.assert_array_equal(dark_pixels(layer, 0.2, 0.0, "difference") == 1, difference)
+    gated = ratio & (second - first > 20.0)
+    np.testing.assert_array_equal(dark_pixels(layer, 0.3, 20.0, "ratio") == 1, gated)
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_the_quadrangle_is_the_largest(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    # Four corners with points along the sides, as the hull of a blurred square has.
+    corners = SLANTED + rng.normal(0.0, 3.0, (4, 2))
+    share: FloatArray = np.sort(rng.random((4, 4)), axis=1)
+    points = np.concatenate(
+        [
+            corners[k] + np.concatenate([[0.0], share[k]])[:, None] * (corners[k - 3] - corners[k])
+            for k in range(4)
+        ]
+    )
+    areas = [
+        abs(float(signed_area(points[list(four)])))
+        for four in itertools.combinations(range(len(points)), 4)
+    ]
+    best = max(areas)
+    found = abs(signed_area(points[largest_quadrangle(points, 7)]))
+    assert found == pytest.approx(best, rel=1e-9)
+
+
+@pytest.mark.parametrize("algorithm", ["A", "B"])
+def test_rough_corners_of_a_quadrangle_are_its_own(algorithm: str) -> None:
+    share = np.linspace(0.0, 1.0, 12, endpoint=False)[:, None]
+    chain = np.concatenate([SLANTED[k] + share * (SLANTED[k - 3] - SLANTED[k]) for k in range(4)])
+    for order in (chain, chain[::-1]):
+        found = rough_corners(np.ascontiguousarray(order), algorithm)  # type: ignore[arg-type]
+        assert found is not None
+        assert is_convex(found)
+        assert same_corners(found, SLANTED, 1e-9, 0.0)
+    angle = np.linspace(0.0, 2.0 * np.pi, 3, endpoint=False)
+    triangle = 20.0 * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    if algorithm == "A":
+        dense = np.concatenate(
+            [triangle[k] + share * (triangle[k - 2] - triangle[k]) for k in range(3)]
+        )
+        assert rough_corners(dense, "A") is None
+    assert rough_corners(triangle, "B") is None
+
+
+def test_areas_count_pixels() -> None:
+    box = np.array([[2, 3], [9, 3], [9, 7], [2, 7]], np.int32)
+    assert pixel_area(box) == 8 * 5
+    assert signed_area(SQUARE) == 1.0
+    assert signed_area(SQUARE[::-1].copy()) == -1.0
+
+
+def test_the_homography_takes_the_square_to_the_corners() -> None:
+    homography = square_homography(SLANTED)
+    points = np.concatenate([SQUARE, np.ones((4, 1))], axis=1) @ homography.T
+    np.testing.assert_allclose(points[:, :2] / points[:, 2:], SLANTED, atol=1e-9)
+    product = inverse_3x3(homography) @ homography
+    np.testing.assert_allclose(product / product[2, 2], np.eye(3), atol=1e-9)
+
+
+def test_corners_by_homography_agree_with_finite_differences() -> None:
+    homography = square_homography(SLANTED)
+    analytic = corners_by_homography(homography)
+    for k in range(8):
+        row, column = divmod(k, 3)
+        step = 1e-6 * max(1.0, abs(float(homography[row, column])))
+        moved = []
+        for sign in (1.0, -1.0):
+            h = homography.copy()
+            h[row, column] += sign * step
+            points = np.concatenate([SQUARE, np.ones((4, 1))], axis=1) @ h.T
+            moved.append((points[:, :2] / points[:, 2:]).ravel())
+        np.testing.assert_allclose(
+            analytic[:, k], (moved[0] - moved[1]) / (2.0 * step), rtol=1e-5, atol=1e-5
+        )
+
+
+def test_small_systems_are_solved_or_refused() -> None:
+    rng = np.random.default_rng(2)
+    root = rng.normal(size=(9, 6))
+    matrix, right = root.T @ root, rng.normal(size=6)
+    solution, inverse = np.empty(6), np.empty((6, 6))
+    assert solve_positive(matrix, right, solution)
+    np.testing.assert_allclose(matrix @ solution, right, atol=1e-9)
+    assert invert_positive(matrix, inverse)
+    np.testing.assert_allclose(inverse @ matrix, np.eye(6), atol=1e-9)
+    matrix[:, 5] = matrix[:, 0]
+    matrix[5, :] = matrix[0, :]
+    assert not solve_positive(matrix, right, solution)
+    assert not invert_positive(-np.eye(6), inverse)
+
+
+def test_the_lens_is_the_cameras_distortion(published_camera: Camera) -> None:
+    image = np.zeros((published_camera.height, published_camera.width), np.uint8)
+    lens = lens_of(published_camera, image)
+    rng = np.random.default_rng(3)
+    size = np.array([published_camera.width, published_camera.height])
+    pixels = rng.random((200, 2)) * (size - 1)
+    scale = np.array([published_camera.scale_x, published_camera.scale_y])
+    offset = np.array([published_camera.offset_x, published_camera.offset_y])
+    expected = published_camera.undistort(pixels) * scale + offset
+    np.testing.assert_allclose(lens.straighten(pixels), expected, atol=0.005)
+    for pixel in pixels[:20]:
+        straight = lens.straighten(pixel[None])
+        np.testing.assert_allclose(lens.bend(straight, pixel + 3.0)[0], pixel, atol=1e-5)
+        jacobian = lens.pixel_jacobian(pixel)
+        moved = lens.bend(straight + np.array([[1e-4, 0.0], [0.0, 1e-4]]), pixel)
+        np.testing.assert_allclose(jacobian, (moved - pixel).T / 1e-4, atol=1e-3)
+    assert lens_of(None, image) is NO_LENS
+    np.testing.assert_array_equal(NO_LENS.straighten(pixels), pixels)
+
+
+@given(
+    st.floats(-3.0, 3.0),
+    st.floats(-3.0, 3.0),
+    st.floats(-0.9, 0.9).filter(lambda rho: abs(rho) > 0.02),
+)
+def test_a_blurred_corner_is_the_bivariate_normal_distribution(
+    h: float, k: float, rho: float
+) -> None:
+    exact = multivariate_normal.cdf([h, k], cov=[[1.0, rho], [rho, 1.0]])
+    angle = np.arcsin(rho)
+    sines = np.sin(angle * pattern_kernels._NODES)
+    excess = pattern_kernels._corner_excess(h, k, sines, angle)
+    assert norm.cdf(h) * norm.cdf(k) + excess == pytest.approx(exact, abs=4e-3)
+
+
+@pytest.mark.parametrize("rho", [0.0, 0.5, -0.8])
+def test_the_blurred_patterns_derivatives(rho: float) -> None:
+    templates = templates_of("6x6_250", (7,))
+    black = templates.blackness(0)
+    vertex = pattern_kernels.corner_signs(black)
+    work = np.empty((7, len(templates.lines)))
+
+    def value(at: FloatArray) -> FloatArray:
+        mx, my, sx, sy, correlation = at
+        numbers = pattern_kernels._blackness(
+            mx, my, sx, sy, correlation, templates.lines, black, vertex, work
+        )
+        return np.array(list(numbers))
+
+    rng = np.random.default_rng(4)
+    for _ in range(50):
+        at = np.array([*rng.uniform(-0.05, 1.05, 2), *rng.uniform(0.02, 0.08, 2), rho])
+        analytic = value(at)[1:]
+        for k in range(5 if rho else 4):
+            step = np.zeros(5)
+            step[k] = 1e-6
+            numeric = (value(at + step)[0] - value(at - step)[0]) / 2e-6
+            # Three nodes of quadrature are not the derivative's own.
+            scale = 0.02 / at[2] if k < 4 else 0.02
+            assert analytic[k] == pytest.approx(numeric, abs=scale + 0.02 * abs(numeric))
+
+
+def test_decoys_are_no_markers() -> None:
+    for name in ("4x4_1000", "rawseeds", "apriltag_36h11"):
+        templates = templates_of(name, ())
+        apart = np.abs(templates.decoys[:, None, :] - templates.cells[None, :200, :]).sum(axis=-1)
+        assert len(templates.decoys)
+        assert apart.min() >= 2.0
+
+
+def test_templates_know_the_turned_patterns_and_their_place() -> None:
+    templates = templates_of("rawseeds", ())
+    patterns = templates.dictionary.patterns
+    for template in (3, 512 + 3, 1024 + 3, 1536 + 3):
+        turned = np.rot90(patterns[3], templates.turns[template])
+        np.testing.assert_array_equal(templates.cells[template].reshape(7, 7) > 0.5, turned)
+        black = templates.blackness(template)
+        assert black.shape == (9, 9)
+        assert black[0].all()
+        assert black[:, -1].all()
+    # 24 units: the border's end, seven cells of two units from 5 to 19, the border.
+    np.testing.assert_allclose(24.0 * templates.lines, [0, 5, 7, 9, 11, 13, 15, 17, 19, 24])
+
+
+@pytest.mark.parametrize("sigma", [1.0, 3.0, 8.0])
+def test_the_noise_is_measured(sigma: float) -> None:
+    rng = np.random.default_rng(5)
+    v, u = np.mgrid[0:300, 0:400]
+    grey = 100.0 + 0.1 * u + 0.05 * v + 60.0 * (u > 200) + rng.normal(0.0, sigma, u.shape)
+    assert image_noise(np.rint(grey).astype(np.uint8)) == pytest.approx(sigma, rel=0.12)
