@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 FloatArray = NDArray[np.float64]
 
-_PLANES = ((0, 1, "from above"), (0, 2, "from the right"), (1, 2, "from behind"))
+_PLANES = ((0, 1, "from above"), (0, 2, "from the right"), (1, 2, "from the front"))
 _AXES = ("x", "y", "z")
 _AGREES, _DIFFERS = "#2a78b5", "#d9822b"
 

@@ -63,7 +63,7 @@ class PoseSettings:
     loss_scale: float = 2.0
     outlier_sigma: float = 5.0
     outlier_px: float = 1.0
-    corner_floor_px: float = 0.02
+    corner_floor_px: float = 0.01
     ambiguity_odds: float = 1000.0
     floor: bool = False
     floor_z_m: float = 0.0
@@ -121,7 +121,7 @@ class RigSettings:
     least_support: int = 3
     outlier_sigma: float = 5.0
     outlier_px: float = 1.0
-    corner_floor_px: float = 0.02
+    corner_floor_px: float = 0.01
     time_tolerance_s: float = 0.005
 
     def __post_init__(self) -> None:
