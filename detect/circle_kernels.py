@@ -29,6 +29,7 @@ from detect.vector_kernels import (
 from lut.kernels import BLOCK, GROUP, LEAST_COPIES
 
 _ONE = np.uint64(1)
+_TWO = np.uint64(2)
 
 #: The first comparison of a quality with the threshold lets through a little more than the second:
 #: its numbers have 24 bits.
@@ -69,26 +70,20 @@ def _sum_block(
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _quality(
-    sums: NDArray[np.uint16],
-    products: NDArray[np.uint32],
-    patterns: NDArray[np.uint8],
-    pattern: int,
-    i: np.uint64,
+    inner: float, outer: float, product: float, n_inner: float, n_outer: float
 ) -> tuple[float, float]:
-    """Quality and contrast of a block's centre from its sums and votes."""
-    # Signed: differences follow.
-    inner = np.int64(sums[0, i])
-    outer = np.int64(sums[1, i])
-    product = np.int64(products[i & _ONE, i >> _ONE])
-    n_inner = np.int64(patterns[pattern, 0, i])
-    n_outer = np.int64(patterns[pattern, 1, i])
+    """Quality and contrast from the sums x of both outlines, x (255 - x) of all, and the votes.
+
+    These are whole numbers, of which nothing here exceeds 2^53.
+    """
     n = n_inner + n_outer
     total = inner + outer
-    spread = n * (255 * total - product) - total * total
+    spread = n * (255.0 * total - product) - total * total
     difference = n_outer * inner - n_inner * outer
-    pairs = float(n_inner * n_outer)
-    quality = (difference * difference) / (pairs * spread) if spread > 0 else 0.0
-    return quality, difference / pairs
+    pairs = n_inner * n_outer
+    quality = (difference * difference) / (pairs * spread)
+    contrast = difference / pairs
+    return quality if spread > 0.0 else 0.0, contrast if pairs > 0.0 else 0.0
 
 
 def working_memory(
@@ -133,19 +128,29 @@ def quality_map(
     gathered, sums, products
         Memory to work in (`working_memory`).
     quality : (H, W) float64
-        Result, in [0, 1]; written for usable centres only, 0 where all grey values are equal.
+        Result, in [0, 1]; 0 where all grey values are equal. Nothing is written where there is no
+        block.
     contrast : (H, W) float32
-        Result: mean grey value inside minus outside; written for usable centres only.
+        Result: mean grey value inside minus outside.
     """
+    in_order = np.empty(BLOCK, np.uint32)
     for b in range(len(block_row)):
         _sum_block(pixels, samples, copies, block_copies, gathered, sums, products, b, b == 0)
-        v = block_row[b]
-        pattern = block_pattern[b]
-        for i in range(BLOCK):
-            if patterns[pattern, 0, i] > 0:
-                here, difference = _quality(sums, products, patterns, pattern, np.uint64(i))
-                quality[v, block_column[b] + i] = here
-                contrast[v, block_column[b] + i] = difference
+        for i in range(np.uint64(BLOCK // 2)):
+            in_order[_TWO * i] = products[0, i]
+            in_order[_TWO * i + _ONE] = products[1, i]
+        v = np.uint64(block_row[b])
+        u = np.uint64(block_column[b])
+        pattern = np.uint64(block_pattern[b])
+        # Unsigned indices and no branch: several centres at once.
+        for i in range(min(np.uint64(BLOCK), np.uint64(quality.shape[1]) - u)):
+            quality[v, u + i], contrast[v, u + i] = _quality(
+                np.float64(sums[0, i]),
+                np.float64(sums[1, i]),
+                np.float64(in_order[i]),
+                np.float64(patterns[pattern, 0, i]),
+                np.float64(patterns[pattern, 1, i]),
+            )
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -212,7 +217,13 @@ def centres_above(
         while mask != 0:
             i = lowest_bit(mask)
             mask &= mask - _ONE
-            here, difference = _quality(sums, products, patterns, pattern, i)
+            here, difference = _quality(
+                np.float64(sums[0, i]),
+                np.float64(sums[1, i]),
+                np.float64(products[i & _ONE, i >> _ONE]),
+                np.float64(patterns[pattern, 0, i]),
+                np.float64(patterns[pattern, 1, i]),
+            )
             if here >= threshold and here > 0.0 and difference * sign >= 0.0:
                 columns[count] = block_column[b] + np.int64(i)
                 rows[count] = block_row[b]
