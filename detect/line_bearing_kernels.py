@@ -116,8 +116,8 @@ def ends_of_lines(
     reference: NDArray[np.float64],
     line: NDArray[np.float64],
     chosen: NDArray[np.int64],
-) -> NDArray[np.float64]:
-    """Where lines cross the first and the last row of their tracks.
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Where lines cross the first and the last row of their tracks, and how they are inclined.
 
     Parameters
     ----------
@@ -132,16 +132,20 @@ def ends_of_lines(
 
     Returns
     -------
-    (N, 4) float64
+    ends : (N, 4) float64
         xtop, ytop, xbottom, ybottom: undistorted normalised coordinates.
+    beta : (N,) float64
+        Inclinations of the normals of their planes (rad).
     """
     width = len(bearing)
     ends = np.empty((len(chosen), 4))
+    beta = np.empty(len(chosen))
     for n in range(len(chosen)):
         t = chosen[n]
         phi = reference[t]
         a = line[t, 0]
         b = line[t, 1]
+        beta[n] = -math.asin(b / math.sqrt(1.0 + a * a + b * b))
         for end in range(2):
             i = bounds[t] if end == 0 else bounds[t + 1] - 1
             v = row[i]
@@ -182,4 +186,4 @@ def ends_of_lines(
             )
             ends[n, 2 * end] = right / forward
             ends[n, 2 * end + 1] = down / forward
-    return ends
+    return ends, beta

@@ -24,14 +24,11 @@ class LineFilter:
     weights : (2, 2r + 1) float32
         Across the line: of sum 1; and the same times the distance in units of its standard
         deviation.
-    weights_between : (4, 8 n) float32
-        For a window between two pixels, from `reach_across` pixels left of the left one on: both
-        weights if it is on the left one, each followed by what is to be added for a whole pixel to
-        the right. Filled up with zeros.
-    along : (4 n,) float32
-        Along the line, of sum 1, and zeros behind.
-    reach_across, reach_along : int
-        r and s: how far the window reaches.
+    weights_between : (4, 2r + 2) float32
+        For a window between two pixels, from r pixels left of the left one on: both weights if it
+        is on the left one, each followed by what is to be added for a whole pixel to the right.
+    along : (2s + 1,) float32
+        Along the line, of sum 1.
     regulariser : float32
         Added to the variance in the window (grey values squared).
     """
@@ -39,8 +36,6 @@ class LineFilter:
     weights: NDArray[np.float32]
     weights_between: NDArray[np.float32]
     along: NDArray[np.float32]
-    reach_across: int
-    reach_along: int
     regulariser: np.float32
 
 
@@ -86,20 +81,29 @@ class FilteredColumns:
 
     Attributes
     ----------
-    moments : (W * 3 * (H + 4),) float32
-        Mean, covariance and mean square, in the rows of each of the strip's columns that are known.
-    known : (2, W) int32
-        First of these rows, and the one after the last.
+    moments : (4 * W * H,) float32
+        Mean, covariance and mean square, and the response as far as it is known, in the rows of
+        each of the strip's columns that are known: H of each for one column after the other, in the
+        order in which they came to be needed.
+    known : (3, W) int32
+        First of these rows, and the one after the last; the column's place in `moments`.
+    used : (1,) int32
+        How many places are taken.
     """
 
     moments: NDArray[np.float32]
     known: NDArray[np.int32]
+    used: NDArray[np.int32]
 
     @classmethod
     def none_yet(cls, table: VerticalTable) -> FilteredColumns:
         """Nothing has been filtered."""
         height, width = table.column.shape
-        return cls(np.empty(width * 3 * (height + 4), np.float32), np.zeros((2, width), np.int32))
+        return cls(
+            np.empty(4 * width * height, np.float32),
+            np.zeros((3, width), np.int32),
+            np.zeros(1, np.int32),
+        )
 
 
 def gaussian_window(sigma: float) -> FloatArray:
@@ -126,13 +130,10 @@ def line_filter(settings: LineSettings) -> LineFilter:
     left = np.pad(weights, [(0, 0), (0, 1)])
     step = np.pad(weights, [(0, 0), (1, 0)]) - left
     between = np.stack([left[0], step[0], left[1], step[1]])
-    along = gaussian_window(settings.sigma_along_rows)
     return LineFilter(
         weights=weights.astype(np.float32),
-        weights_between=np.pad(between, [(0, 0), (0, -between.shape[1] % 8)]).astype(np.float32),
-        along=np.pad(along, (0, -len(along) % 4)).astype(np.float32),
-        reach_across=weights.shape[1] // 2,
-        reach_along=len(along) // 2,
+        weights_between=between.astype(np.float32),
+        along=gaussian_window(settings.sigma_along_rows).astype(np.float32),
         regulariser=np.float32(settings.regulariser),
     )
 
@@ -154,7 +155,7 @@ def start_band(table: VerticalTable, settings: LineSettings) -> StartBand:
         Computed once for each table.
     """
     window = line_filter(settings)
-    r, s = window.reach_across, window.reach_along
+    r, s = window.weights.shape[1] // 2, len(window.along) // 2
     height, width = table.column.shape
     steps = settings.start_band_rows // settings.start_spacing_rows
     reach = steps * settings.start_spacing_rows + s
@@ -169,7 +170,7 @@ def start_band(table: VerticalTable, settings: LineSettings) -> StartBand:
 
     evaluated = slice(s, 2 * reach + 1 - s, settings.start_spacing_rows)
     # Windows are cut off where the vertical ends.
-    share = np.concatenate([[0.0], np.cumsum(window.along[: 2 * s + 1], dtype=np.float64)])
+    share = np.concatenate([[0.0], np.cumsum(window.along, dtype=np.float64)])
     middle = row[evaluated]
     below = np.clip(table.last_row - middle + s + 1, 0, 2 * s + 1)
     above = np.clip(table.first_row - middle + s, 0, 2 * s + 1)

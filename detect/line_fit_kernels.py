@@ -128,7 +128,7 @@ def fit_eigenlines(
     return reference, pixel, line, scatter_px, middle, spread
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"})
 def refine_lines(
     image: NDArray[np.uint8],
     table_column: NDArray[np.float32],

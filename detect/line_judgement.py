@@ -39,34 +39,30 @@ FATES = (
 _NOT_VERTICAL = FATES.index("not vertical")
 
 
-def line_evidence(tracks: LineTracks, fits: LineFits, table: VerticalTable) -> FloatArray:
-    """(T,) how much speaks for each track: response summed over its length in pixel widths.
-
-    Soft edges are shadows and glare more often than the building's: their evidence is weakened by
-    the square of their sharpness.
-    """
-    return np.asarray(tracks.total_score * table.row_aspect * fits.sharpness**2)
-
-
 def judge_lines(
-    tracks: LineTracks,
-    fits: LineFits,
-    evidence: FloatArray,
-    table: VerticalTable,
-    settings: LineSettings,
-) -> FateArray:
-    """(T,) int8, places in `FATES`: whether each track can be a vertical, by itself."""
+    tracks: LineTracks, fits: LineFits, table: VerticalTable, settings: LineSettings
+) -> tuple[FloatArray, FateArray]:
+    """Tell for each track what speaks for it, and whether it can be a vertical, by itself.
+
+    Returns
+    -------
+    evidence : (T,) float64
+        Response summed over the track's length in pixel widths, weakened by the square of its
+        sharpness: soft edges are shadows and glare more often than the building's.
+    fate : (T,) int8
+        Places in `FATES`.
+    """
     from detect.line_judgement_kernels import judge_tracks
 
-    fate = np.empty(len(tracks), np.int8)
-    judge_tracks(
-        tracks.bounds, tracks.row, tracks.column, evidence, table.horizon_row, table.row_aspect,
-        fits.pixel_rad, fits.line, fits.covariance, fits.scatter_px, fits.shift_px, fits.contrast,
-        fits.sharpness, settings.least_points(table.row_aspect), settings.least_evidence,
-        settings.largest_shift_px, settings.largest_scatter_px, settings.largest_horizon_gap_px,
-        settings.largest_noise_px, settings.least_sharpness, settings.soft_evidence, fate,
+    evidence, fate = judge_tracks(
+        tracks.bounds, tracks.row, tracks.column, tracks.score, table.horizon_row,
+        table.row_aspect, fits.pixel_rad, fits.line, fits.covariance, fits.scatter_px,
+        fits.shift_px, fits.contrast, fits.sharpness, settings.least_points(table.row_aspect),
+        settings.least_evidence, settings.largest_shift_px, settings.largest_scatter_px,
+        settings.largest_horizon_gap_px, settings.largest_noise_px, settings.least_sharpness,
+        settings.soft_evidence,
     )  # fmt: skip
-    return fate
+    return evidence, fate
 
 
 def agree_on_tilt(

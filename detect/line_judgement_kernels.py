@@ -43,7 +43,7 @@ def judge_tracks(
     bounds: NDArray[np.int64],
     row: NDArray[np.int32],
     column: NDArray[np.float64],
-    evidence: NDArray[np.float64],
+    score: NDArray[np.float32],
     horizon_row: NDArray[np.float64],
     row_aspect: float,
     pixel: NDArray[np.float64],
@@ -61,30 +61,40 @@ def judge_tracks(
     largest_noise_px: float,
     least_sharpness: float,
     soft_evidence: float,
-    fate: NDArray[np.int8],
-) -> None:
-    """Tell for each track whether it can be a vertical, by itself.
+) -> tuple[NDArray[np.float64], NDArray[np.int8]]:
+    """Tell for each track what speaks for it, and whether it can be a vertical, by itself.
 
     Parameters
     ----------
-    bounds, row, column
+    bounds, row, column, score
         The tracks (see `detect.line_tracks.LineTracks`).
-    evidence : (T,) float64
-        Evidence for them.
     horizon_row, row_aspect
         The table.
     pixel, line, covariance, scatter_px, shift_px, contrast, sharpness
         Their lines (see `detect.line_fit.LineFits`).
     least_points, ..., soft_evidence
         See `detect.line_settings.LineSettings`.
+
+    Returns
+    -------
+    evidence : (T,) float64
+        Scores summed over the track's length in pixel widths. Soft edges are shadows and glare more
+        often than the building's: theirs is weakened by the square of their sharpness.
     fate : (T,) int8
-        Result: accepted, or the first reason why not.
+        Accepted, or the first reason why not.
     """
     width = len(horizon_row)
-    accepted = np.empty(len(fate), np.int64)
+    count = len(bounds) - 1
+    evidence = np.empty(count)
+    fate = np.empty(count, np.int8)
+    accepted = np.empty(count, np.int64)
     n = 0
-    for t in range(len(fate)):
+    for t in range(count):
         begin, end = bounds[t], bounds[t + 1]
+        total = 0.0
+        for i in range(begin, end):
+            total += score[i]
+        evidence[t] = total * row_aspect * sharpness[t] * sharpness[t]
         near = min(max(int(np.rint(column[begin])), 0), width - 1)
         gap = max(horizon_row[near] - row[end - 1], row[begin] - horizon_row[near]) * row_aspect
         if end - begin < least_points:
@@ -106,7 +116,7 @@ def judge_tracks(
             accepted[n] = t
             n += 1
     if n == 0:
-        return
+        return evidence, fate
     # How sharp an edge can be depends on the image's focus and motion.
     chosen = accepted[:n]
     sharp = least_sharpness * _quantile(sharpness[chosen], 0.25)
@@ -114,6 +124,7 @@ def judge_tracks(
     for t in chosen:
         if sharpness[t] < sharp and contrast[t] < clear and evidence[t] < soft_evidence:
             fate[t] = SOFT
+    return evidence, fate
 
 
 @njit(cache=True, error_model="numpy")

@@ -69,7 +69,7 @@ def _top_of_parabola(left: np.float32, centre: np.float32, right: np.float32) ->
     return float(0.5 * (left - right) / bend) if bend < 0.0 else 0.0
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"})
 def _follow(
     image: NDArray[np.uint8],
     table_column: NDArray[np.float32],
@@ -79,11 +79,10 @@ def _follow(
     elevation_tan: NDArray[np.float32],
     weights: NDArray[np.float32],
     along: NDArray[np.float32],
-    reach_across: int,
-    reach_along: int,
     regulariser: np.float32,
     moments: NDArray[np.float32],
     known: NDArray[np.int32],
+    used: NDArray[np.int32],
     sign: np.float32,
     row: int,
     column: float,
@@ -105,20 +104,19 @@ def _follow(
     each call, which would take longer than evaluating the filter.
     """
     height, width = table_column.shape
-    pixels = weights.shape[1]
+    taps = weights.shape[1]
     w_left = weights[0]
     w_step = weights[1]
     h_left = weights[2]
     h_step = weights[3]
     grey_values = image.reshape(-1)
-    last_pixel = np.uint64(height * width - 1)
-    stride = len(moments) // (3 * width)
-    r = reach_across
-    s = reach_along
+    r = taps // 2 - 1
+    s = len(along) // 2
     leftmost = np.float32(r)
     rightmost = np.float32(width - 1 - r)
     zero = np.float32(0.0)
     middle = np.float32(128.0)
+    unknown = np.float32(np.nan)
     v = row
     here = column
     n = 0
@@ -161,13 +159,15 @@ def _follow(
             if x >= leftmost and x < rightmost:
                 top = max(first_row[c], v - s)
                 bottom = min(last_row[c], v + s)
-                column_moments = np.uint64(3 * c * stride)
                 begin = known[0, c]
                 end = known[1, c]
                 if begin >= end:
                     begin = top
                     end = top
                     known[0, c] = top
+                    known[2, c] = used[0]
+                    used[0] += 1
+                column_moments = np.uint64(4 * known[2, c] * height)
                 if top < begin or bottom >= end:
                     # Some rows more than needed: the next ones will be.
                     if top < begin:
@@ -184,61 +184,50 @@ def _follow(
                         if x >= leftmost and x < rightmost:
                             f = x - np.float32(int(x))
                             at_pixel = np.uint64(y * width + int(x) - r)
-                            for chunk in range(pixels // 8):
-                                for i in range(8):
-                                    tap = np.uint64(8 * chunk + i)
-                                    # Beyond the window, and perhaps the image, weights are 0.
-                                    u = min(at_pixel + tap, last_pixel)
-                                    grey = np.float32(grey_values[u]) - middle
-                                    weighted = (w_left[tap] + f * w_step[tap]) * grey
-                                    mean += weighted
-                                    square += weighted * grey
-                                    cov += (h_left[tap] + f * h_step[tap]) * grey
+                            for i in range(taps):
+                                tap = np.uint64(i)
+                                grey = np.float32(grey_values[at_pixel + tap]) - middle
+                                weighted = (w_left[tap] + f * w_step[tap]) * grey
+                                mean += weighted
+                                square += weighted * grey
+                                cov += (h_left[tap] + f * h_step[tap]) * grey
                         place = column_moments + np.uint64(y)
                         moments[place] = mean
-                        moments[place + np.uint64(stride)] = cov
-                        moments[place + np.uint64(2 * stride)] = square
-                    # What the last chunk of weights, which are 0, may meet.
-                    for i in range(np.int64(known[1, c]), np.int64(known[1, c]) + 4):
-                        place = column_moments + np.uint64(i)
-                        moments[place] = zero
-                        moments[place + np.uint64(stride)] = zero
-                        moments[place + np.uint64(2 * stride)] = zero
-                mean = zero
-                cov = zero
-                square = zero
-                if bottom - top == 2 * s:
-                    place = column_moments + np.uint64(top)
-                    for chunk in range(len(along) // 4):
-                        # Sums of their own need not wait for each other.
-                        mean_part = zero
-                        cov_part = zero
-                        square_part = zero
-                        for i in range(4):
-                            tap = np.uint64(4 * chunk + i)
+                        moments[place + np.uint64(height)] = cov
+                        moments[place + np.uint64(2 * height)] = square
+                        moments[place + np.uint64(3 * height)] = unknown
+                kept = column_moments + np.uint64(3 * height + v)
+                response = moments[kept]
+                if math.isnan(response):
+                    mean = zero
+                    cov = zero
+                    square = zero
+                    if bottom - top == 2 * s:
+                        place = column_moments + np.uint64(top)
+                        for i in range(2 * s + 1):
+                            tap = np.uint64(i)
                             w = along[tap]
                             at = place + tap
-                            mean_part += w * moments[at]
-                            cov_part += w * moments[at + np.uint64(stride)]
-                            square_part += w * moments[at + np.uint64(2 * stride)]
-                        mean += mean_part
-                        cov += cov_part
-                        square += square_part
-                else:
-                    share = zero
-                    for y in range(top, bottom + 1):
-                        w = along[y - v + s]
-                        at = column_moments + np.uint64(y)
-                        share += w
-                        mean += w * moments[at]
-                        cov += w * moments[at + np.uint64(stride)]
-                        square += w * moments[at + np.uint64(2 * stride)]
-                    mean /= share
-                    cov /= share
-                    square /= share
-                # Rounding can make a vanishing variance negative.
-                variance = abs(square - mean * mean)
-                response = sign * cov * abs(cov) / (variance + regulariser)
+                            mean += w * moments[at]
+                            cov += w * moments[at + np.uint64(height)]
+                            square += w * moments[at + np.uint64(2 * height)]
+                    else:
+                        share = zero
+                        for y in range(top, bottom + 1):
+                            w = along[y - v + s]
+                            at = column_moments + np.uint64(y)
+                            share += w
+                            mean += w * moments[at]
+                            cov += w * moments[at + np.uint64(height)]
+                            square += w * moments[at + np.uint64(2 * height)]
+                        mean /= share
+                        cov /= share
+                        square /= share
+                    # Rounding can make a vanishing variance negative.
+                    variance = abs(square - mean * mean)
+                    response = cov * abs(cov) / (variance + regulariser)
+                    moments[kept] = response
+                response *= sign
             if c == j - 2:
                 right = centre
                 centre = left
@@ -278,11 +267,10 @@ def follow_edges(
     elevation_tan: NDArray[np.float32],
     weights: NDArray[np.float32],
     along: NDArray[np.float32],
-    reach_across: int,
-    reach_along: int,
     regulariser: np.float32,
     moments: NDArray[np.float32],
     known: NDArray[np.int32],
+    used: NDArray[np.int32],
     start_row: NDArray[np.int32],
     start_column: NDArray[np.int32],
     start_sign: NDArray[np.float32],
@@ -308,13 +296,16 @@ def follow_edges(
         Grey values.
     table_column, first_row, last_row, bearing, elevation_tan
         The table (see `lut.verticals.VerticalTable`).
-    weights, along, reach_across, reach_along, regulariser
+    weights, along, regulariser
         The filter (see `detect.line_filter.LineFilter`): `weights_between`, `along`.
-    moments : (W * 3 * (H + 4),) float32
-        Mean, covariance and mean square across the vertical, in the rows that are known; 4 more
-        rows for each column.
-    known : (2, W) int32
-        First of the known rows and the one after the last, of each column; extended as needed.
+    moments : (4 * W * H,) float32
+        Mean, covariance and mean square across the vertical and the response (NaN where it is not
+        known yet), in the rows that are known: H of each for one column after the other, in the
+        order in which they came to be needed.
+    known : (3, W) int32
+        First of the known rows and the one after the last, of each column; its place in `moments`.
+    used : (1,) int32
+        How many places are taken.
     start_row, start_column : (N,) int32
         Strip pixels to start from, in this order.
     start_sign : (N,) float32
@@ -380,7 +371,7 @@ def follow_edges(
             score = grown_score
         above = _follow(
             image, table_column, first_row, last_row, bearing, elevation_tan, weights, along,
-            reach_across, reach_along, regulariser, moments, known, polarity, v,
+            regulariser, moments, known, used, polarity, v,
             float(start_column[start]), -1, pitch, roll, threshold, max_gap, border, pull, reach,
             up_row, up_column, up_score,
         )  # fmt: skip
@@ -394,7 +385,7 @@ def follow_edges(
         n += above - 1
         n += _follow(
             image, table_column, first_row, last_row, bearing, elevation_tan, weights, along,
-            reach_across, reach_along, regulariser, moments, known, polarity, v, up_column[0], 1,
+            regulariser, moments, known, used, polarity, v, up_column[0], 1,
             pitch, roll, threshold, max_gap, border, pull, reach, row[n:], column[n:], score[n:],
         )  # fmt: skip
         for i in range(bounds[tracks], n):

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Literal
 
 from detect.errors import DetectError
@@ -206,7 +207,16 @@ class LineSettings:
         """Least number of points of a line, given the height of a row in widths of a pixel."""
         return max(self.least_rows, math.ceil(self.least_length_px / row_aspect))
 
-    @property
+    @cached_property
+    def _hash(self) -> int:
+        # Numbers only: the hashes of strings differ between processes, and settings travel.
+        return hash(tuple(v for v in astuple(self) if not isinstance(v, str)))
+
+    def __hash__(self) -> int:
+        # Tables are looked up by the settings several times for each image.
+        return self._hash
+
+    @cached_property
     def consensus(self) -> ConsensusSettings:
         """What of this the estimation of the tilt is told."""
         from detect.tilt import ConsensusSettings  # numpy is too much for `--help`

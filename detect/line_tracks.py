@@ -79,13 +79,6 @@ class LineTracks:
         """(T,) last row of each track."""
         return self.row[self.bounds[1:] - 1]
 
-    @property
-    def total_score(self) -> FloatArray:
-        """(T,) sum of the points' responses."""
-        if not len(self):
-            return np.zeros(0)
-        return np.add.reduceat(self.score.astype(np.float64), self.bounds[:-1])
-
 
 def line_response(
     image: NDArray[np.uint8], table: VerticalTable, settings: LineSettings
@@ -126,7 +119,7 @@ def line_response(
         table.first_row,
         table.last_row,
         window.weights,
-        window.along[: 2 * window.reach_along + 1],
+        window.along,
         window.regulariser,
         response,
     )
@@ -184,7 +177,7 @@ def start_response(
         band.visible,
         band.spacing,
         band.weights,
-        window.along[: 2 * window.reach_along + 1],
+        window.along,
         window.regulariser,
         response,
     )
@@ -237,11 +230,10 @@ def line_tracks(
             table.elevation_tan,
             window.weights_between,
             window.along,
-            window.reach_across,
-            window.reach_along,
             window.regulariser,
             filtered.moments,
             filtered.known,
+            filtered.used,
             starts.row,
             starts.column,
             starts.polarity,

@@ -20,9 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from detect.errors import FrameError
-from detect.line_bearing import inclinations
 from detect.line_filter import FilteredColumns
-from detect.line_fit import LineFits, fit_lines, plane_normals_of_lines
+from detect.line_fit import LineFits, fit_lines
 from detect.line_judgement import (
     ACCEPTED,
     FATES,
@@ -31,7 +30,6 @@ from detect.line_judgement import (
     group_lines,
     judge_lines,
     line_bearings,
-    line_evidence,
 )
 from detect.line_settings import DEFAULT, LineSettings
 from detect.line_tracks import LineTracks, line_starts, line_tracks
@@ -138,14 +136,12 @@ def detect_lines(
 
     tracks = line_tracks(image, starts, table, settings, filtered=filtered)
     fits = fit_lines(image, tracks, table, settings)
-    evidence = line_evidence(tracks, fits, table)
-    fate = judge_lines(tracks, fits, evidence, table, settings)
+    evidence, fate = judge_lines(tracks, fits, table, settings)
     tilt = agree_on_tilt(fits, evidence, fate, settings)
     if settings.guided and tilt is not None:
         tracks = line_tracks(image, starts, table, settings, tilt, filtered)
         fits = fit_lines(image, tracks, table, settings)
-        evidence = line_evidence(tracks, fits, table)
-        fate = judge_lines(tracks, fits, evidence, table, settings)
+        evidence, fate = judge_lines(tracks, fits, table, settings)
         tilt = agree_on_tilt(fits, evidence, fate, settings)
 
     alpha, noise = line_bearings(fits, tilt, settings)
@@ -154,10 +150,11 @@ def detect_lines(
         alpha, noise, fits.pixel_rad, evidence, members, bounds, settings.sigma_px
     )
     strongest = members[bounds[:-1]]
+    ends, beta = line_ends(tracks, fits, table, strongest)
     return LineDetections(
-        ends=line_ends(tracks, fits, table, strongest),
+        ends=ends,
         alpha_rad=joined,
-        beta_rad=inclinations(plane_normals_of_lines(fits.reference_rad, fits.line)[strongest]),
+        beta_rad=beta,
         sigma_rad=sigma,
         noise_rad=noise[strongest],
         members=_split(members, bounds),
@@ -171,8 +168,8 @@ def detect_lines(
 
 def line_ends(
     tracks: LineTracks, fits: LineFits, table: VerticalTable, chosen: NDArray[np.int64]
-) -> FloatArray:
-    """Ends of fitted lines at the first and last row of their tracks.
+) -> tuple[FloatArray, FloatArray]:
+    """Ends of fitted lines at the first and last row of their tracks, and their inclinations.
 
     Parameters
     ----------
@@ -183,17 +180,18 @@ def line_ends(
 
     Returns
     -------
-    (N, 4) float64
+    ends : (N, 4) float64
         xtop, ytop, xbottom, ybottom: undistorted normalised coordinates.
+    beta : (N,) float64
+        Inclinations of the normals of their planes (rad).
     """
     from detect.line_bearing_kernels import ends_of_lines
 
-    return np.asarray(
-        ends_of_lines(
-            table.bearing_rad, table.elevation_tan, table.robot_from_camera,
-            tracks.bounds, tracks.row, tracks.column, fits.reference_rad, fits.line, chosen,
-        )
+    ends, beta = ends_of_lines(
+        table.bearing_rad, table.elevation_tan, table.robot_from_camera,
+        tracks.bounds, tracks.row, tracks.column, fits.reference_rad, fits.line, chosen,
     )  # fmt: skip
+    return ends, beta
 
 
 def _split(members: NDArray[np.int64], bounds: NDArray[np.int64]) -> tuple[tuple[int, ...], ...]:

@@ -100,14 +100,19 @@ def consensus(
     consistent : (N,) bool
         Lines that are vertical under that tilt; without an estimate, under no tilt.
     """
-    from detect.tilt_kernels import refine_tilt, vote_for_tilt
+    from detect.tilt_kernels import agree_on_tilt
 
-    strongest = np.argsort(-weight, kind="stable")[: settings.proposers]
-    limit, prior = settings.largest_rad, settings.prior_rad
-    pitch, roll = vote_for_tilt(normal, tolerance, weight, strongest, limit, prior)
-    variance = settings.building_rad**2 + inclination_variance
-    pitch, roll, covariance, consistent = refine_tilt(
-        normal, variance, tolerance, pitch, roll, prior, _SOFTENING, _REFINEMENTS
+    limit = settings.largest_rad
+    pitch, roll, covariance, consistent = agree_on_tilt(
+        normal,
+        settings.building_rad**2 + inclination_variance,
+        tolerance,
+        weight,
+        settings.proposers,
+        limit,
+        settings.prior_rad,
+        _SOFTENING,
+        _REFINEMENTS,
     )
     lines = int(np.count_nonzero(consistent))
     if lines < settings.least_lines or abs(pitch) > limit or abs(roll) > limit:

@@ -174,3 +174,24 @@ def refine_tilt(
         pitch -= covariance[0, 0] * gradient_p + covariance[0, 1] * gradient_r
         roll -= covariance[1, 0] * gradient_p + covariance[1, 1] * gradient_r
     return pitch, roll, covariance, agrees
+
+
+@njit(cache=True, error_model="numpy")
+def agree_on_tilt(
+    normal: NDArray[np.float64],
+    variance: NDArray[np.float64],
+    tolerance: NDArray[np.float64],
+    weight: NDArray[np.float64],
+    proposers: int,
+    limit: float,
+    prior: float,
+    softening: float,
+    repetitions: int,
+) -> tuple[float, float, NDArray[np.float64], NDArray[np.bool_]]:
+    """The tilt that most lines vote for, refined; parameters and results as of these two.
+
+    Pairs of the `proposers` lines of the largest weight propose.
+    """
+    strongest = np.argsort(-weight, kind="mergesort")[:proposers]
+    pitch, roll = vote_for_tilt(normal, tolerance, weight, strongest, limit, prior)
+    return refine_tilt(normal, variance, tolerance, pitch, roll, prior, softening, repetitions)

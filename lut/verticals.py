@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera
+from camera.kernels import camera_numbers
+from lut.vertical_kernels import trace_verticals
 
 #: Verticals farther than this from the image's vertical are not followed: du/dv of 45 deg.
 STEEPEST_SLOPE = 1.0
 
-_ELEVATIONS = 361
-_NEWTON_STEPS = 6
-_NEWTON_TOLERANCE_PX = 1e-7
+_HORIZON_STEPS = 12
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +95,9 @@ def build_vertical_table(camera: Camera) -> VerticalTable:
     row = horizon_rows(camera, normalised)
     on_horizon = camera.directions_robot(np.stack([np.arange(width, dtype=np.float64), row], -1))
     bearing = np.arctan2(on_horizon[:, 0], -on_horizon[:, 1])
-    column, elevation = vertical_columns(camera, bearing)
+    column = np.empty((height, width))
+    elevation = np.empty_like(column)
+    trace_verticals(camera_numbers(camera), bearing, row, column, elevation)
     first, last, seen = _unbroken(column, row)
     return VerticalTable(
         horizon_row=row,
@@ -137,94 +139,37 @@ def horizon_rows(camera: Camera, normalised: NDArray[np.float64]) -> NDArray[np.
         distance = np.abs(np.arange(height - 1) + 0.5 - 0.5 * (height - 1))
         above = np.where(crosses, distance[:, None], np.inf).argmin(axis=0)
         some = np.flatnonzero(crosses.any(axis=0))
-        low = above[some].astype(np.float64)
-        high = low + 1.0
-        sign = np.where(rise[above[some], some] > 0.0, 1.0, -1.0)
-        # Bisection needs no derivative through the distortion; 44 halvings reach 1e-13 px.
-        for _ in range(44):
-            middle = 0.5 * (low + high)
-            at = camera.undistort(np.stack([some.astype(np.float64), middle], axis=-1))
-            before = sign * (at @ toward_up[:2] + toward_up[2]) > 0.0
-            low = np.where(before, middle, low)
-            high = np.where(before, high, middle)
-        row[some] = 0.5 * (low + high)
+        row[some] = _roots(camera, toward_up, some, above[some], rise)
     return row
 
 
-def vertical_columns(
-    camera: Camera, bearing_rad: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Columns at which verticals of given bearings cross the image's rows.
-
-    Parameters
-    ----------
-    camera : Camera
-        The calibrated camera.
-    bearing_rad : (N,) float64
-        Bearings of the verticals; NaN for none.
-
-    Returns
-    -------
-    column : (H, N) float64
-        Column of each vertical at rows 0 ... H-1, inside the image or not; NaN where the row does
-        not show the vertical.
-    elevation_rad : (H, N) float64
-        Elevation above the horizon of that point; NaN as above.
-    """
-    height = camera.height
-    columns = np.full((height, len(bearing_rad)), np.nan)
-    elevations = np.full_like(columns, np.nan)
-    some = np.flatnonzero(np.isfinite(bearing_rad))
-    if not len(some):
-        return columns, elevations
-    bearing = bearing_rad[some]
-    level = np.stack([np.sin(bearing), -np.cos(bearing), np.zeros(len(some))], axis=-1)
-    up = np.array([0.0, 0.0, 1.0])
-    elevation = np.linspace(-0.5 * np.pi, 0.5 * np.pi, _ELEVATIONS + 2)[1:-1]
-    coarse = camera.project(
-        (np.cos(elevation)[:, None, None] * level + np.sin(elevation)[:, None, None] * up)
-        @ camera.rotation
-    )[..., 1]
-    rows = np.arange(height, dtype=np.float64)
-    angle = np.full((height, len(some)), np.nan)
-    for k in range(len(some)):
-        angle[:, k] = _angle_at_rows(elevation, coarse[:, k], rows)
-
-    pixels = np.full((height, len(some), 2), np.nan)
-    for _ in range(_NEWTON_STEPS):
-        sine, cosine = np.sin(angle)[..., None], np.cos(angle)[..., None]
-        direction = (cosine * level + sine * up) @ camera.rotation
-        change = (cosine * up - sine * level) @ camera.rotation
-        pixels = camera.project(direction)
-        slope = (camera.project_jacobian(direction) @ change[..., None])[..., 1, 0]
-        step = (rows[:, None] - pixels[..., 1]) / slope
-        angle = angle + step
-        if not np.any(np.abs(rows[:, None] - pixels[..., 1]) > _NEWTON_TOLERANCE_PX):
-            break
-    converged = np.abs(rows[:, None] - pixels[..., 1]) < 1e-3
-    columns[:, some] = np.where(converged, pixels[..., 0], np.nan)
-    elevations[:, some] = np.where(converged, angle, np.nan)
-    return columns, elevations
-
-
-def _angle_at_rows(
-    elevation: NDArray[np.float64], seen_row: NDArray[np.float64], rows: NDArray[np.float64]
+def _roots(
+    camera: Camera,
+    toward_up: NDArray[np.float64],
+    columns: NDArray[np.intp],
+    above: NDArray[np.intp],
+    rise: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Elevations at which one vertical crosses rows, to start Newton's method; NaN where never."""
-    level = len(elevation) // 2
-    if not np.isfinite(seen_row[level]):
-        return np.full(len(rows), np.nan)
-    direction = 1.0 if seen_row[level - 1] > seen_row[level + 1] else -1.0
-    descending = np.diff(direction * seen_row) < 0.0  # False next to NaN
-    before = np.flatnonzero(~descending[:level])
-    after = np.flatnonzero(~descending[level:])
-    first = int(before[-1]) + 1 if len(before) else 0
-    last = level + int(after[0]) if len(after) else len(elevation) - 1
-    part = slice(first, last + 1)
-    row, angle = seen_row[part], elevation[part]
-    if direction > 0.0:
-        row, angle = row[::-1], angle[::-1]
-    return np.interp(rows, row, angle, left=np.nan, right=np.nan)
+    """Rows between `above` and the next at which columns see the horizon.
+
+    Regula falsi (the Illinois variant): it needs no derivative through the distortion and does not
+    leave the interval; where the rise is as smooth as here, a few steps reach 1e-13 px.
+    """
+    low, high = above.astype(np.float64), above + 1.0
+    at_low, at_high = rise[above, columns], rise[above + 1, columns]
+    middle = low
+    for _ in range(_HORIZON_STEPS):
+        middle = high - at_high * (high - low) / (at_high - at_low)
+        at = camera.undistort(np.stack([columns.astype(np.float64), middle], axis=-1))
+        value = at @ toward_up[:2] + toward_up[2]
+        crossed = (value > 0.0) != (at_high > 0.0)
+        # The end that stays counts half, so that it does not stay for long.
+        low = np.where(crossed, high, low)
+        at_low = np.where(crossed, at_high, 0.5 * at_low)
+        high, at_high = middle, value
+        if np.all(np.abs(value) < 1e-15):
+            break
+    return middle
 
 
 def _unbroken(

@@ -143,7 +143,6 @@ def test_no_horizon_no_tracks() -> None:
     assert not response.any()
     tracks = line_tracks(image, line_starts(image, table, DEFAULT), table, DEFAULT)
     assert len(tracks) == 0
-    assert len(tracks.total_score) == 0
 
 
 # -- evaluated only where needed: against the filter evaluated everywhere -------------------------
