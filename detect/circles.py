@@ -15,10 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera
+from camera.kernels import camera_numbers
 from detect.centres import best_centres
 from detect.centres import quality_of_centres as quality_of_centres
-from detect.circle_kernels import suppress_neighbours
-from detect.disc_fit import blur_ratio_of, disc_evidence, estimate_noise, fit_discs
+from detect.disc_covariance_kernels import refined_covariances
+from detect.disc_fit import blur_ratio_of, estimate_noise, fit_settings, fitted_positions
+from detect.disc_search_kernels import search_discs, strong_and_alone
 from detect.errors import FrameError
 from detect.settings import CircleSettings
 from lut import DiscShape, DiscTable
@@ -28,9 +30,6 @@ FloatArray = NDArray[np.float64]
 #: The published covariance: this deviation in every direction, and two pixels squared.
 PUBLISHED_FLOOR_M = 0.04
 PUBLISHED_PIXEL_VARIANCE = 2.0
-
-#: Candidates whose first look is this much below the required evidence are not fitted in full.
-_FIRST_LOOK_SLACK = 6.0
 
 #: For the noise floor an image's noise is never less than this: one grey level, its resolution.
 _LEAST_NOISE = 1.0
@@ -98,63 +97,52 @@ def detect_circles(
         image, table, settings.threshold, settings.polarity
     )
     noise = estimate_noise(image)
-    strong = np.abs(contrast) >= settings.noise_floor * max(noise, _LEAST_NOISE)
-    pixels, found_quality, contrast = pixels[strong], found_quality[strong], contrast[strong]
-    floor_xy = camera.floor_from_pixel(pixels.astype(np.float64))
-    evidence = np.full(len(pixels), np.nan)
-
+    weakest = settings.noise_floor * max(noise, _LEAST_NOISE)
     if not (settings.verify or settings.refine):
-        keep = _alone(floor_xy, found_quality, settings.separation_m)
+        keep = strong_and_alone(
+            pixels, found_quality, contrast, table.floor_xy, weakest, settings.separation_m
+        )
+        pixels = pixels[keep]
         return CircleDetections(
-            pixels=pixels[keep],
-            floor_xy=floor_xy[keep],
-            covariance=published_covariance(camera, pixels[keep]),
+            pixels=pixels,
+            floor_xy=camera.floor_from_pixel(pixels.astype(np.float64)),
+            covariance=published_covariance(camera, pixels),
             quality=found_quality[keep],
-            evidence=evidence[keep],
+            evidence=np.full(len(keep), np.nan),
         )
 
-    # A first look at every maximum, then the full fit of those that may be discs, about their
-    # centres.
-    keep = _alone(floor_xy, found_quality, 0.5 * settings.separation_m)
-    pixels, found_quality, floor_xy = pixels[keep], found_quality[keep], floor_xy[keep]
-    contrast = contrast[keep]
-    ratio = blur_ratio_of(camera)
-    first = fit_discs(
-        image, table.floor_xy, pixels, settings.radius_m, noise, blur_ratio=ratio, first_look=True
+    # Each disc has several best centres: of those in the middle of it one is enough.
+    keep = strong_and_alone(
+        pixels, found_quality, contrast, table.floor_xy, weakest, 0.5 * settings.separation_m
     )
-    likely = first.fitted
-    if settings.verify:
-        promise = disc_evidence(first, settings.radius_m, settings.blur_px)
-        likely &= promise >= settings.evidence - _FIRST_LOOK_SLACK
-    pixels, found_quality, floor_xy = pixels[likely], found_quality[likely], floor_xy[likely]
-    contrast = contrast[likely]
-    centres = _nearest_pixels(camera, first.floor_xy[likely])
-    fits = fit_discs(
-        image, table.floor_xy, centres, settings.radius_m, noise, blur_ratio=ratio,
-        blur_guess=first.blur_px[likely],
-    )  # fmt: skip
-    evidence = disc_evidence(fits, settings.radius_m, settings.blur_px)
-    # A fit that wandered off, or turned the disc's contrast round, is about something else.
-    stayed = np.hypot(*(fits.floor_xy - floor_xy).T) < settings.radius_m
-    same_sign = fits.contrast * contrast > 0.0
-    sound = fits.fitted & stayed & same_sign
-    if settings.verify:
-        sound &= evidence >= settings.evidence
-    position = fits.floor_xy if settings.refine else floor_xy
-    score = np.where(np.isfinite(evidence), evidence, -1e9 + found_quality)
-    index = np.flatnonzero(sound)
-    index = index[_alone(position[index], score[index], settings.separation_m)]
-    covariance = (
-        refined_covariance(camera, fits.floor_xy[index], fits.covariance[index], settings)
-        if settings.refine
-        else published_covariance(camera, pixels[index])
+    results, evidence, index = search_discs(
+        image,
+        table.floor_xy,
+        pixels[keep],
+        found_quality[keep],
+        contrast[keep],
+        settings.radius_m,
+        fit_settings(noise, blur_ratio_of(camera)),
+        settings.verify,
+        settings.refine,
+        settings.evidence,
+        settings.blur_px,
+        settings.separation_m,
     )
+    index = keep[index]
+    pixels = pixels[index]
+    if settings.refine:
+        floor_xy, fitted = fitted_positions(results)
+        covariance = refined_covariance(camera, floor_xy, fitted, settings)
+    else:
+        floor_xy = camera.floor_from_pixel(pixels.astype(np.float64))
+        covariance = published_covariance(camera, pixels)
     return CircleDetections(
-        pixels=pixels[index],
-        floor_xy=position[index],
+        pixels=pixels,
+        floor_xy=floor_xy,
         covariance=covariance,
         quality=found_quality[index],
-        evidence=evidence[index],
+        evidence=evidence,
     )
 
 
@@ -210,14 +198,15 @@ def refined_covariance(
     (N, 2, 2) float64
         Square metres.
     """
-    jacobian = camera.floor_jacobian(camera.project_floor(floor_xy))
-    spread = jacobian @ jacobian.swapaxes(-1, -2)
-    tilt = tilt_jacobian(camera, floor_xy)
-    tilt_spread = tilt @ tilt.swapaxes(-1, -2)
     return np.asarray(
-        fitted
-        + settings.systematic_px**2 * spread
-        + np.radians(settings.tilt_sigma_deg) ** 2 * tilt_spread
+        refined_covariances(
+            camera_numbers(camera),
+            camera.centre,
+            np.ascontiguousarray(floor_xy, np.float64),
+            np.ascontiguousarray(fitted, np.float64),
+            settings.systematic_px**2,
+            np.radians(settings.tilt_sigma_deg) ** 2,
+        )
     )
 
 
@@ -243,16 +232,3 @@ def tilt_jacobian(camera: Camera, floor_xy: FloatArray) -> FloatArray:
     per_height = (floor_xy - camera.centre[:2]) / camera.centre[2]
     height_per_tilt = np.stack([-floor_xy[:, 1], floor_xy[:, 0]], axis=-1)
     return np.asarray(per_height[:, :, None] * height_per_tilt[:, None, :])
-
-
-def _nearest_pixels(camera: Camera, floor_xy: FloatArray) -> NDArray[np.int64]:
-    """(N, 2) pixels of the image nearest to where (N, 2) floor positions are seen."""
-    last = np.array([camera.width - 1, camera.height - 1])
-    seen = np.nan_to_num(camera.project_floor(floor_xy), nan=0.0)
-    return np.asarray(np.clip(np.rint(seen), 0, last).astype(np.int64))
-
-
-def _alone(floor_xy: FloatArray, score: FloatArray, separation_m: float) -> NDArray[np.bool_]:
-    if separation_m == 0.0:
-        return np.ones(len(score), bool)
-    return np.asarray(suppress_neighbours(floor_xy, score, separation_m))

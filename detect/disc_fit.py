@@ -14,17 +14,11 @@ from numpy.typing import NDArray
 
 from camera import Camera
 from detect import disc_fit_kernels as kernels
+from detect.disc_evidence_kernels import evidence_of_all
 from detect.disc_patch_kernels import FitSettings
-from detect.disc_profile import T_LIMIT, Z_LIMIT, disc_profile
+from detect.noise_kernels import median_response
 
 FloatArray = NDArray[np.float64]
-
-#: Pixels used for a first look, and for the final fit.
-_FIRST_LOOK_PIXELS = 700
-_ALL_PIXELS = 40_000
-#: Nodes of the quadrature across flat discs, likewise.
-_FIRST_LOOK_NODES = 5
-_ALL_NODES = 31
 
 #: Pixels within this many radii of the centre are fitted, and those this near to the edge, in
 #: pixels or in standard deviations of the blur.
@@ -39,15 +33,8 @@ _BLUR_PX = 0.6
 #: Grey values are rounded: noise is never below this.
 _LEAST_NOISE = 0.3
 
-#: What no disc's fit violates: radius relative to the nominal one, explained variance, and the
-#: share of the outline that has a step of the right sign.
-_RADIUS_RANGE = (0.75, 1.28)
-_LEAST_EXPLAINED = 0.35
-_LEAST_SECTORS = 0.75
-#: An outline may be this uneven where the disc explains more than the given share: with nothing
-#: else there to disturb it, it is the shape that is wrong (a square of the same size, say).
-_MOST_UNEVEN = 1.2
-_UNDISTURBED = 0.75
+#: With fewer pixels than this that are neither black nor saturated, all count for the noise.
+_LEAST_COUNTABLE = 100
 
 
 @dataclass(frozen=True)
@@ -124,9 +111,37 @@ def fit_discs(
     -------
     DiscFits
     """
-    count = _FIRST_LOOK_NODES if first_look else _ALL_NODES
-    nodes, weights = np.polynomial.hermite_e.hermegauss(count)
-    settings = FitSettings(
+    settings = fit_settings(noise, blur_ratio)
+    if blur_guess is None:
+        blur_guess = np.full(len(pixels), _BLUR_PX)
+    results, fitted = kernels.fit_discs(
+        image,
+        floor_xy,
+        np.ascontiguousarray(pixels[:, 0]),
+        np.ascontiguousarray(pixels[:, 1]),
+        radius_m,
+        settings,
+        blur_guess,
+        kernels.LOOK if first_look else kernels.ALL,
+    )
+    centres, covariance = fitted_positions(results)
+    return DiscFits(
+        fitted=fitted,
+        floor_xy=centres,
+        covariance=covariance,
+        radius_m=results[:, kernels.RADIUS],
+        blur_px=results[:, kernels.BLUR],
+        contrast=results[:, kernels.CONTRAST],
+        explained=results[:, kernels.EXPLAINED],
+        sectors_good=results[:, kernels.SECTORS_GOOD],
+        outline_deviation=results[:, kernels.OUTLINE_DEVIATION],
+        relative_blur=results[:, kernels.RELATIVE_BLUR],
+    )
+
+
+def fit_settings(noise: float, blur_ratio: float) -> FitSettings:
+    """What an image's fits are told: its noise (grey levels) and `blur_ratio_of` the camera."""
+    return FitSettings(
         noise=max(noise, _LEAST_NOISE),
         reach_radii=_REACH_RADII,
         reach_px=_REACH_PX,
@@ -136,36 +151,13 @@ def fit_discs(
         blur_sigma=_BLUR_SIGMA,
         blur_ratio=blur_ratio,
     )
-    if blur_guess is None:
-        blur_guess = np.full(len(pixels), _BLUR_PX)
-    results, fitted = kernels.fit_discs(
-        image,
-        floor_xy,
-        np.ascontiguousarray(pixels[:, 0]),
-        np.ascontiguousarray(pixels[:, 1]),
-        radius_m,
-        disc_profile(),
-        Z_LIMIT,
-        T_LIMIT,
-        nodes,
-        weights / weights.sum(),
-        settings,
-        blur_guess,
-        _FIRST_LOOK_PIXELS if first_look else _ALL_PIXELS,
-    )
-    xx, xy, yy = (results[:, k] for k in (kernels.COV_XX, kernels.COV_XY, kernels.COV_YY))
-    return DiscFits(
-        fitted=fitted,
-        floor_xy=results[:, [kernels.X, kernels.Y]],
-        covariance=np.stack([xx, xy, xy, yy], axis=-1).reshape(-1, 2, 2),
-        radius_m=results[:, kernels.RADIUS],
-        blur_px=results[:, kernels.BLUR],
-        contrast=results[:, kernels.CONTRAST],
-        explained=results[:, kernels.EXPLAINED],
-        sectors_good=results[:, kernels.SECTORS_GOOD],
-        outline_deviation=results[:, kernels.OUTLINE_DEVIATION],
-        relative_blur=results[:, kernels.RELATIVE_BLUR],
-    )
+
+
+def fitted_positions(results: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """(N, 2) centres, metres, and their (N, 2, 2) covariances from (N, RESULT_SIZE) results."""
+    centre = [kernels.X, kernels.Y]
+    spread = [kernels.COV_XX, kernels.COV_XY, kernels.COV_XY, kernels.COV_YY]
+    return results[:, centre], results[:, spread].reshape(-1, 2, 2)
 
 
 def blur_ratio_of(camera: Camera) -> float:
@@ -202,28 +194,17 @@ def disc_evidence(fits: DiscFits, radius_m: float, blur_px: float = 1.0) -> Floa
     -------
     (N,) float64
     """
-    explained = np.clip(fits.explained, 0.003, 0.997)
-    relative_radius = np.where(fits.radius_m > 0.0, fits.radius_m / radius_m, 1.0)
-    blur = np.clip(fits.relative_blur, 0.02, 2.5)
-    # What is seen sharply must fit closely; a blurred outline may seem larger, smaller or uneven.
-    off_radius = np.abs(np.log(relative_radius)) / (0.03 + 0.3 * blur)
-    uneven = fits.outline_deviation / (0.03 + 0.2 * blur)
-    score = (
-        3.1 * np.log(explained / (1.0 - explained))
-        - 1.8 * off_radius
-        - 2.6 * uneven
-        - 6.3 * np.log(np.maximum(blur / max(blur_px, 1.0), 0.02))
-        - 11.7
+    return np.asarray(
+        evidence_of_all(
+            fits.fitted,
+            fits.explained,
+            fits.radius_m / radius_m,
+            fits.outline_deviation,
+            fits.sectors_good,
+            fits.relative_blur,
+            blur_px,
+        )
     )
-    possible = (
-        fits.fitted
-        & (relative_radius > _RADIUS_RANGE[0])
-        & (relative_radius < _RADIUS_RANGE[1])
-        & (fits.explained >= _LEAST_EXPLAINED)
-        & (fits.sectors_good > _LEAST_SECTORS)
-        & ((uneven < _MOST_UNEVEN) | (fits.explained < _UNDISTURBED))
-    )
-    return np.asarray(np.where(possible, score, -np.inf))
 
 
 def estimate_noise(image: NDArray[np.uint8]) -> float:
@@ -233,15 +214,9 @@ def estimate_noise(image: NDArray[np.uint8]) -> float:
     planes nor straight edges (after Immerkaer, "Fast noise variance estimation", 1996); black and
     saturated pixels do not count.
     """
-    inner = image[1:-1, 1:-1]
-    countable = (inner > 2) & (inner < 253)
-    grey = image.astype(np.int16)
-    rows = grey[:-2] - 2 * grey[1:-1] + grey[2:]
-    response = np.abs(rows[:, :-2] - 2 * rows[:, 1:-1] + rows[:, 2:])
-    values = response[countable]
-    if values.size < 100:
-        values = response.ravel()
-    if not values.size:
+    count = (image.shape[0] - 2) * (image.shape[1] - 2)
+    if min(image.shape) < 3:
         return 0.0
+    response = np.empty(count, np.int16)
     # The mask's coefficients have a sum of squares of 36; 0.6745 makes a median a deviation.
-    return float(np.median(values) / 0.6745 / 6.0)
+    return median_response(image, _LEAST_COUNTABLE, response) / 0.6745 / 6.0

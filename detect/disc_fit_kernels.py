@@ -1,311 +1,497 @@
 """Compiled fit of a disc, seen through the camera, to the grey values around a candidate.
 
-Model of a grey value at a pixel that sees the floor at distance r from the disc's centre:
+Model of a grey value:
 
-    grey = background + contrast * W(z, t),    z = (r - R) / sigma,    t = sigma / R
+    grey = background + contrast * W
 
-W is the exact profile of a disc of radius R blurred by a Gaussian of width sigma; sigma is the
-blur in pixels times the length of floor per pixel in the direction of the centre. The background
-is a plane plus the two saddle terms, which let light fall off across the disc without imitating
-one.
-
-Parameters of the fit, in this order: x, y, R (units of the nominal radius, relative to the
-candidate), log blur (pixels), contrast, and the five terms of the background.
+W is the share of the disc that the pixel sees (see `detect.disc_model_kernels`). The background is
+a plane plus the two saddle terms, which let light fall off across the disc without imitating one.
+Parameters are x, y, radius (in units of the nominal radius, relative to the candidate) and log
+blur; contrast and background are linear, and every Gauss-Newton step solves for them anew.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from detect.disc_model_kernels import chord_pixel, profile_pixel
+from detect import disc_normal_kernels as normal
+from detect.disc_evidence_kernels import evidence_of
+from detect.disc_model_kernels import (
+    CAPACITY,
+    FIELDS,
+    PIXEL_VARIANCE,
+    blur_across,
+    chord_shares,
+    edge_shares,
+)
+from detect.disc_normal_kernels import (
+    background_products,
+    disc_products,
+    factor_rows,
+    left_over,
+    solution,
+)
 from detect.disc_outline_kernels import (
-    EDGE_COLUMNS,
-    ERROR,
-    PER_RADIUS,
-    SHARE,
+    blur_widths,
     correlated_area,
     outline_statistics,
+    residuals,
 )
 from detect.disc_patch_kernels import (
-    FX,
-    FY,
-    GREY,
-    GROWTH,
-    NEAR,
-    PIXEL_COLUMNS,
-    XU,
-    XV,
-    YU,
-    YV,
+    COLUMNS,
+    LIST,
+    ONE,
     FitSettings,
-    gather_pixels,
+    Patch,
+    gather_grid,
+    gather_list,
+    gather_sparse,
+    new_patch,
+    view_of,
 )
 
-PARAMETERS = 10
-_NONLINEAR = 4
-_BACKGROUND = 5
-
 #: Columns of a result.
-X, Y, RADIUS, BLUR, CONTRAST, BACKGROUND = range(6)
-EXPLAINED, RESIDUAL_VARIANCE, PIXELS = range(6, 9)
-COV_XX, COV_XY, COV_YY = range(9, 12)
-SECTORS_STEP, SECTORS_GOOD, OUTLINE_DEVIATION = range(12, 15)
-RELATIVE_BLUR = 15
-ITERATIONS = 16
-RESULT_SIZE = 17
+X, Y, RADIUS, BLUR, CONTRAST = range(5)
+EXPLAINED, RESIDUAL_VARIANCE, PIXELS = range(5, 8)
+COV_XX, COV_XY, COV_YY = range(8, 11)
+SECTORS_STEP, SECTORS_GOOD, OUTLINE_DEVIATION, RELATIVE_BLUR = range(11, 15)
+ITERATIONS, BLUR_BOUND, COMPLETE = range(15, 18)
+RESULT_SIZE = 18
+
+#: How many pixels a fit uses.
+LOOK, EDGE, ALL = range(3)
+#: About how many for a look, and besides those at the edge.
+_LOOK_PIXELS = 160
+_OTHER_PIXELS = 400
+
+_LEAST_BLUR, _MOST_BLUR = 0.1, 8.0
+_LEAST_RADIUS, _MOST_RADIUS = 0.4, 2.0
+_LONGEST_STEP = 0.3
+_MAX_EVALUATIONS = 15
+_LOOK_EVALUATIONS = 3
+#: A step that promises less than this, in variances of the noise, is the last.
+_CONVERGED = 0.01
+#: What the first step of a fit promises may be this much less evidence than is needed.
+_FIRST_STEP_SLACK = 2.0
+# Numba knows it as the type, the type checker as a function.
+_F: Callable[[Any], Any] = np.float32
 
 
-_PIXEL_VARIANCE = 1.0 / 12.0
-_MAX_ITERATIONS = 25
+class Hope(NamedTuple):
+    """When a fit is given up: as soon as a step promises less than this."""
+
+    least_share: float
+    """Share of the variance that the disc explains."""
+    least_evidence: float
+    """Evidence, as far as it is known by then: for an even outline."""
+    optics_px: float
+    """Blur of the camera's optics, for the evidence."""
+
+
+class Work(NamedTuple):
+    """Working space of the fits of one image."""
+
+    patch: Patch
+    fields: NDArray[np.float32]
+    shares: NDArray[np.float32]
+    widths: NDArray[np.float32]
+    weights: NDArray[np.float32]
+    products: NDArray[np.float64]
+    kept: NDArray[np.float64]
+    damped: NDArray[np.float64]
+    factor: NDArray[np.float64]
+    values: NDArray[np.float64]
+    bare: NDArray[np.float64]
+    p: NDArray[np.float64]
+    best: NDArray[np.float64]
+
+
+#: Never give up.
+PATIENT = Hope(-math.inf, -math.inf, 1.0)
 
 
 @njit(cache=True, error_model="numpy")
-def _solve(
-    a: NDArray[np.float64], b: NDArray[np.float64], n: int, lower: NDArray[np.float64]
+def new_work() -> Work:
+    """Working space."""
+    n = normal.ROWS
+    return Work(
+        new_patch(),
+        np.zeros(FIELDS * CAPACITY, np.float32),
+        np.zeros(FIELDS * CAPACITY, np.float32),
+        np.zeros(CAPACITY, np.float32),
+        np.zeros(64, np.float32),
+        np.zeros((n, n)),
+        np.zeros((n, n)),
+        np.zeros((n, n)),
+        np.zeros((n, n)),
+        np.zeros(n),
+        np.zeros(n),
+        np.zeros(4),
+        np.zeros(4),
+    )
+
+
+@njit(cache=True, error_model="numpy")
+def sigma_of(blur: float) -> float:
+    """Standard deviation of optics and pixel together, pixels."""
+    return math.sqrt(blur * blur + PIXEL_VARIANCE)
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def _mask(n: int, terms: NDArray[np.float32], fields: NDArray[np.float32]) -> None:
+    for field in range(FIELDS):
+        row = field * CAPACITY
+        for i in range(n):
+            fields[row + i] *= terms[ONE * CAPACITY + i]
+
+
+@njit(cache=True, error_model="numpy")
+def _evaluate(
+    shape: int, n: int, margin: int, p: NDArray[np.float64], ratio: float, work: Work
+) -> None:
+    """The disc's fields at the parameters p (x, y, radius, log blur)."""
+    blur = math.exp(p[3])
+    if shape == LIST:
+        edge_shares(work.patch.geometry, n, p[0], p[1], p[2], blur, blur * ratio, work.fields)
+        return
+    along, across = (blur, blur * ratio) if shape == COLUMNS else (blur * ratio, blur)
+    if margin == 0:
+        # Scattered pixels: an even weight of the same variance stands for blur and pixel across.
+        width = math.sqrt(12.0) * sigma_of(across)
+        chord_shares(work.patch.geometry, n, p[0], p[1], p[2], along, width, work.fields)
+        return
+    chord_shares(work.patch.geometry, n, p[0], p[1], p[2], along, 1.0, work.shares)
+    blur_across(work.shares, n, margin, across, work.weights, work.fields)
+    _mask(n, work.patch.terms, work.fields)
+
+
+@njit(cache=True, error_model="numpy")
+def _blur_width(shape: int, n: int, p: NDArray[np.float64], ratio: float, work: Work) -> float:
+    """Mean width of the blur across the edge, in nominal radii, at the parameters p."""
+    blur = math.exp(p[3])
+    sigma_u = sigma_of(blur)
+    sigma_v = sigma_of(blur * ratio)
+    if shape == COLUMNS:
+        sigma_u, sigma_v = sigma_v, sigma_u
+    return blur_widths(
+        work.patch.geometry, work.patch.terms, work.fields, shape == LIST, n, p[0], p[1],
+        sigma_u, sigma_v, work.widths,
+    )  # fmt: skip
+
+
+@njit(cache=True, error_model="numpy")
+def _step(
+    products: NDArray[np.float64],
+    damping: float,
+    p: NDArray[np.float64],
+    contrast: float,
+    variance: float,
+    settings: FitSettings,
+    log_most: float,
+    damped: NDArray[np.float64],
+    factor: NDArray[np.float64],
+    values: NDArray[np.float64],
 ) -> bool:
-    """Solve the symmetric positive definite a x = b in place of b (Cholesky)."""
-    for i in range(n):
+    """Solve for the four nonlinear parameters' steps, times contrast, into `values`.
+
+    The first six rows of the factor are those of the products; the prior knowledge of radius and
+    blur and the damping come in only then.
+    """
+    n = normal.ROWS
+    for i in range(normal.LOG_BLUR, n):
         for j in range(i + 1):
-            s = a[i, j]
-            for k in range(j):
-                s -= lower[i, k] * lower[j, k]
-            if i == j:
-                if not s > 0.0:
-                    return False
-                lower[i, i] = math.sqrt(s)
-            else:
-                lower[i, j] = s / lower[j, j]
-    for i in range(n):
-        s = b[i]
-        for k in range(i):
-            s -= lower[i, k] * b[k]
-        b[i] = s / lower[i, i]
-    for i in range(n - 1, -1, -1):
-        s = b[i]
-        for k in range(i + 1, n):
-            s -= lower[k, i] * b[k]
-        b[i] = s / lower[i, i]
+            damped[i, j] = products[i, j]
+    for j in range(n):
+        damped[normal.GREYS, j] = products[normal.GREYS, j]
+    prior_blur = variance / (settings.blur_sigma * settings.blur_sigma)
+    prior_radius = variance / (settings.radius_sigma * settings.radius_sigma)
+    c_2 = contrast * contrast
+    damped[normal.LOG_BLUR, normal.LOG_BLUR] += prior_blur / c_2
+    damped[normal.RADIUS, normal.RADIUS] += prior_radius / c_2
+    off_blur = p[3] - math.log(settings.blur_px)
+    off_radius = p[2] - 1.0
+    damped[normal.GREYS, normal.LOG_BLUR] -= prior_blur * off_blur / contrast
+    damped[normal.GREYS, normal.RADIUS] -= prior_radius * off_radius / contrast
+    for i in range(normal.LOG_BLUR, normal.UNKNOWNS):
+        damped[i, i] *= 1.0 + damping
+    if not factor_rows(damped, normal.LOG_BLUR, normal.UNKNOWNS, factor):
+        return False
+    solution(factor, normal.LOG_BLUR, normal.UNKNOWNS, values)
+    if p[3] >= log_most and values[normal.LOG_BLUR] / contrast > 0.0:
+        # The blur stays at its bound.
+        damped[normal.LOG_BLUR, normal.LOG_BLUR] *= 1e9
+        damped[normal.GREYS, normal.LOG_BLUR] = 0.0
+        if not factor_rows(damped, normal.LOG_BLUR, normal.UNKNOWNS, factor):
+            return False
+        solution(factor, normal.LOG_BLUR, normal.UNKNOWNS, values)
     return True
 
 
 @njit(cache=True, error_model="numpy")
-def _fit(
+def _move(
+    best: NDArray[np.float64],
+    values: NDArray[np.float64],
+    contrast: float,
+    log_least: float,
+    log_most: float,
+    p: NDArray[np.float64],
+) -> None:
+    """Take a step from the best parameters, within limits."""
+    d_x = values[normal.X] / contrast
+    d_y = values[normal.Y] / contrast
+    length = math.hypot(d_x, d_y)
+    shorten = min(1.0, _LONGEST_STEP / length) / contrast if length > 0.0 else 1.0 / contrast
+    p[0] = best[0] + shorten * values[normal.X]
+    p[1] = best[1] + shorten * values[normal.Y]
+    radius = best[2] + shorten * values[normal.RADIUS]
+    p[2] = min(max(radius, _LEAST_RADIUS), _MOST_RADIUS)
+    p[3] = min(max(best[3] + shorten * values[normal.LOG_BLUR], log_least), log_most)
+
+
+@njit(cache=True, error_model="numpy")
+def fit_disc(
     image: NDArray[np.uint8],
     floor_xy: NDArray[np.float32],
     u0: int,
     v0: int,
     radius: float,
-    profile: NDArray[np.float64],
-    z_limit: float,
-    t_limit: float,
-    nodes: NDArray[np.float64],
-    weights: NDArray[np.float64],
     settings: FitSettings,
+    start: NDArray[np.float64],
     blur_guess: float,
-    pixels: NDArray[np.float64],
-    edge: NDArray[np.float64],
+    detail: int,
+    hope: Hope,
+    work: Work,
     out: NDArray[np.float64],
 ) -> bool:
-    """Fit one candidate; see `fit_discs`."""
-    n_linear = 1 + _BACKGROUND
+    """Fit one candidate.
+
+    Parameters
+    ----------
+    start : (4,) float64
+        Where to start: x, y, radius (nominal radii, relative to the candidate), log blur.
+    blur_guess : float
+        About how blurred the candidate is (along u), pixels: how far out pixels are gathered.
+    detail : int
+        How many pixels: `LOOK`, about 160 and few steps; `EDGE`, of large discs all that tell where
+        the edge is and some hundred others; `ALL`.
+    hope : Hope
+        When to give up.
+    """
     out[:] = 0.0
-    noise = settings.noise
-    n, flat = gather_pixels(image, floor_xy, u0, v0, radius, blur_guess, settings, pixels)
-    out[PIXELS] = n
-    if n < PARAMETERS + 4:
+    patch = work.patch
+    p = work.p
+    best = work.best
+    products = work.products
+    kept = work.kept
+    factor = work.factor
+    values = work.values
+    ratio = settings.blur_ratio
+    noise_2 = settings.noise * settings.noise
+    shape, along_u, along_v, area = view_of(floor_xy, u0, v0, radius, blur_guess, ratio)
+    if area == 0.0:
         return False
-    sigma_r = settings.radius_sigma
-    log_blur = math.log(settings.blur_px)
-    sigma_blur = settings.blur_sigma
-    blur_ratio = settings.blur_ratio
-
-    p = np.zeros(PARAMETERS)
-    best = np.zeros(PARAMETERS)
-    p[2] = 1.0
-    p[3] = log_blur
-    row = np.zeros(PARAMETERS)
-    normal = np.zeros((PARAMETERS, PARAMETERS))
-    kept = np.zeros((PARAMETERS, PARAMETERS))
-    damped = np.zeros((PARAMETERS, PARAMETERS))
-    lower = np.zeros((PARAMETERS, PARAMETERS))
-    gradient = np.zeros(PARAMETERS)
-    kept_gradient = np.zeros(PARAMETERS)
-    step = np.zeros(PARAMETERS)
-
-    # Without a disc: the background alone, the measure of what there is to explain.
-    for i in range(n):
-        x = pixels[i, FX]
-        y = pixels[i, FY]
-        row[0] = 1.0
-        row[1] = x
-        row[2] = y
-        row[3] = x * x - y * y
-        row[4] = x * y
-        for j in range(_BACKGROUND):
-            gradient[j] += row[j] * pixels[i, GREY]
-            for k in range(j + 1):
-                normal[j, k] += row[j] * row[k]
-    for j in range(_BACKGROUND):
-        normal[j, j] += 1e-9 * n
-    if not _solve(normal, gradient, _BACKGROUND, lower):
-        return False
-    total = 0.0
-    for i in range(n):
-        x = pixels[i, FX]
-        y = pixels[i, FY]
-        grey = gradient[0] + gradient[1] * x + gradient[2] * y
-        grey += gradient[3] * (x * x - y * y) + gradient[4] * x * y
-        total += pixels[i, NEAR] * (pixels[i, GREY] - grey) ** 2
-
-    cost = math.inf
-    residual = 0.0
-    near_residual = 0.0
-    damping = 1e-3
-    linear_start = True
-    iteration = 0
-    while iteration < _MAX_ITERATIONS:
-        normal[:] = 0.0
-        gradient[:] = 0.0
-        residual = 0.0
-        near_residual = 0.0
-        blur = math.exp(p[3])
-        blur_v = blur * blur_ratio
-        sigma_u = math.sqrt(blur * blur + _PIXEL_VARIANCE)
-        sigma_v = math.sqrt(blur_v * blur_v + _PIXEL_VARIANCE)
-        for i in range(n):
-            x = pixels[i, FX] - p[0]
-            y = pixels[i, FY] - p[1]
-            xu = pixels[i, XU]
-            xv = pixels[i, XV]
-            yu = pixels[i, YU]
-            yv = pixels[i, YV]
-            if flat == 0:
-                w, dx, dy, dr, db = profile_pixel(
-                    x, y, xu, xv, yu, yv, p[2], blur, blur_v, sigma_u, sigma_v,
-                    profile, z_limit, t_limit,
-                )  # fmt: skip
-            elif flat == 1:
-                w, dx, dy, dr, db = chord_pixel(
-                    x, y, xv, yv, xu, yu, pixels[i, GROWTH], p[2],
-                    blur_v, blur, sigma_v, sigma_u, nodes, weights,
-                )  # fmt: skip
-            else:
-                w, dx, dy, dr, db = chord_pixel(
-                    x, y, xu, yu, xv, yv, pixels[i, GROWTH], p[2],
-                    blur, blur_v, sigma_u, sigma_v, nodes, weights,
-                )  # fmt: skip
-            xb = pixels[i, FX]
-            yb = pixels[i, FY]
-            grey = p[4] * w + p[5] + p[6] * xb + p[7] * yb
-            grey += p[8] * (xb * xb - yb * yb) + p[9] * xb * yb
-            error = pixels[i, GREY] - grey
-            residual += error * error
-            near_residual += pixels[i, NEAR] * error * error
-            row[0] = p[4] * dx
-            row[1] = p[4] * dy
-            row[2] = p[4] * dr
-            row[3] = p[4] * db
-            row[4] = w
-            edge[i, SHARE] = w
-            edge[i, PER_RADIUS] = row[2]
-            edge[i, ERROR] = error
-            row[5] = 1.0
-            row[6] = xb
-            row[7] = yb
-            row[8] = xb * xb - yb * yb
-            row[9] = xb * yb
-            for j in range(PARAMETERS):
-                gradient[j] += row[j] * error
-                for k in range(j + 1):
-                    normal[j, k] += row[j] * row[k]
-        variance = max(residual / (n - PARAMETERS), noise * noise)
-        # Weak prior knowledge of radius and blur keeps tiny and blurred discs determined.
-        prior_r = (p[2] - 1.0) / sigma_r
-        prior_blur = (p[3] - log_blur) / sigma_blur
-        now = residual + variance * (prior_r * prior_r + prior_blur * prior_blur)
-        normal[2, 2] += variance / (sigma_r * sigma_r)
-        normal[3, 3] += variance / (sigma_blur * sigma_blur)
-        gradient[2] -= variance * prior_r / sigma_r
-        gradient[3] -= variance * prior_blur / sigma_blur
-        for j in range(PARAMETERS):
-            normal[j, j] += 1e-9 * n
-        if linear_start:
-            # First the grey levels alone, with the disc where the candidate is.
-            for j in range(n_linear):
-                step[j] = gradient[_NONLINEAR + j]
-                for k in range(j + 1):
-                    damped[j, k] = normal[_NONLINEAR + j, _NONLINEAR + k]
-            if not _solve(damped, step, n_linear, lower):
-                return False
-            for j in range(n_linear):
-                p[_NONLINEAR + j] = step[j]
-            linear_start = False
-            continue
-        iteration += 1
-        if now <= cost:
-            converged = cost - now <= 1e-4 * variance
-            cost = now
-            best[:] = p
-            kept[:] = normal
-            kept_gradient[:] = gradient
-            damping = max(0.2 * damping, 1e-7)
-            if converged:
-                break
+    beyond_u = max(settings.reach_px, settings.reach_blurs * blur_guess)
+    beyond_v = max(settings.reach_px, settings.reach_blurs * blur_guess * ratio)
+    room = 1.08 * settings.reach_radii
+    half_u = int(max(room * along_u, 1.08 * along_u + beyond_u)) + 1
+    half_v = int(max(room * along_v, 1.08 * along_v + beyond_v)) + 1
+    half_u = min(half_u, image.shape[1])
+    half_v = min(half_v, image.shape[0])
+    window = (2 * half_u + 1) * (2 * half_v + 1)
+    # How far the blur may grow before the patch is too small for it.
+    most_blur = _MOST_BLUR
+    margin = 0
+    every = 1
+    if detail == LOOK:
+        every = max(1, window // _LOOK_PIXELS)
+        n = gather_sparse(
+            image, floor_xy, u0, v0, radius, settings, half_u, half_v, every, shape, patch
+        )
+        count = n
+    else:
+        if shape != LIST:
+            across = 1.0 if shape != COLUMNS else ratio
+            margin = min(int(3.0 * 1.3 * blur_guess * across) + 3, 30)
+            length = 2 * (half_u if shape != COLUMNS else half_v) + 1 + 2 * margin
+            lines = 2 * (half_v if shape != COLUMNS else half_u) + 1
+            if length * (lines + 2) > CAPACITY:
+                shape = LIST
+                margin = 0
+        if shape == LIST:
+            every = 1 + window // _OTHER_PIXELS if detail == EDGE else 1
+            # All of them, but for discs that are larger than a patch.
+            every = max(every, 1 + window // CAPACITY)
+            n = gather_list(
+                image, floor_xy, u0, v0, radius, blur_guess, settings, half_u, half_v,
+                every, patch,
+            )  # fmt: skip
+            count = n
         else:
+            most_blur = min((margin - 1.0) / (2.5 * across), _MOST_BLUR)
+            n, count = gather_grid(
+                image, floor_xy, u0, v0, radius, blur_guess, settings, half_u, half_v, margin,
+                shape == COLUMNS, patch,
+            )  # fmt: skip
+    out[PIXELS] = count
+    out[COMPLETE] = 1.0 if every == 1 else 0.0
+    freedom = count - normal.UNKNOWNS
+    if freedom < 4:
+        return False
+    background_products(patch.terms, n, products)
+    for j in range(normal.BACKGROUND):
+        products[j, j] += 1e-9 * n
+
+    log_least = math.log(_LEAST_BLUR)
+    log_most = math.log(most_blur)
+    for k in range(4):
+        p[k] = start[k]
+        best[k] = start[k]
+    p[3] = min(p[3], log_most)
+    log_blur = math.log(settings.blur_px)
+    damping = 1e-3
+    cost = math.inf
+    contrast = 0.0
+    variance = noise_2
+    evaluations = 0
+    width_per_px = 0.0
+    finished = False
+    current = False
+    most_evaluations = _LOOK_EVALUATIONS if detail == LOOK else _MAX_EVALUATIONS
+    while evaluations < most_evaluations:
+        evaluations += 1
+        _evaluate(shape, n, margin, p, ratio, work)
+        disc_products(patch.terms, work.fields, n, products)
+        for j in range(normal.BACKGROUND, normal.UNKNOWNS):
+            products[j, j] += 1e-9 * n
+        if not factor_rows(products, 0, normal.LOG_BLUR, factor):
+            return False
+        without = left_over(products, factor, normal.BACKGROUND)
+        residual = left_over(products, factor, normal.LOG_BLUR)
+        variance_now = max(residual / freedom, noise_2)
+        prior_blur = (p[3] - log_blur) / settings.blur_sigma
+        prior_radius = (p[2] - 1.0) / settings.radius_sigma
+        now = residual + variance_now * (prior_blur * prior_blur + prior_radius * prior_radius)
+        if now <= cost:
+            gain = cost - now
+            cost = now
+            current = True
+            variance = variance_now
+            contrast = (
+                factor[normal.GREYS, normal.CONTRAST] * factor[normal.CONTRAST, normal.CONTRAST]
+            )
+            for k in range(4):
+                best[k] = p[k]
+            for i in range(normal.ROWS):
+                for j in range(i + 1):
+                    kept[i, j] = products[i, j]
+            damping = max(0.2 * damping, 1e-7)
+            if not abs(contrast) > 1e-6:
+                return False
+            if gain <= 1e-3 * variance:
+                finished = True
+        else:
+            current = False
             damping *= 10.0
             if damping > 1e6:
-                break
-        for j in range(PARAMETERS):
-            step[j] = kept_gradient[j]
-            for k in range(j + 1):
-                damped[j, k] = kept[j, k]
-            damped[j, j] *= 1.0 + damping
-        if not _solve(damped, step, PARAMETERS, lower):
+                finished = True
+            if not factor_rows(kept, 0, normal.LOG_BLUR, factor):
+                return False
+        if finished:
+            break
+        if not _step(
+            kept,
+            damping,
+            best,
+            contrast,
+            variance,
+            settings,
+            log_most,
+            work.damped,
+            factor,
+            values,
+        ):
             return False
-        length = math.hypot(step[0], step[1])
-        shorten = min(1.0, 0.3 / length) if length > 0.0 else 1.0
-        for j in range(PARAMETERS):
-            p[j] = best[j] + shorten * step[j]
-        p[2] = min(max(p[2], 0.4), 2.0)
-        p[3] = min(max(p[3], math.log(0.1)), math.log(8.0))
+        promised = 0.0
+        for k in range(normal.LOG_BLUR, normal.UNKNOWNS):
+            promised += factor[normal.GREYS, k] ** 2
+        share = 1.0 - max(cost - promised, 0.0) / max(without, 1e-9)
+        if share < hope.least_share:
+            return False
+        _move(best, values, contrast, log_least, log_most, p)
+        if hope.least_evidence > -math.inf:
+            if evaluations == 1:
+                # How wide a blur is on the floor: the first pixels tell it for all blurs.
+                blur = math.exp(best[3])
+                width_per_px = _blur_width(shape, n, best, ratio, work) / sigma_of(blur)
+            width = width_per_px * sigma_of(math.exp(p[3])) / p[2]
+            slack = _FIRST_STEP_SLACK if evaluations == 1 else 0.0
+            promise = evidence_of(share, p[2], 0.0, 1.0, width, hope.optics_px)
+            if promise < hope.least_evidence - slack:
+                return False
+        if promised <= _CONVERGED * variance:
+            break
     if not cost < math.inf:
         return False
-
-    # `edge` may belong to a rejected step: only the sectors use it.
-    out[X] = floor_xy[v0, u0, 0] + best[0] * radius
-    out[Y] = floor_xy[v0, u0, 1] + best[1] * radius
-    out[RADIUS] = best[2] * radius
-    out[BLUR] = math.exp(best[3])
-    out[CONTRAST] = best[4]
-    out[BACKGROUND] = best[5]
-    out[EXPLAINED] = 1.0 - min(near_residual / max(total, 1e-12), 1.0)
-    out[RESIDUAL_VARIANCE] = residual / (n - PARAMETERS)
-    out[ITERATIONS] = iteration
-    variance = max(out[RESIDUAL_VARIANCE], noise * noise) * correlated_area(edge, n)
-    for axis in range(2):
-        step[:] = 0.0
-        step[axis] = 1.0
-        for j in range(PARAMETERS):
-            for k in range(j + 1):
-                damped[j, k] = kept[j, k]
-        if not _solve(damped, step, PARAMETERS, lower):
-            return False
-        if axis == 0:
-            out[COV_XX] = variance * step[0] * radius * radius
-            out[COV_XY] = variance * step[1] * radius * radius
-        else:
-            out[COV_YY] = variance * step[1] * radius * radius
-    out[SECTORS_STEP], out[SECTORS_GOOD], out[OUTLINE_DEVIATION], out[RELATIVE_BLUR] = (
-        outline_statistics(
-            pixels, edge, n, best,
-            math.sqrt(out[BLUR] ** 2 + _PIXEL_VARIANCE),
-            math.sqrt((blur_ratio * out[BLUR]) ** 2 + _PIXEL_VARIANCE),
-        )
-    )  # fmt: skip
+    if not current:
+        _evaluate(shape, n, margin, best, ratio, work)
+    # The last step is taken as the linear model has it, and so are its residuals.
+    if not factor_rows(kept, 0, normal.LOG_BLUR, factor):
+        return False
+    solution(factor, 0, normal.BACKGROUND, work.bare)
+    if not _step(
+        kept,
+        0.0,
+        best,
+        contrast,
+        variance,
+        settings,
+        log_most,
+        work.damped,
+        factor,
+        values,
+    ):
+        return False
+    solution(factor, 0, normal.UNKNOWNS, values)
+    _move(best, values, contrast, log_least, log_most, p)
+    contrast = values[normal.CONTRAST]
+    kept_pixels = work.shares
+    residual, near, near_total = residuals(
+        patch.terms, work.fields, n, values, work.bare, kept_pixels
+    )
+    variance = residual / freedom
+    blur = math.exp(p[3])
+    width = _blur_width(shape, n, p, ratio, work)
+    out[X] = floor_xy[v0, u0, 0] + p[0] * radius
+    out[Y] = floor_xy[v0, u0, 1] + p[1] * radius
+    out[RADIUS] = p[2] * radius
+    out[BLUR] = blur
+    out[CONTRAST] = contrast
+    out[EXPLAINED] = 1.0 - min(near / max(near_total, 1e-12), 1.0)
+    out[RESIDUAL_VARIANCE] = variance
+    out[RELATIVE_BLUR] = width / p[2]
+    out[ITERATIONS] = evaluations
+    out[BLUR_BOUND] = most_blur
+    if detail == LOOK:
+        out[SECTORS_GOOD] = 1.0
+        return True
+    variance = max(variance, noise_2) * correlated_area(patch.terms, kept_pixels, n)
+    # x and y come last: their covariance is the inverse of the last two rows' own products.
+    per_xx = factor[normal.X, normal.X]
+    per_yy = factor[normal.Y, normal.Y]
+    xy = factor[normal.Y, normal.X]
+    scale = variance * (radius / contrast) ** 2
+    out[COV_XX] = scale * per_xx * per_xx * (1.0 + (xy * per_yy) ** 2)
+    out[COV_XY] = -scale * per_xx * per_yy * per_yy * xy
+    out[COV_YY] = scale * per_yy * per_yy
+    out[SECTORS_STEP], out[SECTORS_GOOD], out[OUTLINE_DEVIATION] = outline_statistics(
+        patch.terms, work.fields, kept_pixels, n, p[0], p[1], p[2], contrast
+    )
     return True
 
 
@@ -316,14 +502,9 @@ def fit_discs(
     columns: NDArray[np.int64],
     rows: NDArray[np.int64],
     radius: float,
-    profile: NDArray[np.float64],
-    z_limit: float,
-    t_limit: float,
-    nodes: NDArray[np.float64],
-    weights: NDArray[np.float64],
     settings: FitSettings,
     blur_guess: NDArray[np.float64],
-    capacity: int,
+    detail: int,
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Fit a disc at each candidate.
 
@@ -336,15 +517,11 @@ def fit_discs(
         The candidates' pixels.
     radius : float
         Nominal radius, metres.
-    profile, z_limit, t_limit
-        `detect.disc_profile`.
-    nodes, weights : (K,) float64
-        Gauss-Hermite quadrature for a standard normal distribution.
     settings : FitSettings
     blur_guess : (N,) float64
-        About how blurred each candidate is (along u), pixels: how far out pixels are gathered.
-    capacity : int
-        Most pixels to use for one candidate; of larger ones every second, third ... is used.
+        About how blurred each candidate is (along u), pixels.
+    detail : int
+        See `fit_disc`.
 
     Returns
     -------
@@ -356,11 +533,13 @@ def fit_discs(
     n = len(columns)
     results = np.zeros((n, RESULT_SIZE))
     fitted = np.zeros(n, np.bool_)
-    pixels = np.empty((capacity, PIXEL_COLUMNS))
-    edge = np.empty((capacity, EDGE_COLUMNS))
+    work = new_work()
+    start = np.zeros(4)
     for i in range(n):
-        fitted[i] = _fit(
-            image, floor_xy, columns[i], rows[i], radius, profile, z_limit, t_limit,
-            nodes, weights, settings, blur_guess[i], pixels, edge, results[i],
+        start[2] = 1.0
+        start[3] = math.log(blur_guess[i])
+        fitted[i] = fit_disc(
+            image, floor_xy, columns[i], rows[i], radius, settings, start, blur_guess[i], detail,
+            PATIENT,             work, results[i],
         )  # fmt: skip
     return results, fitted

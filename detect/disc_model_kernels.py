@@ -1,152 +1,394 @@
 """What share of a disc's contrast a pixel sees: two models of a blurred disc, with derivatives.
 
-Both work in units of the nominal radius, on the floor, about a pixel that sees the floor at (x, y)
-from the disc's centre and by whose step in u or v the floor moves as the Jacobian says. Both return
+Both work in units of the nominal radius, on the floor, and take a patch of pixels as arrays: each
+pixel sees the floor at some place, and by its step in u or v the floor moves as a Jacobian says. A
+blur is given by its standard deviation along the image axes: of all of it (the optics and the pixel
+itself), and of the optics alone, which is what a fit varies. Results are five rows of values,
 
-    W, dW/dx_centre, dW/dy_centre, dW/dradius, dW/dlog(blur)
+    W, dW/dlog(blur), dW/dradius, dW/dx_centre, dW/dy_centre
 
-A blur is given by its standard deviation along the image axes: of all of it (`sigma`: the optics
-and the pixel itself), and of the optics alone (`blur`), which is what the fit varies.
+`edge_shares` is for discs that are large against the blur: what a pixel sees depends on how far the
+edge is from it, and on how curved the edge is there. `chord_shares` is for discs that are seen so
+flat that the blur reaches across them: along the steeper image axis the blurred chord is integrated
+exactly, along the other by quadrature.
 
-`profile_pixel` is exact for a disc blurred evenly in all directions of the floor, and good where
-the blur is small against the disc. `chord_pixel` is for discs that are seen so flat that the blur
-reaches across them: along the steeper image axis the blurred chord is integrated exactly, along
-the other by quadrature.
+All is single precision, without branches and without library functions, so that the compiler can
+work on several pixels at a time.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-_ROOT_HALF = math.sqrt(0.5)
-_ROOT_2PI = math.sqrt(2.0 * math.pi)
-#: A chord's ends move without bound where the axis touches the circle: slopes end here.
-_FLATTEST = 0.05
+from detect.disc_profile import BEND, T_LIMIT, Z_LIMIT
+
+# Numba knows it as the type, the type checker as a function.
+_F: Callable[[Any], Any] = np.float32
+
+#: Rows of the results.
+SHARE, BY_BLUR, BY_RADIUS, BY_X, BY_Y = range(5)
+FIELDS = 5
+
+#: Rows of a patch's geometry for `edge_shares`: floor x, y and d(x, y)/d(u, v).
+EDGE_X, EDGE_Y, EDGE_XU, EDGE_YU, EDGE_XV, EDGE_YV = range(6)
+#: For `chord_shares`: floor x, y; the floor's step (x, y) along the steep axis over its squared
+#: length; the unit normal of that step; how far one step along the other axis moves across the
+#: chord (radii) and along it (steps); one over the length of the steep step; its relative growth
+#: from one pixel to the next.
+CHORD_X, CHORD_Y, ALONG_X, ALONG_Y, ACROSS_X, ACROSS_Y = range(6)
+PER_STEP_ACROSS, PER_STEP_ALONG, PER_LENGTH, GROWTH = range(6, 10)
+GEOMETRY = 10
+
+#: Most pixels of a patch. Rows are stretches of this length in one flat array: at distances that
+#: the compiler knows, it sees that they do not overlap.
+CAPACITY = 4096
+
+PIXEL_VARIANCE = 1.0 / 12.0
+
+_0, _1, _2, _HALF = _F(0.0), _F(1.0), _F(2.0), _F(0.5)
+_TINY = _F(1e-12)
+_ASIDE = _F(1e-6)
+_Z_LIMIT = _F(Z_LIMIT)
+_T_LIMIT = _F(T_LIMIT)
+_Q00, _Q01, _Q02 = (_F(q) for q in BEND[0])
+_Q10, _Q11, _Q12 = (_F(q) for q in BEND[1])
+_Q20, _Q21, _Q22 = (_F(q) for q in BEND[2])
+_Q30, _Q31, _Q32 = (_F(q) for q in BEND[3])
+_Q40, _Q41, _Q42 = (_F(q) for q in BEND[4])
+_Q50, _Q51, _Q52 = (_F(q) for q in BEND[5])
+_3, _4, _5 = _F(3.0), _F(4.0), _F(5.0)
+#: The polynomial ends where the disc does: at z = -1 / t is the centre.
+_Z_PER_T = _F((Z_LIMIT - 1.0 / T_LIMIT) / T_LIMIT)
+_TWO_THIRDS = _F(2.0 / 3.0)
+
+_FASTMATH = {"reassoc", "contract", "arcp", "nsz"}
+
+# exp(-y) = p(y / 32)^32 with the Taylor polynomial p.
+_PER_32 = _F(0.5 / 32.0)
+_E2, _E3, _E4, _E5 = _F(1 / 2), _F(1 / 6), _F(1 / 24), _F(1 / 120)
+_PER_ROOT_2PI = _F(1.0 / math.sqrt(2.0 * math.pi))
+_FAR = _F(5.0)
+# Abramowitz and Stegun, 26.2.17: the normal distribution's tail, within 8e-8.
+_TAIL = _F(0.2316419)
+_B1, _B2, _B3 = _F(0.319381530), _F(-0.356563782), _F(1.781477937)
+_B4, _B5 = _F(-1.821255978), _F(1.330274429)
 
 
-@njit(cache=True, error_model="numpy", inline="always")
-def profile_pixel(
-    x: float,
-    y: float,
-    xu: float,
-    xv: float,
-    yu: float,
-    yv: float,
+@njit(cache=True, error_model="numpy", inline="always", fastmath=_FASTMATH)
+def normal(x: float) -> tuple[float, float]:
+    """Density and distribution function of a standard normal variable, within 2e-6."""
+    a = min(abs(x), _FAR)
+    y = a * a * _PER_32
+    e = _1 - y * (_1 - y * (_E2 - y * (_E3 - y * (_E4 - y * _E5))))
+    e *= e
+    e *= e
+    e *= e
+    e *= e
+    e *= e
+    density = e * _PER_ROOT_2PI
+    k = _1 / (_1 + _TAIL * a)
+    tail = density * k * (_B1 + k * (_B2 + k * (_B3 + k * (_B4 + k * _B5))))
+    return density, (_1 - tail if x > _0 else tail)
+
+
+@njit(cache=True, error_model="numpy", fastmath=_FASTMATH)
+def edge_shares(
+    geometry: NDArray[np.float32],
+    n: int,
+    x_centre: float,
+    y_centre: float,
     radius: float,
     blur_u: float,
     blur_v: float,
-    sigma_u: float,
-    sigma_v: float,
-    profile: NDArray[np.float64],
-    z_limit: float,
-    t_limit: float,
-) -> tuple[float, float, float, float, float]:
-    """W by the tabulated profile of an evenly blurred disc (see `detect.disc_profile`)."""
-    nz = profile.shape[1] - 1
-    nt = profile.shape[0] - 1
-    z_step = 2.0 * z_limit / nz
-    t_step = t_limit / nt
-    r = math.sqrt(x * x + y * y)
-    # At the centre itself every direction is as good.
-    nx = x / r if r > 0.0 else 1.0
-    ny = y / r if r > 0.0 else 0.0
-    gu = xu * nx + yu * ny
-    gv = xv * nx + yv * ny
-    gu *= gu
-    gv *= gv
-    sigma = math.sqrt(sigma_u * sigma_u * gu + sigma_v * sigma_v * gv)
-    optics = (blur_u * blur_u * gu + blur_v * blur_v * gv) / (sigma * sigma)
-    z = (r - radius) / sigma
-    t = min(sigma / radius, t_limit)
-    fz = (min(max(z, -z_limit), z_limit) + z_limit) / z_step
-    ft = t / t_step
-    iz = min(int(fz), nz - 1)
-    it = min(int(ft), nt - 1)
-    az = fz - iz
-    at = ft - it
-    w00 = profile[it, iz]
-    w01 = profile[it, iz + 1]
-    w10 = profile[it + 1, iz]
-    w11 = profile[it + 1, iz + 1]
-    w0 = w00 + az * (w01 - w00)
-    w1 = w10 + az * (w11 - w10)
-    dwz = ((1.0 - at) * (w01 - w00) + at * (w11 - w10)) / z_step
-    dwt = (w1 - w0) / t_step
-    if z <= -z_limit or z >= z_limit:
-        dwz = 0.0
-    per_r = dwz / sigma
-    return (
-        w0 + at * (w1 - w0),
-        -per_r * nx,
-        -per_r * ny,
-        -per_r - dwt * t / radius,
-        (dwt * t - dwz * z) * optics,
-    )
+    fields: NDArray[np.float32],
+) -> None:
+    """W by the profile of a curved edge (see `detect.disc_profile`), for the first n pixels.
+
+    Distance from the edge and its curvature are counted in the metric in which the blur is round:
+    with G the deviation of the blur across the edge, on the floor, and D that of its area, an edge
+    of radius R has the curvature D^2 / (R G^3) in units of the blur.
+    """
+    x0, y0, r0 = _F(x_centre), _F(y_centre), _F(radius)
+    per_r0 = _1 / r0
+    variance_u = _F(blur_u * blur_u + PIXEL_VARIANCE)
+    variance_v = _F(blur_v * blur_v + PIXEL_VARIANCE)
+    area = variance_u * variance_v
+    optics_u = _F(blur_u * blur_u) / variance_u
+    optics_v = _F(blur_v * blur_v) / variance_v
+    for i in range(n):
+        # At the centre itself any direction will do, but one there must be.
+        x = geometry[EDGE_X * CAPACITY + i] - x0 + _ASIDE
+        y = geometry[EDGE_Y * CAPACITY + i] - y0
+        xu = geometry[EDGE_XU * CAPACITY + i]
+        yu = geometry[EDGE_YU * CAPACITY + i]
+        xv = geometry[EDGE_XV * CAPACITY + i]
+        yv = geometry[EDGE_YV * CAPACITY + i]
+        r = math.sqrt(x * x + y * y)
+        nx = x / r
+        ny = y / r
+        gu = xu * nx + yu * ny
+        gv = xv * nx + yv * ny
+        gu = gu * gu * variance_u
+        gv = gv * gv * variance_v
+        per_g = _1 / math.sqrt(gu + gv + _TINY)
+        optics = (gu * optics_u + gv * optics_v) * per_g * per_g
+        steps = xu * yv - xv * yu
+        t = min(steps * steps * area * per_g * per_g * per_g * per_r0, _T_LIMIT)
+        z_all = (r - r0) * per_g
+        z = min(max(z_all, _Z_PER_T * t - _Z_LIMIT), _Z_LIMIT)
+        c0 = _Q00 + t * (_Q01 + t * _Q02)
+        c1 = _Q10 + t * (_Q11 + t * _Q12)
+        c2 = _Q20 + t * (_Q21 + t * _Q22)
+        c3 = _Q30 + t * (_Q31 + t * _Q32)
+        c4 = _Q40 + t * (_Q41 + t * _Q42)
+        c5 = _Q50 + t * (_Q51 + t * _Q52)
+        q = c0 + z * (c1 + z * (c2 + z * (c3 + z * (c4 + z * c5))))
+        q_z = c1 + z * (_2 * c2 + z * (_3 * c3 + z * (_4 * c4 + z * _5 * c5)))
+        q_t = _Q01 + z * (_Q11 + z * (_Q21 + z * (_Q31 + z * (_Q41 + z * _Q51))))
+        q_tt = _Q02 + z * (_Q12 + z * (_Q22 + z * (_Q32 + z * (_Q42 + z * _Q52))))
+        q_t += _2 * t * q_tt
+        density, outside = normal(z + t * (_HALF + t * q))
+        by_z = -density * (_1 + t * t * q_z)
+        by_z = by_z if z == z_all else _0
+        by_t = -density * (_HALF + t * (_2 * q + t * q_t))
+        per_radius = by_z * per_g
+        fields[SHARE * CAPACITY + i] = _1 - outside
+        fields[BY_BLUR * CAPACITY + i] = (by_t * t - by_z * z) * optics
+        fields[BY_RADIUS * CAPACITY + i] = -per_radius - by_t * t * per_r0
+        fields[BY_X * CAPACITY + i] = -per_radius * nx
+        fields[BY_Y * CAPACITY + i] = -per_radius * ny
+
+
+# asin(x) = pi / 2 - sqrt(1 - x) * polynomial(x) for x from 0 to 1 (Abramowitz and Stegun, 4.4.45).
+_A0, _A1, _A2, _A3 = _F(1.5707288), _F(-0.2121144), _F(0.0742610), _F(-0.0187293)
+_HALF_PI = _F(0.5 * math.pi)
+_S3, _S5, _S7, _S9 = _F(-1 / 6), _F(1 / 120), _F(-1 / 5040), _F(1 / 362880)
+_C2, _C4, _C6, _C8 = _F(-1 / 2), _F(1 / 24), _F(-1 / 720), _F(1 / 40320)
+_C10 = _F(-1 / 3628800)
+#: The two nodes of the Gauss-Legendre quadrature, each of weight one half of the interval.
+_NODE = _F(0.5 / math.sqrt(3.0))
+_MOST_BEND = _F(0.7)
+
+
+@njit(cache=True, error_model="numpy", inline="always", fastmath=_FASTMATH)
+def _arcsine(x: float) -> float:
+    """Arc sine of x, which is cut to [-1, 1], within 7e-5."""
+    a = min(abs(x), _1)
+    angle: float = _HALF_PI - math.sqrt(_1 - a) * (_A0 + a * (_A1 + a * (_A2 + a * _A3)))
+    signed: float = angle if x > _0 else -angle
+    return signed
+
+
+@njit(cache=True, error_model="numpy", fastmath=_FASTMATH)
+def chord_shares(
+    geometry: NDArray[np.float32],
+    n: int,
+    x_centre: float,
+    y_centre: float,
+    radius: float,
+    blur_along: float,
+    width: float,
+    fields: NDArray[np.float32],
+) -> None:
+    """W of pixels that are blurred along the steep axis and `width` pixels wide across it.
+
+    Across, the pixel's width is integrated in the chords' angle theta (a chord at distance
+    R sin(theta) from the centre has the half length R cos(theta)), in which also the disc's tips
+    are smooth. What the optics blur across is left to `blur_across`, or
+    to a width of the same variance.
+    """
+    x0, y0, r0 = _F(x_centre), _F(y_centre), _F(radius)
+    per_r0 = _1 / r0
+    variance = _F(blur_along * blur_along + PIXEL_VARIANCE)
+    per_sigma = _1 / math.sqrt(variance)
+    optics = _F(blur_along * blur_along) / variance
+    pixels = _F(width)
+    for i in range(n):
+        x = geometry[CHORD_X * CAPACITY + i] - x0
+        y = geometry[CHORD_Y * CAPACITY + i] - y0
+        along_x = geometry[ALONG_X * CAPACITY + i]
+        along_y = geometry[ALONG_Y * CAPACITY + i]
+        across_x = geometry[ACROSS_X * CAPACITY + i]
+        across_y = geometry[ACROSS_Y * CAPACITY + i]
+        per_length = geometry[PER_LENGTH * CAPACITY + i]
+        across = x * across_x + y * across_y
+        along = x * along_x + y * along_y
+        step = geometry[PER_STEP_ACROSS * CAPACITY + i]
+        slant = geometry[PER_STEP_ALONG * CAPACITY + i] / step
+        step *= pixels
+        first = _arcsine((across - _HALF * step) * per_r0)
+        last = _arcsine((across + _HALF * step) * per_r0)
+        middle = _HALF * (first + last)
+        aside = _NODE * (last - first)
+        # Of each node: half of the interval's length, over the pixel's width.
+        weight = _HALF * (last - first) * r0 / step
+        growth = geometry[GROWTH * CAPACITY + i]
+        w = _0
+        d_blur = _0
+        d_along = _0
+        d_across = _0
+        d_radius = _0
+        for node in range(2):
+            theta = middle + aside if node == 1 else middle - aside
+            square = theta * theta
+            sine = theta * (_1 + square * (_S3 + square * (_S5 + square * (_S7 + square * _S9))))
+            cosine = _1 + square * (
+                _C2 + square * (_C4 + square * (_C6 + square * (_C8 + square * _C10)))
+            )
+            half = r0 * cosine * per_length
+            centre = (r0 * sine - across) * slant - along
+            for end in range(2):
+                d = centre + half if end == 1 else centre - half
+                bend = min(max(growth * d, -_MOST_BEND), _MOST_BEND)
+                z = d * (_1 - _HALF * bend) * per_sigma
+                density, below = normal(z)
+                sign = _1 if end == 1 else -_1
+                w += sign * cosine * below
+                d_blur -= sign * cosine * density * z
+                # The end of the chord at distance rho moves by -rho / sqrt(R^2 - rho^2) = -tan.
+                per_d = density * (_1 - bend)
+                d_along += sign * cosine * per_d
+                d_across += sine * per_d
+                d_radius += per_d
+        per_d = weight * per_sigma
+        d_across *= per_d * per_length
+        d_along *= per_d
+        fields[SHARE * CAPACITY + i] = weight * w
+        fields[BY_BLUR * CAPACITY + i] = weight * d_blur * optics
+        fields[BY_RADIUS * CAPACITY + i] = per_d * per_length * d_radius
+        fields[BY_X * CAPACITY + i] = d_along * along_x + d_across * across_x
+        fields[BY_Y * CAPACITY + i] = d_along * along_y + d_across * across_y
+
+
+#: A sampled Gaussian is narrower than the continuous one where it is below this (pixels).
+_WELL_SAMPLED_PX = 0.8
+#: Weights of the blur reach this many deviations, and a pixel more.
+_REACH = 3.0
 
 
 @njit(cache=True, error_model="numpy")
-def chord_pixel(
-    x: float,
-    y: float,
-    x1: float,
-    y1: float,
-    x2: float,
-    y2: float,
-    growth: float,
-    radius: float,
-    blur_1: float,
-    blur_2: float,
-    sigma_1: float,
-    sigma_2: float,
-    nodes: NDArray[np.float64],
-    weights: NDArray[np.float64],
-) -> tuple[float, float, float, float, float]:
-    """W by chords along the steep image axis.
+def blur_weights(blur: float, weights: NDArray[np.float32]) -> int:
+    """Gaussian weights 0 ... k of a blur on a grid of pixels, and k, its reach (see `weights`).
 
-    (x1, y1) is the floor's step along the steep axis, (x2, y2) along the other, and so are the
-    blurs; `growth` the relative growth of the steep step from one pixel to the next; `nodes` and
-    `weights` are those of the Gauss-Hermite quadrature for a standard normal distribution.
+    Their sum (both sides) is 1 and their variance blur^2, exactly so also where the blur is well
+    below a pixel: there the sampled Gaussian is one of a different width, found by Newton's method.
     """
-    total = 0.0
-    d_x = 0.0
-    d_y = 0.0
-    d_radius = 0.0
-    d_blur = 0.0
-    a = x1 * x1 + y1 * y1
-    flattest = _FLATTEST * math.sqrt(a)
-    for k in range(len(nodes)):
-        aside = sigma_2 * nodes[k]
-        qx = x + x2 * aside
-        qy = y + y2 * aside
-        b = qx * x1 + qy * y1
-        c = qx * qx + qy * qy - radius * radius
-        discriminant = b * b - a * c
-        if discriminant <= 0.0:
-            continue
-        root = math.sqrt(discriminant)
-        for end in range(2):
-            sign = 1.0 if end == 1 else -1.0
-            d = (-b + sign * root) / a
-            # The step grows along the way: the pixel distance that covers d of today's steps.
-            bend = min(max(1.0 - growth * d, 0.3), 3.0)
-            delta = d * (1.0 - 0.5 * growth * d) if abs(growth * d) < 0.7 else d
-            s = delta / sigma_1
-            total += sign * weights[k] * 0.5 * math.erfc(-s * _ROOT_HALF)
-            density = sign * weights[k] * math.exp(-0.5 * s * s) / (_ROOT_2PI * sigma_1)
-            nx = (qx + x1 * d) / radius
-            ny = (qy + y1 * d) / radius
-            slope = nx * x1 + ny * y1
-            if abs(slope) < flattest:
-                slope = flattest if slope >= 0.0 else -flattest
-            per_d = density * bend
-            d_x += per_d * nx / slope
-            d_y += per_d * ny / slope
-            d_radius += per_d / slope
-            along = density * s * blur_1 * blur_1 / sigma_1
-            across = per_d * nodes[k] * (nx * x2 + ny * y2) / slope
-            d_blur -= along + across * blur_2 * blur_2 / sigma_2
-    return total, d_x, d_y, d_radius, d_blur
+    variance = blur * blur
+    if blur < _WELL_SAMPLED_PX:
+        # With q = exp(-1 / (2 s^2)) the weight n is q^(n^2).
+        q = min(0.5 * variance, 0.25)
+        for _ in range(6):
+            q4 = q * q * q * q
+            q9 = q4 * q4 * q
+            value = 2.0 * (q + 4.0 * q4 + 9.0 * q9) - variance * (1.0 + 2.0 * (q + q4 + q9))
+            slope = 2.0 + 32.0 * q4 / q + 162.0 * q9 / q
+            slope -= variance * (2.0 + 8.0 * q4 / q + 18.0 * q9 / q)
+            q -= value / slope
+    else:
+        q = math.exp(-0.5 / variance)
+    reach = min(int(_REACH * blur) + 1, len(weights) - 1)
+    total = 1.0
+    weight = 1.0
+    ratio = q
+    weights[0] = 1.0
+    for k in range(1, reach + 1):
+        # q^(k^2) = q^((k - 1)^2) q^(2 k - 1)
+        weight *= ratio
+        ratio *= q * q
+        weights[k] = weight
+        total += 2.0 * weight
+    for k in range(reach + 1):
+        weights[k] /= total
+    return reach
+
+
+@njit(cache=True, error_model="numpy", fastmath=_FASTMATH)
+def _sum_of_three(
+    middle: NDArray[np.float32],
+    left: NDArray[np.float32],
+    right: NDArray[np.float32],
+    weight: float,
+    weight_aside: float,
+    result: NDArray[np.float32],
+) -> None:
+    for i in range(len(result)):
+        result[i] = weight * middle[i] + weight_aside * (left[i] + right[i])
+
+
+@njit(cache=True, error_model="numpy", fastmath=_FASTMATH)
+def _add_four(
+    left: NDArray[np.float32],
+    right: NDArray[np.float32],
+    next_left: NDArray[np.float32],
+    next_right: NDArray[np.float32],
+    weight: float,
+    next_weight: float,
+    result: NDArray[np.float32],
+) -> None:
+    for i in range(len(result)):
+        result[i] += weight * (left[i] + right[i]) + next_weight * (next_left[i] + next_right[i])
+
+
+@njit(cache=True, error_model="numpy", fastmath=_FASTMATH)
+def _add_second_difference(
+    values: NDArray[np.float32], scale: float, result: NDArray[np.float32]
+) -> None:
+    for i in range(len(result)):
+        result[i] += scale * (values[i] - _2 * values[i + 1] + values[i + 2])
+
+
+@njit(cache=True, error_model="numpy", fastmath=_FASTMATH)
+def blur_across(
+    shares: NDArray[np.float32],
+    n: int,
+    margin: int,
+    blur: float,
+    weights: NDArray[np.float32],
+    fields: NDArray[np.float32],
+) -> None:
+    """Blur `chord_shares` across the steep axis.
+
+    Parameters
+    ----------
+    shares : (5 * CAPACITY,) float32
+        The shares of n pixels, line after line. Each line has a margin at both of its ends that
+        is longer than the blur reaches: blurred across the lines' ends, it gets wrong values.
+    n, margin : int
+        Pixels altogether, and of a margin.
+    blur : float
+        Standard deviation, pixels.
+    weights : (K,) float32
+        Working space; K - 1 is the longest reach.
+    fields : (5 * CAPACITY,) float32
+        Result, in the same layout.
+    """
+    reach = min(blur_weights(blur, weights), margin - 2)
+    # One pixel more on either side, for the second derivative.
+    begin = margin - 1
+    length = n - 2 * begin
+    for field in range(FIELDS):
+        at = field * CAPACITY + begin
+        result = fields[at : at + length]
+        _sum_of_three(
+            shares[at:], shares[at - 1 :], shares[at + 1 :], weights[0], weights[1], result
+        )
+        for k in range(2, reach + 1, 2):
+            next_weight = weights[k + 1] if k < reach else _0
+            _add_four(
+                shares[at - k :], shares[at + k :], shares[at - k - 1 :], shares[at + k + 1 :],
+                weights[k], next_weight, result,
+            )  # fmt: skip
+        fields[field * CAPACITY : at] = _0
+        fields[at + length : field * CAPACITY + n] = _0
+    # d/dlog(blur) of a Gaussian blur of variance t is t times the second derivative.
+    _add_second_difference(
+        fields[begin : begin + length],
+        _F(blur * blur),
+        fields[BY_BLUR * CAPACITY + margin : BY_BLUR * CAPACITY + n - margin],
+    )

@@ -3,84 +3,237 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from detect.disc_patch_kernels import FX, FY, XU, XV, YU, YV
-
-#: Columns of what the fit keeps of each pixel: the model's share of the contrast, the model's
-#: derivative by the radius, and the residual.
-SHARE, PER_RADIUS, ERROR = range(3)
-EDGE_COLUMNS = 3
+from detect.disc_model_kernels import (
+    ACROSS_X,
+    ACROSS_Y,
+    ALONG_X,
+    ALONG_Y,
+    BY_BLUR,
+    BY_RADIUS,
+    BY_X,
+    BY_Y,
+    CAPACITY,
+    EDGE_XU,
+    EDGE_XV,
+    EDGE_YU,
+    EDGE_YV,
+    PER_LENGTH,
+    PER_STEP_ACROSS,
+    PER_STEP_ALONG,
+    SHARE,
+)
+from detect.disc_patch_kernels import (
+    GREY,
+    LINKED,
+    NEAR,
+    ONE,
+    PLANE_X,
+    PLANE_Y,
+    SADDLE,
+    SADDLE_XY,
+)
 
 _SECTORS = 16
+# Numba knows it as the type, the type checker as a function.
+_F: Callable[[Any], Any] = np.float32
+_FASTMATH = {"reassoc", "contract", "arcp", "nsz"}
+# Where the sectors of a quadrant meet.
+_TAN_1 = math.tan(math.pi / 8.0)
+_TAN_3 = math.tan(3.0 * math.pi / 8.0)
 
 
-@njit(cache=True, error_model="numpy")
-def correlated_area(edge: NDArray[np.float64], n: int) -> float:
+@njit(cache=True, error_model="numpy", fastmath=_FASTMATH)
+def residuals(
+    terms: NDArray[np.float32],
+    fields: NDArray[np.float32],
+    n: int,
+    values: NDArray[np.float64],
+    bare: NDArray[np.float64],
+    errors: NDArray[np.float32],
+) -> tuple[float, float, float]:
+    """Residuals of a fit, into `errors`.
+
+    Parameters
+    ----------
+    values : (10,) float64
+        The unknowns of `detect.disc_normal_kernels`.
+    bare : (5,) float64
+        The terms of the background where there is no disc.
+
+    Returns
+    -------
+    residual, near_residual, near_total : float
+        Sums of squares: of the residuals, of those near the disc, and of what a background alone
+        leaves there.
+    """
+    b0, b1, b2, b3, b4 = _F(values[0]), _F(values[1]), _F(values[2]), _F(values[3]), _F(values[4])
+    a0, a1, a2, a3, a4 = _F(bare[0]), _F(bare[1]), _F(bare[2]), _F(bare[3]), _F(bare[4])
+    c, d_blur, d_radius = _F(values[5]), _F(values[6]), _F(values[7])
+    d_x, d_y = _F(values[8]), _F(values[9])
+    total = _F(0.0)
+    near = _F(0.0)
+    near_total = _F(0.0)
+    for i in range(n):
+        one = terms[ONE * CAPACITY + i]
+        x = terms[PLANE_X * CAPACITY + i]
+        y = terms[PLANE_Y * CAPACITY + i]
+        saddle = terms[SADDLE * CAPACITY + i]
+        xy = terms[SADDLE_XY * CAPACITY + i]
+        grey = terms[GREY * CAPACITY + i]
+        disc = (
+            c * fields[SHARE * CAPACITY + i]
+            + d_blur * fields[BY_BLUR * CAPACITY + i]
+            + d_radius * fields[BY_RADIUS * CAPACITY + i]
+            + d_x * fields[BY_X * CAPACITY + i]
+            + d_y * fields[BY_Y * CAPACITY + i]
+        )
+        error = grey - disc - (b0 * one + b1 * x + b2 * y + b3 * saddle + b4 * xy)
+        without = grey - (a0 * one + a1 * x + a2 * y + a3 * saddle + a4 * xy)
+        weight = terms[NEAR * CAPACITY + i]
+        errors[i] = error
+        total += error * error
+        near += weight * error * error
+        near_total += weight * without * without
+    return total, near, near_total
+
+
+@njit(cache=True, error_model="numpy", fastmath=_FASTMATH)
+def correlated_area(terms: NDArray[np.float32], errors: NDArray[np.float32], n: int) -> float:
     """How many pixels go with one independent residual, from the correlation of neighbours.
 
     White noise gives 1. Where the model does not fit (texture, reflections, a disc that is none)
     the residuals hang together, and their number overstates what they tell: for a first-order
     process of correlation c by (1 + c) / (1 - c) in either direction.
     """
-    product = 0.0
-    square = 0.0
-    for i in range(n - 1):
-        # Pixels were gathered row by row: the next one is nearly always the right neighbour.
-        product += edge[i, ERROR] * edge[i + 1, ERROR]
-        square += edge[i, ERROR] * edge[i, ERROR]
+    product = _F(0.0)
+    square = _F(0.0)
+    pairs = _F(0.0)
+    for i in range(1, n):
+        linked = terms[LINKED * CAPACITY + i]
+        here = errors[i]
+        before = errors[i - 1]
+        product += linked * here * before
+        square += linked * (here * here + before * before)
+        pairs += linked
     if not square > 0.0:
         return 1.0
     # By chance alone the correlation of n residuals scatters by 1 / sqrt(n).
-    correlation = min(max(product / square - 1.5 / math.sqrt(n), 0.0), 0.8)
-    return ((1.0 + correlation) / (1.0 - correlation)) ** 2
+    correlation = min(max(2.0 * product / square - 1.5 / math.sqrt(pairs), 0.0), 0.8)
+    area: float = ((1.0 + correlation) / (1.0 - correlation)) ** 2
+    return area
+
+
+@njit(cache=True, error_model="numpy", fastmath=_FASTMATH)
+def blur_widths(
+    geometry: NDArray[np.float32],
+    terms: NDArray[np.float32],
+    fields: NDArray[np.float32],
+    is_list: bool,
+    n: int,
+    x0: float,
+    y0: float,
+    sigma_1: float,
+    sigma_2: float,
+    widths: NDArray[np.float32],
+) -> float:
+    """Mean width of the blur across the edge, in nominal radii.
+
+    `sigma_1` and `sigma_2` are the blur's deviations in pixels, along u and v for a list, along the
+    lines and across them for a grid. `widths` is working space.
+    """
+    cx, cy = _F(x0), _F(y0)
+    s1, s2 = _F(sigma_1 * sigma_1), _F(sigma_2 * sigma_2)
+    if is_list:
+        for i in range(n):
+            x = terms[PLANE_X * CAPACITY + i] - cx
+            y = terms[PLANE_Y * CAPACITY + i] - cy
+            gu = geometry[EDGE_XU * CAPACITY + i] * x + geometry[EDGE_YU * CAPACITY + i] * y
+            gv = geometry[EDGE_XV * CAPACITY + i] * x + geometry[EDGE_YV * CAPACITY + i] * y
+            r_2 = x * x + y * y + _F(1e-12)
+            widths[i] = math.sqrt((s1 * gu * gu + s2 * gv * gv) / r_2)
+    else:
+        for i in range(n):
+            x = terms[PLANE_X * CAPACITY + i] - cx
+            y = terms[PLANE_Y * CAPACITY + i] - cy
+            per_length = geometry[PER_LENGTH * CAPACITY + i]
+            steep_x = geometry[ALONG_X * CAPACITY + i] / (per_length * per_length)
+            steep_y = geometry[ALONG_Y * CAPACITY + i] / (per_length * per_length)
+            across = geometry[PER_STEP_ACROSS * CAPACITY + i]
+            along = -geometry[PER_STEP_ALONG * CAPACITY + i]
+            other_x = across * geometry[ACROSS_X * CAPACITY + i] + along * steep_x
+            other_y = across * geometry[ACROSS_Y * CAPACITY + i] + along * steep_y
+            g1 = other_x * x + other_y * y
+            g2 = steep_x * x + steep_y * y
+            r_2 = x * x + y * y + _F(1e-12)
+            widths[i] = math.sqrt((s1 * g1 * g1 + s2 * g2 * g2) / r_2)
+    blurs = _F(0.0)
+    weights = _F(0.0)
+    most = _F(2.5)
+    for i in range(n):
+        weight = abs(fields[BY_RADIUS * CAPACITY + i])
+        blurs += weight * min(widths[i], most)
+        weights += weight
+    width: float = blurs / max(weights, _F(1e-12))
+    return width
 
 
 @njit(cache=True, error_model="numpy")
 def outline_statistics(
-    pixels: NDArray[np.float64],
-    edge: NDArray[np.float64],
+    terms: NDArray[np.float32],
+    fields: NDArray[np.float32],
+    errors: NDArray[np.float32],
     n: int,
-    p: NDArray[np.float64],
-    sigma_u: float,
-    sigma_v: float,
-) -> tuple[float, float, float, float]:
+    x0: float,
+    y0: float,
+    radius: float,
+    contrast: float,
+) -> tuple[float, float, float]:
     """How evenly the edge goes round: in each sector its step and how far it is from the circle.
 
     The step is the regression of the grey values on the model's, relative to the whole disc's; the
     distance is the Gauss-Newton step of the radius from that sector's residuals alone.
+
+    Returns
+    -------
+    step, good, deviation : float
+        Mean relative step, share of sectors whose step has the sign and 0.4 of the size of the
+        disc's, and root mean square distance in radii.
     """
     sums = np.zeros((_SECTORS, 7))
+    inner = 0.09 * radius * radius
     for i in range(n):
-        x = pixels[i, FX] - p[0]
-        y = pixels[i, FY] - p[1]
-        if x * x + y * y < 0.09 * p[2] * p[2]:
+        if not terms[ONE * CAPACITY + i] > 0.0:
             continue
-        w = edge[i, SHARE]
+        x = terms[PLANE_X * CAPACITY + i] - x0
+        y = terms[PLANE_Y * CAPACITY + i] - y0
+        if x * x + y * y < inner:
+            continue
+        w = fields[SHARE * CAPACITY + i]
+        error = errors[i]
+        by_radius = contrast * fields[BY_RADIUS * CAPACITY + i]
         # What is left of the grey value when the background is taken off.
-        grey = edge[i, ERROR] + p[4] * w
-        k = int((math.atan2(y, x) / (2.0 * math.pi) + 1.0) * _SECTORS) % _SECTORS
+        grey = error + contrast * w
+        ax = abs(x)
+        ay = abs(y)
+        k = (1 if ay > _TAN_1 * ax else 0) + (1 if ay > ax else 0) + (1 if ay > _TAN_3 * ax else 0)
+        if x < 0.0:
+            k = 7 - k
+        if y < 0.0:
+            k = 15 - k
         sums[k, 0] += 1.0
         sums[k, 1] += w
         sums[k, 2] += w * w
         sums[k, 3] += grey
         sums[k, 4] += w * grey
-        sums[k, 5] += edge[i, PER_RADIUS] * edge[i, ERROR]
-        sums[k, 6] += edge[i, PER_RADIUS] * edge[i, PER_RADIUS]
-    blurs = 0.0
-    weights = 0.0
-    for i in range(n):
-        x = pixels[i, FX] - p[0]
-        y = pixels[i, FY] - p[1]
-        r = math.sqrt(x * x + y * y) + 1e-12
-        gu = (pixels[i, XU] * x + pixels[i, YU] * y) / r
-        gv = (pixels[i, XV] * x + pixels[i, YV] * y) / r
-        weight = abs(edge[i, PER_RADIUS])
-        blurs += weight * min(math.hypot(sigma_u * gu, sigma_v * gv) / p[2], 2.5)
-        weights += weight
+        sums[k, 5] += by_radius * error
+        sums[k, 6] += by_radius * by_radius
     seen = 0
     steps = 0.0
     good = 0
@@ -95,14 +248,13 @@ def outline_statistics(
         if spread < 0.15:
             continue
         seen += 1
-        relative = (sums[k, 4] - sums[k, 1] * sums[k, 3] / sums[k, 0]) / spread / p[4]
+        relative = (sums[k, 4] - sums[k, 1] * sums[k, 3] / sums[k, 0]) / spread / contrast
         steps += min(max(relative, -1.0), 1.0)
         if relative > 0.4:
             good += 1
         # Sectors with little edge in them say little about its place.
         offset = sums[k, 5] / (sums[k, 6] + 0.1 * strongest)
         deviation += min(offset * offset, 0.25)
-    relative_blur = blurs / max(weights, 1e-12)
     if seen == 0:
-        return 0.0, 0.0, 0.0, relative_blur
-    return steps / seen, good / seen, math.sqrt(deviation / seen), relative_blur
+        return 0.0, 0.0, 0.0
+    return steps / seen, good / seen, math.sqrt(deviation / seen)

@@ -73,7 +73,7 @@ class CircleSettings:
     evidence: float = 1.1
     blur_px: float = 1.0
     refine: bool = True
-    systematic_px: float = 0.003
+    systematic_px: float = 0.002
     tilt_sigma_deg: float = 0.0
 
     def __post_init__(self) -> None:

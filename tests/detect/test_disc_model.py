@@ -3,224 +3,279 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from scipy.stats import norm
+from scipy.special import chndtr, ndtr
 
-from detect.disc_model_kernels import chord_pixel, profile_pixel
-from detect.disc_profile import T_LIMIT, Z_LIMIT, disc_profile
+from detect import disc_model_kernels as kernels
+from detect.disc_profile import BEND, T_LIMIT, Z_LIMIT
 
 FloatArray = NDArray[np.float64]
 
-NODES, _WEIGHTS = np.polynomial.hermite_e.hermegauss(31)
-WEIGHTS = _WEIGHTS / _WEIGHTS.sum()
-
 #: A pixel's own blur, per axis: that of a box one pixel wide.
 PIXEL_SIGMA = math.sqrt(1.0 / 12.0)
-
-STEP = 1e-6
-
-
-def share_of_a_round_blur(distance: float, sigma: float) -> float:
-    """Share of a unit disc under a round Gaussian, integrated chord by chord."""
-    count = 20_000
-    angle = ((np.arange(count) + 0.5) / count - 0.5) * np.pi
-    x, half = np.sin(angle), np.cos(angle)
-    chords = norm.pdf((x - distance) / sigma) / sigma * (2.0 * norm.cdf(half / sigma) - 1.0)
-    return float(np.sum(chords * half) * np.pi / count)
+CAPACITY = kernels.CAPACITY
 
 
-def central_difference(function: Callable[[float], float], at: float = 0.0) -> float:
-    return (function(at + STEP) - function(at - STEP)) / (2.0 * STEP)
+def share_of_a_round_blur(distance: FloatArray, sigma: FloatArray) -> FloatArray:
+    """Share of a unit disc under a round Gaussian: a noncentral chi-square distribution."""
+    return np.asarray(chndtr(1.0 / sigma**2, 2, (distance / sigma) ** 2))
 
 
-# -- the tabulated profile ------------------------------------------------------------------
+def share_of_an_ellipse(
+    half_u: float, half_v: float, blur_u: float, blur_v: float, u: FloatArray, v: FloatArray
+) -> FloatArray:
+    """What pixels at (u, v) from its centre see of an ellipse blurred by Gaussian and pixel."""
+    step = 1.0 / 32.0
+    fine = np.arange(-half_u - step, half_u + step, step) + 0.5 * step
+    half = half_v * np.sqrt(np.maximum(1.0 - (fine / half_u) ** 2, 0.0))
+    share = np.zeros(u.shape)
+    box = (np.arange(16) + 0.5) / 16.0 - 0.5
+    for place in np.ndindex(u.shape):
+        weight = ndtr((fine - u[place] + 0.5) / blur_u) - ndtr((fine - u[place] - 0.5) / blur_u)
+        rows = v[place] + box[:, None]
+        chords = ndtr((half - rows) / blur_v) - ndtr((-half - rows) / blur_v)
+        share[place] = step * float(np.sum(weight * chords.mean(axis=0)))
+    return share
 
 
-@pytest.mark.parametrize("sigma", [0.0625, 0.25, 0.5, 1.0, 2.5])
-@pytest.mark.parametrize("z", [-5.0, -2.0, -1.0, -0.3, 0.0, 0.3, 1.0, 2.5, 5.5])
-def test_profile_is_the_blurred_disc(sigma: float, z: float) -> None:
-    table = disc_profile()
-    row = sigma / T_LIMIT * (table.shape[0] - 1)
-    column = (z + Z_LIMIT) / (2.0 * Z_LIMIT) * (table.shape[1] - 1)
-    assert row == pytest.approx(round(row))
-    assert column == pytest.approx(round(column))
-    expected = share_of_a_round_blur(abs(1.0 + z * sigma), sigma)
-    assert table[round(row), round(column)] == pytest.approx(expected, abs=1e-8)
+# -- the normal distribution and the arc sine -------------------------------------------------
 
 
-def test_profile_of_hardly_any_blur_is_a_straight_edge() -> None:
-    table = disc_profile()
-    z = np.linspace(-Z_LIMIT, Z_LIMIT, table.shape[1])
-    np.testing.assert_allclose(table[0], norm.cdf(-z), atol=1e-12)
-    assert not table.flags.writeable
-    assert table.min() >= 0.0
-    assert table.max() <= 1.0
+def test_single_precision_functions_are_near_enough() -> None:
+    for x in np.linspace(-7.0, 7.0, 301):
+        density, below = kernels.normal(float(x))
+        assert density == pytest.approx(math.exp(-0.5 * x * x) / math.sqrt(2 * math.pi), abs=2e-6)
+        assert below == pytest.approx(float(ndtr(x)), abs=2e-6)
+    for x in np.linspace(-1.5, 1.5, 301):
+        cut = min(max(x, -1.0), 1.0)
+        assert kernels._arcsine(float(x)) == pytest.approx(math.asin(cut), abs=5e-4)
 
 
-def round_pixel(x: float, y: float, radius: float, blur: float, step: float = 0.1) -> FloatArray:
-    """`profile_pixel` where both the floor's steps and the blur are the same in all directions."""
-    sigma = math.hypot(blur, PIXEL_SIGMA)
-    return np.array(
-        profile_pixel(
-            x, y, step, 0.0, 0.0, step, radius, blur, blur, sigma, sigma,
-            disc_profile(), Z_LIMIT, T_LIMIT,
-        )
-    )  # fmt: skip
+# -- the edge's profile -------------------------------------------------------------------------
 
 
-@settings(max_examples=60, deadline=None)
-@given(
-    x=st.floats(-1.6, 1.6),
-    y=st.floats(-1.6, 1.6),
-    radius=st.floats(0.8, 1.25),
-    blur=st.floats(0.2, 3.0),
-    step=st.floats(0.02, 0.4),
-)
-def test_round_blur_is_exact(x: float, y: float, radius: float, blur: float, step: float) -> None:
-    """But for what linear interpolation of the table leaves: most at the centre."""
-    sigma = step * math.hypot(blur, PIXEL_SIGMA)
-    distance = math.hypot(x, y)
-    expected = share_of_a_round_blur(distance / radius, sigma / radius)
-    tolerance = 2e-3 if distance > 0.5 * radius else 6e-3
-    assert round_pixel(x, y, radius, blur, step)[0] == pytest.approx(expected, abs=tolerance)
+def test_profile_is_the_blurred_disc() -> None:
+    """The polynomial from its coefficients, against the distribution, all over its reach."""
+    z, t = np.meshgrid(np.linspace(-Z_LIMIT, Z_LIMIT, 161), np.linspace(0.01, T_LIMIT, 40))
+    inside = z * t >= -1.0
+    z, t = z[inside], t[inside]
+    q = sum(c * z**i * t**j for i, row in enumerate(BEND) for j, c in enumerate(row))
+    share = ndtr(-(z + t * (0.5 + t * q)))
+    np.testing.assert_allclose(share, share_of_a_round_blur(1.0 + z * t, t), atol=1.1e-3)
 
 
-def round_cell(x: float, y: float, radius: float, blur: float, step: float) -> tuple[float, float]:
-    """Where a pixel falls between the table's nodes, in columns and rows."""
-    sigma = step * math.hypot(blur, PIXEL_SIGMA)
-    rows, columns = disc_profile().shape
-    z = (math.hypot(x, y) - radius) / sigma
-    column = (z + Z_LIMIT) / (2.0 * Z_LIMIT) * (columns - 1)
-    return column, sigma / radius / T_LIMIT * (rows - 1)
+def edge_values(
+    x: FloatArray,
+    y: FloatArray,
+    steps: tuple[float, float, float, float],
+    radius: float,
+    blur_u: float,
+    blur_v: float,
+    centre: tuple[float, float] = (0.0, 0.0),
+) -> FloatArray:
+    """(5, N) results for pixels that see (x, y); the floor's steps are xu, yu, xv, yv."""
+    n = x.size
+    assert n <= CAPACITY
+    geometry = np.zeros(kernels.GEOMETRY * CAPACITY, np.float32)
+    for row, values in enumerate([x, y, *(np.full(n, step) for step in steps)]):
+        geometry[row * CAPACITY : row * CAPACITY + n] = values
+    fields = np.zeros(kernels.FIELDS * CAPACITY, np.float32)
+    kernels.edge_shares(geometry, n, *centre, radius, blur_u, blur_v, fields)
+    return np.asarray(fields.reshape(kernels.FIELDS, CAPACITY)[:, :n], np.float64)
 
 
-@settings(max_examples=200, deadline=None)
-@given(
-    x=st.floats(-1.5, 1.5),
-    y=st.floats(-1.5, 1.5),
-    radius=st.floats(0.8, 1.25),
-    blur=st.floats(0.2, 2.0),
-    step=st.floats(0.02, 0.5),
-)
-def test_profile_derivatives_are_those_of_its_values(
-    x: float, y: float, radius: float, blur: float, step: float
-) -> None:
-    """The interpolated table has kinks at its nodes: pixels right on them are passed over."""
-    assume(math.hypot(x, y) > 0.05)
-    assume(all(0.002 < part % 1.0 < 0.998 for part in round_cell(x, y, radius, blur, step)))
-    value = round_pixel(x, y, radius, blur, step)
-    numeric = [
-        -central_difference(lambda d: float(round_pixel(x + d, y, radius, blur, step)[0])),
-        -central_difference(lambda d: float(round_pixel(x, y + d, radius, blur, step)[0])),
-        central_difference(lambda d: float(round_pixel(x, y, radius + d, blur, step)[0])),
-        central_difference(lambda d: float(round_pixel(x, y, radius, blur * math.exp(d), step)[0])),
-    ]
-    np.testing.assert_allclose(value[1:], numeric, rtol=1e-5, atol=1e-6)
+def disc_of_pixels(reach: float, step: float) -> tuple[FloatArray, FloatArray]:
+    grid = np.arange(-reach, reach, step) + 0.13 * step
+    x, y = np.meshgrid(grid, grid)
+    return x.ravel(), y.ravel()
+
+
+@pytest.mark.parametrize("blur", [0.3, 0.8, 2.0])
+@pytest.mark.parametrize("step", [0.04, 0.1, 0.15])
+def test_round_blur_is_exact(blur: float, step: float) -> None:
+    x, y = disc_of_pixels(1.8, 0.07)
+    sigma = np.full(x.shape, step * math.hypot(blur, PIXEL_SIGMA))
+    if sigma[0] > T_LIMIT:
+        pytest.skip("too blurred for this model")
+    share = edge_values(x, y, (step, 0.0, 0.0, step), 1.0, blur, blur)[kernels.SHARE]
+    np.testing.assert_allclose(share, share_of_a_round_blur(np.hypot(x, y), sigma), atol=3e-3)
+
+
+@pytest.mark.parametrize(("half_u", "half_v"), [(17.0, 5.0), (21.0, 8.0), (26.0, 12.0)])
+@pytest.mark.parametrize("blur", [0.7, 1.0])
+def test_uneven_scales_and_blur(half_u: float, half_v: float, blur: float) -> None:
+    """An ellipse whose curvature changes all the way round, under half the blur along v."""
+    v, u = (part + 0.3 for part in np.mgrid[-15:16, 0:30].astype(float))
+    share = edge_values(
+        u.ravel() / half_u, v.ravel() / half_v, (1 / half_u, 0.0, 0.0, 1 / half_v), 1.0, blur,
+        blur / 2,
+    )[kernels.SHARE]  # fmt: skip
+    expected = share_of_an_ellipse(half_u, half_v, blur, blur / 2, u, v)
+    np.testing.assert_allclose(share, expected.ravel(), atol=0.01)
+
+
+def derivatives_agree(analytic: FloatArray, numeric: FloatArray, within: float) -> None:
+    assert np.abs(analytic - numeric).max() < within * np.abs(numeric).max()
+
+
+STEPS = [(0.05, 0.0, 0.0, 0.1), (0.05, 0.01, -0.02, 0.09), (-0.03, 0.06, 0.07, 0.02)]
+
+
+@pytest.mark.parametrize("steps", STEPS)
+def test_edge_derivatives_are_those_of_its_values(steps: tuple[float, float, float, float]) -> None:
+    """By x, y, radius and blur; the curvature is held to change slowly, which costs per cents."""
+    x, y = disc_of_pixels(1.4, 0.07)
+    base = edge_values(x, y, steps, 1.0, 0.8, 0.5)
+
+    def share(
+        radius: float = 1.0, grow: float = 1.0, centre: tuple[float, float] = (0.0, 0.0)
+    ) -> FloatArray:
+        values = edge_values(x, y, steps, radius, 0.8 * grow, 0.5 * grow, centre)
+        return np.asarray(values[kernels.SHARE])
+
+    d = 4e-3
+    by_x = (share(centre=(d, 0.0)) - share(centre=(-d, 0.0))) / (2 * d)
+    by_y = (share(centre=(0.0, d)) - share(centre=(0.0, -d))) / (2 * d)
+    by_radius = (share(1.0 + d) - share(1.0 - d)) / (2 * d)
+    by_blur = (share(grow=math.exp(d)) - share(grow=math.exp(-d))) / (2 * d)
+    derivatives_agree(base[kernels.BY_X], by_x, 0.06)
+    derivatives_agree(base[kernels.BY_Y], by_y, 0.06)
+    derivatives_agree(base[kernels.BY_RADIUS], by_radius, 0.06)
+    derivatives_agree(base[kernels.BY_BLUR], by_blur, 0.06)
 
 
 def test_far_from_the_edge_nothing_changes() -> None:
-    inside = round_pixel(0.1, 0.0, 1.0, 0.5, 0.02)
-    outside = round_pixel(3.0, 0.0, 1.0, 0.5, 0.02)
-    np.testing.assert_allclose(inside, [1.0, 0.0, 0.0, 0.0, 0.0], atol=1e-8)
-    np.testing.assert_allclose(outside, np.zeros(5), atol=1e-8)
+    values = edge_values(
+        np.array([0.1, 3.0]), np.array([0.0, 0.0]), (0.02, 0.0, 0.0, 0.02), 1.0, 0.5, 0.5
+    )
+    np.testing.assert_allclose(values[:, 0], [1.0, 0.0, 0.0, 0.0, 0.0], atol=1e-4)
+    np.testing.assert_allclose(values[:, 1], np.zeros(5), atol=1e-4)
 
 
 def test_at_the_very_centre_it_is_finite() -> None:
-    value = round_pixel(0.0, 0.0, 1.0, 1.0, 0.5)
-    expected = share_of_a_round_blur(0.0, 0.5 * math.hypot(1.0, PIXEL_SIGMA))
-    assert np.all(np.isfinite(value))
-    assert value[0] == pytest.approx(expected, abs=6e-3)
+    values = edge_values(np.zeros(1), np.zeros(1), (0.1, 0.0, 0.0, 0.1), 1.0, 1.0, 1.0)
+    assert np.all(np.isfinite(values))
+    assert values[kernels.SHARE, 0] == pytest.approx(1.0, abs=1e-3)
 
 
-@pytest.mark.parametrize("angle_deg", [0.0, 35.0, 90.0, 140.0])
-def test_uneven_blur_counts_across_the_edge(angle_deg: float) -> None:
-    """Of a small blur a straight edge sees what lies across it: pixels a little off the edge."""
-    nx, ny = math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))
-    xu, xv, yu, yv = 0.02, 0.004, -0.003, 0.035
-    blur_u, blur_v, off = 0.6, 0.3, 0.02
-    sigma_u, sigma_v = math.hypot(blur_u, PIXEL_SIGMA), math.hypot(blur_v, PIXEL_SIGMA)
-    sigma = math.hypot(sigma_u * (xu * nx + yu * ny), sigma_v * (xv * nx + yv * ny))
-    value = profile_pixel(
-        (1.0 + off) * nx, (1.0 + off) * ny, xu, xv, yu, yv, 1.0, blur_u, blur_v, sigma_u, sigma_v,
-        disc_profile(), Z_LIMIT, T_LIMIT,
-    )  # fmt: skip
-    assert value[0] == pytest.approx(norm.cdf(-off / sigma), abs=0.012)
+# -- chords -------------------------------------------------------------------------------------
+
+MARGIN = 12
+LINES, LENGTH = 21, 61
 
 
-# -- chords ---------------------------------------------------------------------------------
-
-#: The floor's steps along the steep image axis and the other, in radii: discs seen flat.
-FLAT = [
-    ((0.02, 0.45), (0.05, -0.002)),
-    ((-0.1, 0.9), (0.08, 0.01)),
-    ((0.3, 0.6), (0.09, -0.06)),
-]
-OFFSETS = [(0.0, 0.1), (0.5, 0.3), (-0.6, -0.4), (0.3, 1.2), (-0.2, -1.6), (0.7, 0.9)]
-
-
-def chord(
-    place: tuple[float, float],
-    steps: tuple[tuple[float, float], tuple[float, float]],
+def chord_values(
+    half_u: float,
+    half_v: float,
+    blur_u: float,
+    blur_v: float,
+    centre_px: tuple[float, float] = (0.0, 0.0),
     radius: float = 1.0,
-    log_blur: float = 0.0,
-    growth: float = 0.0,
+    slant: float = 0.0,
 ) -> FloatArray:
-    blur_1, blur_2 = 0.4 * math.exp(log_blur), 0.8 * math.exp(log_blur)
-    sigma_1, sigma_2 = math.hypot(blur_1, PIXEL_SIGMA), math.hypot(blur_2, PIXEL_SIGMA)
-    return np.array(
-        chord_pixel(
-            *place, *steps[0], *steps[1], growth, radius, blur_1, blur_2, sigma_1, sigma_2,
-            NODES, WEIGHTS,
-        )
-    )  # fmt: skip
+    """(5, lines, length) results for an ellipse in the middle of a grid of pixels.
 
-
-def share_of_a_flat_disc(
-    place: tuple[float, float], steps: tuple[tuple[float, float], tuple[float, float]]
-) -> float:
-    """The Gaussian of the image, laid on the floor, summed over a fine grid."""
-    sigma_1, sigma_2 = math.hypot(0.4, PIXEL_SIGMA), math.hypot(0.8, PIXEL_SIGMA)
-    normal = np.linspace(-6.0, 6.0, 2401)
-    weight = norm.pdf(normal)
-    along, across = np.meshgrid(normal * sigma_1, normal * sigma_2)
-    x = place[0] + steps[0][0] * along + steps[1][0] * across
-    y = place[1] + steps[0][1] * along + steps[1][1] * across
-    total = np.outer(weight, weight)
-    return float(total[np.hypot(x, y) < 1.0].sum() / total.sum())
-
-
-@pytest.mark.parametrize("steps", FLAT)
-@pytest.mark.parametrize("place", OFFSETS)
-def test_chords_add_up_to_the_blurred_disc(
-    place: tuple[float, float], steps: tuple[tuple[float, float], tuple[float, float]]
-) -> None:
-    assert chord(place, steps)[0] == pytest.approx(share_of_a_flat_disc(place, steps), abs=2e-3)
-
-
-@pytest.mark.parametrize("growth", [0.0, 0.15, -0.1])
-@pytest.mark.parametrize("steps", FLAT)
-@pytest.mark.parametrize("place", OFFSETS)
-def test_chord_derivatives_are_those_of_its_values(
-    place: tuple[float, float],
-    steps: tuple[tuple[float, float], tuple[float, float]],
-    growth: float,
-) -> None:
-    x, y = place
-    value = chord(place, steps, growth=growth)
-    numeric = [
-        -central_difference(lambda d: float(chord((x + d, y), steps, growth=growth)[0])),
-        -central_difference(lambda d: float(chord((x, y + d), steps, growth=growth)[0])),
-        central_difference(lambda d: float(chord(place, steps, 1.0 + d, growth=growth)[0])),
-        central_difference(lambda d: float(chord(place, steps, log_blur=d, growth=growth)[0])),
+    `slant` is how far the floor that the pixels of a line see moves along the steep axis, in steps
+    of that axis, from one pixel to the next.
+    """
+    wide = LENGTH + 2 * MARGIN
+    line, place = np.mgrid[0:LINES, 0:wide].astype(float)
+    u = place - MARGIN - LENGTH // 2
+    v = line - LINES // 2 + slant * u
+    x1, y1, x2, y2 = 0.0, 1.0 / half_v, 1.0 / half_u, slant / half_v
+    length = math.hypot(x1, y1)
+    across_x, across_y = -y1 / length, x1 / length
+    rows = [
+        u / half_u,
+        v / half_v,
+        x1 / length**2,
+        y1 / length**2,
+        across_x,
+        across_y,
+        x2 * across_x + y2 * across_y,
+        -(x1 * x2 + y1 * y2) / length**2,
+        1.0 / length,
+        0.0,
     ]
-    np.testing.assert_allclose(value[1:], numeric, rtol=1e-4, atol=1e-6)
+    n = u.size
+    assert n <= CAPACITY
+    geometry = np.zeros(kernels.GEOMETRY * CAPACITY, np.float32)
+    for row, values in enumerate(rows):
+        geometry[row * CAPACITY : row * CAPACITY + n] = np.ravel(values)
+    shares = np.zeros(kernels.FIELDS * CAPACITY, np.float32)
+    fields = np.zeros_like(shares)
+    weights = np.zeros(64, np.float32)
+    kernels.chord_shares(
+        geometry, n, centre_px[0] / half_u, centre_px[1] / half_v, radius, blur_v, 1.0, shares
+    )
+    kernels.blur_across(shares, n, MARGIN, blur_u, weights, fields)
+    result = fields.reshape(kernels.FIELDS, CAPACITY)[:, :n].reshape(-1, LINES, wide)
+    return np.asarray(result[:, :, MARGIN:-MARGIN], np.float64)
+
+
+def grid_of_pixels() -> tuple[FloatArray, FloatArray]:
+    line, place = np.mgrid[0:LINES, 0:LENGTH].astype(float)
+    return place - LENGTH // 2, line - LINES // 2
+
+
+@pytest.mark.parametrize(
+    ("half_u", "half_v"), [(6.5, 0.7), (8.0, 1.1), (11.0, 2.0), (14.0, 3.3), (17.0, 5.0)]
+)
+@pytest.mark.parametrize(("blur", "within"), [(0.5, 0.06), (0.7, 0.035), (1.2, 0.01), (3.0, 0.003)])
+def test_chords_add_up_to_the_blurred_disc(
+    half_u: float, half_v: float, blur: float, within: float
+) -> None:
+    """The worst is at the tips; most of what is left for small blurs is the pixel's box along v."""
+    u, v = grid_of_pixels()
+    place = (0.3, 0.4)
+    expected = share_of_an_ellipse(half_u, half_v, blur, blur / 2, u - place[0], v - place[1])
+    share = chord_values(half_u, half_v, blur, blur / 2, place)[kernels.SHARE]
+    np.testing.assert_allclose(share, expected, atol=within)
+    assert np.sqrt(np.mean((share - expected) ** 2)) < 0.1 * within
+
+
+@pytest.mark.parametrize("slant", [0.0, 0.15, -0.1])
+@pytest.mark.parametrize(("half_u", "half_v"), [(6.5, 0.7), (11.0, 2.0), (14.0, 3.3)])
+def test_chord_derivatives_are_those_of_its_values(
+    half_u: float, half_v: float, slant: float
+) -> None:
+    def share(
+        grow: float = 1.0, place: tuple[float, float] = (0.2, 0.1), radius: float = 1.0
+    ) -> FloatArray:
+        values = chord_values(half_u, half_v, 0.9 * grow, 0.45 * grow, place, radius, slant)
+        return np.asarray(values[kernels.SHARE])
+
+    base = chord_values(half_u, half_v, 0.9, 0.45, (0.2, 0.1), 1.0, slant)
+    d = 0.02
+    by_x = (share(place=(0.2 + d, 0.1)) - share(place=(0.2 - d, 0.1))) / (2 * d) * half_u
+    by_y = (share(place=(0.2, 0.1 + d)) - share(place=(0.2, 0.1 - d))) / (2 * d) * half_v
+    by_radius = (share(radius=1.0 + d) - share(radius=1.0 - d)) / (2 * d)
+    by_blur = (share(grow=math.exp(d)) - share(grow=math.exp(-d))) / (2 * d)
+    derivatives_agree(base[kernels.BY_X], by_x, 0.04)
+    derivatives_agree(base[kernels.BY_Y], by_y, 0.01)
+    derivatives_agree(base[kernels.BY_RADIUS], by_radius, 0.05)
+    # By second differences instead of derivatives: at the tips these are not the same.
+    derivatives_agree(base[kernels.BY_BLUR], by_blur, 0.2)
 
 
 def test_chords_that_miss_the_disc_see_nothing() -> None:
-    np.testing.assert_array_equal(chord((3.0, 0.0), FLAT[0]), np.zeros(5))
+    values = chord_values(3.0, 1.0, 0.5, 0.25)
+    np.testing.assert_array_equal(values[:, :, 0], np.zeros((5, LINES)))
+
+
+@settings(max_examples=100, deadline=None)
+@given(blur=st.floats(0.1, 8.0))
+def test_weights_have_the_blurs_variance(blur: float) -> None:
+    weights = np.zeros(64, np.float32)
+    reach = kernels.blur_weights(blur, weights)
+    k = np.arange(-reach, reach + 1)
+    both = np.asarray(weights[np.abs(k)], np.float64)
+    assert both.sum() == pytest.approx(1.0, abs=1e-5)
+    # What lies beyond three deviations is cut off.
+    assert np.sum(both * k**2) == pytest.approx(blur**2, rel=0.04)
+    assert np.all(both >= 0.0)

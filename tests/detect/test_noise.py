@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from detect.disc_fit import estimate_noise
@@ -55,3 +57,37 @@ def test_saturated_parts_do_not_count() -> None:
 @pytest.mark.parametrize("shape", [(1, 1), (2, 40), (3, 3)])
 def test_tiny_images_have_a_number(shape: tuple[int, int]) -> None:
     assert estimate_noise(np.full(shape, 9, np.uint8)) == 0.0
+
+
+def reference(image: NDArray[np.uint8]) -> float:
+    """The definition: the median absolute response where a pixel is neither black nor white."""
+    inner = image[1:-1, 1:-1]
+    countable = (inner > 2) & (inner < 253)
+    grey = image.astype(np.int16)
+    rows = grey[:-2] - 2 * grey[1:-1] + grey[2:]
+    response = np.abs(rows[:, :-2] - 2 * rows[:, 1:-1] + rows[:, 2:])
+    values = response[countable]
+    if values.size < 100:
+        values = response.ravel()
+    return float(np.median(values) / 0.6745 / 6.0)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    height=st.integers(3, 40),
+    width=st.integers(3, 60),
+    sigma=st.floats(0.0, 120.0),
+    middle=st.floats(-20.0, 280.0),
+    seed=st.integers(0, 2**32 - 1),
+)
+def test_the_estimate_is_the_median_exactly(
+    height: int, width: int, sigma: float, middle: float, seed: int
+) -> None:
+    image = noisy(np.full((height, width), middle), sigma, seed)
+    assert estimate_noise(image) == reference(image)
+
+
+def test_the_widest_response_there_is() -> None:
+    v, u = np.indices((50, 70))
+    image = np.where((u + v) % 2 == 0, 3, 252).astype(np.uint8)
+    assert estimate_noise(image) == reference(image) == 16 * 249 / 2 / 0.6745 / 6.0

@@ -1,0 +1,146 @@
+"""Compiled linear algebra of the disc fit: sums of products over a patch, and what follows.
+
+The unknowns of one Gauss-Newton step stand in this order: the five terms of the background, the
+contrast, and the contrast times the steps of log blur, radius, x and y. The grey value comes last.
+So one Cholesky factor of all sums of products tells, row by row, what is left of the grey values'
+squares without a disc, with the disc where it is, and after the step.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from detect.disc_model_kernels import CAPACITY, FIELDS
+from detect.disc_patch_kernels import GREY, ONE, PLANE_X, PLANE_Y, SADDLE, SADDLE_XY
+
+#: Rows of the sums of products.
+BACKGROUND = 5
+CONTRAST, LOG_BLUR, RADIUS, X, Y, GREYS = range(5, 11)
+UNKNOWNS = 10
+ROWS = 11
+
+# Numba knows it as the type, the type checker as a function.
+_F: Callable[[Any], Any] = np.float32
+_FASTMATH = {"reassoc", "contract", "arcp", "nsz"}
+
+
+@njit(cache=True, error_model="numpy", fastmath=_FASTMATH)
+def background_products(terms: NDArray[np.float32], n: int, products: NDArray[np.float64]) -> None:
+    """Sums of products of the background's terms and the grey values, over n pixels."""
+    for a in range(BACKGROUND + 1):
+        row = GREYS if a == BACKGROUND else a
+        first = a * CAPACITY
+        for b in range(a + 1):
+            second = b * CAPACITY
+            total = _F(0.0)
+            for i in range(n):
+                total += terms[first + i] * terms[second + i]
+            products[row, GREYS if b == BACKGROUND else b] = total
+
+
+@njit(cache=True, error_model="numpy", fastmath=_FASTMATH)
+def disc_products(
+    terms: NDArray[np.float32],
+    fields: NDArray[np.float32],
+    n: int,
+    products: NDArray[np.float64],
+) -> None:
+    """Sums of products of the disc's fields with each other, the terms and the grey values."""
+    for field in range(FIELDS):
+        row = field * CAPACITY
+        s0 = _F(0.0)
+        s1 = _F(0.0)
+        s2 = _F(0.0)
+        s3 = _F(0.0)
+        s4 = _F(0.0)
+        s5 = _F(0.0)
+        for i in range(n):
+            value = fields[row + i]
+            s0 += value * terms[ONE * CAPACITY + i]
+            s1 += value * terms[PLANE_X * CAPACITY + i]
+            s2 += value * terms[PLANE_Y * CAPACITY + i]
+            s3 += value * terms[SADDLE * CAPACITY + i]
+            s4 += value * terms[SADDLE_XY * CAPACITY + i]
+            s5 += value * terms[GREY * CAPACITY + i]
+        at = BACKGROUND + field
+        products[at, 0] = s0
+        products[at, 1] = s1
+        products[at, 2] = s2
+        products[at, 3] = s3
+        products[at, 4] = s4
+        products[GREYS, at] = s5
+        s0 = _F(0.0)
+        s1 = _F(0.0)
+        s2 = _F(0.0)
+        s3 = _F(0.0)
+        s4 = _F(0.0)
+        for i in range(n):
+            value = fields[row + i]
+            s0 += value * fields[i]
+            s1 += value * fields[CAPACITY + i]
+            s2 += value * fields[2 * CAPACITY + i]
+            s3 += value * fields[3 * CAPACITY + i]
+            s4 += value * fields[4 * CAPACITY + i]
+        products[at, BACKGROUND] = s0
+        if field >= 1:
+            products[at, BACKGROUND + 1] = s1
+        if field >= 2:
+            products[at, BACKGROUND + 2] = s2
+        if field >= 3:
+            products[at, BACKGROUND + 3] = s3
+        if field >= 4:
+            products[at, BACKGROUND + 4] = s4
+
+
+@njit(cache=True, error_model="numpy")
+def factor_rows(
+    products: NDArray[np.float64], begin: int, end: int, factor: NDArray[np.float64]
+) -> bool:
+    """Rows `begin` to `end` of the Cholesky factor, and the row of the grey values as far.
+
+    The diagonal is stored inverted. Returns False where the products are not positive definite.
+    """
+    for i in range(begin, end):
+        for j in range(i):
+            s = products[i, j]
+            for k in range(j):
+                s -= factor[i, k] * factor[j, k]
+            factor[i, j] = s * factor[j, j]
+        s = products[i, i]
+        for k in range(i):
+            s -= factor[i, k] * factor[i, k]
+        if not s > 1e-7 * products[i, i]:
+            return False
+        factor[i, i] = 1.0 / math.sqrt(s)
+        s = products[GREYS, i]
+        for k in range(i):
+            s -= factor[GREYS, k] * factor[i, k]
+        factor[GREYS, i] = s * factor[i, i]
+    return True
+
+
+@njit(cache=True, error_model="numpy")
+def left_over(products: NDArray[np.float64], factor: NDArray[np.float64], unknowns: int) -> float:
+    """The sum of the squared residuals with so many of the unknowns."""
+    s = products[GREYS, GREYS]
+    for k in range(unknowns):
+        s -= factor[GREYS, k] * factor[GREYS, k]
+    return max(float(s), 0.0)
+
+
+@njit(cache=True, error_model="numpy")
+def solution(
+    factor: NDArray[np.float64], begin: int, end: int, values: NDArray[np.float64]
+) -> None:
+    """Unknowns `begin` to `end` of the least-squares solution with the first `end` unknowns."""
+    for i in range(end - 1, begin - 1, -1):
+        s = factor[GREYS, i]
+        for k in range(i + 1, end):
+            s -= factor[k, i] * values[k]
+        values[i] = s * factor[i, i]

@@ -1,0 +1,234 @@
+"""Compiled search for discs among the maxima of the quality: looks, fits, and one row per disc."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from detect import disc_fit_kernels as fit
+from detect.circle_kernels import suppress_neighbours
+from detect.disc_evidence_kernels import evidence_of
+from detect.disc_fit_kernels import PATIENT, Hope, fit_disc, new_work
+from detect.disc_patch_kernels import FitSettings
+
+#: Candidates whose first look is this much below the required evidence are not fitted in full.
+_FIRST_LOOK_SLACK = 2.0
+#: A look must promise to explain this share of the variance.
+_LEAST_SHARE = 0.1
+#: Looks that came to places nearer than this share of the separation are at the same disc.
+_SAME_DISC = 0.3
+#: A blur that reached this share of the most that a patch allows is fitted again in a wider one.
+_AT_BOUND = 0.98
+_MOST_REFITS = 2
+
+
+@njit(cache=True, error_model="numpy")
+def strong_and_alone(
+    pixels: NDArray[np.int64],
+    quality: NDArray[np.float64],
+    contrast: NDArray[np.float32],
+    floor_xy: NDArray[np.float32],
+    weakest: float,
+    separation: float,
+) -> NDArray[np.int64]:
+    """Which of the best centres have at least the contrast `weakest`, and no better one nearby.
+
+    Parameters
+    ----------
+    pixels, quality, contrast : (N, 2) int64, (N,) float64, (N,) float32
+        See `detect.centres.best_centres`.
+    floor_xy : (H, W, 2) float32
+        Floor position of each pixel, metres.
+    weakest : float
+        Grey levels.
+    separation : float
+        Of centres closer than this on the floor the one of the highest quality stays, metres.
+
+    Returns
+    -------
+    (M,) int64
+        Indices, ascending.
+    """
+    index = np.flatnonzero(np.abs(contrast) >= weakest)
+    place = np.empty((len(index), 2))
+    for k in range(len(index)):
+        u, v = pixels[index[k]]
+        place[k, 0] = floor_xy[v, u, 0]
+        place[k, 1] = floor_xy[v, u, 1]
+    return index[suppress_neighbours(place, quality[index], separation)]
+
+
+@njit(cache=True, error_model="numpy")
+def _nearest_pixel(
+    floor_xy: NDArray[np.float32], u: int, v: int, x: float, y: float
+) -> tuple[int, int]:
+    """The pixel that sees the floor nearest to (x, y), starting from one nearby."""
+    height, width = floor_xy.shape[:2]
+    for _ in range(3):
+        u = min(max(u, 1), width - 2)
+        v = min(max(v, 1), height - 2)
+        xu = 0.5 * (floor_xy[v, u + 1, 0] - floor_xy[v, u - 1, 0])
+        yu = 0.5 * (floor_xy[v, u + 1, 1] - floor_xy[v, u - 1, 1])
+        xv = 0.5 * (floor_xy[v + 1, u, 0] - floor_xy[v - 1, u, 0])
+        yv = 0.5 * (floor_xy[v + 1, u, 1] - floor_xy[v - 1, u, 1])
+        area = xu * yv - xv * yu
+        dx = x - floor_xy[v, u, 0]
+        dy = y - floor_xy[v, u, 1]
+        du = (yv * dx - xv * dy) / area
+        dv = (xu * dy - yu * dx) / area
+        if not (abs(du) < width and abs(dv) < height):
+            return u, v
+        if abs(du) <= 0.5 and abs(dv) <= 0.5:
+            return u, v
+        u += round(du)
+        v += round(dv)
+    return min(max(u, 1), width - 2), min(max(v, 1), height - 2)
+
+
+@njit(cache=True, error_model="numpy")
+def _evidence(result: NDArray[np.float64], radius: float, optics_px: float) -> float:
+    return evidence_of(
+        result[fit.EXPLAINED],
+        result[fit.RADIUS] / radius,
+        result[fit.OUTLINE_DEVIATION],
+        result[fit.SECTORS_GOOD],
+        result[fit.RELATIVE_BLUR],
+        optics_px,
+    )
+
+
+@njit(cache=True, error_model="numpy")
+def search_discs(
+    image: NDArray[np.uint8],
+    floor_xy: NDArray[np.float32],
+    pixels: NDArray[np.int64],
+    quality: NDArray[np.float64],
+    contrast: NDArray[np.float32],
+    radius: float,
+    settings: FitSettings,
+    verify: bool,
+    refine: bool,
+    least_evidence: float,
+    optics_px: float,
+    separation: float,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
+    """Fit discs at candidates, weigh the evidence, and keep the best of those that are one.
+
+    Parameters
+    ----------
+    image : (H, W) uint8
+    floor_xy : (H, W, 2) float32
+        Floor position of each pixel, metres.
+    pixels, quality, contrast : (N, 2) int64, (N,) float64, (N,) float32
+        The candidates (see `detect.centres.best_centres`).
+    radius : float
+        Nominal radius, metres.
+    settings : FitSettings
+    verify : bool
+        Drop candidates without `least_evidence`.
+    refine : bool
+        Neighbours are suppressed at the fitted positions; else at the candidates'.
+    least_evidence, optics_px, separation : float
+        `CircleSettings.evidence`, `blur_px` and `separation_m`.
+
+    Returns
+    -------
+    results : (M, RESULT_SIZE) float64
+        Fits of the discs found (columns: `detect.disc_fit_kernels`).
+    evidence : (M,) float64
+    index : (M,) int64
+        Which of the candidates they are, ascending.
+    """
+    n = len(pixels)
+    work = new_work()
+    looks = np.zeros((n, fit.RESULT_SIZE))
+    place = np.zeros((n, 2))
+    promise = np.full(n, -np.inf)
+    start = np.zeros(4)
+    blur_start = max(settings.blur_px, 0.6 * optics_px)
+    hope = PATIENT
+    if verify:
+        hope = Hope(_LEAST_SHARE, least_evidence - _FIRST_LOOK_SLACK, optics_px)
+    for i in range(n):
+        start[0] = 0.0
+        start[1] = 0.0
+        start[2] = 1.0
+        start[3] = math.log(blur_start)
+        look = looks[i]
+        if not fit_disc(
+            image, floor_xy, pixels[i, 0], pixels[i, 1], radius, settings, start, blur_start,
+            fit.LOOK, hope, work, look,
+        ):  # fmt: skip
+            continue
+        place[i, 0] = look[fit.X]
+        place[i, 1] = look[fit.Y]
+        told = _evidence(look, radius, optics_px)
+        if not verify:
+            promise[i] = told if told > -math.inf else -1e9
+        elif told >= least_evidence - _FIRST_LOOK_SLACK:
+            promise[i] = told
+    likely = np.flatnonzero(promise > -np.inf)
+    if separation > 0.0:
+        likely = likely[
+            suppress_neighbours(place[likely], promise[likely], _SAME_DISC * separation)
+        ]
+
+    results = np.zeros((len(likely), fit.RESULT_SIZE))
+    evidence = np.full(len(likely), -np.inf)
+    score = np.full(len(likely), -np.inf)
+    found = np.empty((len(likely), 2))
+    for k in range(len(likely)):
+        i = likely[k]
+        look = looks[i]
+        result = results[k]
+        u, v = _nearest_pixel(floor_xy, pixels[i, 0], pixels[i, 1], look[fit.X], look[fit.Y])
+        # A look tells the blur but roughly; too small a patch would have to be gathered again.
+        blur = max(look[fit.BLUR], blur_start)
+        start[2] = look[fit.RADIUS] / radius
+        # First with the pixels that tell most; a disc, or one too blurred for the patch, once more.
+        detail = fit.EDGE
+        at_x, at_y = look[fit.X], look[fit.Y]
+        log_blur = math.log(look[fit.BLUR])
+        fitted = False
+        for _ in range(1 + _MOST_REFITS):
+            start[0] = (at_x - floor_xy[v, u, 0]) / radius
+            start[1] = (at_y - floor_xy[v, u, 1]) / radius
+            start[3] = log_blur
+            fitted = fit_disc(
+                image, floor_xy, u, v, radius, settings, start, blur, detail, hope, work, result
+            )
+            if not fitted:
+                break
+            evidence[k] = _evidence(result, radius, optics_px)
+            wider = result[fit.BLUR] > _AT_BOUND * result[fit.BLUR_BOUND]
+            if (verify and evidence[k] < least_evidence) or (
+                not wider and (detail == fit.ALL or result[fit.COMPLETE] > 0.0)
+            ):
+                break
+            detail = fit.ALL
+            at_x, at_y = result[fit.X], result[fit.Y]
+            start[2] = result[fit.RADIUS] / radius
+            log_blur = math.log(result[fit.BLUR])
+            if wider:
+                blur = result[fit.BLUR_BOUND]
+        candidate = floor_xy[pixels[i, 1], pixels[i, 0]]
+        found[k, 0] = result[fit.X] if refine else candidate[0]
+        found[k, 1] = result[fit.Y] if refine else candidate[1]
+        # A fit that wandered off, or turned the disc's contrast round, is about something else.
+        stayed = math.hypot(result[fit.X] - candidate[0], result[fit.Y] - candidate[1]) < radius
+        same_sign = result[fit.CONTRAST] * contrast[i] > 0.0
+        if not (fitted and stayed and same_sign):
+            continue
+        if evidence[k] > -math.inf:
+            score[k] = evidence[k]
+        else:
+            score[k] = -1e9 + quality[i]
+        if verify and evidence[k] < least_evidence:
+            score[k] = -math.inf
+    sound = np.flatnonzero(score > -np.inf)
+    if separation > 0.0:
+        sound = sound[suppress_neighbours(found[sound], score[sound], separation)]
+    return results[sound], evidence[sound], likely[sound]

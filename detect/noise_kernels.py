@@ -1,0 +1,99 @@
+"""Compiled estimate of an image's noise (see `detect.disc_fit.estimate_noise`)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+# Numba knows it as the type, the type checker as a function.
+_I: Callable[[Any], Any] = np.int16
+
+#: What takes the place of responses that do not count: above all of them.
+_NONE = _I(32767)
+_DARK, _LIGHT = _I(2), _I(253)
+
+
+@njit(cache=True, error_model="numpy")
+def second_differences(
+    image: NDArray[np.uint8], countable_only: bool, response: NDArray[np.int16]
+) -> int:
+    """Absolute responses to the second difference along both axes; returns how many count.
+
+    Parameters
+    ----------
+    image : (H, W) uint8
+    countable_only : bool
+        Leave out pixels that are nearly black or saturated.
+    response : ((H - 2) * (W - 2),) int16
+        Result; where a pixel is left out, more than any response.
+    """
+    height, width = image.shape
+    along = np.empty(width, np.int16)
+    left_out = 0
+    for v in range(1, height - 1):
+        above, here, below = image[v - 1], image[v], image[v + 1]
+        for u in range(width):
+            along[u] = _I(_I(above[u]) + _I(below[u])) - _I(_I(here[u]) * _I(2))
+        row = response[(v - 1) * (width - 2) :]
+        for u in range(width - 2):
+            bend = _I(_I(along[u] + along[u + 2]) - _I(along[u + 1] * _I(2)))
+            row[u] = max(bend, _I(-bend))
+        if countable_only:
+            missing = _I(0)
+            for u in range(width - 2):
+                grey = _I(here[u + 1])
+                out = (grey <= _DARK) | (grey >= _LIGHT)
+                row[u] = _NONE if out else row[u]
+                missing = _I(missing + _I(out))
+            left_out += missing
+    return int((height - 2) * (width - 2) - left_out)
+
+
+@njit(cache=True, error_model="numpy")
+def _count_up_to(response: NDArray[np.int16], most: int) -> int:
+    """How many responses are not above `most`."""
+    limit = _I(most)
+    block = 8192
+    total = 0
+    for first in range(0, len(response), block):
+        part = response[first : first + block]
+        count = _I(0)
+        for i in range(len(part)):
+            count = _I(count + _I(part[i] <= limit))
+        total += count
+    return total
+
+
+@njit(cache=True, error_model="numpy")
+def order_statistic(response: NDArray[np.int16], rank: int) -> int:
+    """The response that exactly `rank` others are not above, in the sorted order (from 0)."""
+    low, high = -1, 8
+    while _count_up_to(response, high) <= rank:
+        low = high
+        high *= 2
+    # More than `rank` are not above high, and at most `rank` not above low.
+    while high - low > 1:
+        middle = (low + high) // 2
+        if _count_up_to(response, middle) > rank:
+            high = middle
+        else:
+            low = middle
+    return high
+
+
+@njit(cache=True, error_model="numpy")
+def median_response(
+    image: NDArray[np.uint8], least_countable: int, response: NDArray[np.int16]
+) -> float:
+    """Median of the countable responses; of all, where fewer than `least_countable` are."""
+    count = second_differences(image, True, response)
+    if count < least_countable:
+        count = second_differences(image, False, response)
+    lower = order_statistic(response, (count - 1) // 2)
+    if count % 2 == 1 or _count_up_to(response, lower) > count // 2:
+        return float(lower)
+    return 0.5 * (lower + order_statistic(response, count // 2))
