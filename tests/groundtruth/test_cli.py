@@ -91,6 +91,7 @@ def refused(arguments: list[str], names: str, captured: Captured) -> None:
     assert names in line
 
 
+@pytest.mark.long
 def test_a_sessions_poses_and_their_score(tmp_path: Path, capsys: Captured) -> None:
     session = write_session(tmp_path / "s")
     report, tum = tmp_path / "report.jsonl", tmp_path / "poses.tum"
@@ -177,6 +178,7 @@ def test_a_rig_that_nobody_saw_gives_no_poses(tmp_path: Path, capsys: Captured) 
     assert not (session / "poses.csv").exists()
 
 
+@pytest.mark.long
 def test_a_rig_from_a_session(tmp_path: Path, capsys: Captured) -> None:
     rig = box_rig()
     session = write_session(tmp_path / "s", count=25, moved=False)
@@ -240,6 +242,7 @@ def test_settings_that_cannot_be_are_a_wrong_command_line(capsys: Captured) -> N
     assert "loss_scale is 0" in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_a_network_from_corners(tmp_path: Path, capsys: Captured) -> None:
     folder = tmp_path / "boards"
     folder.mkdir()

@@ -191,6 +191,7 @@ def normalised_errors(
     return np.array(squares), np.array(plane), np.array(costs)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("calibration_sigma", "floor", "cameras"),
     [(0.0, False, 4), (0.0, True, 1), (2e-3, False, 2), (5e-3, False, 4), (3e-3, True, 2)],

@@ -136,6 +136,7 @@ def test_the_rigs_covariance_is_true() -> None:
     assert low < squares < high
 
 
+@pytest.mark.long
 def test_wrong_solutions_of_small_markers_do_not_reach_the_rig() -> None:
     """Far, frontal, noisy: the better fitting solution is often the mirror image."""
     rig = box_rig()
@@ -250,6 +251,7 @@ def test_a_misread_marker_is_left_out_of_the_adjustment() -> None:
     assert np.abs(error).max() < 2e-3
 
 
+@pytest.mark.long
 def test_cameras_of_a_network_see_the_rig_together() -> None:
     """With two cameras calibrated to each other, markers of different images are a pair."""
     rig = box_rig(4)
@@ -317,6 +319,7 @@ def test_several_measured_markers_define_the_frame_together() -> None:
     assert frame_error(moved, rig) < 2.0
 
 
+@pytest.mark.long
 def test_the_frame_follows_from_reference_poses() -> None:
     rig = box_rig()
     generator = np.random.default_rng(14)
