@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import Generic, TypeVar
 
 from detect.compare_result import CompareError
-from landmarks import Association, Frame, Landmark
+from landmarks import Association, CircleLandmark, Frame, LineLandmark
 
-RowType = TypeVar("RowType", bound=Landmark)
+RowType = TypeVar("RowType", bound=CircleLandmark | LineLandmark)
 
 _IMAGE_EXTENSIONS = (".jpg", ".jpeg", ".png", ".pgm", ".ppm", ".bmp", ".tif", ".tiff")
 _LONGEST_SHOWN_NAME = 80
