@@ -24,8 +24,9 @@ _LEAST_PIXELS = 12
 _LEAST_BLUR = 0.25
 _LARGEST_BLUR = 8.0
 _WIDE_STEPS = 5
-_STEPS = 8
-_CLOSE_ENOUGH_PX = 2e-3
+_STEPS = 12
+#: Largest standard deviation of what a step leaves over, in its contrast.
+_LARGEST_REST = 0.6
 #: Residuals beyond so many deviations lose weight.
 _OUTLIER = 3.0
 _ROOT_HALF = math.sqrt(0.5)
@@ -148,6 +149,7 @@ def _fit_step(
     wide: float,
     blur_guess: float,
     noise: float,
+    close_enough: float,
     out: NDArray[np.float64],
 ) -> bool:
     """Robust least squares of a blurred step; fills an edge's row of results."""
@@ -169,8 +171,11 @@ def _fit_step(
     inverse = np.empty((_PARAMETERS, _PARAMETERS))
     scale = -1.0
     converged = False
+    free_steps = 0
     for iteration in range(_WIDE_STEPS + _STEPS):
         wide_now = iteration < _WIDE_STEPS and wide > 1.2 * blur_guess
+        if not wide_now:
+            free_steps += 1
         if iteration == _WIDE_STEPS or (iteration == 0 and not wide_now):
             p[5] = math.log(blur_guess)
         normal[:] = 0.0
@@ -189,7 +194,7 @@ def _fit_step(
             r = grey[k] - (bottom + step * share)
             residual[k] = r
             weight = 1.0
-            if not wide_now and scale > 0.0 and abs(r) > _OUTLIER * scale:
+            if free_steps > 2 and abs(r) > _OUTLIER * scale:
                 weight = (_OUTLIER * scale / r) ** 2
             slope = -step * density / blur - p[6] * share
             jacobian[0] = slope
@@ -223,9 +228,12 @@ def _fit_step(
         prior = variance / 0.25
         normal[5, 5] += prior
         right[5] -= prior * (p[5] - math.log(blur_guess))
-        if wide_now:
-            # Place and levels only: the rest would follow what is not the edge.
-            for i in range(4, _PARAMETERS):
+        if wide_now or free_steps == 1:
+            # Place and levels only: the rest would follow what is not the edge. Then levels alone,
+            # with the narrow blur: those of the wide one are off.
+            for i in range(_PARAMETERS):
+                if i == 2 or i == 3 or (wide_now and i < 2):
+                    continue
                 normal[i, :] = 0.0
                 normal[:, i] = 0.0
                 normal[i, i] = 1.0
@@ -248,7 +256,7 @@ def _fit_step(
                 # Close: go on with the blur free.
                 wide = blur_guess
                 p[5] = math.log(blur_guess)
-        elif largest < _CLOSE_ENOUGH_PX and iteration > 1:
+        elif largest < close_enough and free_steps > 2:
             converged = True
             break
     if not converged and iteration + 1 < _WIDE_STEPS + _STEPS:
@@ -329,6 +337,7 @@ def fit_edges(
     blur_guess: float,
     noise: float,
     most_pixels: int,
+    close_enough: float,
     edges: NDArray[np.float64],
 ) -> bool:
     """Fit a blurred step to each of four edges.
@@ -353,6 +362,8 @@ def fit_edges(
         Standard deviation of the noise at least, grey levels.
     most_pixels : int
         About how many pixels are used per edge; of more, whole columns (rows) are left out.
+    close_enough : float
+        Steps smaller than this end the iteration, pixels.
     edges : (4, EDGE_NUMBERS) float64
         Result: see the module's indices.
 
@@ -378,7 +389,11 @@ def fit_edges(
             image, grid, step, p0, p1, guess, inwards, reach, margin, stride, along, across, grey
         )
         wide = max(0.6 * reach, blur_guess)
-        if not _fit_step(along, across, grey, count, reach, wide, blur_guess, noise, edges[k]):
+        if not _fit_step(
+            along, across, grey, count, reach, wide, blur_guess, noise, close_enough, edges[k]
+        ):
+            return False
+        if not edges[k, REST] < _LARGEST_REST * (edges[k, LIGHT] - edges[k, DARK]):
             return False
     return True
 

@@ -45,7 +45,9 @@ FIT_NUMBERS = 11
 _PIXEL_VARIANCE = 1.0 / 12.0
 _LEAST_VARIANCE = 0.07
 _LARGEST_VARIANCE = 60.0
-_REACH = 4.0
+_REACH = 3.6
+#: Twice the negative exponent beyond which a cell's corner adds nothing: exp(-6) and less.
+_FAR_FROM_CORNER = 12.0
 _ROOT_HALF = math.sqrt(0.5)
 _ROOT_2PI = math.sqrt(2.0 * math.pi)
 _MEDIAN_TO_SIGMA = 1.0 / 0.6745
@@ -244,6 +246,7 @@ def _blackness(
     if abs(rho) > _LEAST_CORRELATION:
         r = min(max(rho, -_LARGEST_CORRELATION), _LARGEST_CORRELATION)
         root = math.sqrt(1.0 - r * r)
+        far = _FAR_FROM_CORNER * (1.0 + abs(r))
         angle = math.asin(r)
         sines = work[6]
         for i in range(3):
@@ -256,6 +259,8 @@ def _blackness(
                 if px[i] == 0.0 or sign == 0.0:
                     continue
                 h, k = zx[i], zy[j]
+                if h * h + k * k > far:
+                    continue
                 value += sign * _corner_excess(h, k, sines, angle)
                 # Of the bivariate distribution less the product of its margins.
                 by_h = (

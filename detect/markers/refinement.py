@@ -36,14 +36,19 @@ _PASSES = 3
 _CLOSE_ENOUGH_PX = 0.05
 _FIRST_BLUR_PX = 0.9
 #: Pixels per edge in the first pass, and later.
-_FIRST_PIXELS = 160
+_FIRST_PIXELS = 100
 _MOST_PIXELS = 1500
 #: Pixels per edge in later passes if the edges are not the last word.
-_QUICK_PIXELS = 300
+_QUICK_PIXELS = 250
 _QUICK_PASSES = 2
+#: Steps that end a fit's iteration, in these passes and in the last.
+_ROUGHLY_PX = 0.02
+_EXACTLY_PX = 0.002
 #: In the last passes an edge is looked for within this many of its blurs, and this many pixels.
 _REACH_BLURS = 2.5
 _REACH_PX = 0.8
+#: With fewer rows of pixels on each side than that there would be more unknowns than rows.
+_LEAST_REACH_PX = 2.2
 #: Corners that move farther than this (in capture ranges) left their quadrangle.
 _LARGEST_MOVE = 2.5
 
@@ -126,7 +131,8 @@ def refine_quadrangle(
     for attempt in range(_QUICK_PASSES if quick else _PASSES):
         if not fit_edges(
             image, lens.grid, lens.step, corners, guess, capture, border, blur, noise,
-            _FIRST_PIXELS if attempt == 0 else pixels, edges,
+            _FIRST_PIXELS if attempt == 0 else pixels,
+            _ROUGHLY_PX if quick or attempt == 0 else _EXACTLY_PX, edges,
         ):  # fmt: skip
             return None
         refined = np.empty((4, 2))
@@ -137,7 +143,7 @@ def refine_quadrangle(
         moved = float(np.abs(refined - corners).max())
         corners = refined
         blur = float(np.clip(np.median(edges[:, BLUR]), 0.3, 6.0))
-        capture = _REACH_BLURS * blur + _REACH_PX
+        capture = max(_REACH_BLURS * blur + _REACH_PX, _LEAST_REACH_PX)
         if attempt > 0 and moved < _CLOSE_ENOUGH_PX:
             break
     return RefinedQuadrangle(
