@@ -85,7 +85,7 @@ class FilteredColumns:
         Mean, covariance and mean square, and the response as far as it is known, in the rows of
         each of the strip's columns that are known: H of each for one column after the other, in the
         order in which they came to be needed.
-    known : (3, W) int32
+    known : (W, 3) int32
         First of these rows, and the one after the last; the column's place in `moments`.
     used : (1,) int32
         How many places are taken.
@@ -101,7 +101,7 @@ class FilteredColumns:
         height, width = table.column.shape
         return cls(
             np.empty(4 * width * height, np.float32),
-            np.zeros((3, width), np.int32),
+            np.zeros((width, 3), np.int32),
             np.zeros(1, np.int32),
         )
 

@@ -154,51 +154,53 @@ def _follow(
                     c = j - 2
                 elif not right > centre:
                     break
-            response = zero
-            x = table_column[v, c]
-            if x >= leftmost and x < rightmost:
-                top = max(first_row[c], v - s)
-                bottom = min(last_row[c], v + s)
-                begin = known[0, c]
-                end = known[1, c]
-                if begin >= end:
-                    begin = top
-                    end = top
-                    known[0, c] = top
-                    known[2, c] = used[0]
-                    used[0] += 1
-                column_moments = np.uint64(4 * known[2, c] * height)
-                if top < begin or bottom >= end:
-                    # Some rows more than needed: the next ones will be.
-                    if top < begin:
-                        known[0, c] = max(first_row[c], top - _AHEAD)
-                    if bottom >= end:
-                        known[1, c] = min(last_row[c], bottom + _AHEAD) + 1
-                    for y in range(known[0, c], known[1, c]):
-                        if begin <= y < end:
-                            continue
-                        mean = zero
-                        cov = zero
-                        square = zero
-                        x = table_column[y, c]
-                        if x >= leftmost and x < rightmost:
-                            f = x - np.float32(int(x))
-                            at_pixel = np.uint64(y * width + int(x) - r)
-                            for i in range(taps):
-                                tap = np.uint64(i)
-                                grey = np.float32(grey_values[at_pixel + tap]) - middle
-                                weighted = (w_left[tap] + f * w_step[tap]) * grey
-                                mean += weighted
-                                square += weighted * grey
-                                cov += (h_left[tap] + f * h_step[tap]) * grey
-                        place = column_moments + np.uint64(y)
-                        moments[place] = mean
-                        moments[place + np.uint64(height)] = cov
-                        moments[place + np.uint64(2 * height)] = square
-                        moments[place + np.uint64(3 * height)] = unknown
-                kept = column_moments + np.uint64(3 * height + v)
-                response = moments[kept]
-                if math.isnan(response):
+            begin = known[c, 0]
+            end = known[c, 1]
+            column_moments = np.uint64(4 * known[c, 2] * height)
+            kept = column_moments + np.uint64(3 * height + v)
+            response = moments[kept] if begin <= v < end else unknown
+            if math.isnan(response):
+                response = zero
+                x = table_column[v, c]
+                if x >= leftmost and x < rightmost:
+                    top = max(first_row[c], v - s)
+                    bottom = min(last_row[c], v + s)
+                    if begin >= end:
+                        begin = top
+                        end = top
+                        known[c, 0] = top
+                        known[c, 2] = used[0]
+                        used[0] += 1
+                        column_moments = np.uint64(4 * known[c, 2] * height)
+                        kept = column_moments + np.uint64(3 * height + v)
+                    if top < begin or bottom >= end:
+                        # Some rows more than needed: the next ones will be.
+                        if top < begin:
+                            known[c, 0] = max(first_row[c], top - _AHEAD)
+                        if bottom >= end:
+                            known[c, 1] = min(last_row[c], bottom + _AHEAD) + 1
+                        for y in range(known[c, 0], known[c, 1]):
+                            if begin <= y < end:
+                                continue
+                            mean = zero
+                            cov = zero
+                            square = zero
+                            x = table_column[y, c]
+                            if x >= leftmost and x < rightmost:
+                                f = x - np.float32(int(x))
+                                at_pixel = np.uint64(y * width + int(x) - r)
+                                for i in range(taps):
+                                    tap = np.uint64(i)
+                                    grey = np.float32(grey_values[at_pixel + tap]) - middle
+                                    weighted = (w_left[tap] + f * w_step[tap]) * grey
+                                    mean += weighted
+                                    square += weighted * grey
+                                    cov += (h_left[tap] + f * h_step[tap]) * grey
+                            place = column_moments + np.uint64(y)
+                            moments[place] = mean
+                            moments[place + np.uint64(height)] = cov
+                            moments[place + np.uint64(2 * height)] = square
+                            moments[place + np.uint64(3 * height)] = unknown
                     mean = zero
                     cov = zero
                     square = zero
@@ -227,7 +229,7 @@ def _follow(
                     variance = abs(square - mean * mean)
                     response = cov * abs(cov) / (variance + regulariser)
                     moments[kept] = response
-                response *= sign
+            response *= sign
             if c == j - 2:
                 right = centre
                 centre = left
@@ -302,7 +304,7 @@ def follow_edges(
         Mean, covariance and mean square across the vertical and the response (NaN where it is not
         known yet), in the rows that are known: H of each for one column after the other, in the
         order in which they came to be needed.
-    known : (3, W) int32
+    known : (W, 3) int32
         First of the known rows and the one after the last, of each column; its place in `moments`.
     used : (1,) int32
         How many places are taken.

@@ -1,0 +1,48 @@
+"""Fates by number and by name; filters that are tabulated against their formula."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from detect import line_judgement_kernels as kernels
+from detect.line_judgement import FATES
+from detect.line_step_filters import SUBPIXELS, step_filters
+
+
+def test_numbers_of_fates_are_places_of_their_names() -> None:
+    numbers = {
+        name: value
+        for name, value in vars(kernels).items()
+        if name.isupper() and isinstance(value, int)
+    }
+    assert sorted(numbers.values()) == list(range(len(FATES)))
+    for name, number in numbers.items():
+        assert FATES[number] == name.lower().replace("_", " ")
+
+
+@pytest.mark.parametrize("sigma", [0.8, 1.2, 1.8, 3.0])
+def test_tabulated_filters_are_derivatives(sigma: float) -> None:
+    filters = step_filters((1.0, sigma))
+    half, begin = filters.half[1], filters.begin[1]
+    taps = np.arange(-half + 1, half + 1)
+    rows = slice(begin, begin + SUBPIXELS * 2 * half)
+    height, first, second = (
+        table[rows].reshape(SUBPIXELS, 2 * half)
+        for table in (filters.height, filters.first, filters.second)
+    )
+    position = (np.arange(SUBPIXELS) + 0.5) / SUBPIXELS
+    # A parabola's first derivative is seen in proportion to the distance from its vertex, which a
+    # sum over pixels reproduces as well as the integral does.
+    vertex = 0.3
+    signal = (taps - vertex) ** 2
+    scale = height @ taps.astype(np.float64)
+    expected = 2.0 * (position - vertex)
+    np.testing.assert_allclose(height @ signal / scale, expected, atol=0.02)
+    # Derivatives of the height by the position.
+    change = np.gradient(height @ signal, position) * sigma**2
+    np.testing.assert_allclose((first @ signal)[2:-2], change[2:-2], rtol=0.02, atol=0.02)
+    change = np.gradient(first @ signal, position)
+    np.testing.assert_allclose((second @ signal)[2:-2], change[2:-2], rtol=0.02, atol=0.1)
+    for table in (height, first, second):
+        np.testing.assert_allclose(table.sum(axis=1), 0.0, atol=1e-4)
