@@ -76,7 +76,7 @@ _LONGEST_STEP = 0.3
 _MAX_EVALUATIONS = 15
 _LOOK_EVALUATIONS = 3
 #: A step that promises less than this, in variances of the noise, is the last.
-_CONVERGED = 0.01
+_CONVERGED = 0.3
 #: What the first step of a fit promises may be this much less evidence than is needed.
 _FIRST_STEP_SLACK = 2.0
 # Numba knows it as the type, the type checker as a function.

@@ -18,6 +18,10 @@ from detect.disc_patch_kernels import FitSettings
 _FIRST_LOOK_SLACK = 2.0
 #: A look must promise to explain this share of the variance.
 _LEAST_SHARE = 0.1
+#: A look this much above the required evidence shows a disc clearly; within this share of the
+#: separation from it nothing else is looked for.
+_CLEAR = 6.0
+_WITHIN = 0.75
 #: Looks that came to places nearer than this share of the separation are at the same disc.
 _SAME_DISC = 0.3
 #: A blur that reached this share of the most that a patch allows is fitted again in a wider one.
@@ -25,7 +29,7 @@ _AT_BOUND = 0.98
 _MOST_REFITS = 2
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", nogil=True)
 def strong_and_alone(
     pixels: NDArray[np.int64],
     quality: NDArray[np.float64],
@@ -100,7 +104,7 @@ def _evidence(result: NDArray[np.float64], radius: float, optics_px: float) -> f
     )
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", nogil=True)
 def search_discs(
     image: NDArray[np.uint8],
     floor_xy: NDArray[np.float32],
@@ -152,7 +156,21 @@ def search_discs(
     hope = PATIENT
     if verify:
         hope = Hope(_LEAST_SHARE, least_evidence - _FIRST_LOOK_SLACK, optics_px)
-    for i in range(n):
+    # The best first: what lies within a disc that shows clearly need not be looked at.
+    clear = np.empty((n, 2))
+    clear_count = 0
+    within_2 = (_WITHIN * separation) ** 2
+    for i in np.argsort(-quality, kind="mergesort"):
+        u, v = pixels[i]
+        seen = False
+        for k in range(clear_count):
+            dx = clear[k, 0] - floor_xy[v, u, 0]
+            dy = clear[k, 1] - floor_xy[v, u, 1]
+            if dx * dx + dy * dy < within_2:
+                seen = True
+                break
+        if seen:
+            continue
         start[0] = 0.0
         start[1] = 0.0
         start[2] = 1.0
@@ -170,6 +188,10 @@ def search_discs(
             promise[i] = told if told > -math.inf else -1e9
         elif told >= least_evidence - _FIRST_LOOK_SLACK:
             promise[i] = told
+            if told >= least_evidence + _CLEAR:
+                clear[clear_count, 0] = look[fit.X]
+                clear[clear_count, 1] = look[fit.Y]
+                clear_count += 1
     likely = np.flatnonzero(promise > -np.inf)
     if separation > 0.0:
         likely = likely[

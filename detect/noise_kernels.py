@@ -85,7 +85,7 @@ def order_statistic(response: NDArray[np.int16], rank: int) -> int:
     return high
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", nogil=True)
 def median_response(
     image: NDArray[np.uint8], least_countable: int, response: NDArray[np.int16]
 ) -> float:
