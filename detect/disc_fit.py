@@ -1,8 +1,8 @@
 """Is it a disc, and where exactly: the fit of a disc through the camera to the grey values.
 
 Around each candidate a blurred disc on an unevenly lit background is fitted (Levenberg-Marquardt,
-all pixels, through the camera's exact geometry). The fit gives the position with its covariance,
-and the evidence that there is a disc at all.
+through the camera's exact geometry). The fit gives the position with its covariance, and the
+evidence that there is a disc at all.
 """
 
 from __future__ import annotations
@@ -104,8 +104,8 @@ def fit_discs(
     blur_guess : (N,) float64, optional
         About how blurred each candidate is (along u), pixels.
     first_look : bool
-        Use a part of the pixels of large discs and a coarse quadrature: several times faster, good
-        enough to tell what is no disc.
+        Use some of the pixels and few steps: several times faster, good enough to tell what is no
+        disc. Covariance and outline are left out.
 
     Returns
     -------

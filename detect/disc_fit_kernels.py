@@ -22,6 +22,8 @@ from numpy.typing import NDArray
 
 from detect import disc_normal_kernels as normal
 from detect.disc_evidence_kernels import evidence_of
+from detect.disc_grid_kernels import gather_grid
+from detect.disc_list_kernels import gather_list, gather_sparse
 from detect.disc_model_kernels import (
     CAPACITY,
     FIELDS,
@@ -49,12 +51,10 @@ from detect.disc_patch_kernels import (
     ONE,
     FitSettings,
     Patch,
-    gather_grid,
-    gather_list,
-    gather_sparse,
     new_patch,
     view_of,
 )
+from detect.disc_step_kernels import gauss_newton_step, move
 
 #: Columns of a result.
 X, Y, RADIUS, BLUR, CONTRAST = range(5)
@@ -71,8 +71,6 @@ _LOOK_PIXELS = 160
 _OTHER_PIXELS = 400
 
 _LEAST_BLUR, _MOST_BLUR = 0.1, 8.0
-_LEAST_RADIUS, _MOST_RADIUS = 0.4, 2.0
-_LONGEST_STEP = 0.3
 _MAX_EVALUATIONS = 15
 _LOOK_EVALUATIONS = 3
 #: A step that promises less than this, in variances of the noise, is the last.
@@ -183,75 +181,6 @@ def _blur_width(shape: int, n: int, p: NDArray[np.float64], ratio: float, work: 
         work.patch.geometry, work.patch.terms, work.fields, shape == LIST, n, p[0], p[1],
         sigma_u, sigma_v, work.widths,
     )  # fmt: skip
-
-
-@njit(cache=True, error_model="numpy")
-def _step(
-    products: NDArray[np.float64],
-    damping: float,
-    p: NDArray[np.float64],
-    contrast: float,
-    variance: float,
-    settings: FitSettings,
-    log_most: float,
-    damped: NDArray[np.float64],
-    factor: NDArray[np.float64],
-    values: NDArray[np.float64],
-) -> bool:
-    """Solve for the four nonlinear parameters' steps, times contrast, into `values`.
-
-    The first six rows of the factor are those of the products; the prior knowledge of radius and
-    blur and the damping come in only then.
-    """
-    n = normal.ROWS
-    for i in range(normal.LOG_BLUR, n):
-        for j in range(i + 1):
-            damped[i, j] = products[i, j]
-    for j in range(n):
-        damped[normal.GREYS, j] = products[normal.GREYS, j]
-    prior_blur = variance / (settings.blur_sigma * settings.blur_sigma)
-    prior_radius = variance / (settings.radius_sigma * settings.radius_sigma)
-    c_2 = contrast * contrast
-    damped[normal.LOG_BLUR, normal.LOG_BLUR] += prior_blur / c_2
-    damped[normal.RADIUS, normal.RADIUS] += prior_radius / c_2
-    off_blur = p[3] - math.log(settings.blur_px)
-    off_radius = p[2] - 1.0
-    damped[normal.GREYS, normal.LOG_BLUR] -= prior_blur * off_blur / contrast
-    damped[normal.GREYS, normal.RADIUS] -= prior_radius * off_radius / contrast
-    for i in range(normal.LOG_BLUR, normal.UNKNOWNS):
-        damped[i, i] *= 1.0 + damping
-    if not factor_rows(damped, normal.LOG_BLUR, normal.UNKNOWNS, factor):
-        return False
-    solution(factor, normal.LOG_BLUR, normal.UNKNOWNS, values)
-    if p[3] >= log_most and values[normal.LOG_BLUR] / contrast > 0.0:
-        # The blur stays at its bound.
-        damped[normal.LOG_BLUR, normal.LOG_BLUR] *= 1e9
-        damped[normal.GREYS, normal.LOG_BLUR] = 0.0
-        if not factor_rows(damped, normal.LOG_BLUR, normal.UNKNOWNS, factor):
-            return False
-        solution(factor, normal.LOG_BLUR, normal.UNKNOWNS, values)
-    return True
-
-
-@njit(cache=True, error_model="numpy")
-def _move(
-    best: NDArray[np.float64],
-    values: NDArray[np.float64],
-    contrast: float,
-    log_least: float,
-    log_most: float,
-    p: NDArray[np.float64],
-) -> None:
-    """Take a step from the best parameters, within limits."""
-    d_x = values[normal.X] / contrast
-    d_y = values[normal.Y] / contrast
-    length = math.hypot(d_x, d_y)
-    shorten = min(1.0, _LONGEST_STEP / length) / contrast if length > 0.0 else 1.0 / contrast
-    p[0] = best[0] + shorten * values[normal.X]
-    p[1] = best[1] + shorten * values[normal.Y]
-    radius = best[2] + shorten * values[normal.RADIUS]
-    p[2] = min(max(radius, _LEAST_RADIUS), _MOST_RADIUS)
-    p[3] = min(max(best[3] + shorten * values[normal.LOG_BLUR], log_least), log_most)
 
 
 @njit(cache=True, error_model="numpy")
@@ -404,7 +333,7 @@ def fit_disc(
                 return False
         if finished:
             break
-        if not _step(
+        if not gauss_newton_step(
             kept,
             damping,
             best,
@@ -423,7 +352,7 @@ def fit_disc(
         share = 1.0 - max(cost - promised, 0.0) / max(without, 1e-9)
         if share < hope.least_share:
             return False
-        _move(best, values, contrast, log_least, log_most, p)
+        move(best, values, contrast, log_least, log_most, p)
         if hope.least_evidence > -math.inf:
             if evaluations == 1:
                 # How wide a blur is on the floor: the first pixels tell it for all blurs.
@@ -444,7 +373,7 @@ def fit_disc(
     if not factor_rows(kept, 0, normal.LOG_BLUR, factor):
         return False
     solution(factor, 0, normal.BACKGROUND, work.bare)
-    if not _step(
+    if not gauss_newton_step(
         kept,
         0.0,
         best,
@@ -458,7 +387,7 @@ def fit_disc(
     ):
         return False
     solution(factor, 0, normal.UNKNOWNS, values)
-    _move(best, values, contrast, log_least, log_most, p)
+    move(best, values, contrast, log_least, log_most, p)
     contrast = values[normal.CONTRAST]
     kept_pixels = work.shares
     residual, near, near_total = residuals(
