@@ -77,29 +77,40 @@ def residuals(
     a0, a1, a2, a3, a4 = _F(bare[0]), _F(bare[1]), _F(bare[2]), _F(bare[3]), _F(bare[4])
     c, d_blur, d_radius = _F(values[5]), _F(values[6]), _F(values[7])
     d_x, d_y = _F(values[8]), _F(values[9])
+    # The sums have a loop of their own: a loop that stores, too, exists twice in the machine code,
+    # and where the arrays lie in memory would decide in which order it adds.
+    for i in range(n):
+        errors[i] = (
+            terms[GREY * CAPACITY + i]
+            - (
+                c * fields[SHARE * CAPACITY + i]
+                + d_blur * fields[BY_BLUR * CAPACITY + i]
+                + d_radius * fields[BY_RADIUS * CAPACITY + i]
+                + d_x * fields[BY_X * CAPACITY + i]
+                + d_y * fields[BY_Y * CAPACITY + i]
+            )
+            - (
+                b0 * terms[ONE * CAPACITY + i]
+                + b1 * terms[PLANE_X * CAPACITY + i]
+                + b2 * terms[PLANE_Y * CAPACITY + i]
+                + b3 * terms[SADDLE * CAPACITY + i]
+                + b4 * terms[SADDLE_XY * CAPACITY + i]
+            )
+        )
     total = _F(0.0)
     near = _F(0.0)
     near_total = _F(0.0)
     for i in range(n):
-        one = terms[ONE * CAPACITY + i]
-        x = terms[PLANE_X * CAPACITY + i]
-        y = terms[PLANE_Y * CAPACITY + i]
-        saddle = terms[SADDLE * CAPACITY + i]
-        xy = terms[SADDLE_XY * CAPACITY + i]
-        grey = terms[GREY * CAPACITY + i]
-        disc = (
-            c * fields[SHARE * CAPACITY + i]
-            + d_blur * fields[BY_BLUR * CAPACITY + i]
-            + d_radius * fields[BY_RADIUS * CAPACITY + i]
-            + d_x * fields[BY_X * CAPACITY + i]
-            + d_y * fields[BY_Y * CAPACITY + i]
+        without = terms[GREY * CAPACITY + i] - (
+            a0 * terms[ONE * CAPACITY + i]
+            + a1 * terms[PLANE_X * CAPACITY + i]
+            + a2 * terms[PLANE_Y * CAPACITY + i]
+            + a3 * terms[SADDLE * CAPACITY + i]
+            + a4 * terms[SADDLE_XY * CAPACITY + i]
         )
-        error = grey - disc - (b0 * one + b1 * x + b2 * y + b3 * saddle + b4 * xy)
-        without = grey - (a0 * one + a1 * x + a2 * y + a3 * saddle + a4 * xy)
         weight = terms[NEAR * CAPACITY + i]
-        errors[i] = error
-        total += error * error
-        near += weight * error * error
+        total += errors[i] * errors[i]
+        near += weight * errors[i] * errors[i]
         near_total += weight * without * without
     return total, near, near_total
 

@@ -21,7 +21,6 @@ from detect.disc_model_kernels import (
     PIXEL_VARIANCE,
 )
 
-
 #: Rows of what the fit knows of each pixel besides the geometry: the terms of the background (1, x,
 #: y, x^2 - y^2, x y), the grey value, how many pixels it stands for in the explained variance (0
 #: where it is too far from the disc to speak for or against it), and whether the pixel before it
