@@ -44,8 +44,22 @@ _LEAST_CORRELATION = 0.6
 _LEAST_LOG_ODDS = 15.0
 #: Whiteness of cells is trusted to no better than this.
 _LEAST_CELL_SIGMA = 0.08
-#: Cells that are blurred by more than this (in cells) tell nothing for certain.
-_LARGEST_BLUR_CELLS = 0.65
+#: Cells that are blurred by more than this (in cells) tell nothing for certain. Of each pair the
+#: first number is for dictionaries whose patterns are next to never met by chance, the second for
+#: those whose are (see `Templates.weakness`).
+_LARGEST_BLUR_CELLS = (0.7, 0.6)
+#: From the first blur (in cells) to the second what is demanded of a fit grows: many patterns can
+#: be bent to blurred cells, but none fits them to the noise unless it is the right one.
+_STRICT_FROM, _STRICT_AT = 0.35, 0.6
+#: What a fit may leave over beyond the noise (in contrasts), and least mean agreement of the cells,
+#: for clear cells; and for blurred ones.
+_CLEAR_MISFIT, _CLEAR_AGREEMENT = 0.12, 0.85
+_BLURRED_MISFIT = (0.1, 0.03)
+_BLURRED_AGREEMENT = (0.87, 0.95)
+#: Patterns that other things show as well have to be seen this clearly.
+_PLAIN_LARGEST_MISFIT = 0.04
+_PLAIN_LEAST_AGREEMENT = 0.95
+_PLAIN_LARGEST_CELL_ERROR = 0.25
 
 
 @dataclass(frozen=True)
@@ -160,25 +174,39 @@ def verified_identity(
     -------
     Identity or str
     """
-    if fit.blur_cells > _LARGEST_BLUR_CELLS:
+    weakness = templates.weakness
+    if fit.blur_cells > _between(_LARGEST_BLUR_CELLS, weakness):
         return TOO_SMALL
-    if fit.explained < settings.least_explained:
+    strict = (fit.blur_cells - _STRICT_FROM) / (_STRICT_AT - _STRICT_FROM)
+    misfit = _between((_CLEAR_MISFIT, _between(_BLURRED_MISFIT, weakness)), strict)
+    agreement = _between((_CLEAR_AGREEMENT, _between(_BLURRED_AGREEMENT, weakness)), strict)
+    allowed = settings.largest_cell_error
+    if templates.plain[template]:
+        misfit = min(misfit, _PLAIN_LARGEST_MISFIT)
+        agreement = max(agreement, _PLAIN_LEAST_AGREEMENT)
+        allowed = min(allowed, _PLAIN_LARGEST_CELL_ERROR)
+    if fit.explained < settings.least_explained or fit.misfit > misfit:
         return UNEXPLAINED
     error = np.abs(fit.cells - templates.cells[template])
-    allowed = settings.largest_cell_error
     if error.max() > allowed or (fit.border.size and np.abs(fit.border).max() > allowed):
         return WRONG_CELLS
     best, distance, margin = _nearest(fit.cells, templates)
     if best != template or margin < settings.least_margin:
         return AMBIGUOUS
-    if distance > settings.largest_distance:
-        return NO_PATTERN
+    if distance > min(settings.largest_distance, 1.0 - agreement):
+        return WRONG_CELLS
     others, decoys = _log_odds(fit, template, templates)
     if others < _LEAST_LOG_ODDS:
         return AMBIGUOUS
     if decoys < _LEAST_LOG_ODDS:
         return NO_MARKER
     return Identity(best, distance, margin)
+
+
+def _between(pair: tuple[float, float], share: float) -> float:
+    """From the first number to the second as the share goes from 0 to 1."""
+    share = min(max(share, 0.0), 1.0)
+    return (1.0 - share) * pair[0] + share * pair[1]
 
 
 def _nearest(whiteness: FloatArray, templates: Templates) -> tuple[int, float, float]:

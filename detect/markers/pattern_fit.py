@@ -28,6 +28,8 @@ _FIRST_LOOK_STEPS = 5
 _SEAM_BLURS = 2.5
 _SEAM_PX = 0.5
 _LEAST_SEAM_PX = 1.2
+#: Grey values are rounded: noise is never below this.
+_LEAST_NOISE = 0.3
 #: How far a corner may move from where the edges meet, pixels or cells, the greater.
 _REACH_PX = 1.5
 _REACH_CELLS = 0.75
@@ -51,6 +53,8 @@ class PatternFit:
         Whiteness of the other cells of the square.
     rest : float
         Standard deviation of what is left over, grey levels, but for outliers.
+    misfit : float
+        Standard deviation of what is left over beyond the image's noise, in contrasts.
     explained : float
         Explained share of the grey values' variance, noise aside.
     agree : float
@@ -71,6 +75,7 @@ class PatternFit:
     cell_sigma: FloatArray
     border: FloatArray
     rest: float
+    misfit: float
     explained: float
     agree: float
     contrast: float
@@ -142,6 +147,8 @@ def fit_marker(
         max(_REACH_PX, _REACH_CELLS * cell_px), fitted, covariance, cells, cell_sigma, numbers,
     ):  # fmt: skip
         return None
+    rest = float(numbers[kernels.REST])
+    contrast = max(float(numbers[kernels.CONTRAST]), 1e-3)
     outside = np.ones(black.shape, dtype=bool)
     side = templates.dictionary.patterns.shape[-1]
     outside[templates.first : templates.first + side, templates.first : templates.first + side] = 0
@@ -151,7 +158,8 @@ def fit_marker(
         cells=templates.grid_of(cells),
         cell_sigma=templates.grid_of(cell_sigma),
         border=cells[outside],
-        rest=float(numbers[kernels.REST]),
+        rest=rest,
+        misfit=float(np.sqrt(max(0.0, rest**2 - max(noise, _LEAST_NOISE) ** 2)) / contrast),
         explained=float(numbers[kernels.EXPLAINED]),
         agree=float(numbers[kernels.AGREE]),
         contrast=float(numbers[kernels.CONTRAST]),

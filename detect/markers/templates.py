@@ -12,6 +12,10 @@ from detect.markers.dictionaries import MarkerDictionary, marker_dictionary
 
 FloatArray = NDArray[np.float64]
 
+#: A random pattern is one of the dictionary's with a probability of 2 to the power of minus this:
+#: in strong dictionaries, and in weak ones.
+_STRONG_BITS, _WEAK_BITS = 24.0, 14.0
+
 #: Blurs for which templates are kept, in cells.
 _BLURS_CELLS = (0.2, 0.35, 0.5, 0.7, 1.0)
 
@@ -26,8 +30,12 @@ class Templates:
         The markers.
     cells : (T, G * G) float32
         1 for white; T is four times the number of markers.
+    weakness : float
+        How easily a pattern is met by chance, from 0 (next to never) to 1.
     decoys : (D, G * G) float32
         What other things show that are framed in black: nothing, or a bar, or a half.
+    plain : (T,) bool
+        Which of the templates are like such things themselves.
     marker : (T,) int64
         Index of the marker in the dictionary.
     turns : (T,) int64
@@ -47,7 +55,9 @@ class Templates:
 
     dictionary: MarkerDictionary
     cells: NDArray[np.float32]
+    weakness: float
     decoys: NDArray[np.float32]
+    plain: NDArray[np.bool_]
     marker: NDArray[np.int64]
     turns: NDArray[np.int64]
     blurred: tuple[NDArray[np.float32], ...]
@@ -102,6 +112,7 @@ def templates_of(name: str, ids: tuple[int, ...]) -> Templates:
     count, side = len(dictionary), dictionary.patterns.shape[-1]
     turned = [np.rot90(dictionary.patterns, turn, axes=(1, 2)) for turn in range(4)]
     patterns = np.concatenate(turned).astype(np.float32)
+    decoys, plain = _decoys(dictionary, patterns)
     step = dictionary.cell
     edges = dictionary.centres[0] - 0.5 * step + step * np.arange(side + 1)
     inner = edges[(edges > 1e-9) & (edges < 1.0 - 1e-9)]
@@ -109,7 +120,9 @@ def templates_of(name: str, ids: tuple[int, ...]) -> Templates:
     return Templates(
         dictionary=dictionary,
         cells=np.ascontiguousarray(patterns.reshape(len(patterns), -1)),
-        decoys=_decoys(dictionary),
+        weakness=_weakness(dictionary, len(patterns)),
+        decoys=decoys,
+        plain=plain,
         marker=np.tile(np.arange(count, dtype=np.int64), 4),
         turns=np.repeat(np.arange(4, dtype=np.int64), count),
         blurred=tuple(
@@ -149,8 +162,18 @@ def _normalised(patterns: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.ascontiguousarray(centred / np.maximum(length, 1e-6), dtype=np.float32)
 
 
-def _decoys(dictionary: MarkerDictionary) -> NDArray[np.float32]:
-    """Patterns of frames, bars, panes: all that differ from the markers' by two cells or more."""
+def _weakness(dictionary: MarkerDictionary, templates: int) -> float:
+    bits = int(dictionary.patterns.any(axis=0).sum()) - np.log2(templates)
+    return float(np.clip((_STRONG_BITS - bits) / (_STRONG_BITS - _WEAK_BITS), 0.0, 1.0))
+
+
+def _decoys(
+    dictionary: MarkerDictionary, patterns: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Patterns of frames, bars, panes, and which of the markers' are within two cells of them.
+
+    Decoys that are as near a marker's pattern are left out: it could never be found.
+    """
     varied = np.asarray(dictionary.patterns.any(axis=0))
     rows, columns = np.flatnonzero(varied.any(axis=1)), np.flatnonzero(varied.any(axis=0))
     top, left, height, width = rows[0], columns[0], len(rows), len(columns)
@@ -176,10 +199,10 @@ def _decoys(dictionary: MarkerDictionary) -> NDArray[np.float32]:
     for k, pattern in enumerate(inner):
         decoys[k, top : top + height, left : left + width] = pattern
     flat = np.unique(decoys.reshape(len(decoys), -1), axis=0)
-    known = np.concatenate([np.rot90(dictionary.patterns, turn, axes=(1, 2)) for turn in range(4)])
-    known = known.reshape(len(known), -1).astype(np.float32)
+    known = patterns.reshape(len(patterns), -1)
     apart = flat.sum(axis=1)[:, None] + known.sum(axis=1)[None] - 2.0 * flat @ known.T
-    return np.ascontiguousarray(flat[apart.min(axis=1) >= 2.0])
+    near = apart < 2.0
+    return np.ascontiguousarray(flat[~near.any(axis=1)]), near.any(axis=0)
 
 
 def _border(dictionary: MarkerDictionary, first_edge: float) -> float:
