@@ -19,7 +19,7 @@ MOST_UNEVEN = 1.2
 UNDISTURBED = 0.75
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def evidence_of(
     explained: float,
     relative_radius: float,

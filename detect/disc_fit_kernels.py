@@ -114,7 +114,7 @@ class Work(NamedTuple):
 PATIENT = Hope(-math.inf, -math.inf, 1.0)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def new_work() -> Work:
     """Working space."""
     n = normal.ROWS
@@ -135,13 +135,13 @@ def new_work() -> Work:
     )
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def sigma_of(blur: float) -> float:
     """Standard deviation of optics and pixel together, pixels."""
     return math.sqrt(blur * blur + PIXEL_VARIANCE)
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@njit(cache=True, error_model="numpy", forceinline=True, fastmath={"contract"})
 def _mask(n: int, terms: NDArray[np.float32], fields: NDArray[np.float32]) -> None:
     for field in range(FIELDS):
         row = field * CAPACITY
@@ -149,7 +149,7 @@ def _mask(n: int, terms: NDArray[np.float32], fields: NDArray[np.float32]) -> No
             fields[row + i] *= terms[ONE * CAPACITY + i]
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _evaluate(
     shape: int, n: int, margin: int, p: NDArray[np.float64], ratio: float, work: Work
 ) -> None:
@@ -169,7 +169,7 @@ def _evaluate(
     _mask(n, work.patch.terms, work.fields)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _blur_width(shape: int, n: int, p: NDArray[np.float64], ratio: float, work: Work) -> float:
     """Mean width of the blur across the edge, in nominal radii, at the parameters p."""
     blur = math.exp(p[3])
@@ -183,7 +183,7 @@ def _blur_width(shape: int, n: int, p: NDArray[np.float64], ratio: float, work: 
     )  # fmt: skip
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def fit_disc(
     image: NDArray[np.uint8],
     floor_xy: NDArray[np.float32],

@@ -77,7 +77,7 @@ def store_chord(
     geometry[GROWTH * CAPACITY + i] = _F(2.0) * (after - before) / (after + before + _F(1e-9))
 
 
-@njit(cache=True, error_model="numpy", fastmath=_FASTMATH)
+@njit(cache=True, error_model="numpy", forceinline=True, fastmath=_FASTMATH)
 def fill_chords(
     floor_xy: NDArray[np.float32], radius: float, columns: bool, count: int, patch: Patch
 ) -> None:
@@ -108,7 +108,7 @@ def fill_chords(
         )  # fmt: skip
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def gather_grid(
     image: NDArray[np.uint8],
     floor_xy: NDArray[np.float32],
@@ -198,7 +198,7 @@ def gather_grid(
     return n, count
 
 
-@njit(cache=True, error_model="numpy", fastmath=_FASTMATH)
+@njit(cache=True, error_model="numpy", forceinline=True, fastmath=_FASTMATH)
 def _chord_geometry(
     floor: NDArray[np.float32],
     n: int,
@@ -255,7 +255,7 @@ def _chord_geometry(
         terms[PLANE_Y * CAPACITY + i] = y
 
 
-@njit(cache=True, error_model="numpy", fastmath=_FASTMATH)
+@njit(cache=True, error_model="numpy", forceinline=True, fastmath=_FASTMATH)
 def _mask_terms(n: int, terms: NDArray[np.float32]) -> None:
     """Finish the terms of a grid: zero where a pixel is not to be fitted."""
     terms[LINKED * CAPACITY] = 0.0

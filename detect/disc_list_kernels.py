@@ -52,7 +52,7 @@ _BAND_PX = 0.3
 _BEYOND, _FAR, _NEARBY, _AT_EDGE = _F(0.0), _F(1.0), _F(2.0), _F(3.0)
 
 
-@njit(cache=True, error_model="numpy", fastmath=_FASTMATH)
+@njit(cache=True, error_model="numpy", forceinline=True, fastmath=_FASTMATH)
 def _weigh_row(
     floor: NDArray[np.float32],
     x0: float,
@@ -98,7 +98,7 @@ def _weigh_row(
         wanted[k] = _AT_EDGE if off_2 <= edge_u * gu + edge_v * gv else what
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def gather_list(
     image: NDArray[np.uint8],
     floor_xy: NDArray[np.float32],
@@ -170,7 +170,7 @@ def gather_list(
     return count
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def gather_sparse(
     image: NDArray[np.uint8],
     floor_xy: NDArray[np.float32],
@@ -235,7 +235,7 @@ def gather_sparse(
     return count
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _fill_terms(
     image: NDArray[np.uint8],
     floor_xy: NDArray[np.float32],
@@ -270,7 +270,7 @@ def _fill_terms(
         before = pixel
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _fill_edges(floor_xy: NDArray[np.float32], radius: float, count: int, patch: Patch) -> None:
     """The geometry for `edge_shares` of the pixels in the patch's list."""
     index = patch.pixels

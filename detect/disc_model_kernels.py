@@ -97,7 +97,7 @@ def normal(x: float) -> tuple[float, float]:
     return density, (_1 - tail if x > _0 else tail)
 
 
-@njit(cache=True, error_model="numpy", fastmath=_FASTMATH)
+@njit(cache=True, error_model="numpy", forceinline=True, fastmath=_FASTMATH)
 def edge_shares(
     geometry: NDArray[np.float32],
     n: int,
@@ -185,7 +185,7 @@ def _arcsine(x: float) -> float:
     return signed
 
 
-@njit(cache=True, error_model="numpy", fastmath=_FASTMATH)
+@njit(cache=True, error_model="numpy", forceinline=True, fastmath=_FASTMATH)
 def chord_shares(
     geometry: NDArray[np.float32],
     n: int,
@@ -272,7 +272,7 @@ _WELL_SAMPLED_PX = 0.8
 _REACH = 3.0
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def blur_weights(blur: float, weights: NDArray[np.float32]) -> int:
     """Gaussian weights 0 ... k of a blur on a grid of pixels, and k, its reach (see `weights`).
 
@@ -308,7 +308,7 @@ def blur_weights(blur: float, weights: NDArray[np.float32]) -> int:
     return reach
 
 
-@njit(cache=True, error_model="numpy", fastmath=_FASTMATH)
+@njit(cache=True, error_model="numpy", forceinline=True, fastmath=_FASTMATH)
 def _sum_of_three(
     middle: NDArray[np.float32],
     left: NDArray[np.float32],
@@ -321,7 +321,7 @@ def _sum_of_three(
         result[i] = weight * middle[i] + weight_aside * (left[i] + right[i])
 
 
-@njit(cache=True, error_model="numpy", fastmath=_FASTMATH)
+@njit(cache=True, error_model="numpy", forceinline=True, fastmath=_FASTMATH)
 def _add_four(
     left: NDArray[np.float32],
     right: NDArray[np.float32],
@@ -335,7 +335,7 @@ def _add_four(
         result[i] += weight * (left[i] + right[i]) + next_weight * (next_left[i] + next_right[i])
 
 
-@njit(cache=True, error_model="numpy", fastmath=_FASTMATH)
+@njit(cache=True, error_model="numpy", forceinline=True, fastmath=_FASTMATH)
 def _add_second_difference(
     values: NDArray[np.float32], scale: float, result: NDArray[np.float32]
 ) -> None:
@@ -343,7 +343,7 @@ def _add_second_difference(
         result[i] += scale * (values[i] - _2 * values[i + 1] + values[i + 2])
 
 
-@njit(cache=True, error_model="numpy", fastmath=_FASTMATH)
+@njit(cache=True, error_model="numpy", forceinline=True, fastmath=_FASTMATH)
 def blur_across(
     shares: NDArray[np.float32],
     n: int,

@@ -30,7 +30,7 @@ _F: Callable[[Any], Any] = np.float32
 _FASTMATH = {"reassoc", "contract", "arcp", "nsz"}
 
 
-@njit(cache=True, error_model="numpy", fastmath=_FASTMATH)
+@njit(cache=True, error_model="numpy", forceinline=True, fastmath=_FASTMATH)
 def background_products(terms: NDArray[np.float32], n: int, products: NDArray[np.float64]) -> None:
     """Sums of products of the background's terms and the grey values, over n pixels."""
     for a in range(BACKGROUND + 1):
@@ -44,7 +44,7 @@ def background_products(terms: NDArray[np.float32], n: int, products: NDArray[np
             products[row, GREYS if b == BACKGROUND else b] = total
 
 
-@njit(cache=True, error_model="numpy", fastmath=_FASTMATH)
+@njit(cache=True, error_model="numpy", forceinline=True, fastmath=_FASTMATH)
 def disc_products(
     terms: NDArray[np.float32],
     fields: NDArray[np.float32],
@@ -98,7 +98,7 @@ def disc_products(
             products[at, BACKGROUND + 4] = s4
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def factor_rows(
     products: NDArray[np.float64], begin: int, end: int, factor: NDArray[np.float64]
 ) -> bool:
@@ -125,7 +125,7 @@ def factor_rows(
     return True
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def left_over(products: NDArray[np.float64], factor: NDArray[np.float64], unknowns: int) -> float:
     """The sum of the squared residuals with so many of the unknowns."""
     s = products[GREYS, GREYS]
@@ -134,7 +134,7 @@ def left_over(products: NDArray[np.float64], factor: NDArray[np.float64], unknow
     return max(float(s), 0.0)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def solution(
     factor: NDArray[np.float64], begin: int, end: int, values: NDArray[np.float64]
 ) -> None:

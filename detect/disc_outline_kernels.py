@@ -49,7 +49,7 @@ _TAN_1 = math.tan(math.pi / 8.0)
 _TAN_3 = math.tan(3.0 * math.pi / 8.0)
 
 
-@njit(cache=True, error_model="numpy", fastmath=_FASTMATH)
+@njit(cache=True, error_model="numpy", forceinline=True, fastmath=_FASTMATH)
 def residuals(
     terms: NDArray[np.float32],
     fields: NDArray[np.float32],
@@ -115,7 +115,7 @@ def residuals(
     return total, near, near_total
 
 
-@njit(cache=True, error_model="numpy", fastmath=_FASTMATH)
+@njit(cache=True, error_model="numpy", forceinline=True, fastmath=_FASTMATH)
 def correlated_area(terms: NDArray[np.float32], errors: NDArray[np.float32], n: int) -> float:
     """How many pixels go with one independent residual, from the correlation of neighbours.
 
@@ -141,7 +141,7 @@ def correlated_area(terms: NDArray[np.float32], errors: NDArray[np.float32], n: 
     return area
 
 
-@njit(cache=True, error_model="numpy", fastmath=_FASTMATH)
+@njit(cache=True, error_model="numpy", forceinline=True, fastmath=_FASTMATH)
 def blur_widths(
     geometry: NDArray[np.float32],
     terms: NDArray[np.float32],
@@ -195,7 +195,7 @@ def blur_widths(
     return width
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def outline_statistics(
     terms: NDArray[np.float32],
     fields: NDArray[np.float32],

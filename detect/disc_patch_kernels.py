@@ -74,7 +74,7 @@ class Patch(NamedTuple):
     """(2 * CAPACITY,): likewise."""
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def new_patch() -> Patch:
     """An empty patch."""
     return Patch(
@@ -85,7 +85,7 @@ def new_patch() -> Patch:
     )
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def view_of(
     floor_xy: NDArray[np.float32], u0: int, v0: int, radius: float, blur: float, ratio: float
 ) -> tuple[int, float, float, float]:

@@ -65,7 +65,7 @@ def strong_and_alone(
     return index[suppress_neighbours(place, quality[index], separation)]
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _nearest_pixel(
     floor_xy: NDArray[np.float32], u: int, v: int, x: float, y: float
 ) -> tuple[int, int]:
@@ -92,7 +92,7 @@ def _nearest_pixel(
     return min(max(u, 1), width - 2), min(max(v, 1), height - 2)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _evidence(result: NDArray[np.float64], radius: float, optics_px: float) -> float:
     return evidence_of(
         result[fit.EXPLAINED],

@@ -17,7 +17,7 @@ _LEAST_RADIUS, _MOST_RADIUS = 0.4, 2.0
 _LONGEST_STEP = 0.3
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def gauss_newton_step(
     products: NDArray[np.float64],
     damping: float,
@@ -65,7 +65,7 @@ def gauss_newton_step(
     return True
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def move(
     best: NDArray[np.float64],
     values: NDArray[np.float64],

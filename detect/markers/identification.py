@@ -47,15 +47,15 @@ _LEAST_CELL_SIGMA = 0.08
 #: Cells that are blurred by more than this (in cells) tell nothing for certain. Of each pair the
 #: first number is for dictionaries whose patterns are next to never met by chance, the second for
 #: those whose are (see `Templates.weakness`).
-_LARGEST_BLUR_CELLS = (0.7, 0.6)
+_LARGEST_BLUR_CELLS = (0.62, 0.6)
 #: From the first blur (in cells) to the second what is demanded of a fit grows: many patterns can
 #: be bent to blurred cells, but none fits them to the noise unless it is the right one.
 _STRICT_FROM, _STRICT_AT = 0.35, 0.6
 #: What a fit may leave over beyond the noise (in contrasts), and least mean agreement of the cells,
 #: for clear cells; and for blurred ones.
 _CLEAR_MISFIT, _CLEAR_AGREEMENT = 0.12, 0.85
-_BLURRED_MISFIT = (0.1, 0.03)
-_BLURRED_AGREEMENT = (0.87, 0.95)
+_BLURRED_MISFIT = (0.06, 0.03)
+_BLURRED_AGREEMENT = (0.92, 0.95)
 #: Patterns that other things show as well have to be seen this clearly.
 _PLAIN_LARGEST_MISFIT = 0.04
 _PLAIN_LEAST_AGREEMENT = 0.95

@@ -1,8 +1,11 @@
-"""The same image gives the same bytes, wherever in memory the arrays happen to lie."""
+"""The same image gives the same bytes, wherever arrays lie in memory and code comes from."""
 
 from __future__ import annotations
 
 import dataclasses
+import os
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -66,3 +69,26 @@ def test_the_same_image_gives_the_same_bytes(project_root: Path, kind: str) -> N
             seen.add(detect(np.array(image, np.uint8)))
             assert len(kept) < 9
         assert len(seen) == 1, path.name
+
+
+@pytest.mark.long
+def test_compiled_now_or_before_discs_are_the_same(project_root: Path, tmp_path: Path) -> None:
+    # A kernel that is called by others exists several times, optimised among different code: which
+    # of them runs depends on what was compiled in the same process. So those whose order of adding
+    # is up to the compiler (fastmath) have to be part of their callers.
+    found = []
+    for turn in ("compiled", "loaded"):
+        output = tmp_path / f"{turn}.json"
+        subprocess.run(
+            [
+                *(sys.executable, "-m", "detect", "circles", str(project_root / "images" / "e")),
+                *("-o", str(tmp_path / f"{turn}.circles"), "--json", str(output), "--jobs", "1"),
+            ],
+            env={**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "kernels")},
+            cwd=project_root,
+            check=True,
+            timeout=600,
+            capture_output=True,
+        )
+        found.append(output.read_bytes())
+    assert found[0] == found[1]
