@@ -378,10 +378,11 @@ class Camera:
         Shapes as in `floor_jacobian`.
         """
         uv = np.asarray(pixels, dtype=np.float64)
-        step_u, step_v = np.array([PUBLISHED_STEP_PX, 0.0]), np.array([0.0, PUBLISHED_STEP_PX])
-        along_u = self.floor_from_pixel(uv + step_u) - self.floor_from_pixel(uv - step_u)
-        along_v = self.floor_from_pixel(uv + step_v) - self.floor_from_pixel(uv - step_v)
-        return np.asarray(np.stack([along_u, along_v], axis=-1) / (2.0 * PUBLISHED_STEP_PX))
+        step = PUBLISHED_STEP_PX * np.array([[1.0, 0.0], [0.0, 1.0]])
+        # Rows: what is seen a step ahead in u, in v, and a step behind.
+        seen = self.floor_from_pixel(uv[..., None, :] + np.concatenate([step, -step]))
+        moved = seen[..., :2, :] - seen[..., 2:, :]
+        return np.asarray(moved.swapaxes(-1, -2) / (2.0 * PUBLISHED_STEP_PX))
 
 
 def _pose(name: str, rows: ArrayLike) -> Pose:

@@ -96,9 +96,10 @@ def detect_circles(
     pixels, found_quality, contrast = best_centres(
         image, table, settings.threshold, settings.polarity
     )
-    noise = estimate_noise(image)
-    weakest = settings.noise_floor * max(noise, _LEAST_NOISE)
     if not (settings.verify or settings.refine):
+        weakest = 0.0
+        if settings.noise_floor > 0.0:
+            weakest = settings.noise_floor * max(estimate_noise(image), _LEAST_NOISE)
         keep = strong_and_alone(
             pixels, found_quality, contrast, table.floor_xy, weakest, settings.separation_m
         )
@@ -111,6 +112,8 @@ def detect_circles(
             evidence=np.full(len(keep), np.nan),
         )
 
+    noise = estimate_noise(image)
+    weakest = settings.noise_floor * max(noise, _LEAST_NOISE)
     # Each disc has several best centres: of those in the middle of it one is enough.
     keep = strong_and_alone(
         pixels, found_quality, contrast, table.floor_xy, weakest, 0.5 * settings.separation_m
