@@ -26,7 +26,13 @@ from detect.markers.identification import (
 from detect.markers.lens import Lens, lens_of
 from detect.markers.noise import image_noise
 from detect.markers.pattern_fit import PatternFit, fit_marker
-from detect.markers.polygon_kernels import is_convex, is_inside, same_corners, signed_area
+from detect.markers.polygon_kernels import (
+    count_same,
+    is_convex,
+    is_inside,
+    same_corners,
+    signed_area,
+)
 from detect.markers.quadrangle import (
     NO_QUADRANGLE,
     NOT_FOUR_CORNERS,
@@ -245,14 +251,15 @@ def detect_markers(
     # Phase 3: the edges in the image itself, and which marker it is.
     markers: list[_Marker] = []
     candidates: list[Candidate] = []
-    tried: list[FloatArray] = []
+    tried, tries = np.empty((len(quadrangles), 4, 2)), 0
     for region, rough in quadrangles:
         if any(_same_place(rough, marker.corners) for marker in markers):
             candidates.append(Candidate(region, rough, _bent(rough, lens), SAME_MARKER))
             continue
-        if sum(_same_place(rough, other) for other in tried) >= _TRIES:
+        if count_same(rough, tried, tries, _SAME_PX, _SAME_WIDTHS) >= _TRIES:
             continue
-        tried.append(rough)
+        tried[tries] = rough
+        tries += 1
         refined = refine_quadrangle(
             image, lens, rough, capture_px=_capture(region, rough), border=templates.border,
             noise=noise, quick=settings.joint,

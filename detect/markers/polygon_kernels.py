@@ -47,6 +47,22 @@ def same_corners(
 
 
 @njit(cache=True, error_model="numpy")
+def count_same(
+    first: NDArray[np.float64],
+    others: NDArray[np.float64],
+    count: int,
+    apart_px: float,
+    apart_widths: float,
+) -> int:
+    """How many of the first `count` of (N, 4, 2) quadrangles have the same corners as one."""
+    total = 0
+    for n in range(count):
+        if same_corners(first, others[n], apart_px, apart_widths):
+            total += 1
+    return total
+
+
+@njit(cache=True, error_model="numpy")
 def is_inside(x: float, y: float, corners: NDArray[np.float64]) -> bool:
     """Whether a point is inside a clockwise convex quadrangle."""
     for k in range(4):
