@@ -19,9 +19,10 @@ from camera.kernels import camera_numbers
 from detect.centres import best_centres
 from detect.centres import quality_of_centres as quality_of_centres
 from detect.disc_covariance_kernels import refined_covariances
-from detect.disc_fit import blur_ratio_of, estimate_noise, fit_settings, fitted_positions
+from detect.disc_fit import blur_ratio_of, fit_settings, fitted_positions
 from detect.disc_search_kernels import search_discs, strong_and_alone
 from detect.errors import FrameError
+from detect.noise import estimate_noise
 from detect.settings import CircleSettings
 from lut import DiscShape, DiscTable
 

@@ -16,7 +16,6 @@ from camera import Camera
 from detect import disc_fit_kernels as kernels
 from detect.disc_evidence_kernels import evidence_of_all
 from detect.disc_patch_kernels import FitSettings
-from detect.noise_kernels import median_response
 
 FloatArray = NDArray[np.float64]
 
@@ -32,9 +31,6 @@ _BLUR_SIGMA = 0.7
 _BLUR_PX = 0.6
 #: Grey values are rounded: noise is never below this.
 _LEAST_NOISE = 0.3
-
-#: With fewer pixels than this that are neither black nor saturated, all count for the noise.
-_LEAST_COUNTABLE = 100
 
 
 @dataclass(frozen=True)
@@ -205,18 +201,3 @@ def disc_evidence(fits: DiscFits, radius_m: float, blur_px: float = 1.0) -> Floa
             blur_px,
         )
     )
-
-
-def estimate_noise(image: NDArray[np.uint8]) -> float:
-    """Standard deviation of an image's noise, grey levels.
-
-    The median absolute response to the second difference in both directions, which sees neither
-    planes nor straight edges (after Immerkaer, "Fast noise variance estimation", 1996); black and
-    saturated pixels do not count.
-    """
-    count = (image.shape[0] - 2) * (image.shape[1] - 2)
-    if min(image.shape) < 3:
-        return 0.0
-    response = np.empty(count, np.int16)
-    # The mask's coefficients have a sum of squares of 36; 0.6745 makes a median a deviation.
-    return median_response(image, _LEAST_COUNTABLE, response) / 0.6745 / 6.0

@@ -1,4 +1,4 @@
-"""Compiled estimate of an image's noise (see `detect.disc_fit.estimate_noise`)."""
+"""Compiled estimate of an image's noise (see `detect.noise`)."""
 
 from __future__ import annotations
 
@@ -19,26 +19,32 @@ _DARK, _LIGHT = _I(2), _I(253)
 
 @njit(cache=True, error_model="numpy")
 def second_differences(
-    image: NDArray[np.uint8], countable_only: bool, response: NDArray[np.int16]
+    image: NDArray[np.uint8],
+    rows: NDArray[np.int64],
+    countable_only: bool,
+    response: NDArray[np.int16],
 ) -> int:
     """Absolute responses to the second difference along both axes; returns how many count.
 
     Parameters
     ----------
     image : (H, W) uint8
+    rows : (R,) int64
+        The rows to look at, none of them the first or the last.
     countable_only : bool
         Leave out pixels that are nearly black or saturated.
-    response : ((H - 2) * (W - 2),) int16
+    response : (R * (W - 2),) int16
         Result; where a pixel is left out, more than any response.
     """
-    height, width = image.shape
+    width = image.shape[1]
     along = np.empty(width, np.int16)
     left_out = 0
-    for v in range(1, height - 1):
+    for k in range(len(rows)):
+        v = rows[k]
         above, here, below = image[v - 1], image[v], image[v + 1]
         for u in range(width):
             along[u] = _I(_I(above[u]) + _I(below[u])) - _I(_I(here[u]) * _I(2))
-        row = response[(v - 1) * (width - 2) :]
+        row = response[k * (width - 2) :]
         for u in range(width - 2):
             bend = _I(_I(along[u] + along[u + 2]) - _I(along[u + 1] * _I(2)))
             row[u] = max(bend, _I(-bend))
@@ -50,7 +56,7 @@ def second_differences(
                 row[u] = _NONE if out else row[u]
                 missing = _I(missing + _I(out))
             left_out += missing
-    return int((height - 2) * (width - 2) - left_out)
+    return int(len(rows) * (width - 2) - left_out)
 
 
 @njit(cache=True, error_model="numpy")
@@ -87,12 +93,15 @@ def order_statistic(response: NDArray[np.int16], rank: int) -> int:
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def median_response(
-    image: NDArray[np.uint8], least_countable: int, response: NDArray[np.int16]
+    image: NDArray[np.uint8],
+    rows: NDArray[np.int64],
+    least_countable: int,
+    response: NDArray[np.int16],
 ) -> float:
     """Median of the countable responses; of all, where fewer than `least_countable` are."""
-    count = second_differences(image, True, response)
+    count = second_differences(image, rows, True, response)
     if count < least_countable:
-        count = second_differences(image, False, response)
+        count = second_differences(image, rows, False, response)
     lower = order_statistic(response, (count - 1) // 2)
     if count % 2 == 1 or _count_up_to(response, lower) > count // 2:
         return float(lower)

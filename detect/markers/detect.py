@@ -24,7 +24,6 @@ from detect.markers.identification import (
     verified_identity,
 )
 from detect.markers.lens import Lens, lens_of
-from detect.markers.noise import image_noise
 from detect.markers.pattern_fit import PatternFit, fit_marker
 from detect.markers.polygon_kernels import (
     count_same,
@@ -42,6 +41,7 @@ from detect.markers.refinement import NO_EDGE, RefinedQuadrangle, refine_quadran
 from detect.markers.regions import Region, marker_regions
 from detect.markers.settings import MarkerSettings
 from detect.markers.templates import Templates, templates_of
+from detect.noise import estimate_noise
 from landmarks import MarkerCorner, MarkerLandmark
 
 FloatArray = NDArray[np.float64]
@@ -49,6 +49,8 @@ FloatArray = NDArray[np.float64]
 ACCEPTED = "accepted"
 SAME_MARKER = "a marker already found"
 
+#: Rows of the image that its noise is estimated from.
+_NOISE_ROWS = 64
 #: Rough quadrangles whose corners are all this near (pixels, and in widths) are one and the same.
 _SAME_PX = 1.0
 _SAME_WIDTHS = 0.08
@@ -227,7 +229,7 @@ def detect_markers(
     templates = templates_of(settings.dictionary, settings.ids)
     lens = lens_of(camera, image)
     image = np.ascontiguousarray(image)
-    noise = image_noise(image)
+    noise = estimate_noise(image, _NOISE_ROWS)
     rejected: Counter[str] = Counter()
     masks: list[Mask] = []
 

@@ -10,12 +10,12 @@ import numpy as np
 from camera import Camera
 from detect.centres import best_centres, quality_of_centres
 from detect.circles import detect_circles, disc_shape
-from detect.disc_fit import estimate_noise
 from detect.frame import tilt_of_lines
 from detect.levelling import levelled
 from detect.line_settings import DEFAULT as LINES_DEFAULT
 from detect.line_tracks import line_response
 from detect.lines import detect_lines
+from detect.noise import estimate_noise
 from detect.settings import PUBLISHED, CircleSettings
 from lut import cached_disc_table, cached_vertical_table
 from tools.benchmark.material import Picture, decode
@@ -124,7 +124,7 @@ def plain_gather(camera: Camera) -> Measured:
     return Measured(PLAIN_GATHER, "peer", lambda p: plain_quality_of_centres(p.grey, table))
 
 
-def library_peers() -> tuple[list[Measured], list[str]]:
+def peers_of_other_libraries() -> tuple[list[Measured], list[str]]:
     """Detectors of circles and lines of OpenCV and scikit-image.
 
     Returns

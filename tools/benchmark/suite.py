@@ -125,7 +125,7 @@ def benchmark(settings: Settings, on_stage: Callable[[str], None] | None = None)
     if settings.photographs is None:
         skipped.append("photographs: no folder was given")
 
-    peers, absent = f.library_peers()
+    peers, absent = f.peers_of_other_libraries()
     say("compiling")
     measured = [
         f.decoding(),

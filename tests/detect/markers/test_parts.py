@@ -20,12 +20,12 @@ from detect.markers.homography_kernels import (
     square_homography,
 )
 from detect.markers.lens import NO_LENS, lens_of
-from detect.markers.noise import image_noise
 from detect.markers.polygon_kernels import is_convex, pixel_area, same_corners, signed_area
 from detect.markers.quadrangle import rough_corners
 from detect.markers.quadrangle_kernels import largest_quadrangle
 from detect.markers.solve_kernels import invert_positive, solve_positive
 from detect.markers.templates import templates_of
+from detect.noise import estimate_noise
 
 FloatArray = NDArray[np.float64]
 
@@ -243,4 +243,6 @@ def test_the_noise_is_measured(sigma: float) -> None:
     rng = np.random.default_rng(5)
     v, u = np.mgrid[0:300, 0:400]
     grey = 100.0 + 0.1 * u + 0.05 * v + 60.0 * (u > 200) + rng.normal(0.0, sigma, u.shape)
-    assert image_noise(np.rint(grey).astype(np.uint8)) == pytest.approx(sigma, rel=0.12)
+    assert estimate_noise(np.rint(grey).astype(np.uint8), most_rows=64) == pytest.approx(
+        sigma, rel=0.12
+    )
