@@ -1,0 +1,66 @@
+"""The command ``slam``.
+
+Only what `--help` needs is imported at once; everything heavy waits for the command that uses it.
+
+Exit codes: 0 all went well; 1 the command could not be carried out; 2 the command line was wrong;
+130 it was interrupted, and wrote nothing.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from importlib import import_module
+from typing import Annotated
+
+import tyro
+from tyro.conf import arg, subcommand
+
+from slam.options import Associate, Command, Ekf, Export, Import, Localize, Map, Noise
+
+EXIT_ERROR = 1
+EXIT_INTERRUPTED = 130
+
+#: The module whose `perform` carries a command out.
+PERFORMED_BY: dict[type, str] = {
+    Map: "slam.map_command",
+    Localize: "slam.localize_command",
+    Ekf: "slam.ekf_command",
+    Associate: "slam.associate_command",
+    Noise: "slam.noise_command",
+    Export: "slam.export_command",
+    Import: "slam.export_command",
+}
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command line; returns the exit code."""
+    # Matrices are small or sparse here: threads of BLAS would cost more than they save.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    command: Command = tyro.cli(
+        Annotated[
+            Annotated[Map, subcommand("map")]
+            | Annotated[Localize, subcommand("localize")]
+            | Annotated[Ekf, subcommand("ekf")]
+            | Annotated[Associate, subcommand("associate")]
+            | Annotated[Noise, subcommand("noise")]
+            | Annotated[Export, subcommand("export")]
+            | Annotated[Import, subcommand("import")],
+            arg(name=""),
+        ],
+        prog="slam",
+        description="What landmarks are for: map, localisation, SLAM, association, noise.",
+        args=sys.argv[1:] if arguments is None else arguments,
+    )
+    try:
+        return int(import_module(PERFORMED_BY[type(command)]).perform(command))
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return EXIT_INTERRUPTED
+    except (ValueError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return EXIT_ERROR
+
+
+if __name__ == "__main__":
+    sys.exit(main())

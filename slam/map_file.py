@@ -1,0 +1,285 @@
+"""Landmark maps and paths on disk: comma-separated, with a head that says where they come from."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.errors import SlamError
+from storage import write_whole
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+Kind = Literal["disc", "line"]
+
+MAP_COLUMNS = ("kind", "id", "x_m", "y_m", "cxx_m2", "cxy_m2", "cyy_m2", "rows")
+_COVARIANCE = (
+    "cxx",
+    "cxy",
+    "cxtheta",
+    "cyx",
+    "cyy",
+    "cytheta",
+    "cthetax",
+    "cthetay",
+    "cthetatheta",
+)
+PATH_COLUMNS = ("prefix", "x_m", "y_m", "theta_rad", *_COVARIANCE)
+_LARGEST_FILE_BYTES = 1 << 30
+
+
+@dataclass(frozen=True, eq=False)
+class Landmarks:
+    """Landmarks of one kind in the map.
+
+    Attributes
+    ----------
+    ids : (M,) int64
+        Identifiers, each once.
+    xy : (M, 2) float64
+        Places in the map (m).
+    covariance : (M, 2, 2) float64
+        Of `xy` (m^2).
+    rows : (M,) int64
+        How many rows each was estimated from.
+    """
+
+    ids: IntArray
+    xy: FloatArray
+    covariance: FloatArray
+    rows: IntArray
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+
+@dataclass(frozen=True, eq=False)
+class LandmarkMap:
+    """Discs and vertical lines in one map."""
+
+    discs: Landmarks
+    lines: Landmarks
+
+
+@dataclass(frozen=True, eq=False)
+class Path2D:
+    """The poses of a run: the start, and one after each step.
+
+    Attributes
+    ----------
+    prefixes : tuple of N str
+        Name of each pose; of the start ``start``.
+    poses : (N, 3) float64
+        x, y (m), theta (rad).
+    covariance : (N, 3, 3) float64 or None
+        Of the poses.
+    """
+
+    prefixes: tuple[str, ...]
+    poses: FloatArray
+    covariance: FloatArray | None = None
+
+
+def no_landmarks() -> Landmarks:
+    """A map of nothing."""
+    return Landmarks(
+        ids=np.zeros(0, dtype=np.int64),
+        xy=np.zeros((0, 2)),
+        covariance=np.zeros((0, 2, 2)),
+        rows=np.zeros(0, dtype=np.int64),
+    )
+
+
+def write_map(
+    path: str | os.PathLike[str],
+    landmark_map: LandmarkMap,
+    comments: Sequence[str] = (),
+    *,
+    overwrite: bool = False,
+) -> None:
+    """Write a map.
+
+    Parameters
+    ----------
+    path : path
+        The file.
+    landmark_map : LandmarkMap
+        What is written: columns as `MAP_COLUMNS`, numbers in full precision.
+    comments : sequence of str
+        Lines for the head.
+    overwrite : bool
+        Whether an existing file may be replaced.
+
+    Raises
+    ------
+    storage.OutputExistsError
+        If the file exists and may not be replaced.
+    """
+    kinds: tuple[tuple[Kind, Landmarks], ...] = (
+        ("disc", landmark_map.discs),
+        ("line", landmark_map.lines),
+    )
+    rows = [
+        (kind, int(number), *map(_number, (*xy, c[0, 0], c[0, 1], c[1, 1])), int(count))
+        for kind, some in kinds
+        for number, xy, c, count in zip(some.ids, some.xy, some.covariance, some.rows)
+    ]
+    _write(path, MAP_COLUMNS, rows, comments, overwrite)
+
+
+def read_map(path: str | os.PathLike[str]) -> LandmarkMap:
+    """Read a map that `write_map` wrote, or one made by hand with the same columns.
+
+    Raises
+    ------
+    SlamError
+        If the file cannot be read or a row is malformed, a landmark stands twice or a covariance is
+        negative; the message names file and line.
+    """
+    found: dict[str, dict[int, tuple[list[float], int]]] = {"disc": {}, "line": {}}
+    for line, words in _read(path, MAP_COLUMNS):
+        if words[0] not in found:
+            raise SlamError(f"{path}:{line}: kind is {words[0][:20]!r}: expected disc or line")
+        number = _whole(path, line, "id", words[1])
+        values = [
+            _finite(path, line, name, word) for name, word in zip(MAP_COLUMNS[2:7], words[2:7])
+        ]
+        rows = _whole(path, line, "rows", words[7])
+        if number in found[words[0]]:
+            raise SlamError(f"{path}:{line}: {words[0]} {number} stands in the map already")
+        if values[2] < 0.0 or values[4] < 0.0 or values[3] ** 2 > values[2] * values[4] * 1.000001:
+            raise SlamError(f"{path}:{line}: {words[0]} {number}: covariance is negative")
+        found[words[0]][number] = (values, rows)
+    return LandmarkMap(discs=_landmarks(found["disc"]), lines=_landmarks(found["line"]))
+
+
+def write_path(
+    path: str | os.PathLike[str],
+    poses: Path2D,
+    comments: Sequence[str] = (),
+    *,
+    overwrite: bool = False,
+) -> None:
+    """Write a path: columns as `PATH_COLUMNS`, the covariance row by row where there is one."""
+    width = len(PATH_COLUMNS) if poses.covariance is not None else 4
+    rows = []
+    for k, (prefix, pose) in enumerate(zip(poses.prefixes, poses.poses)):
+        spread = () if poses.covariance is None else poses.covariance[k].ravel()
+        rows.append((prefix, *map(_number, (*pose, *spread))))
+    _write(path, PATH_COLUMNS[:width], rows, comments, overwrite)
+
+
+def read_path(path: str | os.PathLike[str]) -> Path2D:
+    """Read a path that `write_path` wrote.
+
+    Raises
+    ------
+    SlamError
+        If the file cannot be read or a row is malformed; the message names file and line.
+    """
+    prefixes, numbers = [], []
+    for line, words in _read(path, PATH_COLUMNS, fewest=4):
+        prefixes.append(words[0])
+        numbers.append(
+            [_finite(path, line, name, word) for name, word in zip(PATH_COLUMNS[1:], words[1:])]
+        )
+    table = np.array(numbers, dtype=np.float64)
+    return Path2D(
+        prefixes=tuple(prefixes),
+        poses=table[:, :3].copy(),
+        covariance=table[:, 3:].reshape(-1, 3, 3) if table.shape[1] > 3 else None,
+    )
+
+
+def _landmarks(found: dict[int, tuple[list[float], int]]) -> Landmarks:
+    if not found:
+        return no_landmarks()
+    table = np.array([values for values, _ in found.values()], dtype=np.float64)
+    return Landmarks(
+        ids=np.array(list(found), dtype=np.int64),
+        xy=table[:, :2].copy(),
+        covariance=table[:, [2, 3, 3, 4]].reshape(-1, 2, 2),
+        rows=np.array([rows for _, rows in found.values()], dtype=np.int64),
+    )
+
+
+def _number(value: float) -> str:
+    return repr(float(value))
+
+
+def _write(
+    path: str | os.PathLike[str],
+    columns: Sequence[str],
+    rows: Sequence[Sequence[object]],
+    comments: Sequence[str],
+    overwrite: bool,
+) -> None:
+    text = io.StringIO()
+    for comment in comments:
+        text.write(f"# {comment}\n")
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows(rows)
+    with write_whole(path, overwrite=overwrite) as stream:
+        stream.write(text.getvalue().encode("utf-8", "surrogateescape"))
+
+
+def _read(
+    path: str | os.PathLike[str], columns: Sequence[str], fewest: int | None = None
+) -> Iterator[tuple[int, list[str]]]:
+    """Rows of a file with their line numbers, after its head was checked."""
+    place = Path(path)
+    try:
+        if place.stat().st_size > _LARGEST_FILE_BYTES:
+            raise SlamError(f"{place}: larger than {_LARGEST_FILE_BYTES} bytes")
+        text = place.read_bytes().decode("utf-8", "surrogateescape")
+    except OSError as error:
+        raise SlamError(f"{place}: cannot be read: {error.strerror or error}") from None
+    head: list[str] | None = None
+    count = 0
+    for number, line in enumerate(text.splitlines(), 1):
+        if not line.strip() or line.startswith("#"):
+            continue
+        words = next(csv.reader([line]))
+        if head is None:
+            widths = {len(columns), fewest or len(columns)}
+            if len(words) not in widths or tuple(words) != tuple(columns[: len(words)]):
+                raise SlamError(f"{place}:{number}: expected the columns {','.join(columns)}")
+            head = words
+            continue
+        if len(words) != len(head):
+            raise SlamError(f"{place}:{number}: {len(words)} values: expected {len(head)}")
+        count += 1
+        yield number, words
+    if count == 0:
+        raise SlamError(f"{place}: no rows: expected at least one under {','.join(columns)}")
+
+
+def _finite(path: str | os.PathLike[str], line: int, name: str, word: str) -> float:
+    try:
+        value = float(word)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise SlamError(f"{path}:{line}: {name} is {word[:30]!r}: expected a finite number")
+    return value
+
+
+def _whole(path: str | os.PathLike[str], line: int, name: str, word: str) -> int:
+    try:
+        value = int(word)
+    except ValueError:
+        value = 2**63
+    if abs(value) >= 2**63:
+        raise SlamError(f"{path}:{line}: {name} is {word[:30]!r}: expected a whole number")
+    return value

@@ -1,0 +1,323 @@
+"""The flags of the command ``slam``: one frozen dataclass per command, nothing heavy imported."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal, Optional
+
+from tyro.conf import Positional, arg
+
+# For `X | None` tyro imports another library that takes a tenth of a second.
+MaybePath = Optional[Path]  # noqa: UP045
+MaybeInt = Optional[int]  # noqa: UP045
+MaybeFloat = Optional[float]  # noqa: UP045
+MaybeStr = Optional[str]  # noqa: UP045
+
+
+@dataclass(frozen=True)
+class Map:
+    """Least-squares map: all poses and landmarks of a run at once.
+
+    Example: slam map images/e --circles --lines -o /tmp/e-map
+
+    Parameters
+    ----------
+    run : Path
+        Run folder, or a .circles or .lines file.
+    circles : bool
+        Use the discs; so it is, too, where neither kind is asked for.
+    lines : bool
+        Use the vertical lines.
+    stem : str
+        Name of the landmark files in the folder; by default map, else detected.
+    camera : Path
+        Calibration, if it is not the one in the run folder (lines and --calibrate need one).
+    calibrate : bool
+        Estimate the camera's mounting (rotation and height) as well.
+    loss : str
+        `huber`, `cauchy` or `geman-mcclure` lets far-off rows pull less.
+    loss_scale : float
+        Standard deviations from which on they do.
+    output : Path
+        Folder for map.csv, path.csv, table.json and pictures; by default `slam` in the run folder.
+    interactive : bool
+        Show the pictures in windows as well.
+    force : bool
+        Replace existing files.
+    """
+
+    run: Positional[Path]
+    circles: bool = False
+    lines: bool = False
+    stem: MaybeStr = None
+    camera: MaybePath = None
+    calibrate: bool = False
+    loss: Literal["none", "huber", "cauchy", "geman-mcclure"] = "none"
+    loss_scale: float = 3.0
+    output: Annotated[MaybePath, arg(aliases=["-o"])] = None
+    interactive: bool = False
+    force: bool = False
+
+
+@dataclass(frozen=True)
+class Localize:
+    """Localise in a known map with an extended Kalman filter.
+
+    Example: slam localize images/e --map /tmp/e-map/map.csv
+
+    Parameters
+    ----------
+    run : Path
+        Run folder, or a .circles or .lines file.
+    map : Path
+        The map (written by `slam map`).
+    circles : bool
+        Use the discs; so it is, too, where neither kind is asked for.
+    lines : bool
+        Use the vertical lines.
+    stem : str
+        Name of the landmark files in the folder; by default map, else detected.
+    camera : Path
+        Calibration, if it is not the one in the run folder (lines need one).
+    association : str
+        `known`: rows say by their IDs which landmark they show; `nearest` or `joint`: it is found
+        out, by Mahalanobis distance of one row at a time or of a frame's rows together.
+    gate_probability : float
+        Share of right rows that pass the gate.
+    reference : Path
+        A path.csv to measure the distance from.
+    output : Path
+        Folder for path.csv, localize.json and pictures; by default `slam/localize` in the run
+        folder.
+    interactive : bool
+        Show the pictures in windows as well.
+    force : bool
+        Replace existing files.
+    """
+
+    run: Positional[Path]
+    map: Path
+    circles: bool = False
+    lines: bool = False
+    stem: MaybeStr = None
+    camera: MaybePath = None
+    association: Literal["known", "nearest", "joint"] = "known"
+    gate_probability: float = 0.999
+    reference: MaybePath = None
+    output: Annotated[MaybePath, arg(aliases=["-o"])] = None
+    interactive: bool = False
+    force: bool = False
+
+
+@dataclass(frozen=True)
+class Ekf:
+    """Map and localise at once with an extended Kalman filter (EKF-SLAM, landmarks by their IDs).
+
+    Example: slam ekf images/e --reference /tmp/e-map/path.csv
+
+    Parameters
+    ----------
+    run : Path
+        Run folder, or a .circles or .lines file.
+    circles : bool
+        Use the discs; so it is, too, where neither kind is asked for.
+    lines : bool
+        Use the vertical lines.
+    stem : str
+        Name of the landmark files in the folder; by default map, else detected.
+    camera : Path
+        Calibration, if it is not the one in the run folder (lines need one).
+    association : str
+        `known`: rows say by their IDs which landmark they show; `nearest` or `joint`: it is found
+        out.
+    gate_probability : float
+        Share of right rows that pass the gate; with known association nothing is gated.
+    reference : Path
+        A path.csv to measure the distance from.
+    output : Path
+        Folder for map.csv, path.csv, ekf.json and pictures; by default `slam/ekf` in the run
+        folder.
+    interactive : bool
+        Show the pictures in windows as well.
+    force : bool
+        Replace existing files.
+    """
+
+    run: Positional[Path]
+    circles: bool = False
+    lines: bool = False
+    stem: MaybeStr = None
+    camera: MaybePath = None
+    association: Literal["known", "nearest", "joint"] = "known"
+    gate_probability: float = 0.999
+    reference: MaybePath = None
+    output: Annotated[MaybePath, arg(aliases=["-o"])] = None
+    interactive: bool = False
+    force: bool = False
+
+
+@dataclass(frozen=True)
+class Associate:
+    """Find out which rows of a run show the same landmark, and write the run with those IDs.
+
+    Where the file has IDs of its own they are not used, but the result is scored against them.
+
+    Example: slam associate images/e --method joint --map-level
+
+    Parameters
+    ----------
+    run : Path
+        Run folder, or a .circles or .lines file.
+    circles : bool
+        Use the discs; so it is, too, where neither kind is asked for.
+    lines : bool
+        Use the vertical lines.
+    stem : str
+        Name of the landmark files in the folder; by default map, else detected.
+    camera : Path
+        Calibration, if it is not the one in the run folder (lines need one).
+    method : str
+        `nearest`: Mahalanobis distance of one row at a time; `joint`: joint compatibility of a
+        frame's rows (JCBB).
+    map_level : bool
+        Then look for loops by fitting local maps of landmarks to each other.
+    gate_probability : float
+        Share of right rows that pass the gate.
+    noise : several floats
+        Score once more with so much noise added to the measurements (factor on their standard
+        deviation).
+    seed : int
+        Of that noise.
+    output : Path
+        The landmark file to write; by default associated.circles (or .lines) in the run folder.
+        The scores go into a .json beside it.
+    force : bool
+        Replace existing files.
+    """
+
+    run: Positional[Path]
+    circles: bool = False
+    lines: bool = False
+    stem: MaybeStr = None
+    camera: MaybePath = None
+    method: Literal["nearest", "joint"] = "joint"
+    map_level: bool = True
+    gate_probability: float = 0.999
+    noise: tuple[float, ...] = ()
+    seed: int = 1
+    output: Annotated[MaybePath, arg(aliases=["-o"])] = None
+    force: bool = False
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Add white Gaussian noise to a run; its covariances are raised to match.
+
+    Example: slam noise images/e --sigma 0.05 -o /tmp/noisy.circles
+
+    Parameters
+    ----------
+    run : Path
+        Run folder, or a .circles, .lines or .txt file.
+    sigma : float
+        Standard deviation added to disc positions along x and y (m).
+    bearing_sigma : float
+        Standard deviation added to bearings of lines (rad).
+    step_sigma : float
+        Standard deviation added to dx and dy of each step (m).
+    turn_sigma : float
+        Standard deviation added to dphi of each step (rad).
+    lines : bool
+        Of a run folder take the .lines file instead of the .circles.
+    stem : str
+        Name of the landmark file in the folder; by default map, else detected.
+    seed : int
+        Everything random follows from it.
+    output : Path
+        The file to write.
+    force : bool
+        Replace an existing file.
+    """
+
+    run: Positional[Path]
+    sigma: float = 0.0
+    bearing_sigma: float = 0.0
+    step_sigma: float = 0.0
+    turn_sigma: float = 0.0
+    lines: bool = False
+    stem: MaybeStr = None
+    seed: int = 1
+    output: Annotated[MaybePath, arg(aliases=["-o"])] = None
+    force: bool = False
+
+
+@dataclass(frozen=True)
+class Export:
+    """Write a run (and a map of it) in the formats of other tools.
+
+    Example: slam export images/e --to g2o -o /tmp/e.g2o
+
+    Parameters
+    ----------
+    run : Path
+        Run folder, or a .circles or .lines file; for --to tum a path.csv as well.
+    to : str
+        `g2o`: graph of poses, discs and their measurements; `tum`: a path as trajectory; `csv`:
+        odometry and measurements as tables for GTSAM or MRPT.
+    solution : Path
+        Folder that `slam map` wrote: its poses and landmarks are the estimates in the graph; by
+        default odometry's and first sight's.
+    axes : str
+        `robotics`: X forward, Y left, as the other tools expect; `dataset`: X left, Y backward.
+    circles : bool
+        Use the discs; so it is, too, where neither kind is asked for.
+    lines : bool
+        Use the vertical lines.
+    stem : str
+        Name of the landmark files in the folder; by default map, else detected.
+    camera : Path
+        Calibration, if it is not the one in the run folder (lines need one).
+    output : Path
+        The file to write; for csv a folder.
+    force : bool
+        Replace existing files.
+    """
+
+    run: Positional[Path]
+    output: Annotated[Path, arg(aliases=["-o"])]
+    to: Literal["g2o", "tum", "csv"] = "g2o"
+    solution: MaybePath = None
+    axes: Literal["robotics", "dataset"] = "robotics"
+    circles: bool = False
+    lines: bool = False
+    stem: MaybeStr = None
+    camera: MaybePath = None
+    force: bool = False
+
+
+@dataclass(frozen=True)
+class Import:
+    """Read a g2o graph or a TUM trajectory back into this project's files.
+
+    Example: slam import /tmp/e.g2o -o /tmp/e-again.circles
+
+    Parameters
+    ----------
+    file : Path
+        A .g2o graph, or a .tum trajectory.
+    axes : str
+        The axes that the file is in; see `slam export`.
+    output : Path
+        Of a graph the .circles file to write; of a trajectory the path.csv.
+    force : bool
+        Replace an existing file.
+    """
+
+    file: Positional[Path]
+    output: Annotated[Path, arg(aliases=["-o"])]
+    axes: Literal["robotics", "dataset"] = "robotics"
+    force: bool = False
+
+
+Command = Map | Localize | Ekf | Associate | Noise | Export | Import
