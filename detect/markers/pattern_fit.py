@@ -1,8 +1,8 @@
 """Phase 3, last part: the whole marker fitted to the grey values.
 
 Four edges know little about a small marker: its cells have edges too. Once it is known which
-marker it may be, all of it is fitted at once (`detect.markers.pattern_kernels`): corners, light,
-blur. What each cell then shows on its own says whether it is that marker indeed.
+marker it may be, all of it is fitted at once (`detect.markers.pattern_fit_kernels`): corners,
+light, blur. What each cell then shows on its own says whether it is that marker indeed.
 """
 
 from __future__ import annotations
@@ -12,9 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.markers import pattern_kernels as kernels
+from detect.markers import pattern_fit_kernels as kernels
 from detect.markers.homography_kernels import square_homography
 from detect.markers.lens import Lens
+from detect.markers.pattern_pixel_kernels import select_pixels
 from detect.markers.templates import Templates
 
 FloatArray = NDArray[np.float64]
@@ -133,7 +134,7 @@ def fit_marker(
     straight = np.empty((room, 2))
     grey = np.empty(room)
     most_pixels = _FIRST_LOOK_PIXELS if first_look else _MOST_PIXELS
-    count = kernels.select_pixels(
+    count = select_pixels(
         image, lens.grid, lens.step, corners, box, templates.lines, seam,
         _SEAM_BLURS * blur_px + _SEAM_PX, most_pixels, pixels, straight, grey,
     )  # fmt: skip

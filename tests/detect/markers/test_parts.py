@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.stats import multivariate_normal, norm
 
 from camera import Camera
-from detect.markers import pattern_kernels
+from detect.markers import pattern_model_kernels as model
 from detect.markers.candidates import Layer, closing, dark_pixels
 from detect.markers.homography_kernels import (
     corners_by_homography,
@@ -184,8 +184,8 @@ def test_a_blurred_corner_is_the_bivariate_normal_distribution(
 ) -> None:
     exact = multivariate_normal.cdf([h, k], cov=[[1.0, rho], [rho, 1.0]])
     angle = np.arcsin(rho)
-    sines = np.sin(angle * pattern_kernels._NODES)
-    excess = pattern_kernels._corner_excess(h, k, sines, angle)
+    sines = np.sin(angle * model.NODES)
+    excess = model.corner_excess(h, k, sines, angle)
     assert norm.cdf(h) * norm.cdf(k) + excess == pytest.approx(exact, abs=4e-3)
 
 
@@ -193,12 +193,12 @@ def test_a_blurred_corner_is_the_bivariate_normal_distribution(
 def test_the_blurred_patterns_derivatives(rho: float) -> None:
     templates = templates_of("6x6_250", (7,))
     black = templates.blackness(0)
-    vertex = pattern_kernels.corner_signs(black)
+    vertex = model.corner_signs(black)
     work = np.empty((7, len(templates.lines)))
 
     def value(at: FloatArray) -> FloatArray:
         mx, my, sx, sy, correlation = at
-        numbers = pattern_kernels._blackness(
+        numbers = model.blurred_blackness(
             mx, my, sx, sy, correlation, templates.lines, black, vertex, work
         )
         return np.array(list(numbers))
