@@ -18,8 +18,11 @@ IntArray = NDArray[np.int64]
 
 UNKNOWN_ID = -1
 
-_STEP_COLUMNS = ("dx", "dy", "dphi") + (
-    ("cxx", "cxy", "cxphi") + ("cxy", "cyy", "cyphi") + ("cxphi", "cyphi", "cphiphi")
+_STEP_COLUMNS = (
+    *("dx", "dy", "dphi"),
+    *("cxx", "cxy", "cxphi"),
+    *("cxy", "cyy", "cyphi"),
+    *("cxphi", "cyphi", "cphiphi"),
 )
 
 # Below this share of its diagonal's product a covariance says that two quantities are one.
