@@ -11,12 +11,14 @@ from __future__ import annotations
 import os
 import sys
 from dataclasses import dataclass, field
+from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Literal, Optional
 
 import tyro
 from tyro.conf import OmitArgPrefixes, Positional, arg, subcommand
 
+from groundtruth.options import Fuse, Laser, Lasers, Report, Sync, Validate
 from groundtruth.settings import NetworkSettings, PoseSettings, RigSettings
 
 # For `X | None` tyro imports another library that takes a tenth of a second.
@@ -171,7 +173,21 @@ class Score:
     force: bool = False
 
 
-Command = Rig | Network | Poses | Score
+Command = Rig | Network | Poses | Score | Lasers | Laser | Sync | Fuse | Validate | Report
+
+#: The module whose `perform` carries a command out.
+PERFORMED_BY: dict[type, str] = {
+    Rig: "groundtruth.commands",
+    Network: "groundtruth.commands",
+    Poses: "groundtruth.commands",
+    Score: "groundtruth.commands",
+    Lasers: "groundtruth.lasers_command",
+    Laser: "groundtruth.laser_command",
+    Sync: "groundtruth.sync_command",
+    Fuse: "groundtruth.fuse_command",
+    Validate: "groundtruth.validate_command",
+    Report: "groundtruth.report_command",
+}
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -183,17 +199,21 @@ def main(arguments: list[str] | None = None) -> int:
             Annotated[Rig, subcommand("rig")]
             | Annotated[Network, subcommand("network")]
             | Annotated[Poses, subcommand("poses")]
-            | Annotated[Score, subcommand("score")],
+            | Annotated[Score, subcommand("score")]
+            | Annotated[Lasers, subcommand("lasers")]
+            | Annotated[Laser, subcommand("laser")]
+            | Annotated[Sync, subcommand("sync")]
+            | Annotated[Fuse, subcommand("fuse")]
+            | Annotated[Validate, subcommand("validate")]
+            | Annotated[Report, subcommand("report")],
             arg(name=""),
         ],
         prog="groundtruth",
-        description="Where the robot really was: poses from markers seen by calibrated cameras.",
+        description="Where the robot really was: markers, lasers, clocks, and their fusion.",
         args=sys.argv[1:] if arguments is None else arguments,
     )
-    from groundtruth.commands import carry_out
-
     try:
-        return carry_out(command)
+        return int(import_module(PERFORMED_BY[type(command)]).perform(command))
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return 130

@@ -12,7 +12,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from groundtruth.cli import EXIT_ERROR, Command, Network, Poses, Rig, Score
+from groundtruth.cli import EXIT_ERROR, Network, Poses, Rig, Score
 from groundtruth.errors import GroundTruthError
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from groundtruth.session import MarkerFrame
 
 
-def carry_out(command: Command) -> int:
+def perform(command: Rig | Network | Poses | Score) -> int:
     """Carry out a command; returns the exit code."""
     if isinstance(command, Rig):
         from groundtruth.rig_command import make_rig

@@ -1,0 +1,224 @@
+"""The flags of the commands round laser, clocks, fusion and validation; nothing heavy imported.
+
+Those round cameras and markers stand in `groundtruth.cli`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal, Optional
+
+from tyro.conf import Positional, arg
+
+# For `X | None` tyro imports another library that takes a tenth of a second.
+MaybePath = Optional[Path]  # noqa: UP045
+MaybeFloat = Optional[float]  # noqa: UP045
+
+
+@dataclass(frozen=True)
+class Lasers:
+    """Align the fixed laser scanners with each other and with the building.
+
+    Example: groundtruth lasers SESSION -o scanners.json
+
+    Parameters
+    ----------
+    session : Path
+        Folder with scanners.json (poses measured by hand), the scans of the empty area and
+        building.csv or building.dxf.
+    building : Path
+        The building map, if it is not the one in the session.
+    gate_m : float
+        Farthest that a reading may lie from what it is matched with at first (m).
+    keep : float
+        Share of the best matches that counts.
+    picture : Path
+        The picture to write; by default the output's name with the ending .png.
+    output : Path
+        The scanners file to write; by default aligned.json in the session.
+    force : bool
+        Replace existing files.
+    """
+
+    session: Positional[Path]
+    building: MaybePath = None
+    gate_m: float = 0.5
+    keep: float = 0.95
+    picture: MaybePath = None
+    output: Annotated[MaybePath, arg(aliases=["-o"])] = None
+    force: bool = False
+
+
+@dataclass(frozen=True)
+class Laser:
+    """Track the robot with the fixed laser scanners.
+
+    Example: groundtruth laser SESSION -o laser.csv
+
+    Parameters
+    ----------
+    session : Path
+        Folder with robot.json, the scans, and the scans of the empty area.
+    scanners : Path
+        Poses of the fixed scanners; by default aligned.json in the session, else scanners.json.
+    gate_m : float
+        Farthest that a reading may lie from the robot's outline (m).
+    keep : float
+        Share of the best matches that counts.
+    output : Path
+        Poses to write (t, x, y, theta and 9 of covariance); by default laser.csv in the session.
+        An account of every set of scans goes into a .jsonl, settings and version into a .json
+        beside it.
+    force : bool
+        Replace existing files.
+    """
+
+    session: Positional[Path]
+    scanners: MaybePath = None
+    gate_m: float = 0.2
+    keep: float = 0.95
+    output: Annotated[MaybePath, arg(aliases=["-o"])] = None
+    force: bool = False
+
+
+@dataclass(frozen=True)
+class Sync:
+    """Align the robot's clock: time offset, drift and angle offset from headings, per segment.
+
+    Example: groundtruth sync odometry.csv laser.csv -o clock.json
+
+    Parameters
+    ----------
+    odometry : Path
+        The robot's own poses (t, x, y, theta) on its clock.
+    groundtruth : Path
+        Poses (t, x, y, theta, and perhaps 9 of covariance) on the ground truth's clock.
+    largest_offset_s : float
+        Bound of the time offset, either way (s).
+    largest_drift : float
+        Bound of the drift: the clocks' rates differ by at most this share.
+    segment_gap_s : float
+        A longer pause in the ground truth begins a new segment (s).
+    ptpd : Path
+        Log of ptpd, to compare with.
+    apply : Path
+        Write the odometry on the ground truth's clock to this file.
+    output : Path
+        The clock file to write.
+    force : bool
+        Replace existing files.
+    """
+
+    odometry: Positional[Path]
+    groundtruth: Positional[Path]
+    largest_offset_s: float = 1.0
+    largest_drift: float = 0.01
+    segment_gap_s: float = 5.0
+    ptpd: MaybePath = None
+    apply: MaybePath = None
+    output: Annotated[Path, arg(aliases=["-o"])] = Path("clock.json")
+    force: bool = False
+
+
+@dataclass(frozen=True)
+class Fuse:
+    """Fuse odometry with laser and camera ground truth: filter forward, smooth backward.
+
+    Example: groundtruth fuse odometry.csv --laser laser.csv --camera camera.csv --clock clock.json
+
+    Parameters
+    ----------
+    odometry : Path
+        The robot's own poses (t, x, y, theta).
+    laser : Path
+        Ground truth from the laser (t, x, y, theta, 9 of covariance).
+    camera : Path
+        Ground truth from the markers, in the same columns.
+    clock : Path
+        What `groundtruth sync` wrote; without it all clocks are one.
+    distance_sigma : float
+        Standard deviation of odometry's distance per square root of a metre driven (m).
+    turn_sigma : float
+        Standard deviation of odometry's heading per square root of a radian turned (rad).
+    turn_per_metre_sigma : float
+        The same per square root of a metre driven (rad).
+    gate_probability : float
+        Share of right poses that pass the gate.
+    covariance_scale : two floats
+        Factors on the covariances of laser and camera.
+    output : Path
+        The file to write (t, x, y, theta and 9 of covariance). What was rejected, settings and
+        version go into a .json beside it.
+    force : bool
+        Replace existing files.
+    """
+
+    odometry: Positional[Path]
+    laser: MaybePath = None
+    camera: MaybePath = None
+    clock: MaybePath = None
+    distance_sigma: float = 0.02
+    turn_sigma: float = 0.02
+    turn_per_metre_sigma: float = 0.01
+    gate_probability: float = 0.9999
+    covariance_scale: tuple[float, float] = (1.0, 1.0)
+    output: Annotated[Path, arg(aliases=["-o"])] = Path("fused.csv")
+    force: bool = False
+
+
+@dataclass(frozen=True)
+class Validate:
+    """Hold a ground truth against reference poses surveyed by distances and on-board scans.
+
+    Example: groundtruth validate SESSION fused.csv -o validation
+
+    Parameters
+    ----------
+    session : Path
+        Folder with fiducials.json, distances.csv, robot.json and the building; with on-board scans,
+        they refine the reference poses.
+    poses : Path
+        The ground truth (t, x, y, theta, and perhaps 9 of covariance).
+    clock : Path
+        What `groundtruth sync` wrote, for the on-board scans.
+    refine : str
+        `scans`: refine the reference poses by ICP of the on-board scans to the building; `none`:
+        distances alone.
+    output : Path
+        Folder for the table, the reference poses and plots.
+    force : bool
+        Replace existing files.
+    """
+
+    session: Positional[Path]
+    poses: Positional[Path]
+    clock: MaybePath = None
+    refine: Literal["scans", "none"] = "scans"
+    output: Annotated[Path, arg(aliases=["-o"])] = Path("validation")
+    force: bool = False
+
+
+@dataclass(frozen=True)
+class Report:
+    """One page with map, path, covariance ellipses and errors over time, as one HTML file.
+
+    Example: groundtruth report SESSION --truth truth.csv -o report.html
+
+    Parameters
+    ----------
+    session : Path
+        Folder with the building and the results: laser.csv, camera.csv, fused.csv, clock.json and
+        validation, as far as they are there.
+    truth : Path
+        True or reference poses (t, x, y, theta); by default truth.csv in the session, if there.
+    output : Path
+        The page to write; by default report.html in the session.
+    force : bool
+        Replace an existing file.
+    """
+
+    session: Positional[Path]
+    truth: MaybePath = None
+    output: Annotated[MaybePath, arg(aliases=["-o"])] = None
+    force: bool = False
