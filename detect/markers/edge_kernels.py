@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from detect.markers.homography_kernels import square_homography
 from detect.markers.lens_kernels import bent, straightened
+from detect.markers.robust_kernels import LEAST_NOISE, OUTLIER, robust_sigma
 from detect.markers.solve_kernels import invert_positive, solve_positive
 
 #: What an edge's row of results holds: offset from the given line outwards in its middle and its
@@ -27,12 +28,8 @@ _WIDE_STEPS = 5
 _STEPS = 12
 #: Largest standard deviation of what a step leaves over, in its contrast.
 _LARGEST_REST = 0.6
-#: Residuals beyond so many deviations lose weight.
-_OUTLIER = 3.0
 _ROOT_HALF = math.sqrt(0.5)
 _ROOT_2PI = math.sqrt(2.0 * math.pi)
-_MEDIAN_TO_SIGMA = 1.0 / 0.6745
-_LEAST_NOISE = 0.3
 _SEGMENTS = 8
 #: Places across an edge at which it may begin to be looked for.
 _SPLITS = 14
@@ -98,13 +95,6 @@ def _pixels_along(
 
 
 @njit(cache=True, error_model="numpy")
-def _scale_of(residual: NDArray[np.float64], count: int, least: float) -> float:
-    """Robust standard deviation of residuals."""
-    stride = max(1, count // _SAMPLED_RESIDUALS)
-    return max(least, _MEDIAN_TO_SIGMA * float(np.median(np.abs(residual[:count:stride]))))
-
-
-@njit(cache=True, error_model="numpy")
 def _best_split(
     across: NDArray[np.float64], grey: NDArray[np.float64], count: int, reach: float
 ) -> tuple[float, float, float]:
@@ -162,7 +152,7 @@ def _fit_step(
     p = np.zeros(_PARAMETERS)
     p[0], p[2], p[3] = split, low, high
     p[5] = math.log(wide)
-    least = max(noise, _LEAST_NOISE)
+    least = max(noise, LEAST_NOISE)
     residual = np.empty(count)
     jacobian = np.empty(_PARAMETERS)
     normal = np.empty((_PARAMETERS, _PARAMETERS))
@@ -194,8 +184,8 @@ def _fit_step(
             r = grey[k] - (bottom + step * share)
             residual[k] = r
             weight = 1.0
-            if free_steps > 2 and abs(r) > _OUTLIER * scale:
-                weight = (_OUTLIER * scale / r) ** 2
+            if free_steps > 2 and abs(r) > OUTLIER * scale:
+                weight = (OUTLIER * scale / r) ** 2
             slope = -step * density / blur - p[6] * share
             jacobian[0] = slope
             jacobian[1] = slope * along[k]
@@ -211,7 +201,7 @@ def _fit_step(
                     normal[i, j] += weight * jacobian[i] * jacobian[j]
             weight_sum += weight
             rest += weight * r * r
-        scale = _scale_of(residual, count, least)
+        scale = robust_sigma(residual, count, _SAMPLED_RESIDUALS, least)
         for i in range(_PARAMETERS):
             for j in range(i):
                 normal[i, j] = normal[j, i]
@@ -395,75 +385,4 @@ def fit_edges(
             return False
         if not edges[k, REST] < _LARGEST_REST * (edges[k, LIGHT] - edges[k, DARK]):
             return False
-    return True
-
-
-@njit(cache=True, error_model="numpy")
-def corners_of_edges(
-    corners: NDArray[np.float64],
-    edges: NDArray[np.float64],
-    refined: NDArray[np.float64],
-    covariance: NDArray[np.float64],
-) -> bool:
-    """Intersections of the fitted edges, and their covariances.
-
-    Parameters
-    ----------
-    corners : (4, 2) float64
-        The corners that the edges' offsets are relative to.
-    edges : (4, EDGE_NUMBERS) float64
-        From `fit_edges`.
-    refined : (4, 2) float64
-        Result.
-    covariance : (4, 2, 2) float64
-        Result, pixels squared.
-
-    Returns
-    -------
-    bool
-        Whether all four edges intersect.
-    """
-    normal = np.empty((4, 2))
-    level = np.empty(4)
-    for k in range(4):
-        p0 = corners[k]
-        p1 = corners[(k + 1) % 4]
-        length = math.hypot(p1[0] - p0[0], p1[1] - p0[1])
-        tx, ty = (p1[0] - p0[0]) / length, (p1[1] - p0[1]) / length
-        # Outward normal (ty, -tx); the fitted line runs through the shifted ends.
-        b0 = edges[k, OFFSET] - edges[k, TURN]
-        b1 = edges[k, OFFSET] + edges[k, TURN]
-        ax, ay = p0[0] + b0 * ty, p0[1] - b0 * tx
-        bx, by = p1[0] + b1 * ty, p1[1] - b1 * tx
-        span = math.hypot(bx - ax, by - ay)
-        normal[k, 0] = (by - ay) / span
-        normal[k, 1] = -(bx - ax) / span
-        level[k] = normal[k, 0] * ax + normal[k, 1] * ay
-    for k in range(4):
-        j = (k + 3) % 4
-        determinant = normal[j, 0] * normal[k, 1] - normal[j, 1] * normal[k, 0]
-        if abs(determinant) < 0.05:
-            return False
-        x = (level[j] * normal[k, 1] - level[k] * normal[j, 1]) / determinant
-        y = (normal[j, 0] * level[k] - normal[k, 0] * level[j]) / determinant
-        refined[k, 0] = x
-        refined[k, 1] = y
-        # Each line's variance at the corner moves it along the other line.
-        covariance[k] = 0.0
-        for which in range(2):
-            e = j if which == 0 else k
-            o = k if which == 0 else j
-            q0 = corners[e]
-            q1 = corners[(e + 1) % 4]
-            length = math.hypot(q1[0] - q0[0], q1[1] - q0[1])
-            s = ((x - q0[0]) * (q1[0] - q0[0]) + (y - q0[1]) * (q1[1] - q0[1])) / length / (
-                0.5 * length
-            ) - 1.0
-            variance = edges[e, VAR_OFFSET] + 2.0 * s * edges[e, COVAR] + s * s * edges[e, VAR_TURN]
-            mx = normal[o, 1] / determinant
-            my = -normal[o, 0] / determinant
-            covariance[k, 0, 0] += variance * mx * mx
-            covariance[k, 0, 1] += variance * mx * my
-            covariance[k, 1, 1] += variance * my * my
-        covariance[k, 1, 0] = covariance[k, 0, 1]
     return True

@@ -16,6 +16,7 @@ from detect.markers import pattern_fit_kernels as kernels
 from detect.markers.homography_kernels import square_homography
 from detect.markers.lens import Lens
 from detect.markers.pattern_pixel_kernels import select_pixels
+from detect.markers.robust_kernels import LEAST_NOISE
 from detect.markers.templates import Templates
 
 FloatArray = NDArray[np.float64]
@@ -29,8 +30,6 @@ _FIRST_LOOK_STEPS = 5
 _SEAM_BLURS = 2.5
 _SEAM_PX = 0.5
 _LEAST_SEAM_PX = 1.2
-#: Grey values are rounded: noise is never below this.
-_LEAST_NOISE = 0.3
 #: How far a corner may move from where the edges meet, pixels or cells, the greater.
 _REACH_PX = 1.5
 _REACH_CELLS = 0.75
@@ -160,7 +159,7 @@ def fit_marker(
         cell_sigma=templates.grid_of(cell_sigma),
         border=cells[outside],
         rest=rest,
-        misfit=float(np.sqrt(max(0.0, rest**2 - max(noise, _LEAST_NOISE) ** 2)) / contrast),
+        misfit=float(np.sqrt(max(0.0, rest**2 - max(noise, LEAST_NOISE) ** 2)) / contrast),
         explained=float(numbers[kernels.EXPLAINED]),
         agree=float(numbers[kernels.AGREE]),
         contrast=float(numbers[kernels.CONTRAST]),

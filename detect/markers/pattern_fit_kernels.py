@@ -30,6 +30,7 @@ from detect.markers.pattern_model_kernels import (
     place_on_marker,
 )
 from detect.markers.pattern_residual_kernels import cell_values, inflation_of
+from detect.markers.robust_kernels import LEAST_NOISE, OUTLIER, robust_sigma
 from detect.markers.solve_kernels import invert_positive, solve_positive
 
 #: Standard deviations of the light's slope and bend over half a marker, in contrasts.
@@ -45,9 +46,6 @@ REST, EXPLAINED, AGREE, CONTRAST, BLACK, BLUR_UU, BLUR_UV, BLUR_VV, TONE, STEPS,
 )
 FIT_NUMBERS = 11
 
-_MEDIAN_TO_SIGMA = 1.0 / 0.6745
-_OUTLIER = 3.0
-_LEAST_NOISE = 0.3
 _SAMPLED_RESIDUALS = 700
 #: Clipped pixels do not count if the model is this near the limit, grey levels, or beyond.
 _CLIP_ZONE = 6.0
@@ -129,7 +127,7 @@ def fit_pattern(
     p[BLUR_AT] = p[BLUR_AT + 2] = levels[2] ** 2
     confine_blur(p)
     blur_guess = p[BLUR_AT]
-    least = max(noise, _LEAST_NOISE)
+    least = max(noise, LEAST_NOISE)
     residual = np.empty(count)
     weights = np.ones(count)
     normal = np.empty((PARAMETERS, PARAMETERS))
@@ -173,8 +171,8 @@ def fit_pattern(
                 rows[k] = 0.0
                 continue
             weight = 1.0
-            if scale > 0.0 and abs(r) > _OUTLIER * scale:
-                weight = (_OUTLIER * scale / r) ** 2
+            if scale > 0.0 and abs(r) > OUTLIER * scale:
+                weight = (OUTLIER * scale / r) ** 2
             weights[k] = weight
             # d(value)/d(blackness), and from there on by the chain rule.
             g = rows[k]
@@ -215,8 +213,7 @@ def fit_pattern(
         _accumulate_squares(rows, squares)
         normal[:] = squares[:PARAMETERS, :PARAMETERS]
         right[:] = squares[:PARAMETERS, PARAMETERS]
-        stride = max(1, count // _SAMPLED_RESIDUALS)
-        scale = max(least, _MEDIAN_TO_SIGMA * float(np.median(np.abs(residual[:count:stride]))))
+        scale = robust_sigma(residual, count, _SAMPLED_RESIDUALS, least)
         variance = scale * scale
         contrast = max(abs(p[WHITE_AT] - p[BLACK_AT]), scale)
         # Weak knowledge, in the same measure as the grey values: light changes little over a

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from detect.markers.edge_corner_kernels import corners_of_edges
 from detect.markers.edge_kernels import (
     BLUR,
     DARK,
@@ -21,7 +22,6 @@ from detect.markers.edge_kernels import (
     PIXELS,
     REST,
     SUPPORT,
-    corners_of_edges,
     fit_edges,
 )
 from detect.markers.lens import Lens

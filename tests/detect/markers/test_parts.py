@@ -23,6 +23,7 @@ from detect.markers.lens import NO_LENS, lens_of
 from detect.markers.polygon_kernels import is_convex, pixel_area, same_corners, signed_area
 from detect.markers.quadrangle import rough_corners
 from detect.markers.quadrangle_kernels import largest_quadrangle
+from detect.markers.robust_kernels import robust_sigma
 from detect.markers.solve_kernels import invert_positive, solve_positive
 from detect.markers.templates import templates_of
 from detect.noise import estimate_noise
@@ -214,6 +215,19 @@ def test_the_blurred_patterns_derivatives(rho: float) -> None:
             # Three nodes of quadrature are not the derivative's own.
             scale = 0.02 / at[2] if k < 4 else 0.02
             assert analytic[k] == pytest.approx(numeric, abs=scale + 0.02 * abs(numeric))
+
+
+def test_the_scale_of_residuals_does_not_follow_outliers() -> None:
+    rng = np.random.default_rng(8)
+    residual = rng.normal(0.0, 2.0, 20_000)
+    residual[::20] = 1e3
+    residual[19_000:] = -1e6  # Beyond the count.
+    # The median of 95 of 100 is the 52.6 % quantile of them all.
+    expected = 2.0 * norm.ppf(0.5 + 0.5 * 0.5 / 0.95) / 0.6745
+    assert robust_sigma(residual, 19_000, 19_000, 0.3) == pytest.approx(expected, rel=0.02)
+    # Every 3rd, whose outliers are as many.
+    assert robust_sigma(residual, 19_000, 6_000, 0.3) == pytest.approx(expected, rel=0.04)
+    assert robust_sigma(residual, 19_000, 6_000, 5.0) == 5.0
 
 
 def test_decoys_are_no_markers() -> None:
