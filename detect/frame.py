@@ -18,7 +18,8 @@ from detect.circles import CircleDetections, detect_circles, disc_shape
 from detect.levelling import levelled
 from detect.line_settings import LineSettings
 from detect.lines import LineDetections, detect_lines
-from detect.markers.detect import MarkerDetections, detect_markers
+from detect.markers.detect import detect_markers
+from detect.markers.detections import MarkerDetections
 from detect.markers.settings import MarkerSettings
 from detect.markers.specimen import specimen_image
 from detect.run import RunFrame, read_image

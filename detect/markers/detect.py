@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from camera import Camera
 from detect.markers import identification as identities
 from detect.markers.candidates import Mask, candidate_layers, dark_masks
+from detect.markers.detections import ACCEPTED, SAME_MARKER, Candidate, MarkerDetections
 from detect.markers.identification import (
     Identity,
     likely_patterns,
@@ -42,12 +43,8 @@ from detect.markers.regions import Region, marker_regions
 from detect.markers.settings import MarkerSettings
 from detect.markers.templates import Templates, templates_of
 from detect.noise import estimate_noise
-from landmarks import MarkerCorner, MarkerLandmark
 
 FloatArray = NDArray[np.float64]
-
-ACCEPTED = "accepted"
-SAME_MARKER = "a marker already found"
 
 #: Rows of the image that its noise is estimated from.
 _NOISE_ROWS = 64
@@ -77,105 +74,6 @@ _STAIRCASE_PX = 0.035
 _STAIRCASE_VARIANCE = 0.1
 #: A first look may explain less than the full fit has to, by this much.
 _FIRST_LOOK_SLACK = 0.1
-
-
-@dataclass(frozen=True)
-class Candidate:
-    """A region that came as far as having corners, and what became of it.
-
-    Attributes
-    ----------
-    region : Region
-        Where it comes from.
-    rough : (4, 2) float64
-        Its rough corners, straight pixels.
-    outline : (4, 2) float64
-        The same as pixels of the image.
-    fate : str
-        ``accepted`` or why not.
-    refined : RefinedQuadrangle or None
-        Its fitted edges, if it came so far.
-    """
-
-    region: Region
-    rough: FloatArray
-    outline: FloatArray
-    fate: str
-    refined: RefinedQuadrangle | None = None
-
-
-@dataclass(frozen=True)
-class MarkerDetections:
-    """The markers found in one image, by ID and place, and what was not taken for one.
-
-    Attributes
-    ----------
-    dictionary : str
-        Name of the dictionary.
-    ids : (N,) int64
-        The markers' numbers.
-    corners : (N, 4, 2) float64
-        Top left, top right, bottom right, bottom left of each marker as printed; pixels (u, v) of
-        the image as it is.
-    covariance : (N, 4, 2, 2) float64
-        Of each corner, pixels squared.
-    quality : (N,) float64
-        1 less the mean absolute difference between the cells' whiteness and the pattern.
-    margin : (N,) float64
-        How much nearer the pattern is than the second best, in cells.
-    explained : (N,) float64
-        Share of the grey values' variance, noise aside, that the fit explains; NaN without
-        ``joint``.
-    candidates : tuple of Candidate
-        All regions that came as far as having corners.
-    rejected : Counter
-        How many regions and candidates were not taken, by cause.
-    masks : tuple of Mask
-        The dark pixels of phase 1, if they were to be kept.
-    """
-
-    dictionary: str
-    ids: NDArray[np.int64]
-    corners: FloatArray
-    covariance: FloatArray
-    quality: FloatArray
-    margin: FloatArray
-    explained: FloatArray
-    candidates: tuple[Candidate, ...]
-    rejected: Counter[str]
-    masks: tuple[Mask, ...]
-
-    def __len__(self) -> int:
-        return len(self.ids)
-
-    def landmarks(self) -> tuple[MarkerLandmark, ...]:
-        """The markers as rows of a file."""
-        return tuple(
-            MarkerLandmark(
-                self.dictionary,
-                int(number),
-                float(quality),
-                (
-                    _corner(corners[0], covariance[0]),
-                    _corner(corners[1], covariance[1]),
-                    _corner(corners[2], covariance[2]),
-                    _corner(corners[3], covariance[3]),
-                ),
-            )
-            for number, quality, corners, covariance in zip(
-                self.ids, self.quality, self.corners, self.covariance
-            )
-        )
-
-
-def _corner(place: FloatArray, covariance: FloatArray) -> MarkerCorner:
-    return MarkerCorner(
-        float(place[0]),
-        float(place[1]),
-        float(covariance[0, 0]),
-        float(covariance[0, 1]),
-        float(covariance[1, 1]),
-    )
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.markers.detect import ACCEPTED, SAME_MARKER, MarkerDetections
+from detect.markers.detections import ACCEPTED, SAME_MARKER, MarkerDetections
 
 FloatArray = NDArray[np.float64]
 Colour = tuple[int, int, int]

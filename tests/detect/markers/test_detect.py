@@ -15,7 +15,8 @@ from camera import Camera
 from detect.errors import DetectError, FrameError
 from detect.markers import identification as identities
 from detect.markers import quadrangle, refinement, regions
-from detect.markers.detect import MarkerDetections, detect_markers
+from detect.markers.detect import detect_markers
+from detect.markers.detections import MarkerDetections
 from detect.markers.dictionaries import dictionary_names, marker_dictionary
 from detect.markers.settings import PUBLISHED, MarkerSettings
 from tests.detect.markers.rendering import View, exposed, render, view_corners
