@@ -13,8 +13,7 @@ blur; contrast and background are linear, and every Gauss-Newton step solves for
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -77,8 +76,6 @@ _LOOK_EVALUATIONS = 3
 _CONVERGED = 0.3
 #: What the first step of a fit promises may be this much less evidence than is needed.
 _FIRST_STEP_SLACK = 2.0
-# Numba knows it as the type, the type checker as a function.
-_F: Callable[[Any], Any] = np.float32
 
 
 class Hope(NamedTuple):

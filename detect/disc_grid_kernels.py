@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 from numba import njit
@@ -18,6 +16,8 @@ from detect.disc_model_kernels import (
     CAPACITY,
     CHORD_X,
     CHORD_Y,
+    F32,
+    FASTMATH,
     GROWTH,
     PER_LENGTH,
     PER_STEP_ACROSS,
@@ -38,13 +38,10 @@ from detect.disc_patch_kernels import (
     Patch,
 )
 
-# Numba knows it as the type, the type checker as a function.
-_F: Callable[[Any], Any] = np.float32
-_FASTMATH = {"reassoc", "contract", "arcp", "nsz"}
-_SMALLEST = _F(1e-6)
+_SMALLEST = F32(1e-6)
 
 
-@njit(cache=True, error_model="numpy", inline="always", fastmath=_FASTMATH)
+@njit(cache=True, error_model="numpy", inline="always", fastmath=FASTMATH)
 def store_chord(
     x: float,
     y: float,
@@ -61,7 +58,7 @@ def store_chord(
 
     `before` and `after` are the lengths of the two steps along it.
     """
-    per_length = _F(1.0) / math.sqrt(x1 * x1 + y1 * y1 + _F(1e-12))
+    per_length = F32(1.0) / math.sqrt(x1 * x1 + y1 * y1 + F32(1e-12))
     across_x = -y1 * per_length
     across_y = x1 * per_length
     across = x2 * across_x + y2 * across_y
@@ -74,10 +71,10 @@ def store_chord(
     geometry[PER_STEP_ACROSS * CAPACITY + i] = across if abs(across) > _SMALLEST else _SMALLEST
     geometry[PER_STEP_ALONG * CAPACITY + i] = -(x1 * x2 + y1 * y2) * per_length * per_length
     geometry[PER_LENGTH * CAPACITY + i] = per_length
-    geometry[GROWTH * CAPACITY + i] = _F(2.0) * (after - before) / (after + before + _F(1e-9))
+    geometry[GROWTH * CAPACITY + i] = F32(2.0) * (after - before) / (after + before + F32(1e-9))
 
 
-@njit(cache=True, error_model="numpy", forceinline=True, fastmath=_FASTMATH)
+@njit(cache=True, error_model="numpy", forceinline=True, fastmath=FASTMATH)
 def fill_chords(
     floor_xy: NDArray[np.float32], radius: float, columns: bool, count: int, patch: Patch
 ) -> None:
@@ -88,8 +85,8 @@ def fill_chords(
     floor_line = floor_xy.reshape(-1)
     next_row = 2 * floor_xy.shape[1]
     steep, other = (2, next_row) if columns else (next_row, 2)
-    per_radius = _F(1.0 / radius)
-    half = _F(0.5)
+    per_radius = F32(1.0 / radius)
+    half = F32(0.5)
     for i in range(count):
         at = 2 * index[i]
         x = floor_line[at]
@@ -147,8 +144,8 @@ def gather_grid(
     y0 = floor_xy[v0, u0, 1]
     floor = patch.floor
     terms = patch.terms
-    per_radius = _F(1.0 / radius)
-    middle = _F(image[v0, u0])
+    per_radius = F32(1.0 / radius)
+    middle = F32(image[v0, u0])
     begin_p = first_p - margin
     # One line more on either side, for the steps from line to line.
     for line in range(lines + 2):
@@ -160,7 +157,7 @@ def gather_grid(
             floor[row + k] = (floor_xy[v, u, 0] - x0) * per_radius
             floor[CAPACITY + row + k] = (floor_xy[v, u, 1] - y0) * per_radius
             if 0 < line <= lines:
-                terms[GREY * CAPACITY + row - length + k] = _F(image[v, u]) - middle
+                terms[GREY * CAPACITY + row - length + k] = F32(image[v, u]) - middle
         # Beyond the image the floor goes on as it ends.
         for k in range(-begin_p - 1, -1, -1):
             for axis in range(0, 2 * CAPACITY, CAPACITY):
@@ -193,12 +190,12 @@ def gather_grid(
         for i in range(row + length - margin, row + length):
             terms[ONE * CAPACITY + i] = 0.0
     for i in range(n):
-        count += 1 if terms[ONE * CAPACITY + i] > _F(0.0) else 0
+        count += 1 if terms[ONE * CAPACITY + i] > F32(0.0) else 0
     _mask_terms(n, terms)
     return n, count
 
 
-@njit(cache=True, error_model="numpy", forceinline=True, fastmath=_FASTMATH)
+@njit(cache=True, error_model="numpy", forceinline=True, fastmath=FASTMATH)
 def _chord_geometry(
     floor: NDArray[np.float32],
     n: int,
@@ -211,15 +208,15 @@ def _chord_geometry(
     terms: NDArray[np.float32],
 ) -> None:
     """The geometry of a grid's pixels, and which of them are within reach."""
-    half = _F(0.5)
-    one = _F(1.0)
-    zero = _F(0.0)
-    reach = _F(reach_radii)
-    reach_2 = _F(reach_px * reach_px)
-    near_2 = _F(NEAR_PX * NEAR_PX)
-    near_radii = _F(NEAR_RADII)
-    along_p = _F(blurs_p)
-    along_q = _F(blurs_q)
+    half = F32(0.5)
+    one = F32(1.0)
+    zero = F32(0.0)
+    reach = F32(reach_radii)
+    reach_2 = F32(reach_px * reach_px)
+    near_2 = F32(NEAR_PX * NEAR_PX)
+    near_radii = F32(NEAR_RADII)
+    along_p = F32(blurs_p)
+    along_q = F32(blurs_q)
     for i in range(n):
         at = i + length
         x = floor[at]
@@ -235,7 +232,7 @@ def _chord_geometry(
         before = math.sqrt(bx * bx + by * by)
         after = math.sqrt(ax * ax + ay * ay)
         store_chord(x, y, x1, y1, x2, y2, before, after, i, geometry)
-        r_2 = x * x + y * y + _F(1e-12)
+        r_2 = x * x + y * y + F32(1e-12)
         r = math.sqrt(r_2)
         off = r - one
         off_2 = off * off
@@ -255,7 +252,7 @@ def _chord_geometry(
         terms[PLANE_Y * CAPACITY + i] = y
 
 
-@njit(cache=True, error_model="numpy", forceinline=True, fastmath=_FASTMATH)
+@njit(cache=True, error_model="numpy", forceinline=True, fastmath=FASTMATH)
 def _mask_terms(n: int, terms: NDArray[np.float32]) -> None:
     """Finish the terms of a grid: zero where a pixel is not to be fitted."""
     terms[LINKED * CAPACITY] = 0.0

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 from numba import njit
@@ -21,6 +19,8 @@ from detect.disc_model_kernels import (
     EDGE_Y,
     EDGE_YU,
     EDGE_YV,
+    F32,
+    FASTMATH,
     PIXEL_VARIANCE,
 )
 from detect.disc_patch_kernels import (
@@ -40,19 +40,16 @@ from detect.disc_patch_kernels import (
     Patch,
 )
 
-# Numba knows it as the type, the type checker as a function.
-_F: Callable[[Any], Any] = np.float32
-_FASTMATH = {"reassoc", "contract", "arcp", "nsz"}
 #: What is called the edge: so many standard deviations of the blur on either side, and a bit.
 _BAND = 2.5
 _BAND_PX = 0.3
 
 
 #: What a pixel is to a list: not within reach, too far to speak for a disc, nearby, at the edge.
-_BEYOND, _FAR, _NEARBY, _AT_EDGE = _F(0.0), _F(1.0), _F(2.0), _F(3.0)
+_BEYOND, _FAR, _NEARBY, _AT_EDGE = F32(0.0), F32(1.0), F32(2.0), F32(3.0)
 
 
-@njit(cache=True, error_model="numpy", forceinline=True, fastmath=_FASTMATH)
+@njit(cache=True, error_model="numpy", forceinline=True, fastmath=FASTMATH)
 def _weigh_row(
     floor: NDArray[np.float32],
     x0: float,
@@ -71,17 +68,17 @@ def _weigh_row(
     wanted: NDArray[np.float32],
 ) -> None:
     """What the pixels of a piece of a row are, from the floor x, y, x, y ... that they see."""
-    x_middle, y_middle, r_disc, r_limit = _F(x0), _F(y0), _F(radius), _F(limit)
-    x_u, y_u, x_v, y_v = _F(xu), _F(yu), _F(xv), _F(yv)
-    px, blurs_u, blurs_v = _F(reach_2), _F(blurs_2), _F(blurs_2 * ratio_2)
-    edge_u, edge_v = _F(band_u), _F(band_v)
-    near_px = _F(NEAR_PX * NEAR_PX)
-    r_near = _F(NEAR_RADII * radius)
+    x_middle, y_middle, r_disc, r_limit = F32(x0), F32(y0), F32(radius), F32(limit)
+    x_u, y_u, x_v, y_v = F32(xu), F32(yu), F32(xv), F32(yv)
+    px, blurs_u, blurs_v = F32(reach_2), F32(blurs_2), F32(blurs_2 * ratio_2)
+    edge_u, edge_v = F32(band_u), F32(band_v)
+    near_px = F32(NEAR_PX * NEAR_PX)
+    r_near = F32(NEAR_RADII * radius)
     for k in range(len(wanted)):
         x = floor[2 * k] - x_middle
         y = floor[2 * k + 1] - y_middle
-        r_2 = x * x + y * y + _F(1e-12)
-        per_r_2 = _F(1.0) / r_2
+        r_2 = x * x + y * y + F32(1e-12)
+        per_r_2 = F32(1.0) / r_2
         r = math.sqrt(r_2)
         off = r - r_disc
         off_2 = off * off
@@ -196,8 +193,8 @@ def gather_sparse(
     shift = max(1, int(0.381966 * every + 0.5))
     first_u = max(1, u0 - half_u)
     last_u = min(width - 2, u0 + half_u)
-    r_2_near = _F((NEAR_RADII * radius) ** 2)
-    r_2_limit = _F((settings.reach_radii * radius) ** 2)
+    r_2_near = F32((NEAR_RADII * radius) ** 2)
+    r_2_limit = F32((settings.reach_radii * radius) ** 2)
     u1 = min(max(u0, 1), width - 2)
     v1 = min(max(v0, 1), height - 2)
     xu = 0.5 * (floor_xy[v1, u1 + 1, 0] - floor_xy[v1, u1 - 1, 0])
@@ -250,10 +247,10 @@ def _fill_terms(
     terms = patch.terms
     floor_line = floor_xy.reshape(-1)
     grey = image.reshape(-1)
-    middle = _F(image[v0, u0])
+    middle = F32(image[v0, u0])
     x0 = floor_xy[v0, u0, 0]
     y0 = floor_xy[v0, u0, 1]
-    per_radius = _F(1.0 / radius)
+    per_radius = F32(1.0 / radius)
     before = -2
     for i in range(count):
         pixel = index[i]
@@ -264,7 +261,7 @@ def _fill_terms(
         terms[PLANE_Y * CAPACITY + i] = y
         terms[SADDLE * CAPACITY + i] = x * x - y * y
         terms[SADDLE_XY * CAPACITY + i] = x * y
-        terms[GREY * CAPACITY + i] = _F(grey[pixel]) - middle
+        terms[GREY * CAPACITY + i] = F32(grey[pixel]) - middle
         terms[NEAR * CAPACITY + i] = index[CAPACITY + i]
         terms[LINKED * CAPACITY + i] = 1.0 if pixel == before + 1 else 0.0
         before = pixel
@@ -278,7 +275,7 @@ def _fill_edges(floor_xy: NDArray[np.float32], radius: float, count: int, patch:
     terms = patch.terms
     floor_line = floor_xy.reshape(-1)
     next_row = 2 * floor_xy.shape[1]
-    per_step = _F(0.5 / radius)
+    per_step = F32(0.5 / radius)
     for i in range(count):
         at = 2 * index[i]
         geometry[EDGE_X * CAPACITY + i] = terms[PLANE_X * CAPACITY + i]

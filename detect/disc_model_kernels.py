@@ -28,8 +28,11 @@ from numpy.typing import NDArray
 
 from detect.disc_profile import BEND, T_LIMIT, Z_LIMIT
 
-# Numba knows it as the type, the type checker as a function.
-_F: Callable[[Any], Any] = np.float32
+#: Single precision. Numba knows it as the type, the type checker as a function.
+F32: Callable[[Any], Any] = np.float32
+#: What the compiler may do in the kernels of discs: another order of sums, products into sums. Not
+#: that nothing is NaN or infinite.
+FASTMATH = {"reassoc", "contract", "arcp", "nsz"}
 
 #: Rows of the results.
 SHARE, BY_BLUR, BY_RADIUS, BY_X, BY_Y = range(5)
@@ -51,36 +54,34 @@ CAPACITY = 4096
 
 PIXEL_VARIANCE = 1.0 / 12.0
 
-_0, _1, _2, _HALF = _F(0.0), _F(1.0), _F(2.0), _F(0.5)
-_TINY = _F(1e-12)
-_ASIDE = _F(1e-6)
-_Z_LIMIT = _F(Z_LIMIT)
-_T_LIMIT = _F(T_LIMIT)
-_Q00, _Q01, _Q02 = (_F(q) for q in BEND[0])
-_Q10, _Q11, _Q12 = (_F(q) for q in BEND[1])
-_Q20, _Q21, _Q22 = (_F(q) for q in BEND[2])
-_Q30, _Q31, _Q32 = (_F(q) for q in BEND[3])
-_Q40, _Q41, _Q42 = (_F(q) for q in BEND[4])
-_Q50, _Q51, _Q52 = (_F(q) for q in BEND[5])
-_3, _4, _5 = _F(3.0), _F(4.0), _F(5.0)
+_0, _1, _2, _HALF = F32(0.0), F32(1.0), F32(2.0), F32(0.5)
+_TINY = F32(1e-12)
+_ASIDE = F32(1e-6)
+_Z_LIMIT = F32(Z_LIMIT)
+_T_LIMIT = F32(T_LIMIT)
+_Q00, _Q01, _Q02 = (F32(q) for q in BEND[0])
+_Q10, _Q11, _Q12 = (F32(q) for q in BEND[1])
+_Q20, _Q21, _Q22 = (F32(q) for q in BEND[2])
+_Q30, _Q31, _Q32 = (F32(q) for q in BEND[3])
+_Q40, _Q41, _Q42 = (F32(q) for q in BEND[4])
+_Q50, _Q51, _Q52 = (F32(q) for q in BEND[5])
+_3, _4, _5 = F32(3.0), F32(4.0), F32(5.0)
 #: The polynomial ends where the disc does: at z = -1 / t is the centre.
-_Z_PER_T = _F((Z_LIMIT - 1.0 / T_LIMIT) / T_LIMIT)
-_TWO_THIRDS = _F(2.0 / 3.0)
-
-_FASTMATH = {"reassoc", "contract", "arcp", "nsz"}
+_Z_PER_T = F32((Z_LIMIT - 1.0 / T_LIMIT) / T_LIMIT)
+_TWO_THIRDS = F32(2.0 / 3.0)
 
 # exp(-y) = p(y / 32)^32 with the Taylor polynomial p.
-_PER_32 = _F(0.5 / 32.0)
-_E2, _E3, _E4, _E5 = _F(1 / 2), _F(1 / 6), _F(1 / 24), _F(1 / 120)
-_PER_ROOT_2PI = _F(1.0 / math.sqrt(2.0 * math.pi))
-_FAR = _F(5.0)
+_PER_32 = F32(0.5 / 32.0)
+_E2, _E3, _E4, _E5 = F32(1 / 2), F32(1 / 6), F32(1 / 24), F32(1 / 120)
+_PER_ROOT_2PI = F32(1.0 / math.sqrt(2.0 * math.pi))
+_FAR = F32(5.0)
 # Abramowitz and Stegun, 26.2.17: the normal distribution's tail, within 8e-8.
-_TAIL = _F(0.2316419)
-_B1, _B2, _B3 = _F(0.319381530), _F(-0.356563782), _F(1.781477937)
-_B4, _B5 = _F(-1.821255978), _F(1.330274429)
+_TAIL = F32(0.2316419)
+_B1, _B2, _B3 = F32(0.319381530), F32(-0.356563782), F32(1.781477937)
+_B4, _B5 = F32(-1.821255978), F32(1.330274429)
 
 
-@njit(cache=True, error_model="numpy", inline="always", fastmath=_FASTMATH)
+@njit(cache=True, error_model="numpy", inline="always", fastmath=FASTMATH)
 def normal(x: float) -> tuple[float, float]:
     """Density and distribution function of a standard normal variable, within 2e-6."""
     a = min(abs(x), _FAR)
@@ -97,7 +98,7 @@ def normal(x: float) -> tuple[float, float]:
     return density, (_1 - tail if x > _0 else tail)
 
 
-@njit(cache=True, error_model="numpy", forceinline=True, fastmath=_FASTMATH)
+@njit(cache=True, error_model="numpy", forceinline=True, fastmath=FASTMATH)
 def edge_shares(
     geometry: NDArray[np.float32],
     n: int,
@@ -114,13 +115,13 @@ def edge_shares(
     with G the deviation of the blur across the edge, on the floor, and D that of its area, an edge
     of radius R has the curvature D^2 / (R G^3) in units of the blur.
     """
-    x0, y0, r0 = _F(x_centre), _F(y_centre), _F(radius)
+    x0, y0, r0 = F32(x_centre), F32(y_centre), F32(radius)
     per_r0 = _1 / r0
-    variance_u = _F(blur_u * blur_u + PIXEL_VARIANCE)
-    variance_v = _F(blur_v * blur_v + PIXEL_VARIANCE)
+    variance_u = F32(blur_u * blur_u + PIXEL_VARIANCE)
+    variance_v = F32(blur_v * blur_v + PIXEL_VARIANCE)
     area = variance_u * variance_v
-    optics_u = _F(blur_u * blur_u) / variance_u
-    optics_v = _F(blur_v * blur_v) / variance_v
+    optics_u = F32(blur_u * blur_u) / variance_u
+    optics_v = F32(blur_v * blur_v) / variance_v
     for i in range(n):
         # At the centre itself any direction will do, but one there must be.
         x = geometry[EDGE_X * CAPACITY + i] - x0 + _ASIDE
@@ -166,17 +167,17 @@ def edge_shares(
 
 
 # asin(x) = pi / 2 - sqrt(1 - x) * polynomial(x) for x from 0 to 1 (Abramowitz and Stegun, 4.4.45).
-_A0, _A1, _A2, _A3 = _F(1.5707288), _F(-0.2121144), _F(0.0742610), _F(-0.0187293)
-_HALF_PI = _F(0.5 * math.pi)
-_S3, _S5, _S7, _S9 = _F(-1 / 6), _F(1 / 120), _F(-1 / 5040), _F(1 / 362880)
-_C2, _C4, _C6, _C8 = _F(-1 / 2), _F(1 / 24), _F(-1 / 720), _F(1 / 40320)
-_C10 = _F(-1 / 3628800)
+_A0, _A1, _A2, _A3 = F32(1.5707288), F32(-0.2121144), F32(0.0742610), F32(-0.0187293)
+_HALF_PI = F32(0.5 * math.pi)
+_S3, _S5, _S7, _S9 = F32(-1 / 6), F32(1 / 120), F32(-1 / 5040), F32(1 / 362880)
+_C2, _C4, _C6, _C8 = F32(-1 / 2), F32(1 / 24), F32(-1 / 720), F32(1 / 40320)
+_C10 = F32(-1 / 3628800)
 #: The two nodes of the Gauss-Legendre quadrature, each of weight one half of the interval.
-_NODE = _F(0.5 / math.sqrt(3.0))
-_MOST_BEND = _F(0.7)
+_NODE = F32(0.5 / math.sqrt(3.0))
+_MOST_BEND = F32(0.7)
 
 
-@njit(cache=True, error_model="numpy", inline="always", fastmath=_FASTMATH)
+@njit(cache=True, error_model="numpy", inline="always", fastmath=FASTMATH)
 def _arcsine(x: float) -> float:
     """Arc sine of x, which is cut to [-1, 1], within 7e-5."""
     a = min(abs(x), _1)
@@ -185,7 +186,7 @@ def _arcsine(x: float) -> float:
     return signed
 
 
-@njit(cache=True, error_model="numpy", forceinline=True, fastmath=_FASTMATH)
+@njit(cache=True, error_model="numpy", forceinline=True, fastmath=FASTMATH)
 def chord_shares(
     geometry: NDArray[np.float32],
     n: int,
@@ -203,12 +204,12 @@ def chord_shares(
     are smooth. What the optics blur across is left to `blur_across`, or
     to a width of the same variance.
     """
-    x0, y0, r0 = _F(x_centre), _F(y_centre), _F(radius)
+    x0, y0, r0 = F32(x_centre), F32(y_centre), F32(radius)
     per_r0 = _1 / r0
-    variance = _F(blur_along * blur_along + PIXEL_VARIANCE)
+    variance = F32(blur_along * blur_along + PIXEL_VARIANCE)
     per_sigma = _1 / math.sqrt(variance)
-    optics = _F(blur_along * blur_along) / variance
-    pixels = _F(width)
+    optics = F32(blur_along * blur_along) / variance
+    pixels = F32(width)
     for i in range(n):
         x = geometry[CHORD_X * CAPACITY + i] - x0
         y = geometry[CHORD_Y * CAPACITY + i] - y0
@@ -308,7 +309,7 @@ def blur_weights(blur: float, weights: NDArray[np.float32]) -> int:
     return reach
 
 
-@njit(cache=True, error_model="numpy", forceinline=True, fastmath=_FASTMATH)
+@njit(cache=True, error_model="numpy", forceinline=True, fastmath=FASTMATH)
 def _sum_of_three(
     middle: NDArray[np.float32],
     left: NDArray[np.float32],
@@ -321,7 +322,7 @@ def _sum_of_three(
         result[i] = weight * middle[i] + weight_aside * (left[i] + right[i])
 
 
-@njit(cache=True, error_model="numpy", forceinline=True, fastmath=_FASTMATH)
+@njit(cache=True, error_model="numpy", forceinline=True, fastmath=FASTMATH)
 def _add_four(
     left: NDArray[np.float32],
     right: NDArray[np.float32],
@@ -335,7 +336,7 @@ def _add_four(
         result[i] += weight * (left[i] + right[i]) + next_weight * (next_left[i] + next_right[i])
 
 
-@njit(cache=True, error_model="numpy", forceinline=True, fastmath=_FASTMATH)
+@njit(cache=True, error_model="numpy", forceinline=True, fastmath=FASTMATH)
 def _add_second_difference(
     values: NDArray[np.float32], scale: float, result: NDArray[np.float32]
 ) -> None:
@@ -343,7 +344,7 @@ def _add_second_difference(
         result[i] += scale * (values[i] - _2 * values[i + 1] + values[i + 2])
 
 
-@njit(cache=True, error_model="numpy", forceinline=True, fastmath=_FASTMATH)
+@njit(cache=True, error_model="numpy", forceinline=True, fastmath=FASTMATH)
 def blur_across(
     shares: NDArray[np.float32],
     n: int,
@@ -389,6 +390,6 @@ def blur_across(
     # d/dlog(blur) of a Gaussian blur of variance t is t times the second derivative.
     _add_second_difference(
         fields[begin : begin + length],
-        _F(blur * blur),
+        F32(blur * blur),
         fields[BY_BLUR * CAPACITY + margin : BY_BLUR * CAPACITY + n - margin],
     )

@@ -9,14 +9,12 @@ squares without a disc, with the disc where it is, and after the step.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from detect.disc_model_kernels import CAPACITY, FIELDS
+from detect.disc_model_kernels import CAPACITY, F32, FASTMATH, FIELDS
 from detect.disc_patch_kernels import GREY, ONE, PLANE_X, PLANE_Y, SADDLE, SADDLE_XY
 
 #: Rows of the sums of products.
@@ -25,12 +23,8 @@ CONTRAST, LOG_BLUR, RADIUS, X, Y, GREYS = range(5, 11)
 UNKNOWNS = 10
 ROWS = 11
 
-# Numba knows it as the type, the type checker as a function.
-_F: Callable[[Any], Any] = np.float32
-_FASTMATH = {"reassoc", "contract", "arcp", "nsz"}
 
-
-@njit(cache=True, error_model="numpy", forceinline=True, fastmath=_FASTMATH)
+@njit(cache=True, error_model="numpy", forceinline=True, fastmath=FASTMATH)
 def background_products(terms: NDArray[np.float32], n: int, products: NDArray[np.float64]) -> None:
     """Sums of products of the background's terms and the grey values, over n pixels."""
     for a in range(BACKGROUND + 1):
@@ -38,13 +32,13 @@ def background_products(terms: NDArray[np.float32], n: int, products: NDArray[np
         first = a * CAPACITY
         for b in range(a + 1):
             second = b * CAPACITY
-            total = _F(0.0)
+            total = F32(0.0)
             for i in range(n):
                 total += terms[first + i] * terms[second + i]
             products[row, GREYS if b == BACKGROUND else b] = total
 
 
-@njit(cache=True, error_model="numpy", forceinline=True, fastmath=_FASTMATH)
+@njit(cache=True, error_model="numpy", forceinline=True, fastmath=FASTMATH)
 def disc_products(
     terms: NDArray[np.float32],
     fields: NDArray[np.float32],
@@ -54,12 +48,12 @@ def disc_products(
     """Sums of products of the disc's fields with each other, the terms and the grey values."""
     for field in range(FIELDS):
         row = field * CAPACITY
-        s0 = _F(0.0)
-        s1 = _F(0.0)
-        s2 = _F(0.0)
-        s3 = _F(0.0)
-        s4 = _F(0.0)
-        s5 = _F(0.0)
+        s0 = F32(0.0)
+        s1 = F32(0.0)
+        s2 = F32(0.0)
+        s3 = F32(0.0)
+        s4 = F32(0.0)
+        s5 = F32(0.0)
         for i in range(n):
             value = fields[row + i]
             s0 += value * terms[ONE * CAPACITY + i]
@@ -75,11 +69,11 @@ def disc_products(
         products[at, 3] = s3
         products[at, 4] = s4
         products[GREYS, at] = s5
-        s0 = _F(0.0)
-        s1 = _F(0.0)
-        s2 = _F(0.0)
-        s3 = _F(0.0)
-        s4 = _F(0.0)
+        s0 = F32(0.0)
+        s1 = F32(0.0)
+        s2 = F32(0.0)
+        s3 = F32(0.0)
+        s4 = F32(0.0)
         for i in range(n):
             value = fields[row + i]
             s0 += value * fields[i]

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 from numba import njit
@@ -24,6 +22,8 @@ from detect.disc_model_kernels import (
     EDGE_XV,
     EDGE_YU,
     EDGE_YV,
+    F32,
+    FASTMATH,
     PER_LENGTH,
     PER_STEP_ACROSS,
     PER_STEP_ALONG,
@@ -41,15 +41,12 @@ from detect.disc_patch_kernels import (
 )
 
 _SECTORS = 16
-# Numba knows it as the type, the type checker as a function.
-_F: Callable[[Any], Any] = np.float32
-_FASTMATH = {"reassoc", "contract", "arcp", "nsz"}
 # Where the sectors of a quadrant meet.
 _TAN_1 = math.tan(math.pi / 8.0)
 _TAN_3 = math.tan(3.0 * math.pi / 8.0)
 
 
-@njit(cache=True, error_model="numpy", forceinline=True, fastmath=_FASTMATH)
+@njit(cache=True, error_model="numpy", forceinline=True, fastmath=FASTMATH)
 def residuals(
     terms: NDArray[np.float32],
     fields: NDArray[np.float32],
@@ -73,10 +70,16 @@ def residuals(
         Sums of squares: of the residuals, of those near the disc, and of what a background alone
         leaves there.
     """
-    b0, b1, b2, b3, b4 = _F(values[0]), _F(values[1]), _F(values[2]), _F(values[3]), _F(values[4])
-    a0, a1, a2, a3, a4 = _F(bare[0]), _F(bare[1]), _F(bare[2]), _F(bare[3]), _F(bare[4])
-    c, d_blur, d_radius = _F(values[5]), _F(values[6]), _F(values[7])
-    d_x, d_y = _F(values[8]), _F(values[9])
+    b0, b1, b2, b3, b4 = (
+        F32(values[0]),
+        F32(values[1]),
+        F32(values[2]),
+        F32(values[3]),
+        F32(values[4]),
+    )
+    a0, a1, a2, a3, a4 = F32(bare[0]), F32(bare[1]), F32(bare[2]), F32(bare[3]), F32(bare[4])
+    c, d_blur, d_radius = F32(values[5]), F32(values[6]), F32(values[7])
+    d_x, d_y = F32(values[8]), F32(values[9])
     # The sums have a loop of their own: a loop that stores, too, exists twice in the machine code,
     # and where the arrays lie in memory would decide in which order it adds.
     for i in range(n):
@@ -97,9 +100,9 @@ def residuals(
                 + b4 * terms[SADDLE_XY * CAPACITY + i]
             )
         )
-    total = _F(0.0)
-    near = _F(0.0)
-    near_total = _F(0.0)
+    total = F32(0.0)
+    near = F32(0.0)
+    near_total = F32(0.0)
     for i in range(n):
         without = terms[GREY * CAPACITY + i] - (
             a0 * terms[ONE * CAPACITY + i]
@@ -115,7 +118,7 @@ def residuals(
     return total, near, near_total
 
 
-@njit(cache=True, error_model="numpy", forceinline=True, fastmath=_FASTMATH)
+@njit(cache=True, error_model="numpy", forceinline=True, fastmath=FASTMATH)
 def correlated_area(terms: NDArray[np.float32], errors: NDArray[np.float32], n: int) -> float:
     """How many pixels go with one independent residual, from the correlation of neighbours.
 
@@ -123,9 +126,9 @@ def correlated_area(terms: NDArray[np.float32], errors: NDArray[np.float32], n: 
     the residuals hang together, and their number overstates what they tell: for a first-order
     process of correlation c by (1 + c) / (1 - c) in either direction.
     """
-    product = _F(0.0)
-    square = _F(0.0)
-    pairs = _F(0.0)
+    product = F32(0.0)
+    square = F32(0.0)
+    pairs = F32(0.0)
     for i in range(1, n):
         linked = terms[LINKED * CAPACITY + i]
         here = errors[i]
@@ -141,7 +144,7 @@ def correlated_area(terms: NDArray[np.float32], errors: NDArray[np.float32], n: 
     return area
 
 
-@njit(cache=True, error_model="numpy", forceinline=True, fastmath=_FASTMATH)
+@njit(cache=True, error_model="numpy", forceinline=True, fastmath=FASTMATH)
 def blur_widths(
     geometry: NDArray[np.float32],
     terms: NDArray[np.float32],
@@ -159,15 +162,15 @@ def blur_widths(
     `sigma_1` and `sigma_2` are the blur's deviations in pixels, along u and v for a list, along the
     lines and across them for a grid. `widths` is working space.
     """
-    cx, cy = _F(x0), _F(y0)
-    s1, s2 = _F(sigma_1 * sigma_1), _F(sigma_2 * sigma_2)
+    cx, cy = F32(x0), F32(y0)
+    s1, s2 = F32(sigma_1 * sigma_1), F32(sigma_2 * sigma_2)
     if is_list:
         for i in range(n):
             x = terms[PLANE_X * CAPACITY + i] - cx
             y = terms[PLANE_Y * CAPACITY + i] - cy
             gu = geometry[EDGE_XU * CAPACITY + i] * x + geometry[EDGE_YU * CAPACITY + i] * y
             gv = geometry[EDGE_XV * CAPACITY + i] * x + geometry[EDGE_YV * CAPACITY + i] * y
-            r_2 = x * x + y * y + _F(1e-12)
+            r_2 = x * x + y * y + F32(1e-12)
             widths[i] = math.sqrt((s1 * gu * gu + s2 * gv * gv) / r_2)
     else:
         for i in range(n):
@@ -182,16 +185,16 @@ def blur_widths(
             other_y = across * geometry[ACROSS_Y * CAPACITY + i] + along * steep_y
             g1 = other_x * x + other_y * y
             g2 = steep_x * x + steep_y * y
-            r_2 = x * x + y * y + _F(1e-12)
+            r_2 = x * x + y * y + F32(1e-12)
             widths[i] = math.sqrt((s1 * g1 * g1 + s2 * g2 * g2) / r_2)
-    blurs = _F(0.0)
-    weights = _F(0.0)
-    most = _F(2.5)
+    blurs = F32(0.0)
+    weights = F32(0.0)
+    most = F32(2.5)
     for i in range(n):
         weight = abs(fields[BY_RADIUS * CAPACITY + i])
         blurs += weight * min(widths[i], most)
         weights += weight
-    width: float = blurs / max(weights, _F(1e-12))
+    width: float = blurs / max(weights, F32(1e-12))
     return width
 
 
