@@ -35,6 +35,16 @@ class Map:
         Calibration, if it is not the one in the run folder (lines and --calibrate need one).
     calibrate : bool
         Estimate the camera's mounting (rotation and height) as well.
+    row_errors : str
+        With --calibrate, where rows are compared with discs: `corrected`, on the floor as the
+        camera as mounted sees it; `recorded`, as the rows were written, where their covariances
+        belong.
+    tilt_deg : float
+        Let the robot tilt by so much (standard deviation of pitch and roll, degrees) in each frame;
+        with --row-errors recorded.
+    solver : str
+        `separable`: the project's own; `gtsam`: GTSAM's Levenberg-Marquardt takes the last steps
+        (extra [slam]).
     loss : str
         `huber`, `cauchy` or `geman-mcclure` lets far-off rows pull less.
     loss_scale : float
@@ -53,6 +63,9 @@ class Map:
     stem: MaybeStr = None
     camera: MaybePath = None
     calibrate: bool = False
+    row_errors: Literal["corrected", "recorded"] = "corrected"
+    tilt_deg: float = 0.0
+    solver: Literal["separable", "gtsam"] = "separable"
     loss: Literal["none", "huber", "cauchy", "geman-mcclure"] = "none"
     loss_scale: float = 3.0
     output: Annotated[MaybePath, arg(aliases=["-o"])] = None
@@ -85,6 +98,13 @@ class Localize:
         out, by Mahalanobis distance of one row at a time or of a frame's rows together.
     gate_probability : float
         Share of right rows that pass the gate.
+    map_errors : str
+        `considered`: the map's covariances are errors that stay the same each time a landmark is
+        seen; `white`: errors that are new each time; `ignored`: the map is exact.
+    start : three floats
+        Pose at the start in the map (m, m, rad).
+    start_sigma : three floats
+        Its standard deviations.
     reference : Path
         A path.csv to measure the distance from.
     output : Path
@@ -104,6 +124,9 @@ class Localize:
     camera: MaybePath = None
     association: Literal["known", "nearest", "joint"] = "known"
     gate_probability: float = 0.999
+    map_errors: Literal["considered", "white", "ignored"] = "considered"
+    start: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    start_sigma: tuple[float, float, float] = (0.0, 0.0, 0.0)
     reference: MaybePath = None
     output: Annotated[MaybePath, arg(aliases=["-o"])] = None
     interactive: bool = False
@@ -133,6 +156,9 @@ class Ekf:
         out.
     gate_probability : float
         Share of right rows that pass the gate; with known association nothing is gated.
+    first_estimates : bool
+        Evaluate Jacobians at first estimates (FEJ): then the filter does not believe to learn its
+        heading from landmarks that it has placed itself.
     reference : Path
         A path.csv to measure the distance from.
     output : Path
@@ -151,6 +177,7 @@ class Ekf:
     camera: MaybePath = None
     association: Literal["known", "nearest", "joint"] = "known"
     gate_probability: float = 0.999
+    first_estimates: bool = False
     reference: MaybePath = None
     output: Annotated[MaybePath, arg(aliases=["-o"])] = None
     interactive: bool = False

@@ -1,0 +1,143 @@
+"""Figures of a filter's run: how far from a reference, and whether innovations are as expected."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from landmarks import wrap_angle
+from slam.filter_frames import FilterRun
+from slam.map_file import Path2D
+from storage import OutputExistsError, write_whole
+
+FloatArray = NDArray[np.float64]
+
+
+def path_distance(path: Path2D, reference: ArrayLike) -> dict[str, float]:
+    """How far a path is from another one of the same run in the same map.
+
+    Parameters
+    ----------
+    path : Path2D
+        N poses.
+    reference : (N, 3) array_like
+        The other's poses.
+
+    Returns
+    -------
+    dict of str to float
+        Root mean square, median and largest distance of positions (m) and headings (rad), and those
+        of the last pose.
+    """
+    other = np.asarray(reference, dtype=np.float64)
+    position = np.hypot(*(path.poses[:, :2] - other[:, :2]).T)
+    heading = np.abs(wrap_angle(path.poses[:, 2] - other[:, 2]))
+    return {
+        f"{name}_{figure}_{unit}": float(value)
+        for name, unit, distance in (("position", "m", position), ("heading", "rad", heading))
+        for figure, value in (
+            ("rms", math.sqrt(float(np.mean(distance**2)))),
+            ("median", np.median(distance)),
+            ("max", np.max(distance)),
+            ("last", distance[-1]),
+        )
+    }
+
+
+def summary(run: FilterRun, settings: Any, distance: dict[str, float] | None) -> dict[str, object]:
+    """What the command's .json holds.
+
+    Parameters
+    ----------
+    run : FilterRun
+    settings : dataclass
+        The command's flags.
+    distance : dict or None
+        See `path_distance`.
+
+    Returns
+    -------
+    dict
+    """
+    import slam
+
+    count = run.count
+    figures: dict[str, object] = {
+        "steps": len(run.path.poses) - 1,
+        "disc_rows_used": count.discs,
+        "line_rows_used": count.lines,
+        "rows_left_out": dict(sorted(count.left_out.items())),
+        "innovation_squared": count.innovation_squared,
+        "innovation_expected": count.innovation_numbers,
+    }
+    if distance is not None:
+        figures["distance_from_reference"] = distance
+    flags = {
+        name: str(value) if isinstance(value, Path) else value
+        for name, value in dataclasses.asdict(settings).items()
+    }
+    return {"version": slam.__version__, "settings": flags, "figures": figures}
+
+
+def write_json(path: Path, content: dict[str, object], *, overwrite: bool) -> None:
+    """Write a summary.
+
+    Raises
+    ------
+    storage.OutputExistsError
+        If the file exists and may not be replaced.
+    """
+    with write_whole(path, overwrite=overwrite) as stream:
+        stream.write((json.dumps(content, indent=1) + "\n").encode())
+
+
+def table(run: FilterRun, distance: dict[str, float] | None) -> list[str]:
+    """Lines for the terminal."""
+    count = run.count
+    lines = [f"steps             {len(run.path.poses) - 1}"]
+    used = [f"{count.discs} of discs"] * bool(count.discs) + [f"{count.lines} of lines"] * bool(
+        count.lines
+    )
+    lines.append(f"rows used         {', '.join(used) or 'none'}")
+    for reason, number in sorted(count.left_out.items()):
+        lines.append(f"left out          {number} ({reason})")
+    if count.innovation_numbers:
+        factor = count.innovation_squared / count.innovation_numbers
+        lines.append(
+            f"innovations       chi2 {count.innovation_squared:.1f}, expected "
+            f"{count.innovation_numbers}, factor {factor:.2f}, its root {math.sqrt(factor):.2f}"
+        )
+    if distance is not None:
+        lines.append(
+            "from reference    position rms {position_rms_m:.3f} m, median "
+            "{position_median_m:.3f}, max {position_max_m:.3f}, last {position_last_m:.3f}".format(
+                **distance
+            )
+        )
+        degrees = {k: math.degrees(v) for k, v in distance.items() if k.startswith("heading")}
+        lines.append(
+            "                  heading rms {heading_rms_rad:.2f} deg, median "
+            "{heading_median_rad:.2f}, max {heading_max_rad:.2f}, last {heading_last_rad:.2f}"
+            "".format(**degrees)
+        )
+    return lines
+
+
+def demand_free(folder: Path, names: tuple[str, ...], *, overwrite: bool) -> None:
+    """Refuse before the work what could not be written after it, and make the folder.
+
+    Raises
+    ------
+    storage.OutputExistsError
+        If one of the files exists and may not be replaced.
+    """
+    for name in names:
+        if (folder / name).exists() and not overwrite:
+            raise OutputExistsError(folder / name)
+    folder.mkdir(parents=True, exist_ok=True)

@@ -1,0 +1,256 @@
+"""Localisation in a known map: an extended Kalman filter of the pose alone.
+
+The map has errors of its own. They are the same each time a landmark is seen, so that adding its
+covariance to each measurement's would let the filter average them away, which it can't. By default
+the filter *considers* them: it carries the correlation of the pose with each landmark's error along
+without estimating the landmarks anew (Schmidt-Kalman filter). What a map file does not tell is the
+correlation of landmarks with each other, so an error that all landmarks have in common (the drift
+of a loop) is not covered: the covariance is that of the pose in the map, as the map stands.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from slam.errors import SlamError
+from slam.filter_association import Associator
+from slam.filter_frames import NO_CAMERA, FilterRun, FrameRows, RowCount, frames_of, unknown
+from slam.filter_kernels import frame_innovation
+from slam.map_file import LandmarkMap, Path2D
+from slam.motion import move, move_jacobians
+from slam.recording import Recording
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+MapErrors = Literal["considered", "white", "ignored"]
+
+_POSE_SIZE = 3
+
+
+class Localizer:
+    """The filter.
+
+    Parameters
+    ----------
+    landmark_map : LandmarkMap
+        Where the landmarks are.
+    start : (3,) array_like
+        Pose at the start, in the map (m, m, rad).
+    start_covariance : (3, 3) array_like
+        Its covariance; none by default, as the start of a run defines its map.
+    camera_xy : (2,) array_like
+        The camera's centre in the robot frame (m); only lines need it.
+    map_errors : str
+        `considered`: see above; `white`: each landmark's covariance is added to that of each of
+        its rows, as if its error were another one each time; `ignored`: the map is exact.
+    """
+
+    def __init__(
+        self,
+        landmark_map: LandmarkMap,
+        start: ArrayLike = (0.0, 0.0, 0.0),
+        start_covariance: ArrayLike | None = None,
+        camera_xy: ArrayLike = NO_CAMERA,
+        *,
+        map_errors: MapErrors = "considered",
+    ) -> None:
+        discs, lines = landmark_map.discs, landmark_map.lines
+        self.camera_xy = np.asarray(camera_xy, dtype=np.float64)
+        self.disc_slots = {int(i): _POSE_SIZE + 2 * k for k, i in enumerate(discs.ids)}
+        first = _POSE_SIZE + 2 * len(discs)
+        self.line_slots = {int(i): first + 2 * k for k, i in enumerate(lines.ids)}
+        self.count = RowCount()
+        self.pose_covariance = np.zeros((3, 3))
+        if start_covariance is not None:
+            self.pose_covariance += np.asarray(start_covariance, dtype=np.float64)
+        self._state = np.concatenate(
+            [np.asarray(start, dtype=np.float64), discs.xy.ravel(), lines.xy.ravel()]
+        )
+        self._map_errors = map_errors
+        self._map_covariance = np.concatenate([discs.covariance, lines.covariance])
+        if map_errors == "ignored":
+            self._map_covariance = np.zeros_like(self._map_covariance)
+        # Of the pose with the landmarks' errors.
+        self._cross = np.zeros((_POSE_SIZE, len(self._state) - _POSE_SIZE))
+
+    @property
+    def state(self) -> FloatArray:
+        """The pose, then the landmarks: (n,)."""
+        return self._state
+
+    @property
+    def pose(self) -> FloatArray:
+        """x, y (m), theta (rad): (3,)."""
+        return self._state[:_POSE_SIZE]
+
+    def block(self, index: IntArray) -> FloatArray:
+        """Rows and columns of the joint covariance of pose and map.
+
+        Parameters
+        ----------
+        index : (3 + 2 k,) int64 array
+            The pose, and then landmarks, of which each may be there several times.
+
+        Returns
+        -------
+        (3 + 2 k, 3 + 2 k) float64
+        """
+        block = np.zeros((len(index), len(index)))
+        block[:_POSE_SIZE, :_POSE_SIZE] = self.pose_covariance
+        if len(index) > _POSE_SIZE:
+            cross = self._cross[:, index[_POSE_SIZE:] - _POSE_SIZE]
+            block[:_POSE_SIZE, _POSE_SIZE:], block[_POSE_SIZE:, :_POSE_SIZE] = cross, cross.T
+            landmark = (index[_POSE_SIZE::2] - _POSE_SIZE) // 2
+            same = landmark[:, None] == landmark
+            blocks = same[:, :, None, None] * self._map_covariance[landmark]
+            block[_POSE_SIZE:, _POSE_SIZE:] = blocks.transpose(0, 2, 1, 3).reshape(
+                2 * len(landmark), -1
+            )
+        return block
+
+    def predict(self, step: FloatArray, noise: FloatArray) -> None:
+        """The robot moves by an odometry step.
+
+        Parameters
+        ----------
+        step : (3,) array
+            dx, dy (m), dphi (rad).
+        noise : (3, 3) array
+            Its covariance.
+        """
+        by_pose, by_step = move_jacobians(self.pose, step)
+        self._state[:_POSE_SIZE] = move(self.pose, step)
+        moved = by_pose @ self.pose_covariance @ by_pose.T + by_step @ noise @ by_step.T
+        self.pose_covariance = 0.5 * (moved + moved.T)
+        self._cross = by_pose @ self._cross
+
+    def measure(self, rows: FrameRows) -> None:
+        """Use the rows of a frame whose landmarks are in the map; the others are left out.
+
+        A row of several lines measures the mean of their bearings.
+
+        Parameters
+        ----------
+        rows : FrameRows
+
+        Raises
+        ------
+        SlamError
+            If the covariance of the innovation is not positive definite.
+        """
+        discs = [k for k, number in enumerate(rows.disc_ids) if number in self.disc_slots]
+        lines = [
+            k
+            for k, numbers in enumerate(rows.line_ids)
+            if numbers and all(number in self.line_slots for number in numbers)
+        ]
+        self._count(rows, discs, lines)
+        if not discs and not lines:
+            return
+        line_ids = [rows.line_ids[k] for k in lines]
+        innovation, jacobian, noise, index = frame_innovation(
+            self._state,
+            self._state,
+            np.array([self.disc_slots[rows.disc_ids[k]] for k in discs], dtype=np.int64),
+            rows.disc_xy[discs],
+            rows.disc_covariance[discs],
+            np.array([self.line_slots[i] for ids in line_ids for i in ids], dtype=np.int64),
+            np.cumsum([0, *map(len, line_ids)]),
+            rows.bearing_rad[lines],
+            rows.sigma_rad[lines],
+            self.camera_xy,
+        )
+        block = self.block(index)
+        covariance = jacobian @ block @ jacobian.T + noise
+        try:
+            root = np.linalg.cholesky(covariance)
+        except np.linalg.LinAlgError:
+            raise SlamError(
+                "the covariance of the innovation is not positive definite: rows or steps with "
+                "covariances that contradict each other"
+            ) from None
+        whitened = np.linalg.solve(root, innovation)
+        # The pose's part of P H^T, over the root of S.
+        factor = np.linalg.solve(root, jacobian @ block[:, :_POSE_SIZE]).T
+        self._state[:_POSE_SIZE] += factor @ whitened
+        if self._map_errors == "considered":
+            seen = np.linalg.solve(root, self._by_map(jacobian, index))
+            self._cross -= factor @ seen
+        self.pose_covariance = self.pose_covariance - factor @ factor.T
+        self.count.innovation_squared += float(whitened @ whitened)
+        self.count.innovation_numbers += len(innovation)
+
+    def _by_map(self, jacobian: FloatArray, index: IntArray) -> FloatArray:
+        """Covariance of the measurement with the landmarks' errors: H P[index, landmarks]."""
+        product = jacobian[:, :_POSE_SIZE] @ self._cross
+        for column in range(_POSE_SIZE, len(index), 2):
+            place = index[column] - _POSE_SIZE
+            product[:, place : place + 2] += (
+                jacobian[:, column : column + 2] @ self._map_covariance[place // 2]
+            )
+        return product
+
+    def _count(self, rows: FrameRows, discs: list[int], lines: list[int]) -> None:
+        used_discs, used_lines = set(discs), set(lines)
+        for k, number in enumerate(rows.disc_ids):
+            if k not in used_discs:
+                reason = "disc without ID" if unknown(number) else "disc not in the map"
+                self.count.left_out[reason] += 1
+        for k, numbers in enumerate(rows.line_ids):
+            if k not in used_lines:
+                reason = "line not in the map" if numbers else "line without ID"
+                self.count.left_out[reason] += 1
+        self.count.discs += len(discs)
+        self.count.lines += len(lines)
+
+
+def run_localizer(
+    recording: Recording, localizer: Localizer, associator: Associator | None = None
+) -> FilterRun:
+    """Take a localizer through a run.
+
+    Parameters
+    ----------
+    recording : Recording
+        The run.
+    localizer : Localizer
+        A filter at the start; changed.
+    associator : Associator, optional
+        How rows are paired with the map; by default by their identifiers.
+
+    Returns
+    -------
+    FilterRun
+        With the landmarks that each row was taken to show.
+
+    Raises
+    ------
+    SlamError
+        If an update is not possible; the message names the step.
+    """
+    pairing = associator or Associator()
+    poses = np.empty((len(recording) + 1, _POSE_SIZE))
+    covariance = np.empty((len(recording) + 1, _POSE_SIZE, _POSE_SIZE))
+    poses[0], covariance[0] = localizer.pose, localizer.pose_covariance
+    disc_ids: list[int] = []
+    line_ids: list[tuple[int, ...]] = []
+    for k, rows in enumerate(frames_of(recording)):
+        try:
+            localizer.predict(recording.steps[k], recording.step_covariance[k])
+            identified = pairing.identified(rows, localizer)
+            localizer.measure(identified)
+        except SlamError as error:
+            raise SlamError(f"step {k + 1} ({recording.prefixes[k]}): {error}") from None
+        disc_ids.extend(identified.disc_ids)
+        line_ids.extend(identified.line_ids)
+        poses[k + 1], covariance[k + 1] = localizer.pose, localizer.pose_covariance
+    return FilterRun(
+        path=Path2D(("start", *recording.prefixes), poses, covariance),
+        count=localizer.count,
+        disc_ids=np.array(disc_ids, dtype=np.int64),
+        line_ids=tuple(line_ids),
+    )
