@@ -1,0 +1,110 @@
+"""Rows as a differently mounted camera would have written them, with derivatives.
+
+A row puts a pixel on the floor through the camera as calibrated. If the camera is really mounted
+otherwise, the same pixel's ray meets the floor elsewhere.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from camera import Camera
+from slam.calibration_model import skew
+from slam.errors import SlamError
+
+FloatArray = NDArray[np.float64]
+
+
+def directions_of_rows(camera: Camera, floor_xy: FloatArray) -> FloatArray:
+    """Rays from the camera as calibrated to rows' places on the floor.
+
+    Parameters
+    ----------
+    camera : Camera
+        As calibrated.
+    floor_xy : (n, 2) float64
+        Rows in the robot frame (m).
+
+    Returns
+    -------
+    (n, 3) float64
+        Directions in the robot frame, z below 0, not of unit length.
+    """
+    on_floor = np.concatenate([floor_xy, np.zeros((len(floor_xy), 1))], axis=1)
+    return np.asarray(on_floor - camera.centre)
+
+
+def rows_through_mounting(
+    camera: Camera, directions: FloatArray, mounting: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Where rows' rays meet the floor if the camera is mounted otherwise.
+
+    Parameters
+    ----------
+    camera : Camera
+        As calibrated.
+    directions : (n, 3) float64
+        See `directions_of_rows`.
+    mounting : (3, 4) float64
+        robot_from_camera as mounted.
+
+    Returns
+    -------
+    floor_xy : (n, 2) float64
+        In the robot frame (m); NaN where a ray does not go down.
+    by_mounting : (n, 2, 4) float64
+        Derivatives by a rotation vector in the robot frame, applied to the mounting from the left,
+        and by the height.
+    """
+    turn = mounting[:, :3] @ np.linalg.inv(camera.rotation)
+    centre = mounting[:, 3]
+    ray = directions @ turn.T
+    ray = np.where(ray[:, 2:] < 0.0, ray, np.nan)
+    slope = ray[:, :2] / ray[:, 2:]
+    by_ray = np.zeros((len(ray), 2, 3))
+    by_ray[:, 0, 0] = by_ray[:, 1, 1] = -centre[2] / ray[:, 2]
+    by_ray[:, :, 2] = centre[2] * slope / ray[:, 2:]
+    by_mounting = np.concatenate([-by_ray @ skew(ray), -slope[:, :, None]], axis=2)
+    return centre[:2] - centre[2] * slope, by_mounting
+
+
+def mounting_change(camera: Camera, mounting: FloatArray) -> FloatArray:
+    """Rotation vector in the robot frame (rad) and height (m), true less calibrated.
+
+    Parameters
+    ----------
+    camera : Camera
+        As calibrated.
+    mounting : (3, 4) float64
+        robot_from_camera as mounted.
+
+    Returns
+    -------
+    (4,) float64
+    """
+    from scipy.spatial.transform import Rotation
+
+    turn = mounting[:, :3] @ np.linalg.inv(camera.rotation)
+    return np.append(
+        Rotation.from_matrix(turn).as_rotvec(), mounting[2, 3] - float(camera.centre[2])
+    )
+
+
+def check_rows_fit_camera(camera: Camera, floor_xy: FloatArray) -> None:
+    """See that rows can come from a camera at all.
+
+    Raises
+    ------
+    SlamError
+        If a row lies where the camera as calibrated cannot see the floor: the calibration is not
+        that of the run.
+    """
+    pixels = camera.project_floor(floor_xy)
+    outside = ~np.all(np.isfinite(pixels), axis=-1)
+    if np.any(outside):
+        x, y = floor_xy[np.flatnonzero(outside)[0]]
+        raise SlamError(
+            f"--calibrate: {int(np.sum(outside))} rows, the first at ({x:g}, {y:g}), lie where the "
+            "camera as calibrated cannot see: expected the calibration that the rows were made with"
+        )

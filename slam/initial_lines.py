@@ -1,0 +1,151 @@
+"""Where vertical lines stand, from bearings alone: the start of their estimation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.recording import LineRows
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+#: Rays to a line have to cross under at least this angle somewhere.
+LEAST_PARALLAX_RAD = float(np.radians(5.0))
+#: Rays may miss the place they define by so many standard deviations (median).
+MOST_MEDIAN_MISS = 10.0
+# Odometry is good enough for a first triangulation over about this many metres of path.
+_LOCAL_PATH_M = 15.0
+
+
+@dataclass(frozen=True, eq=False)
+class InitialLines:
+    """Lines that can be placed, and the others.
+
+    Attributes
+    ----------
+    ids : (K,) int64
+        Lines that can be placed, ascending.
+    xy : (K, 2) float64
+        Where they stand in the map (m).
+    unplaced : (U,) int64
+        Lines never seen, alone in a row, under enough parallax.
+    """
+
+    ids: IntArray
+    xy: FloatArray
+    unplaced: IntArray
+
+
+def place_lines(
+    poses: FloatArray,
+    rows: LineRows,
+    camera_xy: FloatArray,
+    *,
+    least_parallax_rad: float = LEAST_PARALLAX_RAD,
+) -> InitialLines:
+    """Triangulate lines from poses that are known well enough.
+
+    Only rows of one line count: of two lines that were always joined nothing tells which is where.
+    A line is placed by its views along some metres of path from its first sight on; if they have
+    too little parallax, by all of its views.
+
+    Parameters
+    ----------
+    poses : (N + 1, 3) float64
+        The start and the pose after each step.
+    rows : LineRows
+        All rows of lines.
+    camera_xy : (2,) float64
+        Where in the robot frame bearings are taken from (m).
+    least_parallax_rad : float
+        Least angle between some two rays.
+
+    Returns
+    -------
+    InitialLines
+    """
+    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(poses[:, :2], axis=0), axis=1))])
+    views: dict[int, list[int]] = {}
+    for k, ids in enumerate(rows.ids):
+        if len(ids) == 1:
+            views.setdefault(ids[0], []).append(k)
+    every = sorted({i for ids in rows.ids for i in ids})
+    placed: list[tuple[int, FloatArray]] = []
+    for number in every:
+        seen = np.array(views.get(number, []), dtype=np.int64)
+        if len(seen) < 2:
+            continue
+        pose = rows.frame[seen] + 1
+        near = way[pose] - way[pose[0]] <= _LOCAL_PATH_M
+        for some in (near, np.ones(len(seen), dtype=bool)):
+            xy = triangulate(
+                poses[pose[some]],
+                rows.bearing_rad[seen[some]],
+                rows.sigma_rad[seen[some]],
+                camera_xy,
+                least_parallax_rad,
+            )
+            if xy is not None:
+                placed.append((number, xy))
+                break
+    found = np.array([number for number, _ in placed], dtype=np.int64)
+    return InitialLines(
+        ids=found,
+        xy=np.array([xy for _, xy in placed], dtype=np.float64).reshape(-1, 2),
+        unplaced=np.setdiff1d(np.array(every, dtype=np.int64), found),
+    )
+
+
+def triangulate(
+    poses: FloatArray,
+    bearing_rad: FloatArray,
+    sigma_rad: FloatArray,
+    camera_xy: FloatArray,
+    least_parallax_rad: float,
+) -> FloatArray | None:
+    """The place nearest to rays.
+
+    Parameters
+    ----------
+    poses : (n, 3) float64
+        Where the rays were taken.
+    bearing_rad, sigma_rad : (n,) float64
+        Their bearings in the robot frame.
+    camera_xy : (2,) float64
+        Where in the robot frame they begin (m).
+    least_parallax_rad : float
+        Least angle between some two rays.
+
+    Returns
+    -------
+    (2,) float64 or None
+        None where no two rays cross under that angle, or most of them miss the place or have it
+        behind them.
+    """
+    theta = poses[:, 2]
+    cos, sin = np.cos(theta), np.sin(theta)
+    start = poses[:, :2] + np.stack(
+        [cos * camera_xy[0] - sin * camera_xy[1], sin * camera_xy[0] + cos * camera_xy[1]], axis=1
+    )
+    # Bearing b in the robot frame is the direction (sin b, -cos b).
+    course = theta + bearing_rad
+    ray = np.stack([np.sin(course), -np.cos(course)], axis=1)
+    normal = np.stack([-ray[:, 1], ray[:, 0]], axis=1)
+    crossing = np.abs(ray[:, :1] * ray[None, :, 1] - ray[:, 1:] * ray[None, :, 0])
+    if np.max(crossing) < np.sin(least_parallax_rad):
+        return None
+    # Nearest point to all rays, then again with each ray's miss counted as an angle.
+    distance = np.ones(len(ray))
+    for _ in range(3):
+        weight = 1.0 / (sigma_rad * distance)
+        rows = normal * weight[:, None]
+        xy, *_ = np.linalg.lstsq(rows, np.sum(rows * start, axis=1), rcond=None)
+        distance = np.maximum(np.linalg.norm(xy - start, axis=1), 0.1)
+    ahead = np.sum((xy - start) * ray, axis=1) > 0.0
+    miss = np.abs(np.sum((xy - start) * normal, axis=1)) / (sigma_rad * distance)
+    if np.mean(ahead) <= 0.5 or np.median(miss) > MOST_MEDIAN_MISS:
+        return None
+    return np.asarray(xy)
