@@ -121,7 +121,9 @@ def frames_of_graph(graph: RunGraph) -> list[Frame]:
             *(c[0][0], c[0][1], c[1][1], c[0][2], c[1][2], c[2][2]),
         )
         some = slice(of_frame[k], of_frame[k + 1])
-        seen = circle_landmarks(rows.xy[some], quality[some], rows.covariance[some], rows.ids[some])
+        # Of a zero, information matrices do not keep the sign.
+        spread_of_rows = rows.covariance[some] + 0.0
+        seen = circle_landmarks(rows.xy[some], quality[some], spread_of_rows, rows.ids[some])
         frames.append(Frame(record, seen))
     return frames
 

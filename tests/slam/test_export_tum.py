@@ -1,0 +1,83 @@
+"""TUM trajectories: written as the format demands, read back, and refused line by line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from landmarks import wrap_angle
+from slam.axes import Axes
+from slam.errors import SlamError
+from slam.map_file import Path2D
+from slam.tum import read_tum, write_tum
+from storage import OutputExistsError
+
+numbers = st.floats(-1e6, 1e6)
+angles = st.floats(-20.0, 20.0)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.tuples(numbers, numbers, angles), min_size=1, max_size=8), st.booleans())
+def test_a_path_comes_back(
+    tmp_path_factory: pytest.TempPathFactory,
+    poses: list[tuple[float, float, float]],
+    robotics: bool,
+) -> None:
+    file = tmp_path_factory.mktemp("tum") / "p.tum"
+    axes: Axes = "robotics" if robotics else "dataset"
+    path = Path2D(tuple(f"p{k}" for k in range(len(poses))), np.array(poses))
+    write_tum(file, path, axes=axes)
+    again = read_tum(file, axes=axes)
+    np.testing.assert_array_equal(again.poses[:, :2], path.poses[:, :2])
+    turn = wrap_angle(again.poses[:, 2] - path.poses[:, 2])
+    np.testing.assert_allclose(turn, 0.0, atol=1e-14)
+    assert np.all(np.abs(again.poses[:, 2]) <= np.pi)
+    assert again.prefixes[0] == "start"
+    assert again.prefixes[1:] == tuple(map(str, range(1, len(poses))))
+
+
+def test_a_robot_that_turned_left_ahead_of_the_start(tmp_path: Path) -> None:
+    """2 m forward (-Y in the data set's axes), then a quarter turn to the left."""
+    path = Path2D(("start", "a"), np.array([[0.0, 0.0, 0.0], [0.0, -2.0, np.pi / 2]]))
+    write_tum(tmp_path / "p.tum", path)
+    rows = [row for row in (tmp_path / "p.tum").read_text().splitlines() if row[0] != "#"]
+    assert rows[0].split() == ["0", "0.0", "0.0", "0", "0", "0", "0.0", "1.0"]
+    np.testing.assert_allclose(
+        [float(word) for word in rows[1].split()],
+        [1.0, 2.0, 0.0, 0.0, 0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)],
+        atol=1e-15,
+    )
+    with pytest.raises(OutputExistsError):
+        write_tum(tmp_path / "p.tum", path)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "no poses"),
+        ("# only a comment\n", "no poses"),
+        ("0 1 2 0 0 0 0\n", ":1: 7 values: expected 8"),
+        ("0 1 2 0 0 0 0 1\n\n1 nan 2 0 0 0 0 1\n", ":3: x is 'nan'"),
+        ("0 1_0 2 0 0 0 0 1\n", ":1: x is '1_0'"),
+        ("0 1 1e999 0 0 0 0 1\n", ":1: y is '1e999'"),
+        ("1 1 2 0 0 0 0 1\n1 1 2 0 0 0 0 1\n", ":2: t is 1: expected more"),
+        ("0 1 2 0 0 0 0 0.9\n", ":1: qx qy qz qw are no unit quaternion"),
+        ("0 1 2 0.5 0 0 0 1\n", ":1: expected a pose on the floor"),
+        ("0 1 2 0 0.6 0 0 0.8\n", ":1: expected a pose on the floor"),
+        ("# AXES dataset (X left)\n0 1 2 0 0 0 0 1\n", ":1: the file's axes are 'dataset'"),
+        ("0 1 2 0 0 0 0 1" + " " * 2**20 + "\n", ":1: longer than"),
+    ],
+)
+def test_what_is_no_path_on_the_floor_is_refused(tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "p.tum").write_text(text)
+    with pytest.raises(SlamError, match=message):
+        read_tum(tmp_path / "p.tum")
+
+
+def test_a_file_that_is_not_there(tmp_path: Path) -> None:
+    with pytest.raises(SlamError, match="cannot be read: No such file"):
+        read_tum(tmp_path / "p.tum")

@@ -1,0 +1,155 @@
+"""Pictures: what they are drawn from is right, they are the same bytes again, nothing is lost."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import matplotlib as mpl
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from slam.errors import SlamError
+from slam.map_file import LandmarkMap, Landmarks, Path2D, no_landmarks
+from slam.pictures import NEES_BAND, draw_errors, draw_map, ellipse_outlines, pose_errors
+from storage import OutputExistsError
+
+FloatArray = NDArray[np.float64]
+
+DISC_BGR = (0x1E, 0x50, 0xC8)
+
+
+def landmarks(xy: FloatArray, covariance: FloatArray | None = None) -> Landmarks:
+    count = len(xy)
+    spread = np.tile(1e-4 * np.eye(2), (count, 1, 1)) if covariance is None else covariance
+    return Landmarks(np.arange(count), xy, spread, np.full(count, 3))
+
+
+def some_path(count: int = 60, scale: float = 0.2) -> Path2D:
+    angle = np.linspace(0.0, 3.0, count)
+    poses = np.column_stack([scale * 9 * np.sin(angle), -scale * 9 * angle, angle])
+    spread = np.tile(np.diag([1e-4, 4e-4, 1e-5]), (count, 1, 1))
+    return Path2D(("start", *(f"p{k}" for k in range(1, count))), poses, spread)
+
+
+def pixels_like(png: Path, bgr: tuple[int, int, int]) -> NDArray[np.bool_]:
+    image = cv2.imread(str(png), cv2.IMREAD_COLOR)
+    assert image is not None
+    return np.asarray(np.all(np.abs(image.astype(int) - bgr) < 12, axis=2))
+
+
+def test_an_outline_has_the_mahalanobis_distance_asked_for() -> None:
+    rng = np.random.default_rng(1)
+    root = rng.normal(size=(30, 2, 2))
+    covariance, centre = root @ np.swapaxes(root, 1, 2), rng.normal(size=(30, 2))
+    offset = ellipse_outlines(centre, covariance, 3.0) - centre[:, None]
+    squared = np.einsum("mki,mij,mkj->mk", offset, np.linalg.inv(covariance), offset)
+    np.testing.assert_allclose(squared, 9.0, rtol=1e-9)
+
+
+def test_errors_are_wrapped_and_normalised() -> None:
+    path = some_path(4)
+    assert path.covariance is not None
+    path.covariance[0] = 0.0  # a start that is given
+    truth = path.poses.copy()
+    truth[1] += [0.01, 0.0, 2 * np.pi]
+    truth[2] += [0.0, 0.02, 0.0]
+    error, sigma, nees = pose_errors(path, truth)
+    assert sigma is not None
+    assert nees is not None
+    np.testing.assert_allclose(error[1], [-0.01, 0.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(sigma[1], [0.01, 0.02, np.sqrt(1e-5)])
+    assert np.isnan(nees[0])
+    np.testing.assert_allclose(nees[1:], [1.0, 1.0, 0.0], atol=1e-9)
+    with pytest.raises(SlamError, match="one pose for each of the path's 4"):
+        pose_errors(path, truth[1:])
+
+
+def test_the_band_is_that_of_chi_squared() -> None:
+    from scipy.stats import chi2
+
+    np.testing.assert_allclose(NEES_BAND, chi2.ppf([0.025, 0.975], 3), rtol=1e-12)
+
+
+@pytest.mark.long
+def test_the_same_map_again_whatever_the_users_settings(tmp_path: Path) -> None:
+    path = some_path()
+    some = LandmarkMap(landmarks(path.poses[::6, :2] + 0.5), landmarks(path.poses[::9, :2] - 1.0))
+    first, second = tmp_path / "1.png", tmp_path / "2.png"
+    draw_map(first, some, path, before=path, before_map=some, reference=path, overwrite=False)
+    with mpl.rc_context({"font.size": 23.0, "lines.linewidth": 9.0, "savefig.dpi": 30}):
+        draw_map(second, some, path, before=path, before_map=some, reference=path, overwrite=False)
+        assert mpl.rcParams["font.size"] == 23.0
+    assert first.read_bytes() == second.read_bytes()
+    assert b"atplotlib" not in first.read_bytes()
+
+
+@pytest.mark.long
+def test_the_same_errors_again(tmp_path: Path) -> None:
+    path = some_path()
+    draw_errors(tmp_path / "1.png", path, path.poses + 0.01, title="a", overwrite=False)
+    draw_errors(tmp_path / "2.png", path, path.poses + 0.01, title="a", overwrite=False)
+    assert (tmp_path / "1.png").read_bytes() == (tmp_path / "2.png").read_bytes()
+
+
+def test_a_picture_that_exists_is_kept(tmp_path: Path) -> None:
+    png = tmp_path / "m.png"
+    png.write_bytes(b"mine")
+    nothing = LandmarkMap(no_landmarks(), no_landmarks())
+    with pytest.raises(OutputExistsError):
+        draw_map(png, nothing, some_path(), overwrite=False)
+    with pytest.raises(OutputExistsError):
+        draw_errors(png, some_path(), some_path().poses, overwrite=False)
+    assert png.read_bytes() == b"mine"
+    draw_map(png, nothing, some_path(), overwrite=True)
+    assert png.read_bytes()[:4] == b"\x89PNG"
+
+
+def test_axes_are_equally_scaled(tmp_path: Path) -> None:
+    """A round ellipse is as wide as high in the picture, also where the path is not."""
+    path = Path2D(("start", "a"), np.array([[0.0, 0.0, 0.0], [0.0, -30.0, 0.0]]))
+    spread = 0.25 * np.eye(2)[None]
+    some = LandmarkMap(landmarks(np.array([[0.5, -15.0]]), spread), no_landmarks())
+    draw_map(tmp_path / "m.png", some, path, overwrite=False)
+    rows, columns = np.nonzero(pixels_like(tmp_path / "m.png", DISC_BGR))
+    inside = rows < 0.85 * rows.max() if rows.max() > 0 else rows >= 0  # without the legend
+    high, wide = np.ptp(rows[inside]), np.ptp(columns[inside])
+    assert high > 80
+    assert abs(high - wide) <= 2
+
+
+def test_a_vertical_far_outside_does_not_shrink_the_picture(tmp_path: Path) -> None:
+    path = some_path()
+    discs = landmarks(path.poses[::6, :2])
+    near = np.array([[3.0, -3.0], [-2.0, -1.0]])
+    wide = LandmarkMap(discs, landmarks(np.concatenate([near, [[900.0, 0.0]]])))
+    draw_map(tmp_path / "near.png", LandmarkMap(discs, landmarks(near)), path, overwrite=False)
+    draw_map(tmp_path / "wide.png", wide, path, overwrite=False)
+    shares = [
+        np.ptp(np.nonzero(pixels_like(tmp_path / name, DISC_BGR))[0])
+        for name in ("near.png", "wide.png")
+    ]
+    assert abs(int(shares[0]) - int(shares[1])) <= 30
+    assert shares[0] > 300
+
+
+def test_a_path_of_one_pose_is_drawn(tmp_path: Path) -> None:
+    path = Path2D(("start",), np.zeros((1, 3)))
+    nothing = LandmarkMap(no_landmarks(), no_landmarks())
+    draw_map(tmp_path / "m.png", nothing, path, before=path, overwrite=False)
+    perfect = Path2D(path.prefixes, path.poses, np.zeros((1, 3, 3)))
+    draw_errors(tmp_path / "p.png", perfect, path.poses, overwrite=False)
+    for name in ("m.png", "p.png"):
+        image = cv2.imread(str(tmp_path / name))
+        assert image is not None
+        assert image.shape[0] > 300
+
+
+def test_no_window_without_a_display(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mpl, "get_backend", lambda: "agg")
+    with pytest.raises(SlamError, match="no window can be opened here"):
+        draw_errors(
+            tmp_path / "e.png", some_path(), some_path().poses, overwrite=False, interactive=True
+        )
+    assert not (tmp_path / "e.png").exists()
