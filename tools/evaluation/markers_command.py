@@ -18,6 +18,7 @@ from tools.evaluation.markers_detectors import OURS, PEERS, known_to_opencv
 from tools.evaluation.markers_report import bins_lines, counts_lines, statistics_picture
 from tools.evaluation.markers_scoring import ScoredFrame, table_of
 from tools.evaluation.markers_statistics import binned, bins_json
+from tools.evaluation.markers_timing import time_searches, timing_lines
 from tools.simulator.markers.sampling import SampleSettings
 
 T = TypeVar("T")
@@ -36,9 +37,10 @@ _SHOWN = 40
 class Markers:
     """Markers in rendered frames: corner errors, detection rate, false ones; beside OpenCV's ArUco.
 
-    Three parts: statistics of `--statistics` frames with one dictionary, all detectors; a search
-    for false and misidentified markers in `--frames` frames of many dictionaries; photographs below
-    `--photographs`, on which everything found is false. Exit code 1 if anything is.
+    Four parts: statistics of `--statistics` frames with one dictionary, all detectors; the
+    processor time of searching `--timing` of these frames; a search for false and misidentified
+    markers in `--frames` frames of many dictionaries; photographs below `--photographs`, on which
+    everything found is false. Exit code 1 if anything is.
     """
 
     statistics: int = 1000
@@ -47,6 +49,8 @@ class Markers:
     """Dictionary of the statistics; OpenCV's detectors are left out where they do not know it."""
     spot: bool = True
     """Also measure the corners of markers some 60 px wide at noise sigma 3."""
+    timing: int = 0
+    """Frames to time the detectors on, beside decoding; 0 leaves that out."""
     frames: int = 0
     """Frames to search for false and misidentified markers."""
     dictionaries: tuple[str, ...] = _HUNTED
@@ -84,6 +88,8 @@ def _perform(command: Markers) -> int:
         wrong += _statistics(command, content, files)
         if command.spot:
             _spot(command, content)
+    if command.timing:
+        _timing(command, content)
     if command.frames:
         wrong += _hunt(command, content)
     if command.photographs:
@@ -148,6 +154,18 @@ def _spot(command: Markers, content: dict[str, Any]) -> None:
         print(f"Width 58-62 px, noise 3, {label}")
         _print(bins_lines(everything))
         content["spot"][label] = bins_json(everything)[0]
+
+
+def _timing(command: Markers, content: dict[str, Any]) -> None:
+    settings = SampleSettings(dictionaries=(command.dictionary,), samples=_MEASURED_SAMPLES)
+    times = _with_progress(
+        "rendering",
+        command.timing,
+        lambda tick: time_searches(settings, command.timing, command.seed, on_frame=tick),
+    )
+    print(f"Processor time, {command.timing} frames of the statistics")
+    _print(timing_lines(times))
+    content["timing"] = [asdict(timed) for timed in times]
 
 
 def _hunt(command: Markers, content: dict[str, Any]) -> list[Offence]:

@@ -24,6 +24,13 @@ from tools.evaluation.markers_scoring import (
     table_of,
 )
 from tools.evaluation.markers_statistics import BINS, binned, bins_json
+from tools.evaluation.markers_timing import (
+    DECODING,
+    GIVEN_WIDTH,
+    SEARCH,
+    time_searches,
+    timing_lines,
+)
 from tools.simulator.markers.sampling import SampleSettings, sample_frame
 from tools.simulator.markers.truth import MarkerTruth
 
@@ -170,6 +177,22 @@ def test_photographs_are_searched(tmp_path: Path) -> None:
     assert [o.place for o in found] == [f"with.png 4x4_50 id {frame.markers[0].id}"]
     with pytest.raises(ValueError, match="holds no photographs"):
         search_photographs([tmp_path / "none"], ("aruco",), ("4x4_50",))
+
+
+@pytest.mark.long
+def test_searches_are_timed_beside_decoding() -> None:
+    settings = SampleSettings(dictionaries=("4x4_50",), samples=2)
+    rendered = []
+    times = time_searches(settings, 2, 1, rounds=3, on_frame=lambda: rendered.append(1))
+    assert len(rendered) == 2
+    by_name = {timed.name: timed for timed in times}
+    assert {DECODING, SEARCH, GIVEN_WIDTH, "aruco", "aruco apriltag"} <= set(by_name)
+    assert all(timed.ratio.count == timed.milliseconds.count == 6 for timed in times)
+    decoding = by_name[DECODING]
+    assert decoding.ratio.lower_quartile == decoding.ratio.upper_quartile == 1.0
+    lines = timing_lines(times)
+    assert len(lines) == len(times)
+    assert "decoding: 1 x decoding (1 - 1)" in lines[0]
 
 
 @pytest.mark.long
