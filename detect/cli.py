@@ -75,8 +75,8 @@ class Circles:
     json : Path
         Write the rows with their pixels and evidence as JSON as well.
     jobs : int
-        Processes that share the work, 1 for none beside this one; by default as many as there are
-        cores, for runs of hundreds of frames. What is written is the same.
+        Processes that share the work, 1 for none beside this one; by default one for every 500
+        frames, at most as many as there are cores. What is written is the same.
     cluster : str
         Address of a dask scheduler (tcp://host:8786) whose workers do the work instead.
     """
@@ -125,8 +125,8 @@ class Lines:
     response : bool
         Draw the filter's response as well, into files of their own.
     jobs : int
-        Processes that share the work, 1 for none beside this one; by default as many as there are
-        cores, for runs of hundreds of frames. What is written is the same.
+        Processes that share the work, 1 for none beside this one; by default one for every 500
+        frames, at most as many as there are cores. What is written is the same.
     cluster : str
         Address of a dask scheduler (tcp://host:8786) whose workers do the work instead.
     """
@@ -169,8 +169,8 @@ class Markers:
     draw : Path
         Folder for images with the markers drawn in, and with what was rejected.
     jobs : int
-        Processes that share the work, 1 for none beside this one; by default as many as there are
-        cores, for runs of hundreds of frames. What is written is the same.
+        Processes that share the work, 1 for none beside this one; by default one for every 500
+        frames, at most as many as there are cores. What is written is the same.
     cluster : str
         Address of a dask scheduler (tcp://host:8786) whose workers do the work instead.
     """
@@ -205,8 +205,8 @@ class All:
     force : bool
         Replace existing files.
     jobs : int
-        Processes that share the work, 1 for none beside this one; by default as many as there are
-        cores, for runs of hundreds of frames. What is written is the same.
+        Processes that share the work, 1 for none beside this one; by default one for every 500
+        frames, at most as many as there are cores. What is written is the same.
     cluster : str
         Address of a dask scheduler (tcp://host:8786) whose workers do the work instead.
     """

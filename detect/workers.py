@@ -53,7 +53,7 @@ _CLUSTER_LOOK_S = 5.0
 
 
 def default_jobs(frames: int) -> int:
-    """As many processes as there are cores, but none for a handful of frames."""
+    """A process for every `FRAMES_PER_PROCESS` frames, at most as many as there are cores."""
     affinity = getattr(os, "sched_getaffinity", None)
     cores = len(affinity(0)) if affinity is not None else os.cpu_count() or 1
     return max(1, min(cores, frames // FRAMES_PER_PROCESS))
