@@ -33,6 +33,7 @@ _DPI = 120
 _PATH, _REFERENCE, _DISC, _LINE, _BAND = "#1f5f99", "#777777", "#c8501e", "#3a8f4c", "#2a78b5"
 _SIGMA = "\N{GREEK SMALL LETTER SIGMA}"
 _ELLIPSE_POINTS = 40
+_WITHOUT_WINDOWS = ("agg", "cairo", "pdf", "pgf", "ps", "svg", "template")
 # So many discs can be told apart by numbers beside them.
 _MOST_NUMBERED = 40
 # How far beyond path and discs a vertical may stand and still be in the picture.
@@ -380,7 +381,7 @@ def _figure(
         if interactive:
             from matplotlib import pyplot
 
-            if mpl.get_backend().lower() == "agg":
+            if mpl.get_backend().lower() in _WITHOUT_WINDOWS:
                 raise SlamError("no window can be opened here: expected a display for interactive")
             figure = pyplot.figure(figsize=size, dpi=_DPI, layout="constrained")
         else:

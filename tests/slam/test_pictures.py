@@ -153,3 +153,17 @@ def test_no_window_without_a_display(tmp_path: Path, monkeypatch: pytest.MonkeyP
             tmp_path / "e.png", some_path(), some_path().poses, overwrite=False, interactive=True
         )
     assert not (tmp_path / "e.png").exists()
+
+
+def test_a_window_shows_what_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from matplotlib import pyplot
+
+    shown: list[int] = []
+    monkeypatch.setattr(mpl, "get_backend", lambda: "qtagg")
+    monkeypatch.setattr(pyplot, "show", lambda: shown.append(len(pyplot.get_fignums())))
+    path = some_path(9)
+    for name, interactive in (("1.png", True), ("2.png", False)):
+        draw_errors(tmp_path / name, path, path.poses, overwrite=False, interactive=interactive)
+    assert shown == [1]
+    assert pyplot.get_fignums() == []
+    assert (tmp_path / "1.png").read_bytes() == (tmp_path / "2.png").read_bytes()
