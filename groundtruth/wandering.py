@@ -1,0 +1,127 @@
+"""Differences that wander: white noise of each sample on top of a random walk, and least squares.
+
+The model of a difference between two headings: odometry's error adds up (a random walk, variance
+`rate` per second), the other's does not (white, `sigma`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_solve_banded, cholesky_banded
+from scipy.optimize import nnls
+
+from groundtruth.errors import GroundTruthError
+
+FloatArray = NDArray[np.float64]
+
+LAGS = (1, 2, 4, 8, 16, 32, 64, 128, 256)
+# The median of a chi-squared variable with one degree of freedom.
+_MEDIAN_CHI2 = 0.45493642
+_LEAST_SIGMA_RAD = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Wandering:
+    """Noise of N samples of a difference.
+
+    Attributes
+    ----------
+    times_s : (N,) float64
+        Ascending strictly.
+    sigma : float
+        Standard deviation of each sample's own noise, above 0.
+    rate : float
+        Variance that the random walk gains per second, above 0.
+    """
+
+    times_s: FloatArray
+    sigma: float
+    rate: float
+
+    def whiten(self, values: FloatArray) -> FloatArray:
+        """Multiply by the inverse of the covariance, the walk's level being unknown.
+
+        Parameters
+        ----------
+        values : (N,) or (N, k) array
+
+        Returns
+        -------
+        array of the same shape
+        """
+        explained = cho_solve_banded((self._factor, True), values / self.sigma**2)
+        return np.asarray((values - explained) / self.sigma**2)
+
+    def squared(self, values: FloatArray) -> float:
+        """Squared Mahalanobis length of (N,) values, the walk's level being unknown."""
+        return float(values @ self.whiten(values))
+
+    def level(self, values: FloatArray) -> tuple[float, float]:
+        """Mean over time of the walk that explains (N,) values best, and its deviation."""
+        walk = cho_solve_banded((self._factor, True), values / self.sigma**2)
+        ones = np.ones(len(values)) / len(values)
+        variance = ones @ cho_solve_banded((self._factor, True), ones)
+        return float(np.mean(walk)), float(np.sqrt(variance))
+
+    @cached_property
+    def _factor(self) -> FloatArray:
+        """Banded Cholesky factor of the walk's information, given the samples."""
+        between = 1.0 / (self.rate * np.diff(self.times_s))
+        bands = np.zeros((2, len(self.times_s)))
+        bands[0] = 1.0 / self.sigma**2
+        bands[0, 1:] += between
+        bands[0, :-1] += between
+        bands[1, :-1] = -between
+        return np.asarray(cholesky_banded(bands, lower=True))
+
+
+def estimate_wandering(
+    times_s: FloatArray, values: FloatArray, lags: tuple[int, ...] = LAGS
+) -> Wandering:
+    """Tell noise and wandering apart by how far samples differ after more and more time.
+
+    Parameters
+    ----------
+    times_s : (N,) array
+        Ascending strictly, N of 10 or more.
+    values : (N,) array
+        Differences of headings, without jumps.
+    lags : tuple of int
+        How many samples apart they are compared; short ones do not mind what changes slowly.
+
+    Returns
+    -------
+    Wandering
+
+    Raises
+    ------
+    GroundTruthError
+        If there are fewer samples, or two of one time.
+    """
+    if len(times_s) < 10:
+        raise GroundTruthError(f"{len(times_s)} samples: expected 10 or more")
+    if not np.all(np.diff(times_s) > 0.0):
+        raise GroundTruthError("two samples of one time: expected times that ascend")
+    rows, squares = [], []
+    for lag in lags:
+        if lag > len(times_s) // 4 and lag > 1:
+            break
+        apart = times_s[lag:] - times_s[:-lag]
+        typical = float(np.median(apart))
+        squared = (values[lag:] - values[:-lag])[apart <= 2.0 * typical] ** 2
+        # Between mean and median: a few gross errors must not pass for wandering, nor may turns,
+        # in which odometry errs most, be passed over.
+        clipped = np.minimum(squared, 30.0 * np.median(squared) / _MEDIAN_CHI2 + 1e-30)
+        rows.append((2.0, typical))
+        squares.append(float(np.mean(clipped)))
+    design, target = np.array(rows), np.array(squares)
+    weight = 1.0 / np.maximum(target, 2.0 * _LEAST_SIGMA_RAD**2)
+    (variance, rate), _ = nnls(design * weight[:, None], target * weight)
+    sigma = max(float(np.sqrt(variance)), 0.1 * float(np.sqrt(squares[0] / 2.0)), _LEAST_SIGMA_RAD)
+    duration = float(times_s[-1] - times_s[0])
+    # A walk of a hundredth of the noise over the whole segment is none.
+    return Wandering(times_s, sigma, max(float(rate), (0.01 * sigma) ** 2 / duration))
