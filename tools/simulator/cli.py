@@ -13,6 +13,8 @@ import tyro
 
 from storage import OutputExistsError
 from tools.simulator.drive import DriveStyle
+from tools.simulator.laser.commands import LaserSession
+from tools.simulator.laser.commands import perform as perform_laser
 from tools.simulator.markers.commands import MarkerDemo, MarkerFrames, MarkerSession
 from tools.simulator.markers.commands import perform as perform_markers
 from tools.simulator.plan import PUBLISHED_CAMERA, RunSettings
@@ -157,7 +159,8 @@ def main(arguments: list[str] | None = None) -> int:
         | Annotated[Discs, tyro.conf.subcommand("discs")]
         | Annotated[MarkerFrames, tyro.conf.subcommand("marker-frames")]
         | Annotated[MarkerSession, tyro.conf.subcommand("marker-session")]
-        | Annotated[MarkerDemo, tyro.conf.subcommand("marker-demo")],
+        | Annotated[MarkerDemo, tyro.conf.subcommand("marker-demo")]
+        | Annotated[LaserSession, tyro.conf.subcommand("laser-session")],
         prog="python -m tools.simulator",
         description="Rendered runs with known truth.",
         args=arguments,
@@ -170,11 +173,21 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _perform(
-    command: Demo | Run | Rows | Reenact | Discs | MarkerFrames | MarkerSession | MarkerDemo,
+    command: Demo
+    | Run
+    | Rows
+    | Reenact
+    | Discs
+    | MarkerFrames
+    | MarkerSession
+    | MarkerDemo
+    | LaserSession,
 ) -> int:
     begin = time.perf_counter()
     if isinstance(command, MarkerFrames | MarkerSession | MarkerDemo):
         what = perform_markers(command)
+    elif isinstance(command, LaserSession):
+        what = perform_laser(command)
     elif isinstance(command, Discs):
         what = _discs(command)
     elif isinstance(command, Reenact):

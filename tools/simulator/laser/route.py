@@ -1,0 +1,121 @@
+"""Where the robot drives: a smooth curve, driven forward as fast as its bends allow, with stops."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tools.simulator.laser.settings import DrivingLimits
+
+FloatArray = NDArray[np.float64]
+
+_GRID_M = 0.002
+
+
+@dataclass(frozen=True)
+class Stop:
+    """A place on the way where the robot stands."""
+
+    way_m: float
+    length_s: float
+
+
+class Route:
+    """Poses over time, exact at any time.
+
+    Parameters
+    ----------
+    waypoints : (N, 2) array
+        The curve goes through them: a natural cubic spline over the chords' lengths (m).
+    stops : sequence of Stop
+        In the order of the way.
+    limits : DrivingLimits
+    start_s : float
+        When the robot starts.
+    """
+
+    def __init__(
+        self, waypoints: FloatArray, stops: list[Stop], limits: DrivingLimits, start_s: float
+    ) -> None:
+        curve = Curve(waypoints)
+        speed = np.minimum(
+            limits.speed_m_s, limits.turn_rad_s / np.maximum(np.abs(curve.bend), 1e-9)
+        )
+        halts = [0.0, *(stop.way_m for stop in stops), float(curve.way[-1])]
+        speed[np.searchsorted(curve.way, halts).clip(0, len(speed) - 1)] = 0.0
+        speed = _reachable(speed, np.diff(curve.way), limits.acceleration_m_s2)
+        # Speed changes linearly with time within a cell of the grid; two cells between stops.
+        lengths = 2.0 * np.diff(curve.way) / np.maximum(speed[1:] + speed[:-1], 1e-6)
+        waits = np.zeros(len(speed))
+        for stop in stops:
+            waits[np.searchsorted(curve.way, stop.way_m)] += stop.length_s
+        leave = np.concatenate([[0.0], np.cumsum(lengths + waits[1:])]) + start_s
+        self._arrive, self._leave = leave - waits, leave
+        self._curve, self._speed = curve, speed
+        self.start_s, self.end_s = float(start_s), float(leave[-1])
+        #: From and to when it stands at each stop.
+        at = [int(np.searchsorted(curve.way, stop.way_m)) for stop in stops]
+        self.stands = [(float(self._arrive[i]), float(self._leave[i])) for i in at]
+
+    def poses(self, times_s: ArrayLike) -> FloatArray:
+        """Poses x, y (m), theta (rad, continuous) at times; before and after, the ends'.
+
+        Parameters
+        ----------
+        times_s : (N,) array_like
+
+        Returns
+        -------
+        (N, 3) float64
+        """
+        times = np.clip(np.asarray(times_s, dtype=np.float64), self.start_s, self.end_s)
+        cell = np.clip(np.searchsorted(self._leave, times, side="right") - 1, 0, None)
+        cell = np.minimum(cell, len(self._leave) - 2)
+        length = self._arrive[cell + 1] - self._leave[cell]
+        passed = np.clip(times - self._leave[cell], 0.0, length)
+        gain = (self._speed[cell + 1] - self._speed[cell]) / length
+        way = self._curve.way[cell] + passed * (self._speed[cell] + 0.5 * gain * passed)
+        return self._curve.poses(np.minimum(way, self._curve.way[cell + 1]))
+
+
+class Curve:
+    """A cubic spline through waypoints by its length; `way` (M,) and `bend` (M,) on a fine grid."""
+
+    def __init__(self, waypoints: FloatArray, grid_m: float = _GRID_M) -> None:
+        from scipy.interpolate import CubicSpline
+
+        chords = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(waypoints, axis=0).T))])
+        self._spline = CubicSpline(chords, waypoints, bc_type="natural")
+        u = np.linspace(0.0, chords[-1], int(np.ceil(chords[-1] / grid_m)) + 1)
+        rate = np.hypot(*self._spline(u, 1).T)
+        steps = 0.5 * (rate[1:] + rate[:-1]) * np.diff(u)
+        self._chords = chords
+        self._u, self.way = u, np.concatenate([[0.0], np.cumsum(steps)])
+        d1, d2 = self._spline(u, 1), self._spline(u, 2)
+        self.bend = (d1[:, 0] * d2[:, 1] - d1[:, 1] * d2[:, 0]) / rate**3
+        self._heading = np.unwrap(np.arctan2(d1[:, 1], d1[:, 0]))
+
+    def way_of_waypoint(self, index: int) -> float:
+        """How far it is from the start to a waypoint (m)."""
+        return float(np.interp(self._chords[index], self._u, self.way))
+
+    def poses(self, way_m: FloatArray) -> FloatArray:
+        """(N, 3) poses at ways from the start; theta is the curve's direction, continuous."""
+        u = np.interp(way_m, self.way, self._u)
+        d1 = self._spline(u, 1)
+        near = np.interp(way_m, self.way, self._heading)
+        theta = np.arctan2(d1[:, 1], d1[:, 0])
+        theta += 2.0 * np.pi * np.rint((near - theta) / (2.0 * np.pi))
+        return np.column_stack([self._spline(u), theta])
+
+
+def _reachable(speed: FloatArray, steps: FloatArray, acceleration: float) -> FloatArray:
+    """Lower speeds until none is gained or lost faster than allowed."""
+    square = speed**2
+    gain = 2.0 * acceleration * np.concatenate([[0.0], np.cumsum(steps)])
+    # v_j^2 <= v_i^2 + 2 a |s_j - s_i| for all i: running minima from both sides.
+    forward = np.minimum.accumulate(square - gain) + gain
+    backward = np.minimum.accumulate((square + gain)[::-1])[::-1] - gain
+    return np.asarray(np.sqrt(np.maximum(np.minimum(forward, backward), 0.0)))

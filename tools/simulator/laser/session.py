@@ -1,0 +1,293 @@
+"""A simulated session before anything is measured: who is where when, and what is to go wrong."""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from groundtruth.errors import GroundTruthError
+from groundtruth.scans import Robot, Scanner
+from tools.simulator.laser.clock import RobotClock
+from tools.simulator.laser.people import Passer, crossing, strolling
+from tools.simulator.laser.route import Curve, Route, Stop
+from tools.simulator.laser.settings import LaserSettings
+from tools.simulator.laser.site import (
+    DOOR_Y_M,
+    ROOM_M,
+    Site,
+    clearance,
+    is_covered,
+    make_site,
+)
+
+FloatArray = NDArray[np.float64]
+
+#: Near the session's beginning, as stamps of real logs are: seconds since 1970.
+EPOCH_S = 1235561600.0
+
+_FIXED = ((1.5, 0.12, 90.0), (9.88, 1.5, 180.0), (8.3, 7.38, -90.0), (0.12, 6.0, 0.0))
+_ROBOT_CLEAR_M = 0.6
+_PASSER_APART_M = 0.9
+_CROSSING_M = 0.65
+_TRIES = 20_000
+_STUCK = 40
+#: The shortest way from door to door outside, and once more round the room, at full speed.
+_SHORTEST_AWAY_S = 36.0
+_ROUND_S = 62.0
+
+
+@dataclass(frozen=True, eq=False)
+class SessionPlan:
+    """What is true of a session.
+
+    Attributes
+    ----------
+    seed : int
+    settings : LaserSettings
+    site : Site
+    robot : Robot
+        With the scanners on board, exact.
+    scanners : tuple of Scanner
+        The fixed ones, exact, as they stood when the empty room was scanned.
+    moved : tuple of Scanner
+        As they stand in the session.
+    route : Route
+        On the ground truth's clock.
+    visits : tuple of (float, float)
+        From and to when the robot is in the room.
+    references : tuple of (float, float)
+        From and to when it stands for a reference pose.
+    passers : tuple of Passer
+    clock : RobotClock
+    """
+
+    seed: int
+    settings: LaserSettings
+    site: Site
+    robot: Robot
+    scanners: tuple[Scanner, ...]
+    moved: tuple[Scanner, ...]
+    route: Route
+    visits: tuple[tuple[float, float], ...]
+    references: tuple[tuple[float, float], ...]
+    passers: tuple[Passer, ...]
+    clock: RobotClock
+
+    def random(self, what: str) -> np.random.Generator:
+        """The random numbers of one part of the session, independent of all others."""
+        return random_for(self.seed, what)
+
+
+def random_for(seed: int, what: str) -> np.random.Generator:
+    """Random numbers for one purpose."""
+    return np.random.default_rng([seed, zlib.crc32(what.encode())])
+
+
+def plan_session(settings: LaserSettings, seed: int) -> SessionPlan:
+    """Lay a session out.
+
+    Parameters
+    ----------
+    settings : LaserSettings
+    seed : int
+        The same gives the same.
+
+    Returns
+    -------
+    SessionPlan
+
+    Raises
+    ------
+    GroundTruthError
+        If no way through the room was found.
+    """
+    site = make_site(settings.furniture)
+    route, visits, references = _drive(settings, seed, site)
+    scanners = _fixed_scanners(settings, seed)
+    faults = settings.faults
+    moved = tuple(
+        _shifted(s, np.array(faults.by)) if s.name == faults.moved_scanner else s for s in scanners
+    )
+    clock = RobotClock(
+        route.start_s, settings.clock_offset_s, settings.clock_drift,
+        visits[0][0] + faults.clock_jump_at_s if faults.clock_jump_s else float("inf"),
+        faults.clock_jump_s,
+    )  # fmt: skip
+    passers = _passers(settings, seed, site, route, visits)
+    return SessionPlan(
+        seed, settings, site, _robot(settings), scanners, moved, route, visits, references,
+        passers, clock,
+    )  # fmt: skip
+
+
+def sides_of(outline: FloatArray) -> FloatArray:
+    """(K, 4) sides of a closed polygon of (K, 2) corners."""
+    return np.hstack([outline, np.roll(outline, -1, axis=0)])
+
+
+def sick(name: str, pose: FloatArray, settings: LaserSettings) -> Scanner:
+    """A scanner of 181 beams over half a turn at an exact pose."""
+    return Scanner(
+        name, pose, np.zeros((3, 3)), -np.pi / 2, np.pi / 180, 181, settings.max_range_m,
+        settings.reading.sigma_m,
+    )  # fmt: skip
+
+
+def _robot(settings: LaserSettings) -> Robot:
+    """A box whose origin is between the driven wheels, a little before its middle."""
+    front, back, half, cut = 0.35, -0.45, 0.3, settings.front_cut_m
+    corners = [(back, half), (back, -half), (front - cut, -half), (front, cut - half),
+               (front, half - cut), (front - cut, half)]  # fmt: skip
+    if cut == 0.0:
+        corners = [(back, half), (back, -half), (front, -half), (front, half)]
+    mounts = (("front", (0.36, 0.0, 0.0)), ("rear", (-0.46, 0.0, np.pi)))
+    onboard = tuple(sick(name, np.array(pose), settings) for name, pose in mounts)
+    limits = settings.driving
+    return Robot(
+        np.array(corners), 1.25 * limits.speed_m_s, 1.25 * limits.turn_rad_s, onboard
+    )  # fmt: skip
+
+
+def _fixed_scanners(settings: LaserSettings, seed: int) -> tuple[Scanner, ...]:
+    """One at each wall, not quite where it was meant to be."""
+    rng = random_for(seed, "scanners")
+    scanners = []
+    for i, (x, y, degrees) in enumerate(_FIXED):
+        angle = np.deg2rad(degrees)
+        along = rng.uniform(-0.25, 0.25)
+        pose = np.array(
+            [x - along * np.sin(angle), y + along * np.cos(angle),
+             angle + np.deg2rad(rng.uniform(-4.0, 4.0))]
+        )  # fmt: skip
+        scanners.append(sick(f"fixed{i}", pose, settings))
+    return tuple(scanners)
+
+
+def _shifted(scanner: Scanner, by: FloatArray) -> Scanner:
+    return Scanner(
+        scanner.name, scanner.pose + by, scanner.covariance, scanner.first_angle_rad,
+        scanner.angle_step_rad, scanner.readings, scanner.max_range_m, scanner.sigma_m,
+    )  # fmt: skip
+
+
+def _drive(
+    settings: LaserSettings, seed: int, site: Site
+) -> tuple[Route, tuple[tuple[float, float], ...], tuple[tuple[float, float], ...]]:
+    """The whole drive, the visits and where the robot stands for reference poses."""
+    rounds = int(max(0.0, settings.between_s - _SHORTEST_AWAY_S) / _ROUND_S)
+    points: list[tuple[float, float]] = [*_WEST_DOOR]
+    parks: list[int] = []
+    for visit in range(settings.visits):
+        inside = _ways_inside(settings, random_for(seed, f"way {visit}"), site)
+        points += [*((float(x), float(y)) for x, y in inside), *_EAST_DOOR]
+        if visit + 1 < settings.visits:
+            points += [*_NORTH, *(_RING * rounds), *_WEST_DOOR]
+            parks.append(len(points) - len(_WEST_DOOR))
+    waypoints = np.array(points)
+    curve = Curve(waypoints)
+    covered = is_covered(curve.poses(curve.way)[:, :2]).astype(int)
+    enter = curve.way[np.flatnonzero(np.diff(covered) == 1)]
+    leave = curve.way[np.flatnonzero(np.diff(covered) == -1)]
+    stops = []
+    for visit in range(settings.visits):
+        count = len(range(visit, settings.references, settings.visits))
+        ways = np.linspace(enter[visit] + 1.0, leave[visit] - 1.0, count + 2)[1:-1]
+        stops += [Stop(float(way), settings.stand_s) for way in ways]
+    references = [stop.way_m for stop in stops]
+    # It waits at the western door for as long as it comes too early.
+    route = Route(waypoints, stops, settings.driving, EPOCH_S)
+    visits = _visits(route)
+    for (_, left), (entered, _), park in zip(visits, visits[1:], parks):
+        if (rest := settings.between_s - (entered - left)) > 0.0:
+            stops.append(Stop(curve.way_of_waypoint(park), rest))
+    stops.sort(key=lambda stop: stop.way_m)
+    route = Route(waypoints, stops, settings.driving, EPOCH_S)
+    stands = [span for span, stop in zip(route.stands, stops) if stop.way_m in references]
+    return route, tuple(_visits(route)), tuple(stands)
+
+
+def _visits(route: Route) -> list[tuple[float, float]]:
+    """From and to when the robot is in the room."""
+    times = np.arange(route.start_s, route.end_s, 0.01)
+    change = np.diff(is_covered(route.poses(times)[:, :2]).astype(int))
+    return list(zip(times[1:][change == 1].tolist(), times[:-1][change == -1].tolist()))
+
+
+_X, _Y = ROOM_M
+_OUT = 1.55
+_WEST_DOOR = ((-_OUT, _Y - 0.4), (-_OUT, 5.9), (-1.0, 4.4), (0.0, DOOR_Y_M), (0.9, DOOR_Y_M))
+_EAST_DOOR = ((_X - 0.9, DOOR_Y_M), (_X, DOOR_Y_M), (_X + 1.0, 4.4), (_X + _OUT, 5.9),
+              (_X + _OUT, _Y - 0.4))  # fmt: skip
+_NORTH = ((_X + 0.9, _Y + 1.3), (_X - 0.5, _Y + _OUT), (5.0, _Y + _OUT), (0.5, _Y + _OUT),
+          (-0.9, _Y + 1.3))  # fmt: skip
+_RING = ((-_OUT, _Y - 0.4), (-_OUT, DOOR_Y_M), (-_OUT, 0.4), (-0.9, -1.3), (0.5, -_OUT),
+         (5.0, -_OUT), (_X - 0.5, -_OUT), (_X + 0.9, -1.3), (_X + _OUT, 0.4),
+         (_X + _OUT, DOOR_Y_M), (_X + _OUT, _Y - 0.4), *_NORTH)  # fmt: skip
+
+
+def _ways_inside(settings: LaserSettings, rng: np.random.Generator, site: Site) -> FloatArray:
+    """Waypoints of a visit, between the doors: random, but not through what stands there."""
+    if settings.straight:
+        return np.array([[x, DOOR_Y_M] for x in (3.0, 5.0, 7.0)])
+    driving = settings.driving
+    stop = settings.stand_s + driving.speed_m_s / driving.acceleration_m_s2
+    standing = stop * settings.references / settings.visits
+    wanted = 0.85 * driving.speed_m_s * max(settings.visit_s - standing, 0.0)
+    before, after = np.array(_WEST_DOOR[-2:]), np.array(_EAST_DOOR[:2])
+    points, failed = [*before], 0
+    for _ in range(_TRIES):
+        length = float(np.linalg.norm(np.diff([*points, after[0]], axis=0), axis=1).sum())
+        if len(points) > 2 and length >= wanted:
+            whole = np.vstack([*points, after])
+            if _bends_softly(points, after[0]) and _is_clear(whole, site):
+                return np.array(points[2:])
+            points = points[: max(2, len(points) - 2)]
+        low, high = (
+            ((2.0, 2.0), (3.5, 5.5)) if len(points) == 2 else ((1.1, 1.1), (_X - 1.1, _Y - 1.1))
+        )
+        new = rng.uniform(low, high)
+        if _bends_softly(points, new) and _is_clear(np.array([*points[-4:], new]), site):
+            points.append(new)
+            failed = 0
+        elif (failed := failed + 1) > _STUCK:
+            points, failed = points[: max(2, len(points) - 1)], 0
+    raise GroundTruthError("no way through the room was found: try another seed")
+
+
+def _bends_softly(points: list[FloatArray], new: FloatArray) -> bool:
+    """Whether the way to a new point is neither short nor turns by more than about 110 degrees."""
+    came, goes = points[-1] - points[-2], new - points[-1]
+    lengths = np.linalg.norm(came) * np.linalg.norm(goes)
+    return bool(np.linalg.norm(goes) > 1.2 and came @ goes > -0.35 * lengths)
+
+
+def _is_clear(waypoints: FloatArray, site: Site) -> bool:
+    curve = Curve(waypoints, grid_m=0.1)
+    places = curve.poses(curve.way)[:, :2]
+    near = site.solid.reshape(-1, 2, 2)
+    near = site.solid[np.any((near > -0.2) & (near < np.array(ROOM_M) + 0.2), axis=1).all(axis=1)]
+    in_door = np.abs(places[:, 1] - DOOR_Y_M) < 0.3
+    return bool(
+        np.all(is_covered(places) | in_door) and clearance(places, near).min() >= _ROBOT_CLEAR_M
+    )
+
+
+def _passers(
+    settings: LaserSettings,
+    seed: int,
+    site: Site,
+    route: Route,
+    visits: tuple[tuple[float, float], ...],
+) -> tuple[Passer, ...]:
+    passers: list[Passer | None] = []
+    for visit, (begin, end) in enumerate(visits):
+        for number in range(settings.passers):
+            rng = random_for(seed, f"passer {visit} {number}")
+            passers.append(strolling(rng, route.poses, site.solid, (begin, end), _PASSER_APART_M))
+        if settings.faults.crossing:
+            rng = random_for(seed, f"crossing {visit}")
+            passers.append(crossing(rng, route.poses, site.solid, 0.5 * (begin + end), _CROSSING_M))
+    return tuple(passer for passer in passers if passer is not None)
