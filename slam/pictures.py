@@ -285,7 +285,12 @@ def _extent(
     for some, _ in drawn:
         if some is not None:
             near = _inside(some.lines.xy, low - reach, high + reach)
-            inner = np.concatenate([inner, some.lines.xy[near]])
+            for landmarks, shown in ((some.discs, slice(None)), (some.lines, near)):
+                # With their ellipses, but an unknown place shall not shrink the known ones.
+                variance = np.diagonal(landmarks.covariance[shown], axis1=1, axis2=2)
+                around = np.minimum(3.0 * np.sqrt(np.clip(variance, 0.0, None)), 0.5 * reach)
+                places = landmarks.xy[shown]
+                inner = np.concatenate([inner, places - around, places + around])
     low, high = inner.min(axis=0), inner.max(axis=0)
     margin = max(0.03 * float(np.max(high - low)), 0.3)
     # A straight drive has next to no width, but shall have a picture.
@@ -353,10 +358,15 @@ def _draw_landmarks(
     known = shown & np.any(some.covariance != 0.0, axis=(1, 2))
     if known.any():
         outlines = ellipse_outlines(some.xy[known], some.covariance[known])
+        # Of hundreds that lie over each other the fillings would hide all else.
+        filling, edge, width = (0.15, 1.0, 0.7) if len(some) <= 100 else (0.05, 0.55, 0.5)
         ellipses = PolyCollection(
-            list(outlines), facecolors=colour, edgecolors=colour, linewidths=0.7, zorder=2
+            list(outlines),
+            facecolors=[(*_rgb(colour), filling)],
+            edgecolors=[(*_rgb(colour), edge)],
+            linewidths=width,
+            zorder=2,
         )
-        ellipses.set_facecolor((*_rgb(colour), 0.15))
         ellipses.set_label(f"3 {_SIGMA} of {name}")
         axes.add_collection(ellipses, autolim=False)
 
