@@ -15,10 +15,13 @@ from slam.g2o import RunGraph, write_g2o
 from slam.g2o_frames import graph_of_frames
 from slam.measurement import disc_in_robot
 from slam.motion import relative_pose
+from slam.recording import read_recording
+from slam.tables import write_odometry
 
 gtsam: Any = pytest.importorskip("gtsam", reason="needs gtsam: pip install 'redetect[slam]'")
 
 FloatArray = NDArray[np.float64]
+DOCUMENT = Path(__file__).parents[2] / "docs" / "slam" / "formats.md"
 DEMO = Path(__file__).parents[2] / "images" / "e" / "map.circles"
 
 
@@ -114,3 +117,22 @@ def test_the_published_error_of_the_real_run(tmp_path: Path, shared_data: Path) 
     total = squared(step_errors(solved), solved.step_covariance)
     total += squared(disc_errors(solved), solved.circles.covariance)
     assert total == pytest.approx(56_871.45, abs=0.1)
+
+
+def test_the_documented_way_from_the_tables_to_factors(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The program in docs/slam/formats.md makes the factors that GTSAM reads from the g2o file."""
+    graph = estimates_with_error(DEMO)
+    write_g2o(tmp_path / "e.g2o", graph)
+    factors, values = gtsam.readG2o(str(tmp_path / "e.g2o"), False)
+    (tmp_path / "TABLES").mkdir()
+    write_odometry(
+        tmp_path / "TABLES" / "odometry.csv", read_recording(DEMO), "robotics", ["a comment"]
+    )
+    program = DOCUMENT.read_text().split("```python\n")[1].split("```")[0]
+    monkeypatch.chdir(tmp_path)
+    made: dict[str, Any] = {}
+    exec(program, made)
+    assert made["graph"].size() == 80
+    assert made["graph"].error(values) == pytest.approx(factors.error(values), rel=1e-9)
