@@ -84,7 +84,7 @@ class Curve:
     """A cubic spline through waypoints by its length; `way` (M,) and `bend` (M,) on a fine grid."""
 
     def __init__(self, waypoints: FloatArray, grid_m: float = _GRID_M) -> None:
-        from scipy.interpolate import CubicSpline
+        from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
         chords = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(waypoints, axis=0).T))])
         self._spline = CubicSpline(chords, waypoints, bc_type="natural")
@@ -93,6 +93,8 @@ class Curve:
         steps = 0.5 * (rate[1:] + rate[:-1]) * np.diff(u)
         self._chords = chords
         self._u, self.way = u, np.concatenate([[0.0], np.cumsum(steps)])
+        # Straight pieces between the grid's points would make the speed jump.
+        self._u_of_way = CubicHermiteSpline(self.way, u, 1.0 / rate)
         d1, d2 = self._spline(u, 1), self._spline(u, 2)
         self.bend = (d1[:, 0] * d2[:, 1] - d1[:, 1] * d2[:, 0]) / rate**3
         self._heading = np.unwrap(np.arctan2(d1[:, 1], d1[:, 0]))
@@ -103,7 +105,7 @@ class Curve:
 
     def poses(self, way_m: FloatArray) -> FloatArray:
         """(N, 3) poses at ways from the start; theta is the curve's direction, continuous."""
-        u = np.interp(way_m, self.way, self._u)
+        u = self._u_of_way(way_m)
         d1 = self._spline(u, 1)
         near = np.interp(way_m, self.way, self._heading)
         theta = np.arctan2(d1[:, 1], d1[:, 0])
