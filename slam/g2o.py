@@ -213,7 +213,8 @@ def _in_turned_axes(covariance: FloatArray, angle_rad: FloatArray) -> FloatArray
     turn = np.zeros((len(angle_rad), 3, 3))
     turn[:, :2, :2] = np.swapaxes(rotation(angle_rad), 1, 2)
     turn[:, 2, 2] = 1.0
-    turned = np.asarray(turn @ covariance @ np.swapaxes(turn, 1, 2))
+    with np.errstate(all="ignore"):  # what is not finite stays so
+        turned = np.asarray(turn @ covariance @ np.swapaxes(turn, 1, 2))
     return np.asarray(0.5 * (turned + np.swapaxes(turned, 1, 2)))
 
 

@@ -91,6 +91,9 @@ def read_g2o(path: str | os.PathLike[str], *, axes: Axes = "robotics") -> RunGra
     step_covariance, covariance = covariances_of_graph(
         steps, _symmetric(chain, 3), _symmetric(sights, 2), axes
     )
+    for some, spread in ((chain, step_covariance), (sights, covariance)):
+        for bad in np.flatnonzero(~np.all(np.isfinite(spread), axis=(1, 2)))[:1]:
+            raise SlamError(f"{path}:{some[bad].line}: the information matrix has no inverse")
     base = first_disc_vertex(order[-1])
     if any(vertex < base for vertex in rows.discs):
         base = 0

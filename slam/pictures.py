@@ -164,12 +164,17 @@ def draw_map(
     scale = min(largest[0] / span[0], largest[1] / span[1])
     size = (max(scale * span[0] * columns, 6.0) + 1.2, scale * span[1] * rows + 1.8)
     with _figure(png, size, overwrite=overwrite, interactive=interactive) as figure:
+        from matplotlib.ticker import MultipleLocator
+
         all_axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).ravel()
         for axes, (name, some, poses) in zip(all_axes, panels):
             _draw_panel(axes, some, poses, reference, low, high)
             axes.set_xlim(low[0], high[0])
             axes.set_ylim(low[1], high[1])
             axes.set_aspect("equal")
+            # Squares of one size: a scale for the eye.
+            axes.xaxis.set_major_locator(MultipleLocator(_grid_spacing(span)))
+            axes.yaxis.set_major_locator(MultipleLocator(_grid_spacing(span)))
             axes.set_title(name, fontsize=11)
             axes.set_xlabel("x / m")
             axes.set_ylabel("y / m")
@@ -297,6 +302,13 @@ def _extent(
     middle, half = 0.5 * (low + high), 0.5 * (high - low) + margin
     half = np.maximum(half, 0.2 * float(half.max()))
     return middle - half, middle + half
+
+
+def _grid_spacing(span: FloatArray) -> float:
+    """1, 2 or 5 times a power of ten, of which the larger side has 5 to 12."""
+    finest = float(np.max(span)) / 12.0
+    power = 10.0 ** np.floor(np.log10(finest))
+    return float(next(n * power for n in (1.0, 2.0, 5.0, 10.0) if n * power >= finest))
 
 
 def _inside(xy: FloatArray, low: FloatArray, high: FloatArray) -> NDArray[np.bool_]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 
 import numpy as np
@@ -76,6 +77,18 @@ def test_what_is_no_path_on_the_floor_is_refused(tmp_path: Path, text: str, mess
     (tmp_path / "p.tum").write_text(text)
     with pytest.raises(SlamError, match=message):
         read_tum(tmp_path / "p.tum")
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.binary(max_size=40), st.integers(0, 80), st.integers(0, 20))
+def test_damaged_files_are_read_or_refused(
+    tmp_path_factory: pytest.TempPathFactory, junk: bytes, place: int, length: int
+) -> None:
+    whole = b"# AXES robotics\n0 1.5 2 0 0 0 0 1\n1 1 2.5 0 0 0 0.6 0.8\n"
+    file = tmp_path_factory.mktemp("tum") / "a.tum"
+    file.write_bytes(whole[:place] + junk + whole[place + length :])
+    with contextlib.suppress(SlamError):
+        assert np.isfinite(read_tum(file).poses).all()
 
 
 def test_a_file_that_is_not_there(tmp_path: Path) -> None:

@@ -247,6 +247,7 @@ def test_a_file_of_another_tool_is_read(tmp_path: Path) -> None:
         (POSES + STEP + SIGHT.replace("1 17 1", "1 17 inf"), ":5: x is 'inf'"),
         (POSES + STEP + SIGHT.replace("100 0", "100 200"), ":5: the information matrix is not pos"),
         (POSES + STEP.replace("400", "-4"), ":4: the information matrix is not positive"),
+        (POSES + STEP.replace("100 0 0 100 0 400", "1e-320 0 0 1e-320 0 1e-320"), ":4: the info"),
         (POSES + STEP + STEP, ":5: EDGE_SE2 between these poses stands there already"),
         (POSES + STEP.replace("0 1 1", "1 0 1"), ":4: EDGE_SE2 from 1 to 0: expected edges from"),
         (POSES + STEP.replace("0 1 1", "0 9 1"), ":4: no VERTEX_SE2 9"),
