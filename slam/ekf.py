@@ -5,22 +5,23 @@ they were seen from (Smith, Self, Cheeseman: Estimating uncertain spatial relati
 1990). All rows of a frame are one measurement, so that all of them are linearised at the pose the
 odometry leads to.
 
-A vertical line is seen by its bearing only. When it is first seen, a copy of the pose joins the
-state instead (stochastic cloning), and the bearing waits. As soon as another bearing has enough
-parallax to it the line joins the state, computed from both poses, the kept and the present one,
-and both bearings. Each row is used once; rows of the line between those two are not used.
+A vertical line is seen by its bearing only. As long as its bearings have too little parallax,
+copies of the poses they were seen from are kept in the state (stochastic cloning); then the line
+joins the state by all of them at once (`slam.ekf_lines`). Each row is used once.
 """
 
 from __future__ import annotations
 
 from collections import Counter
 from itertools import count
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from slam.ekf_covariance import POSE_SIZE, JointCovariance
-from slam.ekf_lines import FirstView, intersect, intersection_jacobians
+from slam.ekf_lines import relative_range_sigma, start_line
+from slam.ekf_views import View, WaitingLines
 from slam.errors import SlamError
 from slam.filter_association import Associator
 from slam.filter_frames import NO_CAMERA, FilterRun, FrameRows, RowCount, frames_of, unknown
@@ -31,12 +32,13 @@ from slam.recording import Recording
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-# Two bearings make a line when the parallax between them is so many times its standard deviation:
-# then the distance is known to about a tenth, and the intersection is linear enough.
-PARALLAX_SIGMAS = 10.0
-# A first view is given up for a later one after so many frames without parallax.
-LONGEST_WAIT_FRAMES = 300
+JacobiansAt = Literal["first", "latest"]
 
+#: A line joins the state when its distance is known to this share, so that bearings are nearly
+#: linear in its place.
+LARGEST_RANGE_SIGMA = 0.1
+
+_GIVEN_UP = "line without parallax"
 _POSE = np.arange(POSE_SIZE)
 
 
@@ -51,11 +53,12 @@ class EkfSlam:
         Its covariance; none by default, as the start defines the map.
     camera_xy : (2,) array_like
         The camera's centre in the robot frame (m); only lines need it.
-    first_estimates : bool
-        Evaluate Jacobians at the first estimate of each landmark and at the poses as predicted
+    jacobians : str
+        `first`: evaluate them at the first estimate of each landmark and at the poses as predicted
         (Huang, Mourikis, Roumeliotis: Observability-based rules for designing consistent EKF SLAM
         estimators, 2010), so that the filter does not believe to learn its heading from
-        landmarks it has placed itself.
+        landmarks it has placed itself. `latest`: at the latest estimates, as the textbook filter
+        does.
     """
 
     def __init__(
@@ -64,7 +67,7 @@ class EkfSlam:
         start_covariance: ArrayLike | None = None,
         camera_xy: ArrayLike = NO_CAMERA,
         *,
-        first_estimates: bool = False,
+        jacobians: JacobiansAt = "first",
     ) -> None:
         spread = np.zeros((3, 3)) if start_covariance is None else np.asarray(start_covariance)
         self.covariance = JointCovariance(spread)
@@ -77,8 +80,8 @@ class EkfSlam:
         self.frame = -1
         self._state = np.array(start, dtype=np.float64)
         # The same array unless Jacobians are evaluated elsewhere.
-        self._linearised = self._state.copy() if first_estimates else self._state
-        self._first_views: dict[int, FirstView] = {}
+        self._linearised = self._state.copy() if jacobians == "first" else self._state
+        self._waiting = WaitingLines()
         self._free_slots: list[int] = []
 
     @property
@@ -149,8 +152,15 @@ class EkfSlam:
             self._add_disc(number, rows.disc_xy[k], rows.disc_covariance[k])
         if again:
             self._update(rows, again, [])
-        for k in single:
-            self._view_line(rows.line_ids[k][0], rows.bearing_rad[k], rows.sigma_rad[k])
+        if single or self._waiting.slots:
+            self._view_lines(rows, single)
+
+    def finish(self) -> None:
+        """The run is over: lines that still wait are given up."""
+        given_up = self._waiting.forget_all()
+        if given_up:
+            self.count.left_out[_GIVEN_UP] += given_up
+        self._free_slots.extend(self._waiting.release())
 
     def landmark_map(self) -> LandmarkMap:
         """The landmarks that are in the state, with their marginal covariances."""
@@ -173,6 +183,16 @@ class EkfSlam:
             rows.sigma_rad[lines],
             self.camera_xy,
         )
+        self._apply(innovation, jacobian, noise, index)
+        self.count.discs += len(discs)
+        self.count.lines += len(lines)
+        self.disc_rows.update([rows.disc_ids[k] for k in discs])
+        self.line_rows.update([i for ids in line_ids for i in ids])
+
+    def _apply(
+        self, innovation: FloatArray, jacobian: FloatArray, noise: FloatArray, index: IntArray
+    ) -> None:
+        """Update the state by measurements that depend on the numbers `index` of it."""
         projected = self.covariance.projected(index, jacobian)
         change, squared = self.covariance.measure(
             projected, jacobian @ projected[index] + noise, innovation
@@ -180,10 +200,6 @@ class EkfSlam:
         self._state[: len(change)] += change
         self.count.innovation_squared += squared
         self.count.innovation_numbers += len(innovation)
-        self.count.discs += len(discs)
-        self.count.lines += len(lines)
-        self.disc_rows.update([rows.disc_ids[k] for k in discs])
-        self.line_rows.update([i for ids in line_ids for i in ids])
 
     def _add_disc(self, number: int, seen_xy: FloatArray, noise: FloatArray) -> None:
         pose, at = self._state, self._linearised
@@ -195,65 +211,72 @@ class EkfSlam:
         self.disc_rows[number] = 1
         self.count.discs += 1
 
-    def _view_line(self, number: int, bearing_rad: float, sigma_rad: float) -> None:
-        """A line that is not in the state yet: it joins it, or its first view is kept."""
-        first = self._first_views.get(number)
-        if first is None:
-            self._keep_view(number, bearing_rad, sigma_rad)
-        elif not self._add_line(number, first, bearing_rad, sigma_rad):
-            if self.frame - first.frame > LONGEST_WAIT_FRAMES:
-                self._forget_view(number)
-                self._keep_view(number, bearing_rad, sigma_rad)
-            self.count.left_out["line without parallax yet"] += 1
+    def _view_lines(self, rows: FrameRows, single: list[int]) -> None:
+        """Lines that are not in the state yet: they join it, or wait."""
+        waiting, reasons = self._waiting, self.count.left_out
+        given_up = waiting.forget_absent(self.frame)
+        kept = False
+        for k in single:
+            number = rows.line_ids[k][0]
+            view = View(self.frame, float(rows.bearing_rad[k]), float(rows.sigma_rad[k]))
+            if number in self.line_slots or any(
+                other.frame == self.frame for other in waiting.views(number)
+            ):
+                reasons["further row of a new line"] += 1
+            elif not self._start_line(number, [*waiting.views(number), view]):
+                waiting.keep(number, view)
+                kept = True
+        if kept:
+            waiting.slots[self.frame] = self._keep_pose()
+            given_up += waiting.thin()
+        if given_up:
+            reasons[_GIVEN_UP] += given_up
+        self._free_slots.extend(waiting.release())
 
-    def _add_line(
-        self, number: int, first: FirstView, bearing_rad: float, sigma_rad: float
-    ) -> bool:
-        """Add a line if its two bearings have enough parallax."""
-        kept = np.arange(first.slot, first.slot + POSE_SIZE)
-        found = intersect(
-            self._state[kept], first.bearing_rad, self._state[:3], bearing_rad, self.camera_xy
-        )
-        if found is None:
+    def _start_line(self, number: int, views: list[View]) -> bool:
+        """Add a line by all its views, the last from the present pose, if that places it well."""
+        if len(views) < 2:
             return False
-        index = np.concatenate([kept, _POSE])
-        headings = self.covariance.block(index[[2, 5]])
-        variance = first.sigma_rad**2 + sigma_rad**2
-        variance += headings[0, 0] + headings[1, 1] - 2.0 * headings[0, 1]
-        if np.sin(found.parallax_rad) < PARALLAX_SIGMAS * np.sqrt(variance):
+        slots = [*(self._waiting.slots[view.frame] for view in views[:-1]), 0]
+        index = (np.array(slots)[:, None] + _POSE).ravel()
+        bearing = np.array([view.bearing_rad for view in views])
+        sigma = np.array([view.sigma_rad for view in views])
+        poses = self._state[index].reshape(-1, POSE_SIZE)
+        if not self._waiting.worth_trying(number, float(np.ptp(np.unwrap(bearing + poses[:, 2])))):
             return False
-        at = self._linearised
-        by_poses, by_bearings = intersection_jacobians(
-            at[kept], at[:POSE_SIZE], found.xy, self.camera_xy
+        known = self.covariance.block(index)
+        poses_at = self._linearised[index].reshape(-1, POSE_SIZE)
+        start = start_line(poses, poses_at, bearing, sigma, self.camera_xy, known)
+        if start is None:
+            return False
+        both = np.zeros((5, 5))
+        both[:3, :3] = known[-3:, -3:]
+        both[:3, 3:] = known[-3:] @ start.by_poses.T
+        both[3:, :3] = both[:3, 3:].T
+        both[3:, 3:] = start.by_poses @ known @ start.by_poses.T + start.noise
+        if relative_range_sigma(poses[-1], start.xy, both) > LARGEST_RANGE_SIGMA:
+            return False
+        self.line_slots[number] = self._append(
+            index, start.by_poses, start.noise, start.xy + start.correction, start.xy
         )
-        noise = by_bearings @ np.diag([first.sigma_rad**2, sigma_rad**2]) @ by_bearings.T
-        self.line_slots[number] = self._append(index, by_poses, noise, found.xy, found.xy)
-        self.line_rows[number] = 2
-        self.count.lines += 2
-        self._forget_view(number)
+        if len(views) > 2:
+            self._apply(start.residual, start.residual_by_poses, np.eye(len(start.residual)), index)
+        self._waiting.take(number)
+        self.line_rows[number] = len(views)
+        self.count.lines += len(views)
         return True
 
-    def _keep_view(self, number: int, bearing_rad: float, sigma_rad: float) -> None:
-        """Keep a bearing, and the pose it was seen from as part of the state."""
-        shared = [v.slot for v in self._first_views.values() if v.frame == self.frame]
-        if shared:
-            slot = shared[0]
-        else:
-            copy, none = np.eye(POSE_SIZE), np.zeros((POSE_SIZE, POSE_SIZE))
-            pose, at = self._state[:POSE_SIZE].copy(), self._linearised[:POSE_SIZE].copy()
-            if self._free_slots:
-                slot = self._free_slots.pop()
-                self.covariance.replace(slot, _POSE, copy, none)
-                self._linearised[slot : slot + POSE_SIZE] = at
-                self._state[slot : slot + POSE_SIZE] = pose
-            else:
-                slot = self._append(_POSE, copy, none, pose, at)
-        self._first_views[number] = FirstView(slot, self.frame, bearing_rad, sigma_rad)
-
-    def _forget_view(self, number: int) -> None:
-        slot = self._first_views.pop(number).slot
-        if all(view.slot != slot for view in self._first_views.values()):
-            self._free_slots.append(slot)
+    def _keep_pose(self) -> int:
+        """Put a copy of the pose into the state; returns where."""
+        copy, none = np.eye(POSE_SIZE), np.zeros((POSE_SIZE, POSE_SIZE))
+        pose, at = self._state[:POSE_SIZE].copy(), self._linearised[:POSE_SIZE].copy()
+        if not self._free_slots:
+            return self._append(_POSE, copy, none, pose, at)
+        slot = self._free_slots.pop()
+        self.covariance.replace(slot, _POSE, copy, none)
+        self._linearised[slot : slot + POSE_SIZE] = at
+        self._state[slot : slot + POSE_SIZE] = pose
+        return slot
 
     def _append(
         self,
@@ -331,6 +354,7 @@ def run_ekf(recording: Recording, ekf: EkfSlam, associator: Associator | None = 
         disc_ids.extend(identified.disc_ids)
         line_ids.extend(identified.line_ids)
         poses[k + 1], covariance[k + 1] = ekf.state[:POSE_SIZE], ekf.covariance.pose()
+    ekf.finish()
     return FilterRun(
         path=Path2D(("start", *recording.prefixes), poses, covariance),
         count=ekf.count,

@@ -40,7 +40,7 @@ def perform(command: Ekf) -> int:
         camera=command.camera,
     )
     demand_free(output, names, overwrite=command.force)
-    ekf = EkfSlam(camera_xy=camera_xy, first_estimates=command.first_estimates)
+    ekf = EkfSlam(camera_xy=camera_xy, jacobians=command.jacobians)
     began = time.perf_counter()
     run = run_ekf(recording, ekf, associator)
     seconds = time.perf_counter() - began

@@ -45,8 +45,10 @@ class JointCovariance:
 
     def __init__(self, pose_covariance: FloatArray) -> None:
         from scipy.linalg.blas import dsyrk
+        from scipy.linalg.lapack import dtrtrs
 
         self._subtract: Callable[..., FloatArray] = dsyrk
+        self._solve: Callable[..., tuple[FloatArray, int]] = dtrtrs
         self.size = POSE_SIZE
         self._base = np.zeros((_CHUNK, _CHUNK), order="F")
         self._base[:POSE_SIZE, :POSE_SIZE] = pose_covariance
@@ -131,8 +133,6 @@ class JointCovariance:
         SlamError
             If S is not positive definite.
         """
-        from scipy.linalg import solve_triangular
-
         try:
             root = np.linalg.cholesky(innovation_covariance)
         except np.linalg.LinAlgError:
@@ -145,16 +145,12 @@ class JointCovariance:
             self._settle()
             if rows > self._factor.shape[1]:
                 self._factor = np.zeros((self._factor.shape[0], rows), order="F")
-        whitened = solve_triangular(
-            root,
-            np.concatenate([projected.T, innovation[:, None]], axis=1),
-            lower=True,
-            check_finite=False,
-        )
-        factor = whitened[:, :-1].T
+        right = np.empty((self.size + 1, rows))
+        right[:-1], right[-1] = projected, innovation
+        whitened = self._solve(root, right.T, lower=1, overwrite_b=1)[0].T
+        factor, last = whitened[:-1], whitened[-1]
         self._factor[: self.size, self._pending : self._pending + rows] = factor
         self._pending += rows
-        last = whitened[:, -1]
         return factor @ last, float(last @ last)
 
     def append(self, index: IntArray, jacobian: FloatArray, noise: FloatArray) -> int:

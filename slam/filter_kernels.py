@@ -35,7 +35,8 @@ def frame_innovation(
     state : (n,) float64
         Pose, then landmarks; predictions are made from it.
     linearised_at : (n,) float64
-        The state at which Jacobians are evaluated; usually the same.
+        Where the offset of landmarks from the robot, which the heading turns, is taken from:
+        usually the same. With first estimates a frame turned as a whole is no innovation.
     disc_slot : (d,) int64
         Where in the state the disc of each row begins.
     disc_xy, disc_covariance : (d, 2), (d, 2, 2) float64
@@ -70,7 +71,6 @@ def frame_innovation(
     index = np.empty(numbers, dtype=np.int64)
     index[0], index[1], index[2] = 0, 1, 2
     cos, sin = math.cos(state[2]), math.sin(state[2])
-    cos_at, sin_at = math.cos(linearised_at[2]), math.sin(linearised_at[2])
     for k in range(discs):
         slot, row, column = disc_slot[k], 2 * k, 3 + 2 * k
         index[column], index[column + 1] = slot, slot + 1
@@ -79,12 +79,12 @@ def frame_innovation(
         innovation[row + 1] = disc_xy[k, 1] - (-sin * dx + cos * dy)
         dx = linearised_at[slot] - linearised_at[0]
         dy = linearised_at[slot + 1] - linearised_at[1]
-        jacobian[row, 0], jacobian[row, 1] = -cos_at, -sin_at
-        jacobian[row + 1, 0], jacobian[row + 1, 1] = sin_at, -cos_at
-        jacobian[row, 2] = -sin_at * dx + cos_at * dy
-        jacobian[row + 1, 2] = -cos_at * dx - sin_at * dy
-        jacobian[row, column], jacobian[row, column + 1] = cos_at, sin_at
-        jacobian[row + 1, column], jacobian[row + 1, column + 1] = -sin_at, cos_at
+        jacobian[row, 0], jacobian[row, 1] = -cos, -sin
+        jacobian[row + 1, 0], jacobian[row + 1, 1] = sin, -cos
+        jacobian[row, 2] = -sin * dx + cos * dy
+        jacobian[row + 1, 2] = -cos * dx - sin * dy
+        jacobian[row, column], jacobian[row, column + 1] = cos, sin
+        jacobian[row + 1, column], jacobian[row + 1, column + 1] = -sin, cos
         for i in range(2):
             for j in range(2):
                 noise[row + i, row + j] = disc_covariance[k, i, j]
@@ -100,18 +100,15 @@ def frame_innovation(
             seen_y = -sin * dx + cos * dy - camera_xy[1]
             angle = bearing_rad[k] - math.atan2(seen_x, -seen_y)
             difference += share * ((angle + math.pi) % (2.0 * math.pi) - math.pi)
+            weight = share / (seen_x**2 + seen_y**2)
+            by_x = (-seen_y * cos - seen_x * sin) * weight
+            by_y = (-seen_y * sin + seen_x * cos) * weight
+            jacobian[row, column], jacobian[row, column + 1] = by_x, by_y
+            jacobian[row, 0] -= by_x
+            jacobian[row, 1] -= by_y
             dx = linearised_at[slot] - linearised_at[0]
             dy = linearised_at[slot + 1] - linearised_at[1]
-            robot_x = cos_at * dx + sin_at * dy
-            robot_y = -sin_at * dx + cos_at * dy
-            seen_x, seen_y = robot_x - camera_xy[0], robot_y - camera_xy[1]
-            weight = share / (seen_x**2 + seen_y**2)
-            by_x, by_y = -seen_y * weight, seen_x * weight
-            jacobian[row, column] = by_x * cos_at - by_y * sin_at
-            jacobian[row, column + 1] = by_x * sin_at + by_y * cos_at
-            jacobian[row, 0] -= jacobian[row, column]
-            jacobian[row, 1] -= jacobian[row, column + 1]
-            jacobian[row, 2] += by_x * robot_y - by_y * robot_x
+            jacobian[row, 2] += by_x * dy - by_y * dx
         innovation[row] = difference
         noise[row, row] = sigma_rad[k] ** 2
     return innovation, jacobian, noise, index

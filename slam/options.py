@@ -156,9 +156,10 @@ class Ekf:
         out.
     gate_probability : float
         Share of right rows that pass the gate; with known association nothing is gated.
-    first_estimates : bool
-        Evaluate Jacobians at first estimates (FEJ): then the filter does not believe to learn its
-        heading from landmarks that it has placed itself.
+    jacobians : str
+        Where the models are linearised: at the `first` estimate of each landmark, so that the
+        filter does not believe to learn its heading from landmarks it has placed itself; or at the
+        `latest`, as the textbook filter does, which is inconsistent at large heading error.
     reference : Path
         A path.csv to measure the distance from.
     output : Path
@@ -177,7 +178,7 @@ class Ekf:
     camera: MaybePath = None
     association: Literal["known", "nearest", "joint"] = "known"
     gate_probability: float = 0.999
-    first_estimates: bool = False
+    jacobians: Literal["first", "latest"] = "first"
     reference: MaybePath = None
     output: Annotated[MaybePath, arg(aliases=["-o"])] = None
     interactive: bool = False
@@ -336,7 +337,8 @@ class Import:
     axes : str
         The axes that the file is in; see `slam export`.
     output : Path
-        Of a graph the .circles file to write; of a trajectory the path.csv.
+        Of a graph the .circles file to write, or, with the suffix .csv, the path of its estimates;
+        of a trajectory the path.csv.
     force : bool
         Replace an existing file.
     """

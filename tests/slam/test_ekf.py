@@ -9,9 +9,10 @@ import pytest
 from numpy.typing import NDArray
 
 from landmarks import wrap_angle
-from slam.ekf import EkfSlam, run_ekf
+from slam.ekf import EkfSlam, JacobiansAt, run_ekf
 from slam.ekf_covariance import JointCovariance
-from slam.ekf_lines import intersect, intersection_jacobians
+from slam.ekf_lines import start_line, triangulate
+from slam.ekf_views import MOST_KEPT_POSES
 from slam.errors import SlamError
 from slam.filter_association import Associator
 from slam.filter_frames import FrameRows
@@ -122,7 +123,7 @@ def dense_filter(recording: Recording) -> tuple[FloatArray, FloatArray, list[int
 def test_the_filter_is_the_plain_dense_one(seed: int) -> None:
     # So long that its covariance is written anew several times, and so large that it grows.
     recording, _, _ = drive(np.random.default_rng(seed), steps=150, discs=60)
-    ekf = EkfSlam()
+    ekf = EkfSlam(jacobians="latest")
     run_ekf(recording, ekf)
     state, covariance, known = dense_filter(recording)
     assert list(ekf.disc_slots) == known
@@ -263,15 +264,40 @@ def bearings_of(lines: list[tuple[tuple[int, ...], float, float]]) -> FrameRows:
 
 def test_a_line_is_not_placed_without_parallax() -> None:
     ekf = EkfSlam(camera_xy=CAMERA_XY)
-    line = np.array([0.2, -6.0])
-    for _ in range(4):
-        ekf.predict(np.array([0.0, -0.02, 0.0]), 1e-8 * np.eye(3))
+    line = np.array([0.2, -9.0])
+    for _ in range(100):
+        ekf.predict(np.array([0.0, -0.01, 0.0]), 1e-8 * np.eye(3))
         bearing = float(bearing_of_vertical(ekf.state[:3], line, CAMERA_XY))
         ekf.measure(bearings_of([((3,), bearing, 2e-3)]))
     assert not ekf.line_slots
-    assert ekf.count.left_out["line without parallax yet"] == 3
-    # One copy of the pose is kept, however long it takes.
+    assert ekf.count.lines == 0
+    # However long it takes, only so many poses are kept.
+    assert len(ekf.state) <= 3 + 3 * (MOST_KEPT_POSES + 1)
+    # Until it is passed; then what was kept is used, and every row has been counted.
+    for _ in range(20):
+        ekf.predict(np.array([0.0, -0.3, 0.0]), 1e-8 * np.eye(3))
+        bearing = float(bearing_of_vertical(ekf.state[:3], line, CAMERA_XY))
+        ekf.measure(bearings_of([((3,), bearing, 2e-3)]))
+    slot = ekf.line_slots[3]
+    np.testing.assert_allclose(ekf.state[slot : slot + 2], line, atol=1e-9)
+    assert ekf.count.lines > 20
+    assert ekf.count.lines + ekf.count.left_out.total() == 120
+
+
+def test_lines_that_are_lost_from_sight_are_given_up() -> None:
+    ekf = EkfSlam(camera_xy=CAMERA_XY)
+    nothing = bearings_of([])
+    ekf.predict(np.zeros(3), 1e-8 * np.eye(3))
+    ekf.measure(bearings_of([((3,), 0.1, 2e-3)]))
+    for _ in range(60):
+        ekf.predict(np.zeros(3), 1e-8 * np.eye(3))
+        ekf.measure(nothing)
+    assert ekf.count.left_out == {"line without parallax": 1}
+    ekf.measure(bearings_of([((3,), 0.1, 2e-3)]))
+    # The pose kept now takes the place of the one that was given up.
     assert len(ekf.state) == 6
+    ekf.finish()
+    assert ekf.count.left_out == {"line without parallax": 2}
 
 
 def test_a_copy_of_the_pose_is_used_again_when_its_lines_are_placed() -> None:
@@ -289,6 +315,76 @@ def test_a_copy_of_the_pose_is_used_again_when_its_lines_are_placed() -> None:
     np.testing.assert_allclose(
         ekf.covariance.block(np.arange(3, 6)), ekf.covariance.pose(), atol=1e-15
     )
+
+
+@pytest.mark.parametrize("jacobians", ["first", "latest"])
+def test_lines_by_all_their_bearings_are_batch_least_squares(jacobians: JacobiansAt) -> None:
+    """Each bearing counts once: those that waited, and those after the line was placed."""
+    rng = np.random.default_rng(21)
+    lines = np.array([[1.5, -3.0], [-1.0, -3.5], [1.2, -4.5]])
+    share, steps, sigma = 0.01, 12, 4e-3
+    covariance = spd(rng, 3, 0.004)
+    pose, measured, rows = np.zeros(3), [], []
+    for k in range(steps):
+        step = np.array([-0.05, -0.25, 0.03])
+        pose = move(pose, step)
+        measured.append(step + share * rng.multivariate_normal(np.zeros(3), covariance))
+        bearings = bearing_of_vertical(pose, lines, CAMERA_XY) + share * sigma * rng.normal(size=3)
+        rows += [(k, float(b), (i,)) for i, b in enumerate(bearings)]
+    recording = Recording(
+        prefixes=tuple(f"c.{k}" for k in range(steps)),
+        steps=np.array(measured),
+        step_covariance=np.tile(covariance, (steps, 1, 1)),
+        circles=NO_DISCS,
+        lines=LineRows(
+            np.array([r[0] for r in rows]),
+            np.array([r[1] for r in rows]),
+            np.full(len(rows), sigma),
+            tuple(r[2] for r in rows),
+        ),
+    )
+    ekf = EkfSlam(camera_xy=CAMERA_XY, jacobians=jacobians)
+    run = run_ekf(recording, ekf)
+    assert run.count.lines == len(rows)
+    # Pose and two lines come before the last, and several kept poses.
+    assert max(ekf.line_slots.values()) >= 3 + 4 + 9
+    from slam.motion import chain_steps, relative_pose, relative_pose_jacobians
+
+    poses, places = chain_steps(recording.steps), lines.copy()
+    unknowns = 3 * steps + 6
+    for _ in range(20):
+        normal, right = np.zeros((unknowns, unknowns)), np.zeros(unknowns)
+        weight = np.linalg.inv(covariance)
+        for k in range(steps):
+            J = np.zeros((3, unknowns))
+            first, second = relative_pose_jacobians(poses[k], poses[k + 1])
+            if k:
+                J[:, 3 * k - 3 : 3 * k] = first
+            J[:, 3 * k : 3 * k + 3] = second
+            normal += J.T @ weight @ J
+            right += J.T @ weight @ (recording.steps[k] - relative_pose(poses[k], poses[k + 1]))
+        for k, bearing, (i,) in rows:
+            row = np.zeros(unknowns)
+            at = 3 * steps + 2 * i
+            row[3 * k : 3 * k + 3], row[at : at + 2] = bearing_jacobians(
+                poses[k + 1], places[i], CAMERA_XY
+            )
+            error = bearing - bearing_of_vertical(poses[k + 1], places[i], CAMERA_XY)
+            normal += np.outer(row, row) / sigma**2
+            right += row * error / sigma**2
+        change = np.linalg.solve(normal, right)
+        poses[1:] += change[: 3 * steps].reshape(-1, 3)
+        places += change[3 * steps :].reshape(-1, 2)
+    wanted = np.arange(3 * steps - 3, unknowns)
+    expected = np.linalg.inv(normal)[np.ix_(wanted, wanted)]
+    order = np.concatenate(
+        [[0, 1, 2], *(np.array([0, 1]) + ekf.line_slots[i] for i in range(3))]
+    ).astype(np.int64)
+    scale = np.sqrt(np.diag(expected))
+    state = np.concatenate([poses[-1], places.ravel()])
+    np.testing.assert_allclose((ekf.state[order] - state) / scale, 0.0, atol=2e-3)
+    found = ekf.covariance.block(order) / np.outer(scale, scale)
+    np.testing.assert_allclose(found, expected / np.outer(scale, scale), atol=5e-3)
 
 
 def test_a_row_of_several_lines_measures_the_mean_of_their_bearings() -> None:
@@ -340,21 +436,32 @@ def test_jacobians_of_two_rays() -> None:
     poses = np.array([[0.1, 0.3, 0.2], [-0.5, -0.9, 0.5]])
     line = np.array([0.7, -3.0])
     bearings = bearing_of_vertical(poses, line, CAMERA_XY)
-    by_poses, by_bearings = intersection_jacobians(poses[0], poses[1], line, CAMERA_XY)
+    sigma = np.array([0.01, 0.02])
+    start = start_line(poses, poses, bearings, sigma, CAMERA_XY, 1e-6 * np.eye(6))
+    assert start is not None
 
     def meet(numbers: FloatArray) -> FloatArray:
-        met = intersect(numbers[:3], numbers[6], numbers[3:6], numbers[7], CAMERA_XY)
+        met = triangulate(numbers[:6].reshape(2, 3), numbers[6:], sigma, CAMERA_XY)
         assert met is not None
-        return met.xy
+        return met
 
     at = np.concatenate([poses.ravel(), bearings])
-    numeric = np.stack([(meet(at + e) - meet(at - e)) / 2e-6 for e in 1e-6 * np.eye(8)], axis=-1)
-    np.testing.assert_allclose(np.column_stack([by_poses, by_bearings]), numeric, atol=1e-6)
+    numeric = np.stack([(meet(at + e) - meet(at - e)) / 2e-4 for e in 1e-4 * np.eye(8)], axis=-1)
+    np.testing.assert_allclose(start.by_poses, numeric[:, :6], atol=1e-4)
+    noise = numeric[:, 6:] @ np.diag(sigma**2) @ numeric[:, 6:].T
+    np.testing.assert_allclose(start.noise, noise, rtol=1e-4)
+    np.testing.assert_allclose(start.xy, line, atol=1e-9)
+    np.testing.assert_allclose(start.correction, 0.0, atol=1e-9)
 
 
-def test_rays_that_do_not_meet_in_front() -> None:
-    assert intersect(np.zeros(3), 0.0, np.array([1.0, 0, 0]), 0.3, np.zeros(2)) is None
-    assert intersect(np.zeros(3), 0.0, np.array([1.0, 0, 0]), 0.0, np.zeros(2)) is None
+@pytest.mark.parametrize("bearings", [(0.0, 0.3), (0.0, 0.0)])
+def test_rays_that_do_not_meet_in_front(bearings: tuple[float, float]) -> None:
+    poses = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+    assert triangulate(poses, np.array(bearings), np.full(2, 0.01), np.zeros(2)) is None
+    # Turned to each other they do.
+    met = triangulate(poses, np.array([0.3, -0.3]), np.full(2, 0.01), np.zeros(2))
+    assert met is not None
+    np.testing.assert_allclose(met, [0.5, -0.5 / np.tan(0.3)], atol=1e-9)
 
 
 def test_two_rows_of_one_new_disc_are_both_used() -> None:
@@ -373,9 +480,9 @@ def test_first_estimates_do_not_teach_the_heading() -> None:
     plain filter violates.
     """
 
-    def smallest(*, first_estimates: bool) -> float:
+    def smallest(jacobians: JacobiansAt) -> float:
         rng = np.random.default_rng(11)
-        ekf = EkfSlam(start_covariance=np.diag([0.1, 0.1, 0.1]), first_estimates=first_estimates)
+        ekf = EkfSlam(start_covariance=np.diag([0.1, 0.1, 0.1]), jacobians=jacobians)
         places = rng.uniform(-2, 2, (12, 2))
         found = np.inf
         true = np.zeros(3)
@@ -391,8 +498,8 @@ def test_first_estimates_do_not_teach_the_heading() -> None:
             found = min(found, ekf.covariance.pose()[2, 2])
         return found
 
-    assert smallest(first_estimates=True) >= 0.1 - 1e-9
-    assert smallest(first_estimates=False) < 0.09
+    assert smallest("first") >= 0.1 - 1e-9
+    assert smallest("latest") < 0.09
 
 
 def test_the_start_may_be_anywhere() -> None:

@@ -1,0 +1,282 @@
+"""Localisation in a known map against plain dense filters, and what is left out or refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from landmarks import wrap_angle
+from slam.errors import SlamError
+from slam.filter_association import Associator
+from slam.filter_frames import frames_of
+from slam.localize import Localizer, MapErrors, run_localizer
+from slam.map_file import LandmarkMap, Landmarks, no_landmarks
+from slam.measurement import (
+    bearing_jacobians,
+    bearing_of_vertical,
+    disc_in_robot,
+    disc_jacobians,
+)
+from slam.motion import move, move_jacobians
+from slam.recording import CircleRows, LineRows, Recording
+
+FloatArray = NDArray[np.float64]
+CAMERA_XY = np.array([0.0179777, -0.0808609])
+
+
+def spd(rng: np.random.Generator, size: int, scale: float) -> FloatArray:
+    root = rng.normal(0, 1, (size, size))
+    return np.asarray(scale**2 * (root @ root.T / size + 0.3 * np.eye(size)))
+
+
+def landmarks(rng: np.random.Generator, count: int, scale: float) -> Landmarks:
+    return Landmarks(
+        ids=np.arange(count) + 10,
+        xy=rng.uniform(-4, 4, (count, 2)),
+        covariance=np.array([spd(rng, 2, scale) for _ in range(count)]),
+        rows=np.ones(count, dtype=np.int64),
+    )
+
+
+def drive(seed: int, *, noise: float = 1.0) -> tuple[Recording, LandmarkMap, FloatArray]:
+    """A run among discs and lines; some rows show one disc twice, or two lines at once."""
+    rng = np.random.default_rng(seed)
+    some = LandmarkMap(discs=landmarks(rng, 12, 0.05), lines=landmarks(rng, 8, 0.05))
+    pose, poses, steps = np.zeros(3), [np.zeros(3)], []
+    covariances = np.array([spd(rng, 3, 0.02) for _ in range(60)])
+    circles, lines = [], []
+    for k in range(60):
+        step = np.array([0.05, -0.3, 0.1])
+        pose = move(pose, step)
+        poses.append(pose)
+        steps.append(step + noise * rng.multivariate_normal(np.zeros(3), covariances[k]))
+        for i in rng.choice(12, 3):
+            spread = spd(rng, 2, 0.05)
+            error = noise * rng.multivariate_normal(np.zeros(2), spread)
+            circles.append((k, disc_in_robot(pose, some.discs.xy[i]) + error, spread, i + 10))
+        for _ in range(2):
+            seen = rng.choice(8, rng.integers(1, 3), replace=False)
+            bearings = bearing_of_vertical(pose, some.lines.xy[seen], CAMERA_XY)
+            if np.ptp(bearings) < 1.0:
+                bearing = bearings.mean() + noise * rng.normal(0, 0.02)
+                lines.append((k, bearing, tuple(int(i) + 10 for i in seen)))
+    return (
+        Recording(
+            prefixes=tuple(f"b.{k}" for k in range(60)),
+            steps=np.array(steps),
+            step_covariance=covariances,
+            circles=CircleRows(
+                np.array([r[0] for r in circles]),
+                np.array([r[1] for r in circles]),
+                np.array([r[2] for r in circles]),
+                np.array([r[3] for r in circles]),
+            ),
+            lines=LineRows(
+                np.array([r[0] for r in lines]),
+                np.array([r[1] for r in lines]),
+                np.full(len(lines), 0.02),
+                tuple(r[2] for r in lines),
+            ),
+        ),
+        some,
+        np.array(poses),
+    )
+
+
+def dense(
+    recording: Recording, some: LandmarkMap, map_errors: MapErrors
+) -> tuple[FloatArray, FloatArray]:
+    """Poses and covariances by full matrices of pose and map, the map's gain set to zero."""
+    places = np.concatenate([some.discs.xy, some.lines.xy])
+    size = 3 + 2 * len(places)
+    pose, P = np.zeros(3), np.zeros((size, size))
+    blocks = np.zeros((size, size))
+    for i, block in enumerate(np.concatenate([some.discs.covariance, some.lines.covariance])):
+        blocks[3 + 2 * i : 5 + 2 * i, 3 + 2 * i : 5 + 2 * i] = block
+    if map_errors == "considered":
+        P += blocks
+    poses, covariances = [pose], [P[:3, :3]]
+    for k, rows in enumerate(frames_of(recording)):
+        by_pose, by_step = move_jacobians(pose, recording.steps[k])
+        pose = move(pose, recording.steps[k])
+        F = np.eye(size)
+        F[:3, :3] = by_pose
+        P = F @ P @ F.T
+        P[:3, :3] += by_step @ recording.step_covariance[k] @ by_step.T
+        H, v, R = [], [], []
+        for j, number in enumerate(rows.disc_ids):
+            i = number - 10
+            own = np.zeros((2, size))
+            own[:, :3], own[:, 3 + 2 * i : 5 + 2 * i] = disc_jacobians(pose, places[i])
+            H.append(own)
+            v.append(rows.disc_xy[j] - disc_in_robot(pose, places[i]))
+            R.append(rows.disc_covariance[j])
+        for j, numbers in enumerate(rows.line_ids):
+            own, innovation = np.zeros((1, size)), np.zeros(1)
+            for number in numbers:
+                i = len(some.discs) + number - 10
+                first, second = bearing_jacobians(pose, places[i], CAMERA_XY)
+                own[0, :3] += first / len(numbers)
+                own[0, 3 + 2 * i : 5 + 2 * i] += second / len(numbers)
+                bearing = bearing_of_vertical(pose, places[i], CAMERA_XY)
+                innovation += wrap_angle(rows.bearing_rad[j] - bearing) / len(numbers)
+            H.append(own)
+            v.append(innovation)
+            R.append(np.array([[rows.sigma_rad[j] ** 2]]))
+        stacked = np.concatenate(H)
+        noise = np.zeros((len(stacked), len(stacked)))
+        at = 0
+        for block in R:
+            noise[at : at + len(block), at : at + len(block)] = block
+            at += len(block)
+        if map_errors == "white":
+            noise += stacked @ blocks @ stacked.T
+        gain = P @ stacked.T @ np.linalg.inv(stacked @ P @ stacked.T + noise)
+        gain[3:] = 0.0
+        pose = pose + gain[:3] @ np.concatenate(v)
+        keep = np.eye(size) - gain @ stacked
+        P = keep @ P @ keep.T + gain @ noise @ gain.T
+        poses.append(pose)
+        covariances.append(P[:3, :3])
+    return np.array(poses), np.array(covariances)
+
+
+@pytest.mark.parametrize("map_errors", ["considered", "white", "ignored"])
+def test_the_localizer_is_the_plain_dense_filter(map_errors: MapErrors) -> None:
+    recording, some, _ = drive(1)
+    run = run_localizer(recording, Localizer(some, camera_xy=CAMERA_XY, map_errors=map_errors))
+    poses, covariances = dense(recording, some, map_errors)
+    np.testing.assert_allclose(run.path.poses, poses, rtol=0, atol=1e-10)
+    assert run.path.covariance is not None
+    np.testing.assert_allclose(run.path.covariance, covariances, rtol=0, atol=1e-12)
+    assert (run.count.discs, run.count.lines) == (len(recording.circles), len(recording.lines))
+    assert not run.count.left_out
+
+
+def test_without_noise_the_path_is_the_true_one() -> None:
+    recording, some, truth = drive(2, noise=0.0)
+    run = run_localizer(recording, Localizer(some, camera_xy=CAMERA_XY))
+    np.testing.assert_allclose(run.path.poses, truth, atol=1e-9)
+    assert run.path.prefixes[:2] == ("start", "b.0")
+    assert run.count.innovation_squared == pytest.approx(0.0, abs=1e-12)
+    assert run.count.innovation_numbers == 2 * len(recording.circles) + len(recording.lines)
+
+
+def test_a_wrong_start_is_forgotten_when_it_is_said_to_be_uncertain() -> None:
+    recording, some, truth = drive(3, noise=0.0)
+    localizer = Localizer(
+        some,
+        np.array([0.3, -0.2, 0.1]),
+        np.diag([0.25, 0.25, 0.04]),
+        CAMERA_XY,
+        map_errors="ignored",
+    )
+    run = run_localizer(recording, localizer)
+    assert np.hypot(*(run.path.poses[-1] - truth[-1])[:2]) < 0.01
+
+
+def test_rows_that_show_nothing_in_the_map_are_left_out_and_counted() -> None:
+    recording, some, _ = drive(4)
+    recording.circles.ids[:2] = -1
+    recording.circles.ids[2] = 999
+    lines = recording.lines
+    ids = ((), (10, 777), *lines.ids[2:])
+    changed = Recording(
+        recording.prefixes,
+        recording.steps,
+        recording.step_covariance,
+        recording.circles,
+        LineRows(lines.frame, lines.bearing_rad, lines.sigma_rad, ids),
+    )
+    run = run_localizer(changed, Localizer(some, camera_xy=CAMERA_XY))
+    assert run.count.left_out == {
+        "disc without ID": 2,
+        "disc not in the map": 1,
+        "line without ID": 1,
+        "line not in the map": 1,
+    }
+    assert run.count.discs == len(recording.circles) - 3
+
+
+@pytest.mark.parametrize("method", ["nearest", "joint"])
+def test_identities_are_found_in_the_map(method: str) -> None:
+    recording, some, _ = drive(5, noise=0.2)
+    # One row of a line each, and no disc twice in a frame: else a row has no one right answer.
+    single = [len(numbers) == 1 for numbers in recording.lines.ids]
+    lines = LineRows(
+        recording.lines.frame[single],
+        recording.lines.bearing_rad[single],
+        recording.lines.sigma_rad[single],
+        tuple(numbers for numbers in recording.lines.ids if len(numbers) == 1),
+    )
+    pairs = np.stack([recording.circles.frame, recording.circles.ids], axis=1)
+    first = np.sort(np.unique(pairs, axis=0, return_index=True)[1])
+    circles = CircleRows(
+        recording.circles.frame[first],
+        recording.circles.xy[first],
+        recording.circles.covariance[first],
+        recording.circles.ids[first],
+    )
+    one = Recording(recording.prefixes, recording.steps, recording.step_covariance, circles, lines)
+    certain = Landmarks(
+        some.discs.ids, some.discs.xy, some.discs.covariance * 1e-3, some.discs.rows
+    )
+    exact = Landmarks(some.lines.ids, some.lines.xy, some.lines.covariance * 1e-3, some.lines.rows)
+    run = run_localizer(
+        one,
+        Localizer(LandmarkMap(certain, exact), camera_xy=CAMERA_XY),
+        Associator("joint" if method == "joint" else "nearest"),
+    )
+    right = run.disc_ids == circles.ids
+    assert np.mean(right | (run.disc_ids < 0)) > 0.99
+    assert np.mean(right) > 0.97
+    assert np.mean([found == ids for found, ids in zip(run.line_ids, lines.ids)]) > 0.9
+
+
+def test_covariances_that_contradict_each_other_are_refused() -> None:
+    recording, some, _ = drive(6)
+    recording.circles.covariance[recording.circles.frame == 1] = -1e3 * np.eye(2)
+    with pytest.raises(SlamError, match=r"step 2 \(b\.1\): the covariance of the innovation"):
+        run_localizer(recording, Localizer(some, camera_xy=CAMERA_XY))
+
+
+@pytest.mark.parametrize("probability", [0.0, 1.0, -1.0, float("nan")])
+def test_a_gate_that_is_no_probability_is_refused(probability: float) -> None:
+    with pytest.raises(SlamError, match="gate probability"):
+        Associator("nearest", probability)
+
+
+def test_a_run_without_rows_is_odometry() -> None:
+    recording, _, _ = drive(7)
+    empty = LandmarkMap(no_landmarks(), no_landmarks())
+    run = run_localizer(recording, Localizer(empty))
+    pose = np.zeros(3)
+    for k, step in enumerate(recording.steps):
+        pose = move(pose, step)
+        np.testing.assert_allclose(run.path.poses[k + 1], pose, atol=1e-12)
+
+
+def test_the_demo_run_is_near_its_truth(project_root: Path) -> None:
+    """The filters on the demo run: its rows are exact, so that only odometry is wrong."""
+    import json
+
+    from slam.ekf import EkfSlam, run_ekf
+    from slam.filter_input import read_run
+    from slam.motion import relative_pose
+
+    run_folder = project_root / "images" / "e"
+    recording, camera_xy = read_run(run_folder, circles=True, lines=True, stem=None, camera=None)
+    truth = json.loads((run_folder / "truth.json").read_text())
+    start = np.array(truth["start"])
+    poses = np.array([start] + [frame["pose"] for frame in truth["frames"]])
+    true_poses = relative_pose(start, poses)
+    ekf = EkfSlam(camera_xy=camera_xy)
+    mapped = run_ekf(recording, ekf)
+    located = run_localizer(recording, Localizer(ekf.landmark_map(), camera_xy=camera_xy))
+    for run in (mapped, located):
+        error = run.path.poses - true_poses
+        assert np.max(np.hypot(error[:, 0], error[:, 1])) < 0.25
+        assert np.max(np.abs((error[:, 2] + np.pi) % (2 * np.pi) - np.pi)) < np.radians(3)
