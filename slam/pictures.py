@@ -6,9 +6,6 @@ gives the same bytes; a user's own matplotlib settings do not matter.
 
 from __future__ import annotations
 
-import io
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,22 +15,19 @@ from numpy.typing import ArrayLike, NDArray
 from landmarks import is_positive_definite, squared_mahalanobis, wrap_angle
 from slam.errors import SlamError
 from slam.map_file import LandmarkMap, Landmarks, Path2D
-from storage import OutputExistsError, write_whole
+from slam.pictures_file import picture
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 FloatArray = NDArray[np.float64]
 
 #: Central 95 % of chi squared with 3 degrees of freedom.
 NEES_BAND = (0.21579528262389785, 9.348403604496145)
 
-_DPI = 120
 _PATH, _REFERENCE, _DISC, _LINE, _BAND = "#1f5f99", "#777777", "#c8501e", "#3a8f4c", "#2a78b5"
 _SIGMA = "\N{GREEK SMALL LETTER SIGMA}"
 _ELLIPSE_POINTS = 40
-_WITHOUT_WINDOWS = ("agg", "cairo", "pdf", "pgf", "ps", "svg", "template")
 # So many discs can be told apart by numbers beside them.
 _MOST_NUMBERED = 40
 # How far beyond path and discs a vertical may stand and still be in the picture.
@@ -163,7 +157,7 @@ def draw_map(
     largest = (9.0, 8.0) if len(panels) == 1 else (10.0, 6.0) if stacked else (7.0, 7.5)
     scale = min(largest[0] / span[0], largest[1] / span[1])
     size = (max(scale * span[0] * columns, 6.0) + 1.2, scale * span[1] * rows + 1.8)
-    with _figure(png, size, overwrite=overwrite, interactive=interactive) as figure:
+    with picture(png, size, overwrite=overwrite, interactive=interactive) as figure:
         from matplotlib.ticker import MultipleLocator
 
         all_axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).ravel()
@@ -226,7 +220,7 @@ def draw_errors(
     names = ("x error / m", "y error / m", "heading error / °")
     rows = 3 if nees is None else 4
     size = (10.0, 1.9 * rows + 1.0)
-    with _figure(png, size, overwrite=overwrite, interactive=interactive) as figure:
+    with picture(png, size, overwrite=overwrite, interactive=interactive) as figure:
         all_axes = figure.subplots(rows, 1, sharex=True)
         for i, (axes, name) in enumerate(zip(all_axes, names)):
             value = unit[i] * error[:, i]
@@ -387,40 +381,3 @@ def _rgb(colour: str) -> tuple[float, float, float]:
     from matplotlib.colors import to_rgb
 
     return to_rgb(colour)
-
-
-@contextmanager
-def _figure(
-    png: Path, size: tuple[float, float], *, overwrite: bool, interactive: bool
-) -> Iterator[Figure]:
-    """A figure to draw into; at the end it is written and, if asked for, shown."""
-    import matplotlib as mpl
-
-    if not overwrite and png.exists():  # before the work instead of after it
-        raise OutputExistsError(png)
-    with mpl.rc_context():
-        mpl.rcdefaults()
-        if interactive:
-            from matplotlib import pyplot
-
-            if mpl.get_backend().lower() in _WITHOUT_WINDOWS:
-                raise SlamError("no window can be opened here: expected a display for interactive")
-            figure = pyplot.figure(figsize=size, dpi=_DPI, layout="constrained")
-        else:
-            from matplotlib.backends.backend_agg import FigureCanvasAgg
-            from matplotlib.figure import Figure
-
-            figure = Figure(figsize=size, dpi=_DPI, layout="constrained")
-            FigureCanvasAgg(figure)
-        try:
-            yield figure
-            stream = io.BytesIO()
-            # Without the name and version of the program that made it: the same bytes everywhere.
-            figure.savefig(stream, format="png", dpi=_DPI, metadata={"Software": None})
-            with write_whole(png, overwrite=overwrite) as file:
-                file.write(stream.getvalue())
-            if interactive:
-                pyplot.show()
-        finally:
-            if interactive:
-                pyplot.close(figure)
