@@ -24,9 +24,10 @@ class LineFilter:
     weights : (2, 2r + 1) float32
         Across the line: of sum 1; and the same times the distance in units of its standard
         deviation.
-    weights_between : (4, 2r + 2) float32
+    weights_between : (4, T) float32
         For a window between two pixels, from r pixels left of the left one on: both weights if it
         is on the left one, each followed by what is to be added for a whole pixel to the right.
+        There are 2r + 2 of each; behind them zeros up to a whole number of words.
     along : (2s + 1,) float32
         Along the line, of sum 1.
     regulariser : float32
@@ -77,33 +78,35 @@ class StartBand:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FilteredColumns:
-    """What of an image has been filtered across the verticals so far; tracks extend it.
+    """Where an image has been filtered so far, and the responses there; tracks extend it.
 
     Attributes
     ----------
-    moments : (4 * W * H,) float32
-        Mean, covariance and mean square, and the response as far as it is known, in the rows of
-        each of the strip's columns that are known: H of each for one column after the other, in the
-        order in which they came to be needed.
-    known : (W, 3) int32
-        First of these rows, and the one after the last; the column's place in `moments`.
-    used : (1,) int32
-        How many places are taken.
+    response : (G * H * L,) float32
+        Responses at L neighbouring columns of the strip, a group, row by row, for one group after
+        the other; only rows that are known mean anything.
+    known : (G, 2) int32
+        First of these rows, and the one after the last, of each group.
     """
 
-    moments: NDArray[np.float32]
+    response: NDArray[np.float32]
     known: NDArray[np.int32]
-    used: NDArray[np.int32]
 
     @classmethod
     def none_yet(cls, table: VerticalTable) -> FilteredColumns:
         """Nothing has been filtered."""
+        from detect.line_group_kernels import STEP
+        from detect.line_vector_kernels import LANES
+
         height, width = table.column.shape
-        return cls(
-            np.empty(4 * width * height, np.float32),
-            np.zeros((width, 3), np.int32),
-            np.zeros(1, np.int32),
-        )
+        groups = -(-width // STEP)
+        return cls(np.empty(groups * height * LANES, np.float32), np.zeros((groups, 2), np.int32))
+
+
+@lru_cache(maxsize=4)
+def strip_columns(table: VerticalTable) -> NDArray[np.float32]:
+    """(H, W) float32, the table's columns row by row: neighbouring verticals beside each other."""
+    return np.ascontiguousarray(table.column)
 
 
 def gaussian_window(sigma: float) -> FloatArray:
@@ -125,11 +128,14 @@ def _weights_across(sigma_px: float, spacing_px: float) -> FloatArray:
 @lru_cache(maxsize=16)
 def line_filter(settings: LineSettings) -> LineFilter:
     """The filter that settings ask for."""
+    from detect.line_vector_kernels import WORD
+
     weights = _weights_across(settings.sigma_across_px, 1.0)
     # Moments between two pixels are those of both, interpolated; so are the weights.
     left = np.pad(weights, [(0, 0), (0, 1)])
     step = np.pad(weights, [(0, 0), (1, 0)]) - left
     between = np.stack([left[0], step[0], left[1], step[1]])
+    between = np.pad(between, [(0, 0), (0, -between.shape[1] % WORD)])
     return LineFilter(
         weights=weights.astype(np.float32),
         weights_between=between.astype(np.float32),

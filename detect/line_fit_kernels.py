@@ -13,6 +13,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from detect.line_vector_kernels import LANES, WORD, add_products, slope_and_bend
+
 
 @njit(cache=True, error_model="numpy")
 def _tan_and_secant(angle: float) -> tuple[float, float]:
@@ -213,6 +215,8 @@ def refine_lines(
     crossing = np.empty(height)
     by_a = np.empty(height)
     by_b = np.empty(height)
+    # Sums of the fine and the coarse filter.
+    heights = np.empty(2 * LANES, np.float32)
     for t in range(len(sign)):
         begin, end = bounds[t], bounds[t + 1]
         a = tracked_line[t, 0]
@@ -260,14 +264,10 @@ def refine_lines(
                     continue
                 whole = int(u)
                 node = int((u - whole) * subpixels)
-                at_pixel = np.uint64(row[begin + i] * width + whole - reach + 1)
-                at_weight = np.uint64(begin_of[step] + node * 2 * reach)
-                first_sum = np.float32(0.0)
-                second_sum = np.float32(0.0)
-                for k in range(2 * reach):
-                    grey = np.float32(grey_values[at_pixel + np.uint64(k)]) - np.float32(128.0)
-                    first_sum += first_weights[at_weight + np.uint64(k)] * grey
-                    second_sum += second_weights[at_weight + np.uint64(k)] * grey
+                first_sum, second_sum = slope_and_bend(
+                    grey_values, row[begin + i] * width + whole - reach + 1, first_weights,
+                    second_weights, begin_of[step] + node * 2 * reach, 2 * reach // WORD,
+                )  # fmt: skip
                 second = sign[t] * second_sum
                 # From the tabulated position to the crossing.
                 off = u - whole - (node + 0.5) / subpixels
@@ -313,8 +313,7 @@ def refine_lines(
         line[t, 1] = b
         moved = a - tracked_line[t, 0] + (b - tracked_line[t, 1]) * middle[t]
         shift_px[t] = abs(moved) / pixel[t]
-        fine_height = 0.0
-        coarse_height = 0.0
+        heights[:] = 0.0
         used = 0
         margin = max(half[-2], half[-1])
         for i in range(n):
@@ -325,17 +324,14 @@ def refine_lines(
             node = int((u - whole) * subpixels)
             for which in range(2):
                 reach = half[len(farthest) + which]
-                at_pixel = np.uint64(row[begin + i] * width + whole - reach + 1)
-                at_weight = np.uint64(begin_of[len(farthest) + which] + node * 2 * reach)
-                total = np.float32(0.0)
-                for k in range(2 * reach):
-                    grey = np.float32(grey_values[at_pixel + np.uint64(k)]) - np.float32(128.0)
-                    total += height_weights[at_weight + np.uint64(k)] * grey
-                if which == 0:
-                    fine_height += float(total)
-                else:
-                    coarse_height += float(total)
+                add_products(
+                    grey_values, row[begin + i] * width + whole - reach + 1, height_weights,
+                    begin_of[len(farthest) + which] + node * 2 * reach, 2 * reach // WORD,
+                    heights, which * LANES,
+                )  # fmt: skip
             used += 1
+        fine_height = float(np.sum(heights[:LANES]))
+        coarse_height = float(np.sum(heights[LANES:]))
         contrast[t] = sign[t] * fine_height / used if used > 0 else 0.0
         sharp = fine_height / coarse_height if sign[t] * coarse_height > 0.0 else 1.0
         sharpness[t] = min(max(sharp, 0.0), 1.0)

@@ -12,8 +12,11 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from detect.line_group_kernels import MARGIN, STEP, respond, uncounted
+from detect.line_vector_kernels import LANES, ROW_NUMBERS
+
 #: Rows that are filtered ahead of a track.
-_AHEAD = 8
+_AHEAD = 12
 
 
 @njit(cache=True, error_model="numpy")
@@ -62,17 +65,19 @@ def find_starts(
     return row[:n], column[:n], signs[:n], score[:n]
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _top_of_parabola(left: np.float32, centre: np.float32, right: np.float32) -> float:
     """Offset of the maximum of the parabola through three neighbours."""
     bend = left - 2.0 * centre + right
     return float(0.5 * (left - right) / bend) if bend < 0.0 else 0.0
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"})
+@uncounted
 def _follow(
-    image: NDArray[np.uint8],
-    table_column: NDArray[np.float32],
+    pixels: NDArray[np.uint8],
+    strip: NDArray[np.float32],
+    flat_strip: NDArray[np.float32],
+    half_width: int,
     first_row: NDArray[np.int32],
     last_row: NDArray[np.int32],
     bearing: NDArray[np.float64],
@@ -81,8 +86,9 @@ def _follow(
     along: NDArray[np.float32],
     regulariser: np.float32,
     moments: NDArray[np.float32],
+    filtered: NDArray[np.int64],
+    response: NDArray[np.float32],
     known: NDArray[np.int32],
-    used: NDArray[np.int32],
     sign: np.float32,
     row: int,
     column: float,
@@ -100,25 +106,15 @@ def _follow(
 ) -> int:
     """Follow an edge from a row on, that one included; return how many points were written.
 
-    0 if there is none in the first row. All in one piece: Numba counts references to each array in
-    each call, which would take longer than evaluating the filter.
+    0 if there is none in the first row. Points are written from the middle of the results on, in
+    this direction.
     """
-    height, width = table_column.shape
-    taps = weights.shape[1]
-    w_left = weights[0]
-    w_step = weights[1]
-    h_left = weights[2]
-    h_step = weights[3]
-    grey_values = image.reshape(-1)
-    r = taps // 2 - 1
-    s = len(along) // 2
-    leftmost = np.float32(r)
-    rightmost = np.float32(width - 1 - r)
-    zero = np.float32(0.0)
-    middle = np.float32(128.0)
-    unknown = np.float32(np.nan)
+    height, width = strip.shape
     v = row
-    here = column
+    # The expected position is j + part. Whole columns change seldom: a processor that foresees it
+    # works on the next rows before it knows where in this one the edge is.
+    j = math.floor(column + 0.5)
+    part = column - j
     n = 0
     gap = 0
     lean_column = -1
@@ -126,10 +122,7 @@ def _follow(
     while gap <= max_gap:
         if n > 0:
             v += direction
-            if v < border or v > height - 1 - border:
-                break
-            j = math.floor(here + 0.5)
-            if j < 1 or j > width - 2:
+            if v < border or v > height - 1 - border or j < 1 or j > width - 2:
                 break
             rise = elevation_tan[v, j] - elevation_tan[v - direction, j]
             if not math.isfinite(rise):
@@ -138,120 +131,67 @@ def _follow(
                 # A vertical leans by this much in the strip of a tilted camera.
                 lean = pitch * math.sin(bearing[j]) - roll * math.cos(bearing[j])
                 columns_per_rise = 2.0 * lean / (bearing[j + 1] - bearing[j - 1])
+                if not math.isfinite(columns_per_rise):
+                    break
                 lean_column = j
-            here += columns_per_rise * rise
-        j = math.floor(here + 0.5)
+            part += columns_per_rise * rise
+            if part < -0.5 or part >= 0.5:
+                whole = math.floor(part + 0.5)
+                j += whole
+                part -= whole
         if j < 2 or j > width - 3:
             break
-        left = zero
-        centre = zero
-        right = zero
-        # Three neighbours, and a fourth if the highest of them is not the one in the middle.
-        for k in range(4):
-            c = j - 1 + k
-            if k == 3:
-                if left > centre and left > right:
-                    c = j - 2
-                elif not right > centre:
-                    break
-            begin = known[c, 0]
-            end = known[c, 1]
-            column_moments = np.uint64(4 * known[c, 2] * height)
-            kept = column_moments + np.uint64(3 * height + v)
-            response = moments[kept] if begin <= v < end else unknown
-            if math.isnan(response):
-                response = zero
-                x = table_column[v, c]
-                if x >= leftmost and x < rightmost:
-                    top = max(first_row[c], v - s)
-                    bottom = min(last_row[c], v + s)
-                    if begin >= end:
-                        begin = top
-                        end = top
-                        known[c, 0] = top
-                        known[c, 2] = used[0]
-                        used[0] += 1
-                        column_moments = np.uint64(4 * known[c, 2] * height)
-                        kept = column_moments + np.uint64(3 * height + v)
-                    if top < begin or bottom >= end:
-                        # Some rows more than needed: the next ones will be.
-                        if top < begin:
-                            known[c, 0] = max(first_row[c], top - _AHEAD)
-                        if bottom >= end:
-                            known[c, 1] = min(last_row[c], bottom + _AHEAD) + 1
-                        for y in range(known[c, 0], known[c, 1]):
-                            if begin <= y < end:
-                                continue
-                            mean = zero
-                            cov = zero
-                            square = zero
-                            x = table_column[y, c]
-                            if x >= leftmost and x < rightmost:
-                                f = x - np.float32(int(x))
-                                at_pixel = np.uint64(y * width + int(x) - r)
-                                for i in range(taps):
-                                    tap = np.uint64(i)
-                                    grey = np.float32(grey_values[at_pixel + tap]) - middle
-                                    weighted = (w_left[tap] + f * w_step[tap]) * grey
-                                    mean += weighted
-                                    square += weighted * grey
-                                    cov += (h_left[tap] + f * h_step[tap]) * grey
-                            place = column_moments + np.uint64(y)
-                            moments[place] = mean
-                            moments[place + np.uint64(height)] = cov
-                            moments[place + np.uint64(2 * height)] = square
-                            moments[place + np.uint64(3 * height)] = unknown
-                    mean = zero
-                    cov = zero
-                    square = zero
-                    if bottom - top == 2 * s:
-                        place = column_moments + np.uint64(top)
-                        for i in range(2 * s + 1):
-                            tap = np.uint64(i)
-                            w = along[tap]
-                            at = place + tap
-                            mean += w * moments[at]
-                            cov += w * moments[at + np.uint64(height)]
-                            square += w * moments[at + np.uint64(2 * height)]
-                    else:
-                        share = zero
-                        for y in range(top, bottom + 1):
-                            w = along[y - v + s]
-                            at = column_moments + np.uint64(y)
-                            share += w
-                            mean += w * moments[at]
-                            cov += w * moments[at + np.uint64(height)]
-                            square += w * moments[at + np.uint64(2 * height)]
-                        mean /= share
-                        cov /= share
-                        square /= share
-                    # Rounding can make a vanishing variance negative.
-                    variance = abs(square - mean * mean)
-                    response = cov * abs(cov) / (variance + regulariser)
-                    moments[kept] = response
-            response *= sign
-            if c == j - 2:
-                right = centre
-                centre = left
-                left = response
-                j -= 1
-                break
-            if k == 3:
-                j += 1
+        group = j // STEP
+        if not known[group, 0] <= v < known[group, 1]:
+            begin = max(v - (_AHEAD - 1 if direction < 0 else 0), 0)
+            end = min(v + (_AHEAD - 1 if direction > 0 else 0), height - 1) + 1
+            if known[group, 0] < known[group, 1]:
+                if v < known[group, 0]:
+                    end = known[group, 0]
+                else:
+                    begin = known[group, 1]
+                known[group, 0] = min(begin, known[group, 0])
+                known[group, 1] = max(end, known[group, 1])
+            else:
+                known[group, 0] = begin
+                known[group, 1] = end
+            respond(
+                pixels, strip, flat_strip, half_width, first_row, last_row, weights, along,
+                regulariser, moments, filtered, group, begin, end, response,
+            )  # fmt: skip
+        base = min(max(group * STEP - MARGIN, 0), width - LANES)
+        at = (group * height + v) * LANES + j - base
+        left = sign * response[at - 1]
+        centre = sign * response[at]
+        right = sign * response[at + 1]
+        off = -part
+        # A fourth neighbour, if the highest of three is not the one in the middle.
+        if left > centre and left > right:
+            off -= 1.0
+            right = centre
+            centre = left
+            left = sign * response[at - 2]
+        elif right > centre:
+            off += 1.0
             left = centre
             centre = right
-            right = response
+            right = sign * response[at + 2]
         seen = False
         if centre >= threshold and centre >= left and centre >= right:
-            offset = j + _top_of_parabola(left, centre, right) - here
+            off += _top_of_parabola(left, centre, right)
             # A start is known to a column only.
-            seen = n == 0 or abs(offset) <= reach
+            seen = n == 0 or abs(off) <= reach
             if seen:
-                out_row[n] = v
-                out_column[n] = here + offset
-                out_score[n] = centre
+                place = height + direction * n
+                out_row[place] = v
+                out_column[place] = j + (part + off)
+                out_score[place] = centre
                 # The start counts as the expected position, not as a point that confirms it.
-                here += (max(pull, 1.0 / (n + 1.0)) if n > 0 else 1.0) * offset
+                part += (max(pull, 1.0 / (n + 1.0)) if n > 0 else 1.0) * off
+                if part < -0.5 or part >= 0.5:
+                    whole = math.floor(part + 0.5)
+                    j += whole
+                    part -= whole
                 n += 1
         if n == 0:
             break
@@ -261,18 +201,18 @@ def _follow(
 
 @njit(cache=True, error_model="numpy")
 def follow_edges(
-    image: NDArray[np.uint8],
-    table_column: NDArray[np.float32],
+    pixels: NDArray[np.uint8],
+    strip: NDArray[np.float32],
     first_row: NDArray[np.int32],
     last_row: NDArray[np.int32],
     bearing: NDArray[np.float64],
     elevation_tan: NDArray[np.float32],
     weights: NDArray[np.float32],
+    half_width: int,
     along: NDArray[np.float32],
     regulariser: np.float32,
-    moments: NDArray[np.float32],
+    response: NDArray[np.float32],
     known: NDArray[np.int32],
-    used: NDArray[np.int32],
     start_row: NDArray[np.int32],
     start_column: NDArray[np.int32],
     start_sign: NDArray[np.float32],
@@ -294,20 +234,20 @@ def follow_edges(
 
     Parameters
     ----------
-    image : (H, W) uint8
-        Grey values.
-    table_column, first_row, last_row, bearing, elevation_tan
-        The table (see `lut.verticals.VerticalTable`).
-    weights, along, regulariser
-        The filter (see `detect.line_filter.LineFilter`): `weights_between`, `along`.
-    moments : (4 * W * H,) float32
-        Mean, covariance and mean square across the vertical and the response (NaN where it is not
-        known yet), in the rows that are known: H of each for one column after the other, in the
-        order in which they came to be needed.
-    known : (W, 3) int32
-        First of the known rows and the one after the last, of each column; its place in `moments`.
-    used : (1,) int32
-        How many places are taken.
+    pixels : (N,) uint8
+        Grey values in scan order; where T > 2r + 2, behind the last of them as many as that more.
+    strip : (H, W) float32
+        The table's columns (see `lut.verticals.VerticalTable`), row by row; at least `LANES` wide.
+    first_row, last_row, bearing, elevation_tan
+        The table.
+    weights : (4, T) float32
+        See `detect.line_filter.LineFilter.weights_between`.
+    half_width : int
+        r: half the width of the window on whole pixels.
+    along, regulariser
+        The filter.
+    response, known
+        See `detect.line_filter.FilteredColumns`.
     start_row, start_column : (N,) int32
         Strip pixels to start from, in this order.
     start_sign : (N,) float32
@@ -335,7 +275,10 @@ def follow_edges(
     row, column, score : (P,) int32, float64, float32
         The points: row and sub-pixel column in the strip, absolute response.
     """
-    height, width = table_column.shape
+    height, width = strip.shape
+    flat_strip = strip.reshape(-1)
+    moments = np.empty(height * ROW_NUMBERS, np.float32)
+    filtered = np.full(3, -1, np.int64)
     lowest = height
     highest = 0
     for v in start_row:
@@ -349,9 +292,10 @@ def follow_edges(
     score = np.empty(capacity, np.float32)
     sign = np.empty(len(start_row), np.float64)
     bounds = np.zeros(len(start_row) + 1, np.int64)
-    up_row = np.empty(height, np.int32)
-    up_column = np.empty(height, np.float64)
-    up_score = np.empty(height, np.float32)
+    # One track; its start is in the middle.
+    own_row = np.empty(2 * height + 1, np.int32)
+    own_column = np.empty(2 * height + 1, np.float64)
+    own_score = np.empty(2 * height + 1, np.float32)
     tracks = 0
     n = 0
     for start in range(len(start_row)):
@@ -359,6 +303,27 @@ def follow_edges(
         polarity = start_sign[start]
         layer = 0 if polarity > 0.0 else 1
         if followed[layer, v - lowest, start_column[start]]:
+            continue
+        begin = height
+        end = height
+        near = float(start_column[start])
+        for direction in range(-1, 2, 2):
+            count = _follow(
+                pixels, strip, flat_strip, half_width, first_row, last_row, bearing,
+                elevation_tan, weights, along, regulariser, moments, filtered, response, known,
+                polarity, v, near, direction, pitch, roll, threshold, max_gap, border, pull, reach,
+                own_row, own_column, own_score,
+            )  # fmt: skip
+            if count == 0:
+                break
+            if direction < 0:
+                begin = height + 1 - count
+                end = height + 1
+                near = float(own_column[height])
+            else:
+                end = height + count
+        if begin == end:
+            # Starts were looked for with less care.
             continue
         if n + height > capacity:
             capacity *= 2
@@ -371,30 +336,15 @@ def follow_edges(
             grown_score = np.empty(capacity, np.float32)
             grown_score[:n] = score[:n]
             score = grown_score
-        above = _follow(
-            image, table_column, first_row, last_row, bearing, elevation_tan, weights, along,
-            regulariser, moments, known, used, polarity, v,
-            float(start_column[start]), -1, pitch, roll, threshold, max_gap, border, pull, reach,
-            up_row, up_column, up_score,
-        )  # fmt: skip
-        if above == 0:
-            # Starts were looked for with less care.
-            continue
-        for i in range(above):
-            row[n + i] = up_row[above - 1 - i]
-            column[n + i] = up_column[above - 1 - i]
-            score[n + i] = up_score[above - 1 - i]
-        n += above - 1
-        n += _follow(
-            image, table_column, first_row, last_row, bearing, elevation_tan, weights, along,
-            regulariser, moments, known, used, polarity, v, up_column[0], 1,
-            pitch, roll, threshold, max_gap, border, pull, reach, row[n:], column[n:], score[n:],
-        )  # fmt: skip
-        for i in range(bounds[tracks], n):
-            if lowest <= row[i] <= highest:
-                j = math.floor(column[i] + 0.5)
+        for i in range(begin, end):
+            row[n] = own_row[i]
+            column[n] = own_column[i]
+            score[n] = own_score[i]
+            n += 1
+            if lowest <= own_row[i] <= highest:
+                j = math.floor(own_column[i] + 0.5)
                 for k in range(max(0, j - 1), min(width, j + 2)):
-                    followed[layer, row[i] - lowest, k] = True
+                    followed[layer, own_row[i] - lowest, k] = True
         sign[tracks] = polarity
         tracks += 1
         bounds[tracks] = n

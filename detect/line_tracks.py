@@ -7,7 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.line_filter import FilteredColumns, StartBand, line_filter, start_band
+from detect.line_filter import (
+    FilteredColumns,
+    LineFilter,
+    StartBand,
+    line_filter,
+    start_band,
+    strip_columns,
+)
 from detect.line_settings import LineSettings
 from detect.tilt import TiltEstimate
 from lut.verticals import VerticalTable
@@ -222,18 +229,18 @@ def line_tracks(
         filtered = FilteredColumns.none_yet(table)
     return LineTracks(
         *follow_edges(
-            np.ascontiguousarray(image),
-            table.column,
+            _padded(image, window),
+            strip_columns(table),
             table.first_row,
             table.last_row,
             table.bearing_rad,
             table.elevation_tan,
             window.weights_between,
+            window.weights.shape[1] // 2,
             window.along,
             window.regulariser,
-            filtered.moments,
+            filtered.response,
             filtered.known,
-            filtered.used,
             starts.row,
             starts.column,
             starts.polarity,
@@ -246,3 +253,10 @@ def line_tracks(
             settings.guided_reach_px if tilt is not None else 1.0,
         )
     )
+
+
+def _padded(image: NDArray[np.uint8], window: LineFilter) -> NDArray[np.uint8]:
+    """The image in scan order, and behind it what the filter's weights of zero need."""
+    flat = image.reshape(-1)
+    missing = window.weights_between.shape[1] - window.weights.shape[1] - 1
+    return np.pad(flat, (0, missing)) if missing else flat

@@ -171,6 +171,25 @@ def test_tracks_see_the_same_response_as_the_whole_strip(
         np.testing.assert_allclose(signed.max(axis=1), tracks.score[part], atol=2e-4)
 
 
+def test_tracks_see_the_same_response_at_the_borders() -> None:
+    """Where windows are cut off, verticals leave the image, or there are none beside them."""
+    camera = pinhole(160, 120, 90.0, pitch_deg=35.0, roll_deg=20.0)
+    table = build_vertical_table(camera)
+    assert not table.usable.all()
+    edges = [Edge(bearing, 70.0 * (-1.0) ** k) for k, bearing in enumerate(np.linspace(-1, 1, 25))]
+    image = render(camera, edges, grey=120.0, noise=2.0, rng=np.random.default_rng(2))
+    for preset in (DEFAULT, PUBLISHED):
+        preset = replace(preset, border_rows=0, threshold=0.1)
+        response = line_response(image, table, preset)
+        tracks = line_tracks(image, line_starts(image, table, preset), table, preset)
+        assert tracks.points.sum() > 500
+        polarity = np.repeat(tracks.polarity, tracks.points)
+        column = np.rint(tracks.column).astype(int)
+        around = response[tracks.row[:, None], column[:, None] + [-1, 0, 1]]
+        highest = (polarity[:, None] * around).max(axis=1)
+        np.testing.assert_allclose(highest, tracks.score, atol=2e-4)
+
+
 def test_what_was_filtered_before_gives_the_same_tracks() -> None:
     image = render(CAMERA, [Edge(0.1, 80.0), Edge(-0.15, -60.0)], grey=100.0)
     starts = line_starts(image, TABLE, DEFAULT)
