@@ -18,7 +18,7 @@ from tools.simulator.laser.kernels import cast_on_discs, cast_on_robot, cast_on_
 from tools.simulator.laser.measuring import Scene, compose, measured, true_ranges
 from tools.simulator.laser.people import LEG_RADIUS_M, Passer
 from tools.simulator.laser.route import Curve, Route, Stop
-from tools.simulator.laser.session import sides_of
+from tools.simulator.laser.session import plan_session, sides_of
 from tools.simulator.laser.settings import (
     DrivingLimits,
     Faults,
@@ -303,4 +303,4 @@ def test_clearance_is_the_distance_to_the_nearest_wall_or_its_end() -> None:
 )
 def test_impossible_sessions_are_refused(wrong: dict[str, Any], message: str) -> None:
     with pytest.raises(GroundTruthError, match=message):
-        LaserSettings(**wrong)
+        plan_session(LaserSettings(**wrong), 1)

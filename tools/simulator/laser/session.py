@@ -102,8 +102,9 @@ def plan_session(settings: LaserSettings, seed: int) -> SessionPlan:
     Raises
     ------
     GroundTruthError
-        If no way through the room was found.
+        If a setting is impossible, or no way through the room was found.
     """
+    settings.check()
     site = make_site(settings.furniture)
     route, visits, references = _drive(settings, seed, site)
     scanners = _fixed_scanners(settings, seed)

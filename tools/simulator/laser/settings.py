@@ -138,7 +138,14 @@ class LaserSettings:
     driving: DrivingLimits = field(default_factory=DrivingLimits)
     faults: Faults = field(default_factory=Faults)
 
-    def __post_init__(self) -> None:
+    def check(self) -> None:
+        """Refuse what cannot be.
+
+        Raises
+        ------
+        GroundTruthError
+            Naming the setting, its value and what was expected.
+        """
         positive = ("visits", "visit_s", "rate_hz", "onboard_hz", "odometry_hz", "camera_hz",
                     "truth_hz", "ptpd_hz", "max_range_m", "empty_s", "stand_s")  # fmt: skip
         for name in positive:
