@@ -48,7 +48,7 @@ def find_jump(pair: HeadingPair, offset_s: float, drift: float) -> float | None:
     if not information[-1] > 0.0 or len(information) < 4 * _FEWEST_PER_SIDE:
         return None
     differences = without_turns(pair.differences(offset_s, drift))
-    wandering = estimate_wandering(pair.times_s, differences, _SHORT_LAGS)
+    wandering = estimate_wandering(pair.times_s, differences, pair.systematic, _SHORT_LAGS)
     places = np.clip(
         np.interp(np.linspace(0.05, 0.95, _PLACES) * information[-1], information, pair.times_s),
         pair.times_s[_FEWEST_PER_SIDE],
@@ -116,7 +116,7 @@ def _relocate(
 
 def _side_offset(side: HeadingPair, wandering: Wandering, near_s: float) -> float:
     """Offset of one side of a jump, without drift."""
-    own = Wandering(side.times_s, wandering.sigma, wandering.rate)
+    own = Wandering(side.times_s, wandering.sigma, wandering.rate, side.systematic)
 
     def error(offset_s: float) -> float:
         return own.squared(without_turns(side.differences(offset_s, 0.0)))

@@ -25,6 +25,10 @@ _WINDOW_S = 0.4
 _FEWEST_PER_WINDOW = 5
 _SHORT_WINDOW_S = 0.1
 _LARGEST_STREAM_GAP_S = 0.5
+_STRIDE_S = 0.5
+# What a robot's odometry may be off by, systematically: a share of each turn, and a bend.
+_TURN_SCALE_SIGMA = 0.03
+_TURN_PER_METRE_SIGMA = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +38,8 @@ class HeadingPair:
     Windows, since single samples of odometry are rough: shifting them against the other stream
     changes how the roughness is met, which would pass for a better or worse fit.
 
-    `sign` is 1 where the windows are the ground truth's.
+    `sign` is 1 where the windows are the ground truth's. `systematic` holds what odometry's heading
+    may be off by in proportion to the way turned and driven, (N, 2), in deviations.
     """
 
     times_s: FloatArray
@@ -43,6 +48,7 @@ class HeadingPair:
     other: HeadingIntegral
     reference_s: float
     sign: int
+    systematic: FloatArray
 
     def warped(self, times_s: FloatArray, offset_s: float, drift: float) -> FloatArray:
         """Times of the windowed stream on the other's clock."""
@@ -60,7 +66,12 @@ class HeadingPair:
         return np.asarray(self.sign * (self.headings - means))
 
     def kept(self, which: NDArray[np.bool_]) -> HeadingPair:
-        return replace(self, times_s=self.times_s[which], headings=self.headings[which])
+        return replace(
+            self,
+            times_s=self.times_s[which],
+            headings=self.headings[which],
+            systematic=self.systematic[which],
+        )
 
     def sensitivities(self, offset_s: float, drift: float) -> FloatArray:
         """(N, 2) derivatives of the differences by offset and drift."""
@@ -121,7 +132,12 @@ def pair_headings(
         times, headings = windowed_means(times, headings, window)
     else:
         window = _SHORT_WINDOW_S
-    pair = HeadingPair(times, headings, window, other, reference, 1 if sampled == 0 else -1)
+    sign = 1 if sampled == 0 else -1
+    driven = _way_driven(segment if sampled == 0 else odometry, times)
+    systematic = np.column_stack([_TURN_SCALE_SIGMA * headings, _TURN_PER_METRE_SIGMA * driven])
+    if len(times):
+        systematic -= systematic.mean(axis=0)
+    pair = HeadingPair(times, headings, window, other, reference, sign, systematic)
     if len(times) == 0:
         return None
     # Wherever the search looks, the other stream must have a say.
@@ -146,6 +162,14 @@ def _odometry_is_interpolated(
     if slow[0] != slow[1]:
         return slow[0]
     return heading_noise(*odometry) <= heading_noise(*groundtruth)
+
+
+def _way_driven(poses: PlanarPoses, times_s: FloatArray) -> FloatArray:
+    """Metres driven until each of the times, in half seconds: noise lengthens those little."""
+    coarse = np.arange(poses.times_s[0], poses.times_s[-1] + _STRIDE_S, _STRIDE_S)
+    xy = np.column_stack([np.interp(coarse, poses.times_s, poses.poses[:, k]) for k in (0, 1)])
+    way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(xy, axis=0).T))])
+    return np.asarray(np.interp(times_s, coarse, way))
 
 
 def without_turns(differences: FloatArray, *, keep_mean: bool = False) -> FloatArray:

@@ -31,6 +31,7 @@ FloatArray = NDArray[np.float64]
 
 _MOST_COARSE_SAMPLES = 400
 _OUTLIER_SIGMAS = 6.0
+_COARSE_SIGMA_RAD = 0.02
 # A segment tells the offset if its deviation is below this share of the search's bound, and the
 # drift likewise: the deviation of what is merely between the bounds is .58 of them.
 _LEAST_DETERMINED = 0.1
@@ -134,7 +135,9 @@ def _segment(
     if len(pair.times_s) < _FEWEST_SAMPLES:
         return [_untold(segment, turned, "the headings have nothing in common")]
     for _ in range(2):
-        wandering = estimate_wandering(pair.times_s, without_turns(pair.differences(offset, drift)))
+        wandering = estimate_wandering(
+            pair.times_s, without_turns(pair.differences(offset, drift)), pair.systematic
+        )
         offset, drift = _refine(pair, wandering, (offset, drift), bounds)
     covariance = _covariance(pair, wandering, offset, drift)
     note = ""
@@ -194,8 +197,14 @@ def _smoothed(headings: FloatArray) -> FloatArray:
 
 
 def _sum_of_squares(pair: HeadingPair, offset_s: float, drift: float) -> float:
+    """Squared differences after the best angle and the best of the systematic errors."""
     level = without_turns(pair.differences(offset_s, drift))
-    return float(np.var(level))
+    level -= level.mean()
+    shapes = pair.systematic
+    # The systematic errors' deviations stand against a coarse guess of the noise.
+    information = shapes.T @ shapes + _COARSE_SIGMA_RAD**2 * np.eye(shapes.shape[1])
+    along = shapes.T @ level
+    return float((level @ level - along @ np.linalg.solve(information, along)) / len(level))
 
 
 def _search(pair: HeadingPair, bounds: SyncSettings) -> tuple[float, float]:

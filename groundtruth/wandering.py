@@ -1,7 +1,8 @@
 """Differences that wander: white noise of each sample on top of a random walk, and least squares.
 
 The model of a difference between two headings: odometry's error adds up (a random walk, variance
-`rate` per second), the other's does not (white, `sigma`).
+`rate` per second), the other's does not (white, `sigma`). Systematic errors may come on top, such
+as a turn that odometry takes for a share longer than it was.
 """
 
 from __future__ import annotations
@@ -36,14 +37,17 @@ class Wandering:
         Standard deviation of each sample's own noise, above 0.
     rate : float
         Variance that the random walk gains per second, above 0.
+    systematic : (N, k) float64
+        Shapes that the difference may have besides, each times an unknown factor of deviation 1.
     """
 
     times_s: FloatArray
     sigma: float
     rate: float
+    systematic: FloatArray
 
     def whiten(self, values: FloatArray) -> FloatArray:
-        """Multiply by the inverse of the covariance, the walk's level being unknown.
+        """Multiply by the inverse of the covariance, the walk's level being unknown to it.
 
         Parameters
         ----------
@@ -53,8 +57,9 @@ class Wandering:
         -------
         array of the same shape
         """
-        explained = cho_solve_banded((self._factor, True), values / self.sigma**2)
-        return np.asarray((values - explained) / self.sigma**2)
+        weighted = self._without_walk(values)
+        shapes, inverse = self._shapes
+        return np.asarray(weighted - shapes @ (inverse @ (self.systematic.T @ weighted)))
 
     def squared(self, values: FloatArray) -> float:
         """Squared Mahalanobis length of (N,) values, the walk's level being unknown."""
@@ -62,10 +67,25 @@ class Wandering:
 
     def level(self, values: FloatArray) -> tuple[float, float]:
         """Mean over time of the walk that explains (N,) values best, and its deviation."""
-        walk = cho_solve_banded((self._factor, True), values / self.sigma**2)
+        _, inverse = self._shapes
+        factors = inverse @ (self.systematic.T @ self._without_walk(values))
+        rest = values - self.systematic @ factors
+        walk = cho_solve_banded((self._factor, True), rest / self.sigma**2)
         ones = np.ones(len(values)) / len(values)
         variance = ones @ cho_solve_banded((self._factor, True), ones)
         return float(np.mean(walk)), float(np.sqrt(variance))
+
+    def _without_walk(self, values: FloatArray) -> FloatArray:
+        """Multiply by the inverse of the covariance of noise and walk alone."""
+        explained = cho_solve_banded((self._factor, True), values / self.sigma**2)
+        return np.asarray((values - explained) / self.sigma**2)
+
+    @cached_property
+    def _shapes(self) -> tuple[FloatArray, FloatArray]:
+        """The systematic shapes, weighted, and the covariance of their factors."""
+        weighted = self._without_walk(self.systematic)
+        information = np.eye(self.systematic.shape[1]) + self.systematic.T @ weighted
+        return weighted, np.asarray(np.linalg.inv(information))
 
     @cached_property
     def _factor(self) -> FloatArray:
@@ -80,7 +100,10 @@ class Wandering:
 
 
 def estimate_wandering(
-    times_s: FloatArray, values: FloatArray, lags: tuple[int, ...] = LAGS
+    times_s: FloatArray,
+    values: FloatArray,
+    systematic: FloatArray | None = None,
+    lags: tuple[int, ...] = LAGS,
 ) -> Wandering:
     """Tell noise and wandering apart by how far samples differ after more and more time.
 
@@ -90,6 +113,8 @@ def estimate_wandering(
         Ascending strictly, N of 10 or more.
     values : (N,) array
         Differences of headings, without jumps.
+    systematic : (N, k) array, optional
+        Shapes that the differences may have besides; what of them is in the values is taken off.
     lags : tuple of int
         How many samples apart they are compared; short ones do not mind what changes slowly.
 
@@ -106,6 +131,16 @@ def estimate_wandering(
         raise GroundTruthError(f"{len(times_s)} samples: expected 10 or more")
     if not np.all(np.diff(times_s) > 0.0):
         raise GroundTruthError("two samples of one time: expected times that ascend")
+    shapes = np.zeros((len(times_s), 0)) if systematic is None else systematic
+    if shapes.shape[1]:
+        # Their factors by least squares of what changes from sample to sample, which noise and
+        # wandering disturb alike everywhere.
+        change = np.diff(shapes, axis=0)
+        typical = float(np.mean(np.diff(values) ** 2)) + _LEAST_SIGMA_RAD**2
+        information = change.T @ change / typical + np.eye(shapes.shape[1])
+        values = values - shapes @ np.linalg.solve(
+            information, change.T @ np.diff(values) / typical
+        )
     rows, squares = [], []
     for lag in lags:
         if lag > len(times_s) // 4 and lag > 1:
@@ -124,4 +159,4 @@ def estimate_wandering(
     sigma = max(float(np.sqrt(variance)), 0.1 * float(np.sqrt(squares[0] / 2.0)), _LEAST_SIGMA_RAD)
     duration = float(times_s[-1] - times_s[0])
     # A walk of a hundredth of the noise over the whole segment is none.
-    return Wandering(times_s, sigma, max(float(rate), (0.01 * sigma) ** 2 / duration))
+    return Wandering(times_s, sigma, max(float(rate), (0.01 * sigma) ** 2 / duration), shapes)

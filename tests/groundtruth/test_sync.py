@@ -207,8 +207,9 @@ def test_wandering_is_told_from_noise() -> None:
 
 def test_whitening_is_the_inverse_of_the_covariance_with_free_level() -> None:
     times = np.array([0.0, 0.3, 0.7, 1.5, 1.6])
-    noise = Wandering(times, 0.02, 0.003)
-    covariance = 0.02**2 * np.eye(5) + 0.003 * np.minimum.outer(times, times)
+    shape = np.array([[0.0], [0.1], [0.1], [-0.2], [0.3]])
+    noise = Wandering(times, 0.02, 0.003, shape)
+    covariance = 0.02**2 * np.eye(5) + 0.003 * np.minimum.outer(times, times) + shape @ shape.T
     inverse = np.linalg.inv(covariance)
     ones = np.ones(5)
     free = inverse - np.outer(inverse @ ones, ones @ inverse) / (ones @ inverse @ ones)
