@@ -8,8 +8,8 @@ from slam.ekf import EkfSlam, run_ekf
 from slam.errors import SlamError
 from slam.filter_association import Associator
 from slam.filter_input import default_output, read_reference, read_run
-from slam.filter_report import demand_free, path_distance, summary, table, write_json
-from slam.map_file import write_map, write_path
+from slam.filter_report import demand_free, map_distance, path_distance, summary, table, write_json
+from slam.map_file import read_map, write_map, write_path
 from slam.options import Ekf
 from slam.pictures import draw_errors, draw_map
 
@@ -52,14 +52,26 @@ def perform(command: Ekf) -> int:
         )
     reference = read_reference(command.reference, run.path) if command.reference else None
     distance = path_distance(run.path, reference.poses) if reference else None
+    from_map = (
+        map_distance(landmark_map, read_map(command.reference_map))
+        if command.reference_map
+        else None
+    )
     comments = [f"slam ekf {slam.__version__}: {command.run}"]
     write_path(output / PATH_NAME, run.path, comments, overwrite=command.force)
     write_map(output / MAP_NAME, landmark_map, comments, overwrite=command.force)
     content = summary(run, command, distance)
     content["landmarks"] = {"discs": len(landmark_map.discs), "lines": len(landmark_map.lines)}
+    if from_map is not None:
+        content["distance_from_reference_map"] = from_map
     write_json(output / JSON_NAME, content, overwrite=command.force)
     print("\n".join(table(run, distance)))
     print(f"landmarks         {len(landmark_map.discs)} discs, {len(landmark_map.lines)} lines")
+    if from_map is not None:
+        print(
+            "from reference    landmarks rms {rms_m:.3f} m, median {median_m:.3f}, max "
+            "{max_m:.3f}; squared, over their covariance and 2: {normalised:.2f}".format(**from_map)
+        )
     print(f"time              {seconds:.2f} s, {len(recording) / seconds:.0f} steps/s")
     title = f"{command.run.name}: EKF-SLAM, poses as they were at the time, map at the end"
     draw_map(

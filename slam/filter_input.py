@@ -11,6 +11,7 @@ from slam.errors import SlamError
 from slam.filter_frames import NO_CAMERA
 from slam.map_file import Path2D, read_path
 from slam.recording import Recording, read_recording
+from slam.run_camera import camera_of_run
 
 FloatArray = NDArray[np.float64]
 
@@ -42,19 +43,14 @@ def read_run(
     ------
     SlamError
         If there is nothing to use, or lines without a calibration.
+    camera.CameraError
+        If the calibration is malformed.
     """
     recording = read_recording(run, circles=circles or not lines, lines=lines, stem=stem)
     if not len(recording.lines):
         return recording, NO_CAMERA
-    from camera import read_camera
-
-    folder = run if run.is_dir() else run.parent
-    found = [camera] if camera is not None else sorted(folder.glob("*.cam"))
-    if len(found) != 1:
-        raise SlamError(
-            f"{folder}: {len(found)} calibrations (*.cam): lines need one: name it by --camera"
-        )
-    return recording, np.array(read_camera(found[0]).robot_from_camera)[:2, 3]
+    mounting = camera_of_run(run, camera).robot_from_camera
+    return recording, np.array([mounting[0][3], mounting[1][3]])
 
 
 def read_reference(path: Path, poses: Path2D) -> Path2D:

@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from landmarks import wrap_angle
+from landmarks import squared_mahalanobis, wrap_angle
+from slam.errors import SlamError
 from slam.filter_frames import FilterRun
-from slam.map_file import Path2D
+from slam.map_file import LandmarkMap, Path2D
 from storage import OutputExistsError, write_whole
 
 FloatArray = NDArray[np.float64]
@@ -47,6 +48,46 @@ def path_distance(path: Path2D, reference: ArrayLike) -> dict[str, float]:
             ("max", np.max(distance)),
             ("last", distance[-1]),
         )
+    }
+
+
+def map_distance(landmark_map: LandmarkMap, reference: LandmarkMap) -> dict[str, float]:
+    """How far landmarks are from those of another map with the same identifiers.
+
+    Parameters
+    ----------
+    landmark_map, reference : LandmarkMap
+        Both in one frame.
+
+    Returns
+    -------
+    dict of str to float
+        Landmarks that are in both; root mean square, median and largest distance (m); and the
+        mean of the squared distance, normalised by the covariance of `landmark_map` alone, over 2.
+
+    Raises
+    ------
+    SlamError
+        If no landmark is in both.
+    """
+    offsets, covariances = [], []
+    for some, others in (
+        (landmark_map.discs, reference.discs),
+        (landmark_map.lines, reference.lines),
+    ):
+        _, own, other = np.intersect1d(some.ids, others.ids, return_indices=True)
+        offsets.append(some.xy[own] - others.xy[other])
+        covariances.append(some.covariance[own])
+    offset, covariance = np.concatenate(offsets), np.concatenate(covariances)
+    if not len(offset):
+        raise SlamError("no landmark is in both maps: expected some of the same identifiers")
+    distance = np.hypot(*offset.T)
+    return {
+        "landmarks": float(len(distance)),
+        "rms_m": math.sqrt(float(np.mean(distance**2))),
+        "median_m": float(np.median(distance)),
+        "max_m": float(np.max(distance)),
+        "normalised": float(np.mean(squared_mahalanobis(offset, covariance))) / 2.0,
     }
 
 

@@ -162,6 +162,8 @@ class Ekf:
         `latest`, as the textbook filter does, which is inconsistent at large heading error.
     reference : Path
         A path.csv to measure the distance from.
+    reference_map : Path
+        A map.csv to measure the distance of the landmarks from.
     output : Path
         Folder for map.csv, path.csv, ekf.json and pictures; by default `slam/ekf` in the run
         folder.
@@ -180,6 +182,7 @@ class Ekf:
     gate_probability: float = 0.999
     jacobians: Literal["first", "latest"] = "first"
     reference: MaybePath = None
+    reference_map: MaybePath = None
     output: Annotated[MaybePath, arg(aliases=["-o"])] = None
     interactive: bool = False
     force: bool = False
