@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +37,7 @@ _COARSE_SIGMA_RAD = 0.02
 # drift likewise: the deviation of what is merely between the bounds is .58 of them.
 _LEAST_DETERMINED = 0.1
 _MOST_JUMPS = 3
+_JUMP_SIGMAS = 3.5
 _FEWEST_SAMPLES = 20
 
 
@@ -160,12 +162,13 @@ def _segment(
                 part = PlanarPoses(segment.times_s[which], segment.poses[which])
                 if len(part) >= _FEWEST_SAMPLES:
                     parts += _segment(odometry, part, bounds, jumps_left - 1)
-            return [
-                replace(part, status="jump", note=f"the clock was set near {place:.2f} s")
-                if part.status == "ok"
-                else part
-                for part in parts
-            ]
+            if _differ(parts):
+                return [
+                    replace(part, status="jump", note=f"the clock was set near {place:.2f} s")
+                    if part.status == "ok"
+                    else part
+                    for part in parts
+                ]
     status: Status = "ok"
     if abs(offset) > 0.999 * bounds.largest_offset_s or abs(drift) > 0.999 * bounds.largest_drift:
         status = "at a bound"
@@ -188,6 +191,16 @@ def _segment(
             note=note,
         )
     ]
+
+
+def _differ(parts: list[ClockSegment]) -> bool:
+    """Whether the clock before a jump and after it are told, and are not the same."""
+    told = [part for part in parts if part.status != "no turns"]
+    return any(
+        abs(after.offset_s - before.offset_s)
+        > _JUMP_SIGMAS * math.hypot(after.sigma_offset_s, before.sigma_offset_s)
+        for before, after in pairwise(told)
+    )
 
 
 def _smoothed(headings: FloatArray) -> FloatArray:
