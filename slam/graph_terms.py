@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from landmarks import wrap_angle
-from slam.calibration import directions_of_rows, mounting_change, rows_through_mounting
+from slam.calibration import directions_of_rows, rows_through_mounting, turn_to_the_left
 from slam.calibration_model import predict_pixels
 from slam.graph import Estimate, Graph
 from slam.measurement import (
@@ -222,9 +222,12 @@ def linearise(graph: Graph, estimate: Estimate, weighting: Weighting) -> Lineari
     border = np.zeros((rows, MOUNTING_UNKNOWNS if weighting.calibrate else 0))
     if weighting.calibrate:
         border[first_disc_row:first_line_row] = (by_mounting * scale).reshape(-1, 4)
-        # Rows' bearings were put into the robot frame as calibrated: a camera that is really
-        # turned to the left sees things further to the right than they are.
-        border[first_line_row:first_tilt_row, 2] = -line_root / graph.bearing_sigma_rad
+        if estimate.mounting is not None and graph.camera is not None:
+            # Rows' bearings were put into the robot frame as calibrated: a camera that is really
+            # turned to the left sees things further to the right than they are.
+            _, by_turn = turn_to_the_left(graph.camera, estimate.mounting)
+            lines = -(line_root / graph.bearing_sigma_rad)[:, None] * by_turn
+            border[first_line_row:first_tilt_row] = lines
     return Linearised(
         residual=np.concatenate(
             [
@@ -285,13 +288,6 @@ def _disc_blocks(
     return whiten @ by.pose, whiten @ by.tilt, whiten @ by.disc, whiten @ by.mounting
 
 
-def _turn_of_mounting(graph: Graph, estimate: Estimate) -> float:
-    """By how much the camera is turned to the left against the calibration (rad)."""
-    if estimate.mounting is None or graph.camera is None:
-        return 0.0
-    return float(mounting_change(graph.camera, estimate.mounting)[2])
-
-
 def _members(graph: Graph) -> tuple[IntArray, FloatArray]:
     """(e,) pose of each member of a row, and its share of the row."""
     count = np.bincount(graph.member_row, minlength=len(graph.line_pose))
@@ -306,7 +302,9 @@ def _bearing_errors(graph: Graph, estimate: Estimate) -> FloatArray:
     bearing = bearing_of_vertical(
         estimate.poses[pose], estimate.line_xy[graph.member_line], graph.camera_xy
     )
-    turn = _turn_of_mounting(graph, estimate)
+    turn = 0.0
+    if estimate.mounting is not None and graph.camera is not None:
+        turn, _ = turn_to_the_left(graph.camera, estimate.mounting)
     off = wrap_angle(bearing - turn - graph.bearing_rad[graph.member_row])
     mean = np.bincount(graph.member_row, share * off, minlength=len(graph.line_pose))
     return np.asarray(mean / graph.bearing_sigma_rad)

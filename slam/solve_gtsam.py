@@ -1,11 +1,12 @@
 """The same least squares by GTSAM, for those who want the field's own solver, and as a check.
 
-GTSAM has no factor for a disc in the robot frame with a full covariance, but `BetweenFactorPose2`
-is one, exactly, if the disc is a pose whose heading no row weighs: its error is that of
-``measured^-1 * pose^-1 * disc``, whose translation for a measurement without rotation is the disc
-in the robot frame less the row. A step's error comes out in the frame after the step, so its
-covariance is turned there. Bearings of several lines and a camera beside the robot's centre have no
-compiled factor: those rows are `CustomFactor`s, in Python.
+GTSAM has no factor for a point of the plane in the robot frame with a full covariance, but
+`PlanarProjectionFactor2` is one, exactly: a camera one metre below the robot's centre that looks up
+sees a disc at height 0 at the pixel (x, y). (`BetweenFactorPose2` on a disc with an idle heading
+is not: its error is the logarithm, which mixes heading into place.) For odometry
+`BetweenFactorPose2` serves; its logarithm differs from the report's error in the second order only.
+Bearings of several lines in a row, from a camera beside the robot's centre, have no compiled
+factor: those rows are `CustomFactor`s, in Python.
 """
 
 from __future__ import annotations
@@ -28,6 +29,11 @@ from slam.solve import Solution
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
+# Called with factor, values and, where derivatives are wanted, a list for them.
+ErrorFunction = Callable[[Any, Any, list[FloatArray] | None], FloatArray]
+
+# Discs lie on the floor to a micrometre.
+_HEIGHT_ROOT_INFORMATION = 1e6
 _MISSING = "--solver gtsam needs GTSAM, which is not installed: pip install 'redetect[slam]'"
 
 
@@ -126,7 +132,7 @@ def gtsam_problem(graph: Graph, start: Estimate, weighting: Weighting) -> tuple[
     for k, pose in enumerate(start.poses):
         values.insert(k, gtsam.Pose2(*pose))
     for j, xy in enumerate(start.disc_xy):
-        values.insert(first_disc + j, gtsam.Pose2(*xy, 0.0))
+        values.insert(first_disc + j, np.append(xy, 0.0))
     for j, xy in enumerate(start.line_xy):
         values.insert(first_line + j, xy)
 
@@ -135,18 +141,21 @@ def gtsam_problem(graph: Graph, start: Estimate, weighting: Weighting) -> tuple[
     turned = np.zeros((len(graph.steps), 3, 3))
     turned[:, :2, :2] = rotation(graph.steps[:, 2])
     turned[:, 2, 2] = 1.0
+    # This factor's error is in the frame after the step.
     for k, (step, whiten) in enumerate(zip(graph.steps, graph.step_whitening @ turned)):
         factors.add(gtsam.BetweenFactorPose2(k, k + 1, gtsam.Pose2(*step), root(whiten, False)))
-    whitening = np.zeros((len(graph.disc_pose), 3, 3))
-    whitening[:, :2, :2] = graph.disc_whitening
+    looking_up = gtsam.Pose3(gtsam.Rot3(), np.array([0.0, 0.0, -1.0]))
+    lens = gtsam.Cal3DS2(1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     for pose, disc, xy, whiten in zip(
-        graph.disc_pose.tolist(), graph.disc_index.tolist(), graph.disc_xy, whitening
+        graph.disc_pose.tolist(), graph.disc_index.tolist(), graph.disc_xy, graph.disc_whitening
     ):
         model = _under_loss(gtsam, root(whiten, False), weighting)
-        factors.add(gtsam.BetweenFactorPose2(pose, first_disc + disc, gtsam.Pose2(*xy, 0.0), model))
-    heading_only = root(np.diag([0.0, 0.0, 1.0]), False)
+        factors.add(
+            gtsam.PlanarProjectionFactor2(pose, first_disc + disc, xy, looking_up, lens, model)
+        )
+    on_floor = root(np.diag([0.0, 0.0, _HEIGHT_ROOT_INFORMATION]), False)
     for j in range(len(graph.disc_ids)):
-        factors.add(gtsam.PriorFactorPose2(first_disc + j, gtsam.Pose2(0, 0, 0), heading_only))
+        factors.add(gtsam.PriorFactorPoint3(first_disc + j, np.zeros(3), on_floor))
     for row in range(len(graph.line_pose)):
         lines = graph.member_line[graph.member_row == row]
         model = _under_loss(
@@ -170,10 +179,8 @@ def _under_loss(gtsam: Any, model: Any, weighting: Weighting) -> Any:
     return gtsam.noiseModel.Robust.Create(estimator, model)
 
 
-def _bearing_function(
-    measured_rad: float, camera_xy: FloatArray
-) -> Callable[[Any, Any, list[FloatArray] | None], FloatArray]:
-    """Error of a row of lines; its derivatives in GTSAM's way (a pose moves in its own frame)."""
+def _bearing_function(measured_rad: float, camera_xy: FloatArray) -> ErrorFunction:
+    """Error of a row of lines: the mean of their bearings less the row's."""
 
     def error(factor: Any, values: Any, jacobians: list[FloatArray] | None) -> FloatArray:
         pose_key, *line_keys = factor.keys()
@@ -200,11 +207,11 @@ def _estimate(graph: Graph, values: Any, start: Estimate) -> Estimate:
     found = np.array([(p.x(), p.y(), p.theta()) for p in poses])
     # GTSAM keeps headings in (-pi, pi]: back to the turns that odometry counted.
     found[:, 2] = start.poses[:, 2] + wrap_angle(found[:, 2] - start.poses[:, 2])
-    placed = [values.atPose2(first_disc + j) for j in range(discs)]
+    placed = [values.atPoint3(first_disc + j) for j in range(discs)]
     return replace(
         start,
         poses=found,
-        disc_xy=np.array([(p.x(), p.y()) for p in placed]).reshape(-1, 2),
+        disc_xy=np.array([xyz[:2] for xyz in placed]).reshape(-1, 2),
         line_xy=np.array(
             [values.atPoint2(first_disc + discs + j) for j in range(lines)], dtype=np.float64
         ).reshape(-1, 2),

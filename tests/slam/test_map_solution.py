@@ -1,0 +1,351 @@
+"""Least-squares maps of runs whose truth is known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from camera import Camera
+from landmarks import read_frames
+from slam.calibration import directions_of_rows, rows_through_mounting
+from slam.calibration_model import rotation_exp
+from slam.errors import SlamError
+from slam.graph import first_sight, graph_of_recording
+from slam.graph_terms import Weighting
+from slam.initial_lines import place_lines
+from slam.mapping import MappedRun, map_run
+from slam.recording import LineRows, Recording, read_recording, recording_of_frames
+from slam.solve import solve
+from slam.solve_gtsam import solve_gtsam
+from tests.slam.small_run import CAMERA_XY, SmallRun, small_run
+
+
+def _only_discs(run: SmallRun) -> Recording:
+    none = LineRows(np.zeros(0, np.int64), np.zeros(0), np.zeros(0), ())
+    return replace(run.recording, lines=none)
+
+
+def _with_camera_place(camera: Camera) -> Camera:
+    """The camera, standing where the small run's bearings are taken from."""
+    matrix = np.array(camera.robot_from_camera)
+    matrix[:2, 3] = CAMERA_XY
+    return replace(camera, robot_from_camera=matrix)
+
+
+def test_exact_rows_give_the_truth_back(published_camera: Camera) -> None:
+    run = small_run(1, noise=0.0)
+    mapped = map_run(run.recording, _with_camera_place(published_camera))
+    np.testing.assert_allclose(mapped.estimate.poses, run.poses, atol=1e-6)
+    np.testing.assert_allclose(
+        mapped.estimate.disc_xy, run.disc_xy[mapped.graph.disc_ids - 1], atol=1e-6
+    )
+    np.testing.assert_allclose(
+        mapped.estimate.line_xy, run.line_xy[mapped.graph.line_ids - 1], atol=1e-6
+    )
+    assert len(mapped.graph.line_ids) == len(run.line_xy)
+    assert mapped.table.chi_squared < 1e-6
+
+
+@pytest.mark.long
+def test_errors_and_chi_squared_are_as_the_covariances_say(published_camera: Camera) -> None:
+    camera = _with_camera_place(published_camera)
+    chi_squared, expected, disc_nees, line_nees, pose_nees = 0.0, 0, [], [], []
+    for seed in range(30):
+        run = small_run(seed)
+        mapped = map_run(run.recording, camera)
+        chi_squared += mapped.table.chi_squared
+        expected += mapped.table.expected
+        for off, spread, into in (
+            (
+                mapped.estimate.disc_xy - run.disc_xy[mapped.graph.disc_ids - 1],
+                mapped.covariance.discs,
+                disc_nees,
+            ),
+            (
+                mapped.estimate.line_xy - run.line_xy[mapped.graph.line_ids - 1],
+                mapped.covariance.lines,
+                line_nees,
+            ),
+            (
+                (mapped.estimate.poses - run.poses)[-1:],
+                mapped.covariance.poses[-1:],
+                pose_nees,
+            ),
+        ):
+            into.append(np.mean(np.einsum("ni,nij,nj->n", off, np.linalg.inv(spread), off)))
+    # 95 % of chi-squared / its degrees of freedom lies within 1.96 sqrt(2 / dof); twice that here.
+    assert chi_squared / expected == pytest.approx(1.0, abs=4 * np.sqrt(2 / expected))
+    # Landmarks of one run err together: as if each run gave a few independent ones.
+    assert np.mean(disc_nees) == pytest.approx(2.0, abs=0.6)
+    assert np.mean(line_nees) == pytest.approx(2.0, abs=0.6)
+    assert np.mean(pose_nees) == pytest.approx(3.0, abs=4 * np.sqrt(2 * 3 / 30))
+
+
+def test_gtsam_finds_the_same_minimum(published_camera: Camera) -> None:
+    pytest.importorskip("gtsam")
+    mapped = map_run(small_run(2).recording, _with_camera_place(published_camera))
+    for loss in ("none", "cauchy"):
+        weighting = Weighting(loss=loss)  # type: ignore[arg-type]
+        ours = solve(mapped.graph, mapped.estimate, weighting)
+        theirs = solve_gtsam(mapped.graph, mapped.estimate, weighting)
+        # Its error of a step is a logarithm: other in the second order.
+        assert theirs.cost == pytest.approx(ours.cost, rel=1e-5)
+        for one, other in (
+            (ours.estimate.poses, theirs.estimate.poses),
+            (ours.estimate.disc_xy, theirs.estimate.disc_xy),
+            (ours.estimate.line_xy, theirs.estimate.line_xy),
+        ):
+            np.testing.assert_allclose(one, other, atol=1e-3)
+
+
+def test_gtsam_cannot_estimate_the_mounting(published_camera: Camera) -> None:
+    pytest.importorskip("gtsam")
+    with pytest.raises(SlamError, match="mounting"):
+        map_run(
+            _only_discs(small_run(2)),
+            published_camera,
+            Weighting(calibrate=True),
+            solver="gtsam",
+        )
+
+
+@pytest.mark.parametrize("loss", ["huber", "cauchy", "geman-mcclure"])
+def test_a_loss_withstands_wrong_identifiers(loss: str) -> None:
+    run = small_run(6, noise=0.0)
+    circles = run.recording.circles
+    ids = circles.ids.copy()
+    rng = np.random.default_rng(1)
+    wrong = rng.choice(len(ids), len(ids) // 25, replace=False)
+    ids[wrong] = ids[wrong] % 14 + 1
+    spoilt = replace(_only_discs(run), circles=replace(circles, ids=ids))
+    off = {}
+    for name in ("none", loss):
+        mapped = map_run(spoilt, weighting=Weighting(loss=name))  # type: ignore[arg-type]
+        off[name] = np.max(np.abs(mapped.estimate.poses - run.poses))
+    assert off[loss] < off["none"] / 2
+
+
+@pytest.mark.parametrize("row_errors", ["corrected", "recorded"])
+def test_calibration_recovers_a_wrong_mounting(published_camera: Camera, row_errors: str) -> None:
+    true = np.array([-0.03, 0.012, 0.005, -0.03])
+    turn, _ = rotation_exp(true[:3])
+    # The rows that this camera would write, mounted otherwise than the file says.
+    run = small_run(7, noise=0.0, steps=90)
+    circles = run.recording.circles
+    mounted = replace(
+        published_camera,
+        robot_from_camera=np.column_stack(
+            [
+                turn @ published_camera.rotation,
+                published_camera.centre + np.array([0.0, 0.0, true[3]]),
+            ]
+        ),
+    )
+    backward = np.column_stack([published_camera.rotation, published_camera.centre])
+    written, _ = rows_through_mounting(mounted, directions_of_rows(mounted, circles.xy), backward)
+    spoilt = replace(_only_discs(run), circles=replace(circles, xy=written))
+    plain = map_run(spoilt, published_camera)
+    mapped = map_run(
+        spoilt,
+        published_camera,
+        Weighting(calibrate=True, row_errors=row_errors),  # type: ignore[arg-type]
+    )
+    assert mapped.mounting is not None
+    np.testing.assert_allclose(mapped.mounting.change, true, atol=2e-5)
+    assert mapped.mounting.gain == pytest.approx(plain.table.chi_squared, rel=1e-3)
+    assert plain.table.chi_squared > 10.0
+    np.testing.assert_allclose(mapped.estimate.poses, run.poses, atol=2e-4)
+    assert mapped.table.expected == plain.table.expected - 4
+
+
+def test_lines_without_parallax_and_lines_always_joined_are_left_out() -> None:
+    run = small_run(1, noise=0.0)
+    lines = run.recording.lines
+    # Line 1 only from two poses next to each other; lines 2 and 3 only together.
+    seen_one = [k for k, (i,) in enumerate(lines.ids) if i == 1][:2]
+    kept = [k for k, (i,) in enumerate(lines.ids) if i != 1] + seen_one
+    kept.sort()
+    ids = tuple((2, 3) if lines.ids[k][0] in (2, 3) else lines.ids[k] for k in kept)
+    rows = LineRows(lines.frame[kept], lines.bearing_rad[kept], lines.sigma_rad[kept], ids)
+    placed = place_lines(run.poses, rows, CAMERA_XY, least_parallax_rad=np.radians(12.0))
+    assert placed.unplaced.tolist() == [1, 2, 3]
+    np.testing.assert_allclose(placed.xy, run.line_xy[placed.ids - 1], atol=1e-9)
+
+
+def test_rows_of_left_out_lines_are_counted(published_camera: Camera) -> None:
+    run = small_run(1)
+    lines = run.recording.lines
+    joined = tuple((i, 99) if k == 5 else (i,) for k, (i,) in enumerate(lines.ids))
+    spoilt = replace(run.recording, lines=replace(lines, ids=joined))
+    mapped = map_run(spoilt, _with_camera_place(published_camera))
+    assert mapped.left_out.lines_without_parallax == 1
+    assert mapped.left_out.line_rows == 1
+    assert mapped.table.measurements == len(run.recording.circles) + len(lines) - 1
+
+
+def test_a_disc_seen_once_is_in_the_map_and_counted() -> None:
+    run = small_run(8)
+    circles = run.recording.circles
+    ids = circles.ids.copy()
+    ids[10] = 77
+    mapped = map_run(replace(_only_discs(run), circles=replace(circles, ids=ids)))
+    assert mapped.left_out.discs_seen_once == 1
+    assert 77 in mapped.graph.disc_ids
+    assert mapped.table.expected == 2 * len(circles) - 2 * (len(run.disc_xy) + 1)
+
+
+def test_a_run_without_identifiers_is_refused() -> None:
+    run = small_run(1)
+    nameless = replace(
+        run.recording.circles, ids=np.full(len(run.recording.circles), -1, dtype=np.int64)
+    )
+    with pytest.raises(SlamError, match="no row has an identifier"):
+        map_run(replace(_only_discs(run), circles=nameless))
+
+
+def test_lines_without_a_calibration_are_refused() -> None:
+    with pytest.raises(SlamError, match="calibration"):
+        map_run(small_run(1).recording)
+
+
+def test_calibration_with_another_cameras_rows_is_refused(published_camera: Camera) -> None:
+    run = small_run(1)
+    circles = run.recording.circles
+    behind = replace(circles, xy=circles.xy + np.array([0.0, 9.0]))
+    with pytest.raises(SlamError, match="cannot see"):
+        map_run(
+            replace(_only_discs(run), circles=behind), published_camera, Weighting(calibrate=True)
+        )
+
+
+def _lost_at(run: SmallRun, step: int) -> Recording:
+    covariance = run.recording.step_covariance.copy()
+    covariance[step] = np.diag([1e6, 1e6, 1e2])
+    return replace(_only_discs(run), step_covariance=covariance)
+
+
+def test_a_lost_step_bridged_by_landmarks_is_no_matter() -> None:
+    run = small_run(9)
+    mapped = map_run(_lost_at(run, 40))
+    assert np.max(np.abs(mapped.estimate.poses - run.poses)) < 0.3
+
+
+def test_a_disconnected_run_is_refused() -> None:
+    run = small_run(9)
+    lost = _lost_at(run, 40)
+    ids = lost.circles.ids.copy()
+    ids[lost.circles.frame >= 40] += 100
+    # One disc in common leaves the second part free to turn about it.
+    ids[np.flatnonzero(lost.circles.frame >= 40)[0]] = ids[0]
+    with pytest.raises(SlamError, match=r"disconnected at step 41 \(s\.0040\).*share 1 landmarks"):
+        map_run(replace(lost, circles=replace(lost.circles, ids=ids)), name="r")
+
+
+def test_parts_may_be_joined_by_way_of_a_third() -> None:
+    run = small_run(9)
+    lost = _lost_at(_run_lost_twice(run), 45)
+    map_run(lost)
+
+
+def _run_lost_twice(run: SmallRun) -> SmallRun:
+    return replace(run, recording=_lost_at(run, 20))
+
+
+def test_not_a_number_is_refused_where_it_stands(tmp_path: Path) -> None:
+    path = tmp_path / "r.circles"
+    path.write_text(
+        "STEP a 0.1 0 0 0.1 0 0.1 0 0 0.1\nLANDMARK_C nan 1 1 0.1 0 0.1 3\n", encoding="ascii"
+    )
+    with pytest.raises(ValueError, match=r"r\.circles:2.*nan"):
+        map_run(read_recording(path))
+
+
+def test_a_landmark_before_any_step_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "r.circles"
+    path.write_text("LANDMARK_C 1 1 1 0.1 0 0.1 3\n", encoding="ascii")
+    with pytest.raises(ValueError, match=r"r\.circles:1.*STEP"):
+        map_run(read_recording(path))
+
+
+@pytest.fixture(scope="module")
+def run_e_as_shipped(shared_data: Path) -> Recording:
+    return read_recording(shared_data / "dlr" / "map.circles")
+
+
+@pytest.fixture(scope="module")
+def plain_map(run_e_as_shipped: Recording) -> MappedRun:
+    return map_run(run_e_as_shipped)
+
+
+@pytest.mark.long
+def test_the_reports_table(plain_map: MappedRun) -> None:
+    table = plain_map.table
+    assert (table.poses, table.landmarks, table.steps, table.measurements) == (
+        3298,
+        576,
+        3298,
+        14309,
+    )
+    assert table.chi_squared == pytest.approx(56_871.45, abs=0.01)
+    assert table.expected == 27_466
+    assert round(table.factor, 2) == 2.07
+    assert round(table.root, 2) == 1.44
+
+
+@pytest.mark.long
+def test_the_known_solution_of_run_e(shared_data: Path, plain_map: MappedRun) -> None:
+    known = np.loadtxt(shared_data / "dlr" / "least_squares_path.csv", delimiter=",")
+    np.testing.assert_allclose(plain_map.estimate.poses[:, :2], known[:, :2], atol=2e-3)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("row_errors", "chi_squared", "change"),
+    [
+        ("corrected", 41_396.34, (-0.0403, 0.0100, 0.0016, -0.0454)),
+        ("recorded", 37_450.18, (-0.0366, 0.0099, 0.0024, -0.0111)),
+    ],
+)
+def test_calibration_of_run_e(
+    run_e_as_shipped: Recording,
+    published_camera: Camera,
+    row_errors: str,
+    chi_squared: float,
+    change: tuple[float, ...],
+) -> None:
+    weighting = Weighting(calibrate=True, row_errors=row_errors)  # type: ignore[arg-type]
+    mapped = map_run(run_e_as_shipped, published_camera, weighting)
+    assert mapped.table.chi_squared == pytest.approx(chi_squared, abs=0.1)
+    assert mapped.mounting is not None
+    np.testing.assert_allclose(mapped.mounting.change, change, atol=1e-4)
+
+
+@pytest.mark.long
+def test_gtsam_finds_the_reports_minimum(run_e_as_shipped: Recording, plain_map: MappedRun) -> None:
+    pytest.importorskip("gtsam")
+    mapped = map_run(run_e_as_shipped, solver="gtsam")
+    assert mapped.table.chi_squared == pytest.approx(plain_map.table.chi_squared, abs=0.2)
+    np.testing.assert_allclose(mapped.estimate.disc_xy, plain_map.estimate.disc_xy, atol=0.03)
+
+
+def test_headings_far_off_still_lead_to_the_minimum() -> None:
+    """Odometry with a heading error that bends two laps into one and a half."""
+    run = small_run(3)
+    recording = _only_discs(run)
+    minimum = map_run(recording).cost
+    graph = graph_of_recording(recording)
+    start = first_sight(graph)
+    bent = start.poses + np.linspace(0.0, 1.0, len(start.poses))[:, None] * [1.0, -1.0, 1.5]
+    assert solve(graph, replace(start, poses=bent), Weighting()).cost == pytest.approx(minimum)
+
+
+def test_singular_covariances_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "r.circles"
+    path.write_text(
+        "STEP a 0.1 0 0 0.1 0.1 0.1 0 0 0.1\nLANDMARK_C 1 1 1 0.1 0 0.1 3\n", encoding="ascii"
+    )
+    with pytest.raises(SlamError, match=r"step 1 \(a\).*positive definite"):
+        recording_of_frames(list(read_frames(path)), str(path))

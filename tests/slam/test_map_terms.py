@@ -1,0 +1,171 @@
+"""Errors of the least-squares problem, their Jacobians, losses and covariances."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import sparse
+
+from camera import Camera
+from slam.calibration import mounting_change
+from slam.calibration_model import rotation_exp
+from slam.graph import Estimate, Graph, first_sight, graph_of_recording, with_lines
+from slam.graph_terms import Loss, RowErrors, Weighting, errors, layout_of, linearise, robust
+from slam.marginal_kernels import filled_pattern
+from slam.marginals import inverse_blocks, marginals
+from slam.measurement import bearing_of_vertical
+from slam.recording import LineRows
+from slam.solve import moved, solve
+from tests.slam.small_run import CAMERA_XY, small_run
+
+
+def _problem(camera: Camera | None = None) -> tuple[Graph, Estimate]:
+    """A problem with discs and lines, some rows of two lines, and an estimate off its minimum."""
+    run = small_run(3)
+    lines = run.recording.lines
+    # Every third row stands for its line and the next one, and measures the mean of both.
+    ids = tuple(
+        (i, i % len(run.line_xy) + 1) if k % 3 == 0 else (i,) for k, (i,) in enumerate(lines.ids)
+    )
+    bearing = [
+        np.mean(bearing_of_vertical(run.poses[k + 1], run.line_xy[np.array(i) - 1], CAMERA_XY))
+        for k, i in zip(lines.frame, ids)
+    ]
+    rows = LineRows(lines.frame, np.array(bearing), lines.sigma_rad, ids)
+    graph = replace(graph_of_recording(run.recording, camera), camera_xy=CAMERA_XY)
+    graph = with_lines(graph, rows, np.arange(1, len(run.line_xy) + 1))
+    rng = np.random.default_rng(4)
+    return graph, Estimate(
+        poses=run.poses + np.vstack([np.zeros(3), 0.01 * rng.standard_normal((60, 3))]),
+        disc_xy=run.disc_xy + 0.01 * rng.standard_normal(run.disc_xy.shape),
+        line_xy=run.line_xy + 0.01 * rng.standard_normal(run.line_xy.shape),
+    )
+
+
+@pytest.mark.parametrize(
+    ("calibrate", "row_errors", "tilt"),
+    [
+        (False, "corrected", 0.0),
+        (True, "corrected", 0.0),
+        (True, "recorded", 0.0),
+        (True, "recorded", 0.01),
+        (False, "recorded", 0.01),
+    ],
+)
+def test_jacobians_are_those_of_finite_differences(
+    published_camera: Camera, calibrate: bool, row_errors: RowErrors, tilt: float
+) -> None:
+    weighting = Weighting(calibrate=calibrate, row_errors=row_errors, tilt_sigma_rad=tilt)
+    graph, estimate = _problem(published_camera)
+    rng = np.random.default_rng(8)
+    if calibrate:
+        geometry = estimate.geometry(published_camera)
+        turn, _ = rotation_exp(np.array([-0.02, 0.01, 0.03]))
+        estimate = replace(
+            estimate, mounting=np.column_stack([turn @ geometry.rotation, geometry.centre])
+        )
+    if tilt:
+        tilts = np.vstack([np.zeros(2), 0.01 * rng.standard_normal((60, 2))])
+        estimate = replace(estimate, tilt=tilts)
+    layout = layout_of(graph, weighting)
+    problem = linearise(graph, estimate, weighting)
+    for _ in range(4):
+        step = rng.standard_normal(layout.size)
+        mounting = rng.standard_normal(4 if calibrate else 0)
+        h = 1e-6
+        ahead = moved(estimate, layout, h * step, h * mounting)
+        behind = moved(estimate, layout, -h * step, -h * mounting)
+        numeric = [
+            np.concatenate([e.odometry.ravel(), e.discs.ravel(), e.lines.ravel(), e.tilt.ravel()])
+            for e in (errors(graph, ahead, weighting), errors(graph, behind, weighting))
+        ]
+        analytic = problem.jacobian @ step + problem.border @ mounting
+        np.testing.assert_allclose(
+            (numeric[0] - numeric[1]) / (2 * h), analytic, rtol=2e-5, atol=1e-4
+        )
+
+
+@pytest.mark.parametrize("loss", ["none", "huber", "cauchy", "geman-mcclure"])
+def test_weight_of_a_loss_is_its_derivative(loss: Loss) -> None:
+    weighting = Weighting(loss=loss, loss_scale=2.0)
+    squared = np.array([0.0, 0.5, 3.9, 4.1, 25.0, 1e4])
+    h = 1e-6
+    above, weight = robust(squared + h, weighting)[0], robust(squared, weighting)[1]
+    np.testing.assert_allclose((above - robust(squared, weighting)[0]) / h, weight, atol=1e-4)
+    near, one = robust(np.array([1e-8]), weighting)
+    np.testing.assert_allclose((near[0], one[0]), (1e-8, 1.0), rtol=1e-6)
+
+
+def test_a_row_of_two_lines_measures_the_mean_of_their_bearings() -> None:
+    graph, estimate = _problem()
+    pairs = np.flatnonzero(np.bincount(graph.member_row) == 2)
+    assert len(pairs) > 10
+    row = pairs[0]
+    pose = estimate.poses[graph.line_pose[row]]
+    lines = estimate.line_xy[graph.member_line[graph.member_row == row]]
+    mean = np.mean(bearing_of_vertical(pose, lines, graph.camera_xy))
+    expected = (mean - graph.bearing_rad[row]) / graph.bearing_sigma_rad[row]
+    assert errors(graph, estimate, Weighting()).lines[row] == pytest.approx(expected)
+
+
+def test_filled_pattern_is_that_of_a_dense_factor() -> None:
+    rng = np.random.default_rng(1)
+    root = sparse.random_array((40, 40), density=0.04, rng=rng).toarray()
+    matrix = root @ root.T + np.eye(40)
+    columns = sparse.csc_array(matrix)
+    indptr, indices = filled_pattern(
+        columns.indptr.astype(np.int64), columns.indices.astype(np.int64)
+    )
+    dense = np.abs(np.tril(np.linalg.cholesky(matrix), -1)) > 1e-14
+    for j in range(40):
+        inside = indices[indptr[j] : indptr[j + 1]]
+        assert set(np.flatnonzero(dense[:, j])) <= set(inside.tolist())
+        assert np.all(np.diff(inside) > 0)
+
+
+def test_inverse_blocks_are_those_of_the_dense_inverse() -> None:
+    graph, estimate = _problem()
+    problem = linearise(graph, estimate, Weighting())
+    matrix = (problem.jacobian.T @ problem.jacobian).tocsc()
+    first = np.arange(0, 180, 3)
+    (found,) = inverse_blocks(matrix, [(3, first)])
+    dense = np.linalg.inv(matrix.toarray())
+    for block, at in zip(found, first):
+        np.testing.assert_allclose(block, dense[at : at + 3, at : at + 3], rtol=1e-8)
+
+
+def test_marginals_with_mounting_are_those_of_the_dense_inverse(published_camera: Camera) -> None:
+    weighting = Weighting(calibrate=True)
+    graph, estimate = _problem(published_camera)
+    estimate = solve(graph, estimate, weighting).estimate
+    found = marginals(graph, estimate, weighting)
+    problem = linearise(graph, estimate, weighting)
+    jacobian = np.hstack([problem.jacobian.toarray(), problem.border])
+    dense = np.linalg.inv(jacobian.T @ jacobian)
+    layout = layout_of(graph, weighting)
+    assert found.mounting is not None
+    np.testing.assert_allclose(found.mounting, dense[-4:, -4:], rtol=1e-7)
+    np.testing.assert_allclose(found.poses[60], dense[177:180, 177:180], rtol=1e-7)
+    at = layout.first_line
+    np.testing.assert_allclose(found.lines[0], dense[at : at + 2, at : at + 2], rtol=1e-7)
+    np.testing.assert_array_equal(found.poses[0], 0.0)
+
+
+def test_mounting_change_is_what_was_applied(published_camera: Camera) -> None:
+    vector = np.array([-0.04, 0.01, 0.002])
+    turn, _ = rotation_exp(vector)
+    centre = published_camera.centre + np.array([0.0, 0.0, -0.045])
+    mounting = np.column_stack([turn @ published_camera.rotation, centre])
+    found = mounting_change(published_camera, mounting)
+    # The file's rotation has six digits.
+    np.testing.assert_allclose(found, [*vector, -0.045], atol=1e-5)
+
+
+def test_first_sight_places_each_disc_where_its_first_row_does() -> None:
+    run = small_run(5, noise=0.0)
+    start = first_sight(graph_of_recording(run.recording))
+    seen = np.unique(run.recording.circles.ids)
+    np.testing.assert_allclose(start.disc_xy, run.disc_xy[seen - 1], atol=1e-9)
+    np.testing.assert_allclose(start.poses, run.poses, atol=1e-9)
