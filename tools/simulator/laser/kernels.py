@@ -20,11 +20,12 @@ def _meet(
     ex, ey = wall[2] - wall[0], wall[3] - wall[1]
     rx, ry = wall[0] - ox, wall[1] - oy
     across = dx * ey - dy * ex
-    if across == 0.0:  # along the wall: its end on would be hit by the neighbouring wall
+    beside = rx * dy - ry * dx
+    # Both ends on the same side of the ray, or a wall along it, whose end its neighbour shows.
+    if beside * (beside - across) > 0.0 or across == 0.0:
         return nearest
     distance = (rx * ey - ry * ex) / across
-    share = (rx * dy - ry * dx) / across
-    if 0.0 <= share <= 1.0 and 0.0 < distance < nearest:
+    if 0.0 < distance < nearest:
         return np.float64(distance)
     return nearest
 

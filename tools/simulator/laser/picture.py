@@ -73,7 +73,7 @@ def draw_session(
     axes.plot(*body[:, :2].T, color="tab:red", linewidth=1.5)
     axes.autoscale_view()
     axes.set(xlabel="x / m", ylabel="y / m", title=f"t = {at_s:.2f} s")
-    axes.legend(loc="upper right", fontsize=8)
+    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8)
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=100, metadata={"Software": None})
     with write_whole(path, overwrite=overwrite) as stream:

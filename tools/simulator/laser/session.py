@@ -238,14 +238,15 @@ def _ways_inside(settings: LaserSettings, rng: np.random.Generator, site: Site) 
     standing = stop * settings.references / settings.visits
     wanted = 0.85 * driving.speed_m_s * max(settings.visit_s - standing, 0.0)
     before, after = np.array(_WEST_DOOR[-2:]), np.array(_EAST_DOOR[:2])
-    points, failed = [*before], 0
+    points, failed, dead_ends = [*before], 0, 0
     for _ in range(_TRIES):
         length = float(np.linalg.norm(np.diff([*points, after[0]], axis=0), axis=1).sum())
         if len(points) > 2 and length >= wanted:
             whole = np.vstack([*points, after])
             if _bends_softly(points, after[0]) and _is_clear(whole, site):
                 return np.array(points[2:])
-            points = points[: max(2, len(points) - 2)]
+            dead_ends += 1
+            points = points[: max(2, len(points) - 2)] if dead_ends % _STUCK else [*before]
         low, high = (
             ((2.0, 2.0), (3.5, 5.5)) if len(points) == 2 else ((1.1, 1.1), (_X - 1.1, _Y - 1.1))
         )
