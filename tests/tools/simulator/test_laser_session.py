@@ -245,6 +245,14 @@ def test_the_same_seed_gives_the_same_bytes_and_another_does_not(
     assert not np.array_equal(other.scanners[0].pose, plan_session(SMALL, SEED).scanners[0].pose)
 
 
+@pytest.mark.parametrize("seed", [101, 115])
+def test_a_way_is_found_out_of_dead_ends(seed: int) -> None:
+    plan = plan_session(LaserSettings(), seed)
+    times = np.arange(plan.route.start_s, plan.route.end_s, 0.2)
+    places = plan.route.poses(times)[:, :2]
+    assert gap_to(places, plan.site.solid).min() > 0.55  # the robot reaches 0.54 m
+
+
 # -- faults ---------------------------------------------------------------------------------
 
 
