@@ -100,14 +100,16 @@ def fit_lines(
     Returns
     -------
     LineFits
-        One for each track; tracks too short to be lines are not refined. Without refinement the
-        covariance is that of independent points with the scatter that the track shows.
+        One for each track; those too short or too faint to be lines have none. Without refinement
+        the covariance is that of independent points with the scatter that the track shows.
     """
     from detect.line_fit_kernels import fit_eigenlines, refine_lines
 
-    reference, pixel, line, scatter_px, middle, spread = fit_eigenlines(
-        table.bearing_rad, table.elevation_tan, tracks.bounds, tracks.row, tracks.column
-    )
+    reference, pixel, line, scatter_px, middle, spread, rise, off = fit_eigenlines(
+        table.bearing_rad, table.elevation_tan, tracks.bounds, tracks.row, tracks.column,
+        tracks.score, settings.least_points(table.row_aspect),
+        settings.least_evidence / table.row_aspect,
+    )  # fmt: skip
     if not settings.refine_steps_px:
         count = len(tracks)
         return LineFits(
@@ -124,9 +126,9 @@ def fit_lines(
     scales, farthest = zip(*settings.refine_steps_px)
     filters = step_filters((*scales, settings.fine_scale_px, settings.coarse_scale_px))
     line, covariance, shift_px, contrast, sharpness = refine_lines(
-        np.ascontiguousarray(image), table.column, table.bearing_rad, table.elevation_tan,
+        np.ascontiguousarray(image), table.column, table.bearing_rad,
         tracks.polarity, tracks.bounds, tracks.row, tracks.column, reference, pixel, middle,
-        settings.least_points(table.row_aspect), filters.half, filters.begin,
+        rise, off, filters.half, filters.begin,
         filters.height, filters.first, filters.second, np.array(farthest), line,
     )  # fmt: skip
     return LineFits(

@@ -15,11 +15,14 @@ from numpy.typing import NDArray
 
 from detect.line_vector_kernels import LANES, WORD, add_products, slope_and_bend
 
+#: Up to here series of tangents and arc tangents are as good as these.
+_SMALL = 0.1
+
 
 @njit(cache=True, error_model="numpy")
 def _tan_and_secant(angle: float) -> tuple[float, float]:
     """Tangent and inverse cosine; by their series for the small angles of a chart."""
-    if abs(angle) > 0.1:
+    if abs(angle) > _SMALL:
         return math.tan(angle), 1.0 / math.cos(angle)
     q = angle * angle
     tangent = angle * (1.0 + q * (1.0 / 3.0 + q * (2.0 / 15.0 + q * (17.0 / 315.0))))
@@ -27,11 +30,9 @@ def _tan_and_secant(angle: float) -> tuple[float, float]:
     return tangent, secant
 
 
-@njit(cache=True, error_model="numpy")
-def _arctan(x: float) -> float:
-    """Arc tangent; by its series for small arguments."""
-    if abs(x) > 0.1:
-        return math.atan(x)
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _arctan_series(x: float) -> float:
+    """Arc tangent of small arguments, by its series."""
     q = x * x
     return x * (1.0 - q * (1.0 / 3.0 - q * (0.2 - q * (1.0 / 7.0 - q * (1.0 / 9.0)))))
 
@@ -43,7 +44,12 @@ def fit_eigenlines(
     bounds: NDArray[np.int64],
     row: NDArray[np.int32],
     column: NDArray[np.float64],
+    score: NDArray[np.float32],
+    least_points: int,
+    least_score: float,
 ) -> tuple[
+    NDArray[np.float64],
+    NDArray[np.float64],
     NDArray[np.float64],
     NDArray[np.float64],
     NDArray[np.float64],
@@ -57,8 +63,10 @@ def fit_eigenlines(
     ----------
     bearing, elevation_tan
         The table.
-    bounds, row, column
+    bounds, row, column, score
         The tracks (see `follow_edges`).
+    least_points, least_score : int, float
+        Tracks of fewer points, or of a smaller sum of scores, are left alone.
 
     Returns
     -------
@@ -67,12 +75,15 @@ def fit_eigenlines(
     pixel : (T,) float64
         Width of a column there (rad).
     line : (T, 2) float64
-        a, b of X = a + b Z along the larger eigenvalue's eigenvector; NaN for tracks of less than 3
-        points.
+        a, b of X = a + b Z along the larger eigenvalue's eigenvector; NaN, as what follows, for
+        tracks that are left alone or of less than 3 points.
     scatter_px : (T,) float64
         Root of the smaller eigenvalue of the points' covariance, pixels.
     middle, spread : (T,) float64
         Mean of the points' Z, and its variance.
+    rise, off : (P,) float64
+        Tangent of the elevation of each point, and its bearing from the chart's origin (rad); of
+        tracks that are not left alone.
     """
     count = len(bounds) - 1
     reference = np.empty(count)
@@ -81,13 +92,17 @@ def fit_eigenlines(
     scatter_px = np.empty(count)
     middle = np.empty(count)
     spread = np.empty(count)
+    rise = np.empty(len(row))
+    off = np.empty(len(row))
     width = bearing.shape[0]
     for t in range(len(bounds) - 1):
         begin, end = bounds[t], bounds[t + 1]
         n = end - begin
         mean_column = 0.0
+        total = 0.0
         for i in range(begin, end):
             mean_column += column[i]
+            total += score[i]
         j = min(max(int(mean_column / n + 0.5), 1), width - 2)
         phi = bearing[j]
         reference[t] = phi
@@ -95,6 +110,10 @@ def fit_eigenlines(
         line[t, 0] = np.nan
         line[t, 1] = np.nan
         scatter_px[t] = np.nan
+        middle[t] = np.nan
+        spread[t] = np.nan
+        if n < least_points or total < least_score:
+            continue
         sum_x = 0.0
         sum_z = 0.0
         sum_xx = 0.0
@@ -103,10 +122,10 @@ def fit_eigenlines(
         for i in range(begin, end):
             j = min(int(column[i]), width - 2)
             f = column[i] - j
-            off = (1.0 - f) * bearing[j] + f * bearing[j + 1] - phi
-            rise = (1.0 - f) * elevation_tan[row[i], j] + f * elevation_tan[row[i], j + 1]
-            x, secant = _tan_and_secant(off)
-            z = rise * secant
+            off[i] = (1.0 - f) * bearing[j] + f * bearing[j + 1] - phi
+            rise[i] = (1.0 - f) * elevation_tan[row[i], j] + f * elevation_tan[row[i], j + 1]
+            x, secant = _tan_and_secant(off[i])
+            z = rise[i] * secant
             sum_x += x
             sum_z += z
             sum_xx += x * x
@@ -127,7 +146,7 @@ def fit_eigenlines(
         line[t, 0] = mean_x - b * mean_z
         line[t, 1] = b
         scatter_px[t] = math.sqrt(max(smaller, 0.0)) / pixel[t]
-    return reference, pixel, line, scatter_px, middle, spread
+    return reference, pixel, line, scatter_px, middle, spread, rise, off
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"})
@@ -135,7 +154,6 @@ def refine_lines(
     image: NDArray[np.uint8],
     table_column: NDArray[np.float32],
     bearing: NDArray[np.float64],
-    elevation_tan: NDArray[np.float32],
     sign: NDArray[np.float64],
     bounds: NDArray[np.int64],
     row: NDArray[np.int32],
@@ -143,7 +161,8 @@ def refine_lines(
     reference: NDArray[np.float64],
     pixel: NDArray[np.float64],
     middle: NDArray[np.float64],
-    least_points: int,
+    rise: NDArray[np.float64],
+    point_off: NDArray[np.float64],
     half: NDArray[np.int64],
     begin_of: NDArray[np.int64],
     height_weights: NDArray[np.float32],
@@ -173,14 +192,12 @@ def refine_lines(
     ----------
     image : (H, W) uint8
         Grey values.
-    table_column, bearing, elevation_tan
+    table_column, bearing
         The table.
     sign, bounds, row, column
         The tracks (see `follow_edges`).
-    reference, pixel, middle
+    reference, pixel, middle, rise, point_off
         See `fit_eigenlines`.
-    least_points : int
-        Tracks with fewer points are left alone.
     half, begin_of, height_weights, first_weights, second_weights
         Filters (see `detect.line_step_filters.StepFilters`): of each step of Newton's method, and
         two whose contrasts are compared, a fine and a coarse one.
@@ -188,7 +205,7 @@ def refine_lines(
         How far a step may take the middle of a line, pixels; one that would go farther is not made,
         nor any after it.
     tracked_line : (T, 2) float64
-        a, b of the lines to begin with.
+        a, b of the lines to begin with; NaN for those that are left alone.
 
     Returns
     -------
@@ -215,6 +232,15 @@ def refine_lines(
     crossing = np.empty(height)
     by_a = np.empty(height)
     by_b = np.empty(height)
+    turn = np.empty(height)
+    height_of = np.empty(height)
+    turn_by_a = np.empty(height)
+    off = np.empty(height)
+    weight = np.empty(height)
+    first = np.empty(height)
+    second = np.empty(height)
+    at_pixel = np.empty(height, np.int64)
+    at_weight = np.empty(height, np.int64)
     # Sums of the fine and the coarse filter.
     heights = np.empty(2 * LANES, np.float32)
     for t in range(len(sign)):
@@ -222,31 +248,43 @@ def refine_lines(
         a = tracked_line[t, 0]
         b = tracked_line[t, 1]
         refined = False
-        if end - begin < least_points or not math.isfinite(a):
+        if not math.isfinite(a):
             continue
         phi = reference[t]
         n = end - begin
+        widest = 0.0
+        # Again in loops of which the first, the long one, becomes vectors.
+        for i in range(n):
+            # Z depends on X in second order only: one repetition settles it.
+            x = a + b * rise[begin + i]
+            z = rise[begin + i] * math.sqrt(1.0 + x * x)
+            x = a + b * z
+            widest = max(widest, abs(x))
+            turn[i] = _arctan_series(x)
+            height_of[i] = z
+            turn_by_a[i] = 1.0 / (1.0 + x * x)
+        if widest > _SMALL:
+            for i in range(n):
+                turn[i] = math.atan(a + b * height_of[i])
+        j = min(max(int(column[begin]), 1), width - 2)
+        columns_about = 2.0 / (bearing[j + 1] - bearing[j - 1])
         for i in range(n):
             v = row[begin + i]
-            near = column[begin + i]
-            j = min(max(int(near), 0), width - 2)
-            f = near - j
-            rise = (1.0 - f) * elevation_tan[v, j] + f * elevation_tan[v, j + 1]
-            # Z depends on X in second order only: one repetition settles it.
-            x = a + b * rise
-            z = rise * math.sqrt(1.0 + x * x)
-            x = a + b * z
-            wanted = phi + _arctan(x)
-            at = j + (wanted - bearing[j]) / (bearing[j + 1] - bearing[j])
+            # To a hundredth of a column; it decides which of them it lies between.
+            at = column[begin + i] + (turn[i] - point_off[begin + i]) * columns_about
             crossing[i] = math.nan
+            by_a[i] = 0.0
+            by_b[i] = 0.0
             if 0.0 <= at <= width - 1.0:
                 j = min(int(at), width - 2)
-                per_column = bearing[j + 1] - bearing[j]
-                at = (wanted - bearing[j]) / per_column
+                columns_per_rad = 1.0 / (bearing[j + 1] - bearing[j])
+                at = (phi + turn[i] - bearing[j]) * columns_per_rad
                 du_dc = table_column[v, j + 1] - table_column[v, j]
-                crossing[i] = table_column[v, j] + at * du_dc
-                by_a[i] = du_dc / (per_column * (1.0 + x * x))
-                by_b[i] = by_a[i] * z
+                # Beside it a vertical may have ended.
+                if math.isfinite(du_dc):
+                    crossing[i] = table_column[v, j] + at * du_dc
+                    by_a[i] = du_dc * columns_per_rad * turn_by_a[i]
+                    by_b[i] = by_a[i] * height_of[i]
         for step in range(len(farthest)):
             reach = half[step]
             hessian_aa = 0.0
@@ -257,30 +295,39 @@ def refine_lines(
             meat_aa = 0.0
             meat_ab = 0.0
             meat_bb = 0.0
-            used = 0
+            # In three loops, of which the compiler turns the first and the last into vectors.
+            shown = 0.0
             for i in range(n):
                 u = crossing[i]
-                if not (u > reach and u < width - 1 - reach):
-                    continue
+                inside = (u > reach) & (u < width - 1 - reach)
+                u = u if inside else float(reach)
                 whole = int(u)
                 node = int((u - whole) * subpixels)
-                first_sum, second_sum = slope_and_bend(
-                    grey_values, row[begin + i] * width + whole - reach + 1, first_weights,
-                    second_weights, begin_of[step] + node * 2 * reach, 2 * reach // WORD,
-                )  # fmt: skip
-                second = sign[t] * second_sum
                 # From the tabulated position to the crossing.
-                off = u - whole - (node + 0.5) / subpixels
-                first = sign[t] * first_sum + off * second
-                hessian_aa += second * by_a[i] * by_a[i]
-                hessian_ab += second * by_a[i] * by_b[i]
-                hessian_bb += second * by_b[i] * by_b[i]
-                gradient_a += first * by_a[i]
-                gradient_b += first * by_b[i]
-                meat_aa += first * first * by_a[i] * by_a[i]
-                meat_ab += first * first * by_a[i] * by_b[i]
-                meat_bb += first * first * by_b[i] * by_b[i]
-                used += 1
+                off[i] = u - whole - (node + 0.5) / subpixels
+                weight[i] = 1.0 if inside else 0.0
+                shown += weight[i]
+                at_pixel[i] = row[begin + i] * width + whole - reach + 1
+                at_weight[i] = begin_of[step] + node * 2 * reach
+            for i in range(n):
+                first[i], second[i] = slope_and_bend(
+                    grey_values, at_pixel[i], first_weights, second_weights, at_weight[i],
+                    2 * reach // WORD,
+                )  # fmt: skip
+            for i in range(n):
+                bend = sign[t] * weight[i] * second[i]
+                slope = sign[t] * weight[i] * first[i] + off[i] * bend
+                hessian_aa += bend * by_a[i] * by_a[i]
+                hessian_ab += bend * by_a[i] * by_b[i]
+                hessian_bb += bend * by_b[i] * by_b[i]
+                slope_a = slope * by_a[i]
+                slope_b = slope * by_b[i]
+                gradient_a += slope_a
+                gradient_b += slope_b
+                meat_aa += slope_a * slope_a
+                meat_ab += slope_a * slope_b
+                meat_bb += slope_b * slope_b
+            used = int(shown)
             determinant = hessian_aa * hessian_bb - hessian_ab * hessian_ab
             # No maximum here at this scale: what the coarser ones found stands.
             if used < 5 or not (hessian_aa < 0.0 and determinant > 1e-12 * hessian_aa * hessian_bb):

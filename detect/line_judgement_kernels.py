@@ -99,10 +99,10 @@ def judge_tracks(
         gap = max(horizon_row[near] - row[end - 1], row[begin] - horizon_row[near]) * row_aspect
         if end - begin < least_points:
             fate[t] = SHORT
-        elif not math.isfinite(line[t, 0]):
-            fate[t] = NO_MAXIMUM
         elif not evidence[t] >= least_evidence:
             fate[t] = LITTLE_EVIDENCE
+        elif not math.isfinite(line[t, 0]):
+            fate[t] = NO_MAXIMUM
         elif not shift_px[t] <= largest_shift_px:
             fate[t] = OFF_THE_TRACK
         elif not scatter_px[t] <= largest_scatter_px:
