@@ -144,6 +144,8 @@ class Poses:
 class Score:
     """Hold poses against the truth: errors, and whether the covariances are right.
 
+    Errors are absolute (ATE) and, with --relations or --rpe-step, relative as well (RPE).
+
     Example: groundtruth score poses.csv truth.csv
 
     Parameters
@@ -158,6 +160,13 @@ class Score:
         Nothing is interpolated across longer gaps (s).
     align : bool
         Move the poses rigidly onto the truth first, for solutions with a world of their own.
+    relations : Path
+        Relations between two times (t_i, t_j, x, y, z, roll, pitch, yaw): the poses are held
+        against these too.
+    rpe_step : int
+        Relative errors from each of the compared poses to the one so many later.
+    rpe_longest_s : float
+        Such steps that take longer, as across a gap, do not count (s).
     json : Path
         Write the figures as JSON.
     force : bool
@@ -169,6 +178,9 @@ class Score:
     interpolate: Literal["truth", "poses"] = "truth"
     largest_gap_s: float = 0.5
     align: bool = False
+    relations: MaybePath = None
+    rpe_step: MaybeInt = None
+    rpe_longest_s: float = float("inf")
     json: MaybePath = None
     force: bool = False
 

@@ -167,18 +167,20 @@ def read_all_frames(runs: Sequence[Path], network: calibration.Network) -> list[
 
 
 def _score(command: Score) -> int:
-    from groundtruth.scoring import compare_streams
+    from groundtruth.relative_errors import read_relations, score_relations, score_steps
+    from groundtruth.scoring import matched_streams, moved_poses, planar_alignment, score_poses
     from groundtruth.streams import read_planar_poses
 
     check_outputs((command.json,), command.force)
-    poses, truth = read_planar_poses(command.poses), read_planar_poses(command.truth)
-    score = compare_streams(
-        poses,
-        truth,
-        largest_gap_s=command.largest_gap_s,
-        interpolate=command.interpolate,
-        align=command.align,
+    solution, truth = read_planar_poses(command.poses), read_planar_poses(command.truth)
+    relations = None if command.relations is None else read_relations(command.relations)
+    poses, truth, unmatched = matched_streams(
+        solution, truth, largest_gap_s=command.largest_gap_s, interpolate=command.interpolate
     )
+    alignment = planar_alignment(poses, truth) if command.align else None
+    if alignment is not None:
+        poses = moved_poses(poses, alignment)
+    score = score_poses(poses, truth, unmatched)
     print(f"poses             {score.poses} ({score.unmatched} without the other at their time)")
     print(
         f"position error    mean {1e3 * score.position_mean_m:.2f} mm, sigma "
@@ -196,8 +198,25 @@ def _score(command: Score) -> int:
         )
     else:
         print("normalised error squared / dof  none: no covariance that can be inverted")
+    relative = {}
+    if relations is not None:
+        relative["relations"] = score_relations(solution, relations, command.largest_gap_s)
+    if command.rpe_step is not None:
+        steps = score_steps(poses, truth, command.rpe_step, command.rpe_longest_s)
+        relative[f"steps of {command.rpe_step}"] = steps
+    for name, figures in relative.items():
+        print(
+            f"relative error, {name}: {figures.pairs} pairs ({figures.unmatched} left out), "
+            f"rmse {1e3 * figures.position_rmse_m:.2f} mm, median "
+            f"{1e3 * figures.position_median_m:.2f}, max {1e3 * figures.position_max_m:.2f}; "
+            f"rmse {math.degrees(figures.angle_rmse_rad):.3f} deg"
+        )
     if command.json is not None:
-        values = {k: v if v == v else None for k, v in asdict(score).items()}
+        values: dict[str, Any] = {k: v if v == v else None for k, v in asdict(score).items()}
+        if alignment is not None:
+            values["alignment"] = alignment.tolist()
+        if relative:
+            values["relative"] = {name: asdict(figures) for name, figures in relative.items()}
         _write_json(command.json, values, command.force)
     return 0
 

@@ -28,6 +28,9 @@ class PoseScore:
         Of the distances from the truth; sigma with N - 1.
     angle_mean_rad, angle_sigma_rad, angle_max_rad : float
         Of the signed differences of heading; the largest without sign.
+    angle_abs_mean_rad : float
+        Mean of the differences without sign.
+    position_median_m : float
     normalised : int
         Poses whose covariance could be inverted.
     normalised_error : float
@@ -44,6 +47,8 @@ class PoseScore:
     angle_mean_rad: float
     angle_sigma_rad: float
     angle_max_rad: float
+    angle_abs_mean_rad: float
+    position_median_m: float
     normalised: int
     normalised_error: float
 
@@ -92,11 +97,16 @@ def interpolate_poses(
     return PlanarPoses(times_s[known], between, covariances), known
 
 
-def align_poses(poses: PlanarPoses, truth: PlanarPoses) -> PlanarPoses:
-    """Poses moved rigidly in the plane, without scale, so that their positions fit the truth best.
+def planar_alignment(poses: PlanarPoses, truth: PlanarPoses) -> FloatArray:
+    """(3,) rigid motion x, y (m), theta (rad) that takes poses' positions onto the truth's best.
 
-    Both have the same times. Least squares in the plane (Horn 1987) cannot mirror, as alignments in
-    space can.
+    Both have the same times. Least squares in the plane (Horn 1987), without scale, cannot mirror,
+    as alignments in space can.
+
+    Raises
+    ------
+    GroundTruthError
+        If there are fewer than two poses.
     """
     if len(poses) < 2:
         raise GroundTruthError(f"{len(poses)} poses: expected 2 or more to align them")
@@ -104,11 +114,22 @@ def align_poses(poses: PlanarPoses, truth: PlanarPoses) -> PlanarPoses:
     from_a, from_b = a - a.mean(axis=0), b - b.mean(axis=0)
     across = np.sum(from_a[:, 0] * from_b[:, 1] - from_a[:, 1] * from_b[:, 0])
     angle = float(np.arctan2(across, np.sum(from_a * from_b)))
-    c, s = np.cos(angle), np.sin(angle)
-    rotation = np.array([[c, -s], [s, c]])
+    return np.array([*(b.mean(axis=0) - _rotation(angle) @ a.mean(axis=0)), angle])
+
+
+def align_poses(poses: PlanarPoses, truth: PlanarPoses) -> PlanarPoses:
+    """Poses moved rigidly in the plane, without scale, so that their positions fit the truth best.
+
+    Both have the same times (see `planar_alignment`).
+    """
+    return moved_poses(poses, planar_alignment(poses, truth))
+
+
+def moved_poses(poses: PlanarPoses, motion: FloatArray) -> PlanarPoses:
+    """Poses, and their covariances, after a rigid motion (x, y, theta) of the world."""
     turn = np.eye(3)
-    turn[:2, :2] = rotation
-    moved = np.column_stack([from_a @ rotation.T + b.mean(axis=0), poses.poses[:, 2] + angle])
+    turn[:2, :2] = _rotation(float(motion[2]))
+    moved = poses.poses @ turn.T + motion
     covariances = None
     if poses.covariances is not None:
         covariances = turn @ poses.covariances @ turn.T
@@ -161,6 +182,8 @@ def score_poses(poses: PlanarPoses, truth: PlanarPoses, unmatched: int = 0) -> P
         float(error[:, 2].mean()),
         _sigma(error[:, 2]),
         float(np.abs(error[:, 2]).max()),
+        float(np.abs(error[:, 2]).mean()),
+        float(np.median(distance)),
         count,
         normalised,
     )
@@ -195,6 +218,30 @@ def compare_streams(
     GroundTruthError
         If no pose has a truth at its time.
     """
+    mine, theirs, unmatched = matched_streams(
+        poses, truth, largest_gap_s=largest_gap_s, interpolate=interpolate
+    )
+    if align:
+        mine = align_poses(mine, theirs)
+    return score_poses(mine, theirs, unmatched)
+
+
+def matched_streams(
+    poses: PlanarPoses,
+    truth: PlanarPoses,
+    *,
+    largest_gap_s: float = 0.5,
+    interpolate: str = "truth",
+) -> tuple[PlanarPoses, PlanarPoses, int]:
+    """Both streams at common times, and how many times had to be left out.
+
+    See `compare_streams` for the parameters.
+
+    Raises
+    ------
+    GroundTruthError
+        If no pose has a truth at its time.
+    """
     still, moving = (poses, truth) if interpolate == "truth" else (truth, poses)
     at_times, known = interpolate_poses(moving, still.times_s, largest_gap_s)
     kept = PlanarPoses(
@@ -209,9 +256,12 @@ def compare_streams(
             f"{poses.times_s[-1]:.3f} s, truth from {truth.times_s[0]:.3f} to "
             f"{truth.times_s[-1]:.3f} s, gaps of at most {largest_gap_s:g} s interpolated"
         )
-    if align:
-        mine = align_poses(mine, theirs)
-    return score_poses(mine, theirs, int((~known).sum()))
+    return mine, theirs, int((~known).sum())
+
+
+def _rotation(angle: float) -> FloatArray:
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s], [s, c]])
 
 
 def _sigma(values: FloatArray) -> float:

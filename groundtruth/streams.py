@@ -220,6 +220,36 @@ def read_times(path: str | os.PathLike[str]) -> dict[str, float]:
     return times
 
 
+def read_rows_of_numbers(path: str | os.PathLike[str], columns: int, expected: str) -> FloatArray:
+    """Read rows of numbers between commas or blanks; blank lines and `#` comments are skipped.
+
+    Parameters
+    ----------
+    path : path
+    columns : int
+        Numbers in every row.
+    expected : str
+        What they are, for messages.
+
+    Returns
+    -------
+    (N, columns) float64
+
+    Raises
+    ------
+    StreamError
+        If the file cannot be read, is empty or a row is malformed; it names file and line.
+    """
+    rows: list[list[float]] = []
+    for line, words in _rows(path):
+        if len(words) != columns:
+            raise StreamError(path, line, f"{len(words)} numbers: expected {columns}: {expected}")
+        rows.append(_numbers(path, line, words))
+    if not rows:
+        raise StreamError(path, None, f"no rows in it: expected {expected}")
+    return np.array(rows)
+
+
 def _rows(path: str | os.PathLike[str]) -> Iterator[tuple[int, list[str]]]:
     """Yield line numbers and words, without comments and blank lines."""
     try:
