@@ -215,6 +215,8 @@ class Associate:
         Then look for loops by fitting local maps of landmarks to each other.
     gate_probability : float
         Share of right rows that pass the gate.
+    sigma_scale : float
+        Factor on the rows' standard deviations; above 1 where the file's are optimistic.
     noise : several floats
         Score once more with so much noise added to the measurements (factor on their standard
         deviation).
@@ -222,7 +224,7 @@ class Associate:
         Of that noise.
     output : Path
         The landmark file to write; by default associated.circles (or .lines) in the run folder.
-        The scores go into a .json beside it.
+        With both kinds two files, which differ in the suffix. The scores go into a .json beside.
     force : bool
         Replace existing files.
     """
@@ -235,6 +237,7 @@ class Associate:
     method: Literal["nearest", "joint"] = "joint"
     map_level: bool = True
     gate_probability: float = 0.999
+    sigma_scale: float = 1.0
     noise: tuple[float, ...] = ()
     seed: int = 1
     output: Annotated[MaybePath, arg(aliases=["-o"])] = None

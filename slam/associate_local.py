@@ -1,0 +1,375 @@
+"""Association from frame to frame, against a small map that travels with the robot.
+
+The map is robot-centred: its state are the landmarks seen of late *in the frame of the robot now*,
+with their joint covariance, and no pose. A movement transforms them and adds odometry's error to
+all of them alike; a row measures its landmark directly. So nothing depends on how far the robot has
+drifted, the linearisation is about what is in view, and the innovations of a frame carry the
+correlation that joint compatibility needs (J. A. Castellanos, R. Martinez-Cantin, J. D. Tardos,
+J. Neira, "Robocentric map joining", Robotics and Autonomous Systems 55, 2007).
+
+A disc is kept as (x, y); a vertical line, of which a row measures only the bearing, as bearing and
+inverse distance from the camera, which is near Gaussian from the first sight on (J. Civera,
+A. J. Davison, J. M. M. Montiel, "Inverse depth parametrization for monocular SLAM", IEEE
+Transactions on Robotics 24(5), 2008).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from landmarks import wrap_angle
+from slam.compatibility import Pairing, joint_compatible, nearest_compatible
+from slam.motion import rotation
+from slam.recording import CircleRows, LineRows, Recording
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+Method = Literal["nearest", "joint"]
+
+# Of the first sight of a line: half a metre to infinity within two standard deviations.
+_INVERSE_DISTANCE_PRIOR = (0.4, 0.4)
+
+
+@dataclass(frozen=True)
+class LocalSettings:
+    """How rows are associated from frame to frame.
+
+    Attributes
+    ----------
+    method : str
+        `nearest` or `joint`; see `slam.compatibility`.
+    gate_probability : float
+        Share of right rows (or sets of rows) that pass the gate.
+    sigma_scale : float
+        Factor on the rows' standard deviations, where the file's are known to be optimistic.
+    forget_frames : int
+        A landmark unseen for longer is forgotten.
+    forget_sigma_m : float
+        So is a disc whose place relative to the robot has become less certain than this.
+    most_landmarks : int
+        Of each kind only so many are kept, those seen last.
+    most_nodes : int
+        Bound of the joint search; see `slam.compatibility.joint_compatible`.
+    """
+
+    method: Method = "joint"
+    gate_probability: float = 0.999
+    sigma_scale: float = 1.0
+    forget_frames: int = 60
+    forget_sigma_m: float = 0.35
+    most_landmarks: int = 40
+    most_nodes: int = 3000
+
+
+@dataclass(eq=False)
+class LocalMap:
+    """Landmarks in the frame of the robot.
+
+    Attributes
+    ----------
+    mean : (m, 2) float64
+        Discs: x, y (m). Lines: bearing (rad) and inverse distance (1/m) from the camera.
+    covariance : (2 m, 2 m) float64
+    is_line : (m,) bool
+    number : (m,) int64
+        What the landmark is called; discs and lines are counted separately.
+    last_frame : (m,) int64
+        When it was seen last.
+    """
+
+    mean: FloatArray
+    covariance: FloatArray
+    is_line: NDArray[np.bool_]
+    number: IntArray
+    last_frame: IntArray
+
+    @classmethod
+    def empty(cls) -> LocalMap:
+        """A map without landmarks."""
+        whole = np.zeros(0, dtype=np.int64)
+        return cls(np.zeros((0, 2)), np.zeros((0, 0)), np.zeros(0, dtype=np.bool_), whole, whole)
+
+
+@dataclass(frozen=True, eq=False)
+class LocalAssociation:
+    """What was found from frame to frame.
+
+    Attributes
+    ----------
+    circle_labels, line_labels : (n,) int64
+        The landmark of each row, numbered from 0 in order of first sight.
+    line_places : (L, 2) float64
+        Of each line where it was last known to stand in the frame of the robot (m); NaN if that
+        was behind the camera or beyond 50 m.
+    line_frames : (L,) int64
+        After which step.
+    incomplete : int
+        Frames whose joint search was cut short.
+    """
+
+    circle_labels: IntArray
+    line_labels: IntArray
+    line_places: FloatArray
+    line_frames: IntArray
+    incomplete: int
+
+
+def associate_locally(
+    recording: Recording,
+    settings: LocalSettings | None = None,
+    *,
+    camera_xy: tuple[float, float] = (0.0, 0.0),
+    progress: Callable[[int], None] | None = None,
+) -> LocalAssociation:
+    """Give the rows of a run labels, frame by frame; IDs in the file are not looked at.
+
+    Parameters
+    ----------
+    recording : Recording
+        The run.
+    settings : LocalSettings, optional
+        By default as `LocalSettings` says.
+    camera_xy : (2,)
+        The camera's centre in the robot frame (m): bearings of lines are from there.
+    progress : callable, optional
+        Told how many frames are done.
+
+    Returns
+    -------
+    LocalAssociation
+    """
+    setting = settings or LocalSettings()
+    circles, lines = recording.circles, recording.lines
+    circle_labels = np.full(len(circles), -1, dtype=np.int64)
+    line_labels = np.full(len(lines), -1, dtype=np.int64)
+    circle_starts = np.searchsorted(circles.frame, np.arange(len(recording) + 1))
+    line_starts = np.searchsorted(lines.frame, np.arange(len(recording) + 1))
+    places: list[FloatArray] = []
+    frames: list[int] = []
+    local = LocalMap.empty()
+    counts = [0, 0]
+    incomplete = 0
+    for frame in range(len(recording)):
+        local = moved(local, recording.steps[frame], recording.step_covariance[frame], camera_xy)
+        local = _kept(local, frame, setting)
+        for is_line, starts, labels in (
+            (False, circle_starts, circle_labels),
+            (True, line_starts, line_labels),
+        ):
+            first, last = starts[frame], starts[frame + 1]
+            if first == last:
+                continue
+            seen, noise = _measured(circles, lines, slice(first, last), is_line, setting)
+            local, found, complete = _observed(local, frame, seen, noise, is_line, counts, setting)
+            incomplete += not complete
+            labels[first:last] = found
+        frames += [frame] * (counts[1] - len(frames))
+        places += [np.full(2, np.nan)] * (counts[1] - len(places))
+        for place, number in zip(*_line_places(local, frame, camera_xy)):
+            places[number], frames[number] = place, frame
+        if progress:
+            progress(frame + 1)
+    return LocalAssociation(
+        circle_labels,
+        line_labels,
+        np.array(places).reshape(-1, 2),
+        np.array(frames, dtype=np.int64),
+        incomplete,
+    )
+
+
+def moved(
+    local: LocalMap, step: FloatArray, step_covariance: FloatArray, camera_xy: tuple[float, float]
+) -> LocalMap:
+    """The map in the frame of the robot after a step.
+
+    Parameters
+    ----------
+    local : LocalMap
+        In the frame before it.
+    step : (3,) float64
+        dx, dy (m), dphi (rad).
+    step_covariance : (3, 3) float64
+        Of it.
+    camera_xy : (2,)
+        The camera's centre in the robot frame (m).
+
+    Returns
+    -------
+    LocalMap
+    """
+    m = len(local.mean)
+    if m == 0:
+        return local
+    turn = rotation(step[2])
+    mean = np.empty((m, 2))
+    by_landmark = np.empty((m, 2, 2))
+    by_step = np.empty((m, 2, 3))
+
+    discs = ~local.is_line
+    now = (local.mean[discs] - step[:2]) @ turn
+    mean[discs] = now
+    by_landmark[discs] = turn.T
+    by_step[discs, :, :2] = -turn.T
+    by_step[discs, 0, 2], by_step[discs, 1, 2] = now[:, 1], -now[:, 0]
+
+    if np.any(local.is_line):
+        bearing, inverse = local.mean[local.is_line].T
+        camera = np.asarray(camera_xy)
+        shift = step[:2] + turn @ camera - camera
+        sin, cos = np.sin(bearing), np.cos(bearing)
+        # Where the line is from the camera's new place, times the inverse distance; old axes.
+        seen = np.stack([sin, -cos], -1) - inverse[:, None] * shift
+        squared = np.sum(seen**2, axis=-1)
+        length = np.sqrt(squared)
+        mean[local.is_line, 0] = wrap_angle(np.arctan2(seen[:, 0], -seen[:, 1]) - step[2])
+        mean[local.is_line, 1] = inverse / length
+        bearing_by_seen = np.stack([-seen[:, 1], seen[:, 0]], -1) / squared[:, None]
+        inverse_by_seen = -(inverse / (squared * length))[:, None] * seen
+        by_seen = np.stack([bearing_by_seen, inverse_by_seen], axis=1)
+        seen_by_landmark = np.stack(
+            [np.stack([cos, sin], -1), np.broadcast_to(-shift, seen.shape)], axis=-1
+        )
+        turned = turn @ camera
+        seen_by_turn = -inverse[:, None] * np.array([-turned[1], turned[0]])
+        jacobian = by_seen @ seen_by_landmark
+        jacobian[:, 1, 1] += 1.0 / length
+        by_landmark[local.is_line] = jacobian
+        by_step[local.is_line, :, :2] = -inverse[:, None, None] * by_seen
+        by_step[local.is_line, :, 2] = np.einsum("nab,nb->na", by_seen, seen_by_turn)
+        by_step[local.is_line, 0, 2] -= 1.0
+
+    blocks = local.covariance.reshape(m, 2, m, 2)
+    blocks = np.einsum("iab,ibjc->iajc", by_landmark, blocks)
+    covariance = np.einsum("iajb,jcb->iajc", blocks, by_landmark).reshape(2 * m, 2 * m)
+    stacked = by_step.reshape(2 * m, 3)
+    covariance = covariance + stacked @ step_covariance @ stacked.T
+    return LocalMap(mean, covariance, local.is_line, local.number, local.last_frame)
+
+
+def _measured(
+    circles: CircleRows, lines: LineRows, rows: slice, is_line: bool, setting: LocalSettings
+) -> tuple[FloatArray, FloatArray]:
+    """What rows of a frame measure (n, d), and their covariances (n, d, d)."""
+    if is_line:
+        variance = (setting.sigma_scale * lines.sigma_rad[rows]) ** 2
+        return lines.bearing_rad[rows][:, None], variance[:, None, None]
+    return circles.xy[rows], setting.sigma_scale**2 * circles.covariance[rows]
+
+
+def _observed(
+    local: LocalMap,
+    frame: int,
+    seen: FloatArray,
+    noise: FloatArray,
+    is_line: bool,
+    counts: list[int],
+    setting: LocalSettings,
+) -> tuple[LocalMap, IntArray, bool]:
+    """The map after rows of one kind, and their labels; new landmarks raise `counts`."""
+    width = seen.shape[1]
+    candidates = np.flatnonzero(local.is_line == is_line)
+    index = (2 * candidates[:, None] + np.arange(width)).reshape(-1)
+    innovations = seen[:, None] - local.mean[candidates, :width][None]
+    if is_line:
+        innovations = wrap_angle(innovations)
+    pairing = _pairing(innovations, local.covariance[np.ix_(index, index)], noise, setting)
+    rows = np.flatnonzero(pairing.landmark >= 0)
+    paired = pairing.landmark[rows]
+    mean, covariance = local.mean, local.covariance
+    last_frame = local.last_frame.copy()
+    if len(rows):
+        chosen = (2 * candidates[paired][:, None] + np.arange(width)).reshape(-1)
+        innovation_covariance = covariance[np.ix_(chosen, chosen)]
+        for k, row in enumerate(rows):
+            block = slice(k * width, (k + 1) * width)
+            innovation_covariance[block, block] += noise[row]
+        gain = np.linalg.solve(innovation_covariance, covariance[chosen]).T
+        change = gain @ innovations[rows, paired].reshape(-1)
+        mean = mean + change.reshape(-1, 2)
+        covariance = covariance - gain @ covariance[chosen]
+        covariance = 0.5 * (covariance + covariance.T)
+        last_frame[candidates[paired]] = frame
+
+    fresh = np.flatnonzero(pairing.landmark < 0)
+    kind = int(is_line)
+    labels = np.empty(len(seen), dtype=np.int64)
+    labels[rows] = local.number[candidates[paired]]
+    labels[fresh] = counts[kind] + np.arange(len(fresh))
+    counts[kind] += len(fresh)
+    m, k = len(mean), len(fresh)
+    grown = np.zeros((2 * (m + k), 2 * (m + k)))
+    grown[: 2 * m, : 2 * m] = covariance
+    added = np.empty((k, 2))
+    added[:, :width] = seen[fresh]
+    if is_line:
+        added[:, 1] = _INVERSE_DISTANCE_PRIOR[0]
+    for number, row in enumerate(fresh):
+        at = 2 * (m + number)
+        grown[at : at + width, at : at + width] = noise[row]
+        if is_line:
+            grown[at + 1, at + 1] = _INVERSE_DISTANCE_PRIOR[1] ** 2
+    local = LocalMap(
+        np.concatenate([mean, added]),
+        grown,
+        np.concatenate([local.is_line, np.full(k, is_line)]),
+        np.concatenate([local.number, labels[fresh]]),
+        np.concatenate([last_frame, np.full(k, frame)]),
+    )
+    return local, labels, pairing.complete
+
+
+def _pairing(
+    innovations: FloatArray, predicted: FloatArray, noise: FloatArray, setting: LocalSettings
+) -> Pairing:
+    if setting.method == "nearest":
+        return nearest_compatible(
+            innovations, predicted, noise, gate_probability=setting.gate_probability
+        )
+    return joint_compatible(
+        innovations,
+        predicted,
+        noise,
+        gate_probability=setting.gate_probability,
+        most_nodes=setting.most_nodes,
+    )
+
+
+def _kept(local: LocalMap, frame: int, setting: LocalSettings) -> LocalMap:
+    """The map without what was not seen for long, or is no longer certain enough."""
+    m = len(local.mean)
+    if m == 0:
+        return local
+    variance = np.diagonal(local.covariance).reshape(m, 2).sum(axis=1)
+    keep = frame - local.last_frame <= setting.forget_frames
+    keep &= local.is_line | (variance <= setting.forget_sigma_m**2)
+    for kind in (False, True):
+        some = np.flatnonzero(keep & (local.is_line == kind))
+        if len(some) > setting.most_landmarks:
+            oldest_first = some[np.argsort(local.last_frame[some], kind="stable")]
+            keep[oldest_first[: -setting.most_landmarks]] = False
+    if np.all(keep):
+        return local
+    index = np.flatnonzero(np.repeat(keep, 2))
+    return LocalMap(
+        local.mean[keep],
+        local.covariance[np.ix_(index, index)],
+        local.is_line[keep],
+        local.number[keep],
+        local.last_frame[keep],
+    )
+
+
+def _line_places(
+    local: LocalMap, frame: int, camera_xy: tuple[float, float]
+) -> tuple[FloatArray, IntArray]:
+    """Where the lines seen in this frame stand in the robot frame, and their numbers."""
+    some = local.is_line & (local.last_frame == frame) & (local.mean[:, 1] > 0.02)
+    bearing, inverse = local.mean[some].T
+    direction = np.stack([np.sin(bearing), -np.cos(bearing)], axis=-1)
+    return direction / inverse[:, None] + np.asarray(camera_xy), local.number[some]

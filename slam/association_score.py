@@ -1,0 +1,103 @@
+"""How well labels found for a run's rows agree with the IDs that the file has."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+IntArray = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class AssociationScore:
+    """Labels against the file's IDs; rows without ID are left out.
+
+    Attributes
+    ----------
+    rows : int
+        Rows that were scored.
+    true_landmarks, found_landmarks : int
+        Different IDs, and different labels, among them.
+    pair_precision : float
+        Of the pairs of rows with one label, the share that shows one landmark; 1 without pairs.
+    pair_recall : float
+        Of the pairs of rows of one landmark, the share that has one label; 1 without pairs.
+    right_rows : float
+        Share of rows whose label is that of their landmark, where labels and landmarks are matched
+        one to one so that this share is largest. A row with several IDs may be any of them.
+    wrong_merges : int
+        Labels in excess: for each label how many landmarks it has taken in besides its first.
+    splits : int
+        For each landmark how many labels its rows have besides the first.
+    """
+
+    rows: int
+    true_landmarks: int
+    found_landmarks: int
+    pair_precision: float
+    pair_recall: float
+    right_rows: float
+    wrong_merges: int
+    splits: int
+
+
+def score_association(labels: IntArray, ids: Sequence[tuple[int, ...]]) -> AssociationScore:
+    """Score labels.
+
+    Two rows show one landmark where they have an ID in common. For `wrong_merges` and `splits`,
+    and for the one-to-one matching, a row with several IDs counts as the one among them that most
+    rows of its label have.
+
+    Parameters
+    ----------
+    labels : (n,) int64
+        What was found, at least 0.
+    ids : sequence of n tuples of int
+        The file's IDs of each row; empty where unknown.
+
+    Returns
+    -------
+    AssociationScore
+    """
+    from scipy.optimize import linear_sum_assignment
+    from scipy.sparse import csr_array
+
+    known = [k for k, listed in enumerate(ids) if listed]
+    names = {name: k for k, name in enumerate(sorted({i for k in known for i in ids[k]}))}
+    _, label = np.unique(np.asarray(labels, dtype=np.int64)[known], return_inverse=True)
+    row = np.array([n for n, k in enumerate(known) for _ in ids[k]], dtype=np.int64)
+    column = np.array([names[i] for k in known for i in ids[k]], dtype=np.int64)
+    count = len(known)
+    found = int(label.max()) + 1 if count else 0
+
+    listed = csr_array((np.ones(len(row)), (row, column)), shape=(count, len(names)))
+    labelled = csr_array((np.ones(count), (np.arange(count), label)), shape=(count, found))
+    one_landmark = (listed @ listed.T) > 0
+    one_label = (labelled @ labelled.T) > 0
+    both = one_landmark.multiply(one_label)
+    of_landmark, of_label, right = (
+        (matrix.nnz - count) // 2 for matrix in (one_landmark, one_label, both)
+    )
+
+    # What each row counts as: the ID of its own that most rows of its label have.
+    votes = np.asarray((labelled.T @ listed).todense()).reshape(found, len(names))
+    chosen = np.zeros(count, dtype=np.int64)
+    for n, k in enumerate(known):
+        own = sorted(names[i] for i in ids[k])
+        chosen[n] = own[int(np.argmax(votes[label[n], own]))]
+    cells = np.zeros((found, len(names)), dtype=np.int64)
+    np.add.at(cells, (label, chosen), 1)
+    matched = linear_sum_assignment(cells, maximize=True)
+    return AssociationScore(
+        rows=count,
+        true_landmarks=len(set(chosen.tolist())),
+        found_landmarks=found,
+        pair_precision=right / of_label if of_label else 1.0,
+        pair_recall=right / of_landmark if of_landmark else 1.0,
+        right_rows=float(cells[matched].sum() / count) if count else 1.0,
+        wrong_merges=int(np.sum(np.count_nonzero(cells, axis=1) - 1)),
+        splits=int(np.sum(np.maximum(np.count_nonzero(cells, axis=0) - 1, 0))),
+    )

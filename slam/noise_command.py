@@ -1,0 +1,34 @@
+"""``slam noise``: a run's landmark file with noise added."""
+
+from __future__ import annotations
+
+import sys
+
+from landmarks import read_rows, write_rows
+from slam.noise import AddedNoise, noisy_rows
+from slam.options import Noise
+from slam.recording import landmark_file
+
+
+def perform(options: Noise) -> int:
+    """Carry the command out; returns the exit code.
+
+    Raises
+    ------
+    SlamError, landmarks.LandmarkFileError, storage.OutputExistsError, OSError
+        If the file cannot be read or written, or a setting makes no sense.
+    """
+    noise = AddedNoise(
+        disc_m=options.sigma,
+        bearing_rad=options.bearing_sigma,
+        step_m=options.step_sigma,
+        turn_rad=options.turn_sigma,
+        seed=options.seed,
+    )
+    source = options.run
+    if source.is_dir():
+        source = landmark_file(source, ".lines" if options.lines else ".circles", options.stem)
+    target = options.output or source.with_name(f"noisy{source.suffix}")
+    write_rows(target, noisy_rows(read_rows(source), noise), overwrite=options.force)
+    print(f"{target}: {noise.comment if not noise.nothing else 'no noise added'}", file=sys.stderr)
+    return 0
