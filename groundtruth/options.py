@@ -66,6 +66,8 @@ class Laser:
         Farthest that a reading may lie from the robot's outline (m).
     keep : float
         Share of the best matches that counts.
+    average : int
+        Sets of scans that each written pose rests on; no set is used twice.
     output : Path
         Poses to write (t, x, y, theta and 9 of covariance); by default laser.csv in the session.
         An account of every set of scans goes into a .jsonl, settings and version into a .json
@@ -78,6 +80,7 @@ class Laser:
     scanners: MaybePath = None
     gate_m: float = 0.2
     keep: float = 0.95
+    average: int = 6
     output: Annotated[MaybePath, arg(aliases=["-o"])] = None
     force: bool = False
 
@@ -143,6 +146,8 @@ class Fuse:
         Standard deviation of odometry's heading per square root of a radian turned (rad).
     turn_per_metre_sigma : float
         The same per square root of a metre driven (rad).
+    learn_noise : bool
+        Scale these by what makes the measurements likeliest.
     gate_probability : float
         Share of right poses that pass the gate.
     covariance_scale : two floats
@@ -161,6 +166,7 @@ class Fuse:
     distance_sigma: float = 0.02
     turn_sigma: float = 0.02
     turn_per_metre_sigma: float = 0.01
+    learn_noise: bool = True
     gate_probability: float = 0.9999
     covariance_scale: tuple[float, float] = (1.0, 1.0)
     output: Annotated[Path, arg(aliases=["-o"])] = Path("fused.csv")

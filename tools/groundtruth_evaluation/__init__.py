@@ -1,0 +1,1 @@
+"""How good ground truth is: studies on real logs and on simulated sessions."""
