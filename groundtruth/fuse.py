@@ -1,8 +1,10 @@
 """Fusion of odometry with ground truths: Kalman filter forward, smoothing backward (RAWSEEDS D2.1).
 
-Odometry is the control, poses from laser and markers are the measurements. The nodes are the
-odometry's times and the measurements' own, between which odometry is interpolated linearly; so no
-measurement is interpolated, which would make two of one and count the same noise twice.
+Odometry is the control, poses from laser and markers are the measurements. What odometry is off by
+systematically (a share of turns and ways, a bend) is estimated along, since it is what decides how
+far a gap can be bridged; how much it errs at random is what makes the measurements likeliest. The
+nodes are the odometry's times and the measurements' own, between which odometry is interpolated
+linearly; so no measurement is interpolated, which would count the same noise twice.
 """
 
 from __future__ import annotations
@@ -13,11 +15,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
 from scipy.stats import chi2
 
 from groundtruth.errors import GroundTruthError
 from groundtruth.scoring import interpolate_poses, wrapped
-from groundtruth.smoother_kernels import filter_forward, smooth_backward
+from groundtruth.smoother_kernels import STATE, filter_forward, smooth_backward
 from groundtruth.streams import RAWSEEDS_ROUNDING, PlanarPoses
 
 FloatArray = NDArray[np.float64]
@@ -27,7 +30,21 @@ FloatArray = NDArray[np.float64]
 _CREEP_M2_PER_S = (1e-4) ** 2
 _CREEP_RAD2_PER_S = (1e-4) ** 2
 _RESTART_AFTER = 40
-_RESTART_COVARIANCE = np.diag([25.0, 25.0, math.pi**2])
+_RESTART_VARIANCES = np.array([25.0, 25.0, math.pi**2])
+# The factors on odometry's deviations that are tried, and over how many nodes.
+_NOISE_FACTORS = (0.05, 20.0)
+_MOST_NODES_TO_LEARN_FROM = 30_000
+_LEARNING_ROUNDS = 2
+
+
+_DEVIATIONS = (
+    "distance_sigma",
+    "turn_sigma",
+    "turn_per_metre_sigma",
+    "turn_scale_sigma",
+    "turn_bias_per_metre_sigma",
+    "distance_scale_sigma",
+)
 
 
 @dataclass(frozen=True)
@@ -42,6 +59,12 @@ class FuseSettings:
         Standard deviation of its heading after turning a radian (rad).
     turn_per_metre_sigma : float
         The same after a metre driven (rad).
+    learn_noise : bool
+        Scale these deviations (distance's, and both of the heading together) by what makes the
+        measurements likeliest; they only begin the search then.
+    turn_scale_sigma, turn_bias_per_metre_sigma, distance_scale_sigma : float
+        Standard deviations, before anything was measured, of what odometry is off by: the share of
+        each turn, the turn per metre (rad), the share of each way.
     gate_probability : float
         Share of right poses that pass the gate.
     covariance_scale : dict of str to float
@@ -56,11 +79,15 @@ class FuseSettings:
     distance_sigma: float = 0.02
     turn_sigma: float = 0.02
     turn_per_metre_sigma: float = 0.01
+    learn_noise: bool = True
+    turn_scale_sigma: float = 0.03
+    turn_bias_per_metre_sigma: float = 0.01
+    distance_scale_sigma: float = 0.03
     gate_probability: float = 0.9999
     covariance_scale: Mapping[str, float] | None = None
 
     def __post_init__(self) -> None:
-        for name in ("distance_sigma", "turn_sigma", "turn_per_metre_sigma"):
+        for name in _DEVIATIONS:
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0.0):
                 raise GroundTruthError(f"{name} is {value}: expected 0 or more")
@@ -91,6 +118,32 @@ class Rejected:
     squared_innovation: float
 
 
+@dataclass(frozen=True)
+class OdometryErrors:
+    """What the measurements say of odometry.
+
+    Attributes
+    ----------
+    turn_scale, turn_bias_per_metre, distance_scale : float
+        By what share turns are longer than odometry says, the turn it misses per metre (rad), by
+        what share ways are longer.
+    turn_scale_sigma, turn_bias_per_metre_sigma, distance_scale_sigma : float
+        Their standard deviations.
+    distance_sigma, turn_sigma, turn_per_metre_sigma : float
+        Its random errors, as in `FuseSettings`.
+    """
+
+    turn_scale: float
+    turn_bias_per_metre: float
+    distance_scale: float
+    turn_scale_sigma: float
+    turn_bias_per_metre_sigma: float
+    distance_scale_sigma: float
+    distance_sigma: float
+    turn_sigma: float
+    turn_per_metre_sigma: float
+
+
 @dataclass(frozen=True, eq=False)
 class Fusion:
     """The robot's path out of all streams.
@@ -106,6 +159,8 @@ class Fusion:
         When the filter began anew, since nothing of what was measured fitted any more.
     used : dict of str to int
         Measurements that went in, by stream.
+    odometry : OdometryErrors
+        What was learnt of it.
     repaired : dict of str to int
         Covariances that were not positive definite as written, by stream; they were raised by their
         file's rounding.
@@ -115,6 +170,7 @@ class Fusion:
     rejected: tuple[Rejected, ...]
     restarts_s: tuple[float, ...]
     used: dict[str, int]
+    odometry: OdometryErrors
     repaired: dict[str, int]
 
 
@@ -149,56 +205,174 @@ def fuse(
     inside = odometry.times_s[(odometry.times_s >= first) & (odometry.times_s <= last)]
     node_times = np.union1d(inside, times)
     path, _ = interpolate_poses(odometry, node_times)
-    controls, variances = _controls(node_times, path.poses, chosen)
+    controls = _controls(path.poses)
     nodes = np.searchsorted(node_times, times).astype(np.int64)
+    problem = _Problem(node_times, controls, nodes, measured, covariances, chosen)
+    noise = _likeliest_noise(problem) if chosen.learn_noise else _noise_of(chosen)
+    smoothed, spread, account = problem.smooth(noise)
 
-    count = len(node_times)
-    predicted, filtered, smoothed = (np.empty((count, 3)) for _ in range(3))
-    spreads = [np.empty((count, 3, 3)) for _ in range(3)]
-    transitions = np.empty((count, 3, 3))
-    squared = np.empty(len(times))
-    accepted = np.empty(len(times), dtype=np.bool_)
-    restarted = np.empty(count, dtype=np.bool_)
-    filter_forward(
-        controls,
-        variances,
-        measured[0].copy(),
-        _RESTART_COVARIANCE,
-        nodes,
-        measured,
-        covariances,
-        float(chi2.ppf(chosen.gate_probability, 3)),
-        _RESTART_AFTER,
-        _RESTART_COVARIANCE,
-        predicted,
-        spreads[0],
-        filtered,
-        spreads[1],
-        transitions,
-        squared,
-        accepted,
-        restarted,
-    )
-    smooth_backward(
-        predicted, spreads[0], filtered, spreads[1], transitions, restarted, smoothed, spreads[2]
-    )
     at = np.searchsorted(node_times, inside)
-    poses = smoothed[at]
+    poses = smoothed[at, :3]
     poses[:, 2] = wrapped(poses[:, 2])
+    # Odometry's errors are constants: all that is known of them is known at the end.
+    last_spread = np.sqrt(np.maximum(np.diagonal(spread[-1]), 0.0))
     return Fusion(
-        poses=PlanarPoses(
-            inside, poses, 0.5 * (spreads[2][at] + np.swapaxes(spreads[2][at], 1, 2))
-        ),
+        poses=PlanarPoses(inside, poses, spread[at][:, :3, :3].copy()),
         rejected=tuple(
-            Rejected(names[i], float(times[i]), float(squared[i]))
-            for i in np.flatnonzero(~accepted)
+            Rejected(names[i], float(times[i]), float(account.squared[i]))
+            for i in np.flatnonzero(~account.accepted)
         ),
-        restarts_s=tuple(float(time) for time in node_times[restarted]),
+        restarts_s=tuple(float(time) for time in node_times[account.restarted]),
         used={
-            name: int(np.count_nonzero(accepted & (np.array(names) == name))) for name in streams
+            name: int(np.count_nonzero(account.accepted & (np.array(names) == name)))
+            for name in streams
         },
+        odometry=OdometryErrors(
+            *(float(value) for value in smoothed[-1, 3:]),
+            *(float(value) for value in last_spread[3:]),
+            *(float(value) for value in noise),
+        ),
         repaired=repaired,
     )
+
+
+@dataclass(frozen=True, eq=False)
+class _Account:
+    """What became of the measurements."""
+
+    squared: FloatArray
+    accepted: NDArray[np.bool_]
+    restarted: NDArray[np.bool_]
+    surprise: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """All that does not depend on how odometry errs at random."""
+
+    times_s: FloatArray
+    controls: FloatArray
+    nodes: NDArray[np.int64]
+    measured: FloatArray
+    covariances: FloatArray
+    settings: FuseSettings
+
+    def shortened(self, count: int) -> _Problem:
+        """The run of nodes with most measurements among them, of at most so many."""
+        if len(self.times_s) <= count:
+            return self
+        begins = self.nodes[self.nodes + count <= len(self.times_s)]
+        if len(begins) == 0:
+            begins = np.array([len(self.times_s) - count], dtype=np.int64)
+        held = np.searchsorted(self.nodes, begins + count) - np.searchsorted(self.nodes, begins)
+        begin = int(begins[int(np.argmax(held))])
+        here = (self.nodes >= begin) & (self.nodes < begin + count)
+        return _Problem(
+            self.times_s[begin : begin + count],
+            self.controls[begin : begin + count],
+            self.nodes[here] - begin,
+            self.measured[here],
+            self.covariances[here],
+            self.settings,
+        )
+
+    def surprise(self, noise: FloatArray) -> float:
+        """Minus twice the logarithm of the measurements' likelihood."""
+        empty = np.empty((1, STATE)), np.empty((1, STATE, STATE))
+        return self._forward(
+            noise, False, empty[0], empty[1], empty[0], empty[1], empty[1]
+        ).surprise
+
+    def smooth(self, noise: FloatArray) -> tuple[FloatArray, FloatArray, _Account]:
+        """Smoothed states, their covariances, and what became of the measurements."""
+        count = len(self.times_s)
+        predicted, filtered, smoothed = (np.empty((count, STATE)) for _ in range(3))
+        spreads = [np.empty((count, STATE, STATE)) for _ in range(4)]
+        account = self._forward(
+            noise, True, predicted, spreads[0], filtered, spreads[1], spreads[2]
+        )
+        smooth_backward(
+            predicted,
+            spreads[0],
+            filtered,
+            spreads[1],
+            spreads[2],
+            account.restarted,
+            smoothed,
+            spreads[3],
+        )
+        return smoothed, spreads[3], account
+
+    def _forward(
+        self,
+        noise: FloatArray,
+        keep: bool,
+        predicted: FloatArray,
+        predicted_covariance: FloatArray,
+        filtered: FloatArray,
+        filtered_covariance: FloatArray,
+        transitions: FloatArray,
+    ) -> _Account:
+        systematic = (
+            self.settings.turn_scale_sigma,
+            self.settings.turn_bias_per_metre_sigma,
+            self.settings.distance_scale_sigma,
+        )
+        squared = np.empty(len(self.nodes))
+        accepted = np.empty(len(self.nodes), dtype=np.bool_)
+        restarted = np.empty(len(self.times_s), dtype=np.bool_)
+        surprise = filter_forward(
+            self.controls,
+            _variances(self.times_s, self.controls, noise),
+            np.concatenate([self.measured[0], np.zeros(3)]),
+            np.diag(np.concatenate([_RESTART_VARIANCES, np.square(systematic)])),
+            self.nodes,
+            self.measured,
+            self.covariances,
+            float(chi2.ppf(self.settings.gate_probability, 3)),
+            _RESTART_AFTER,
+            _RESTART_VARIANCES,
+            keep,
+            predicted,
+            predicted_covariance,
+            filtered,
+            filtered_covariance,
+            transitions,
+            squared,
+            accepted,
+            restarted,
+        )
+        return _Account(squared, accepted, restarted, float(surprise))
+
+
+def _noise_of(settings: FuseSettings) -> FloatArray:
+    """Odometry's random errors: of a metre (m), of a radian (rad), of a metre (rad)."""
+    return np.array([settings.distance_sigma, settings.turn_sigma, settings.turn_per_metre_sigma])
+
+
+def _likeliest_noise(problem: _Problem) -> FloatArray:
+    """Odometry's random errors that make the measurements likeliest, near those given."""
+    some = problem.shortened(_MOST_NODES_TO_LEARN_FROM)
+    given = _noise_of(problem.settings)
+    logarithms = np.zeros(2)
+    bounds = tuple(math.log(factor) for factor in _NOISE_FACTORS)
+
+    def scaled(values: FloatArray) -> FloatArray:
+        return np.asarray(given * np.exp(values[[0, 1, 1]]))
+
+    for _ in range(_LEARNING_ROUNDS):
+        for axis in (1, 0):
+
+            def surprise(value: float, axis: int = axis) -> float:
+                tried = logarithms.copy()
+                tried[axis] = value
+                return some.surprise(scaled(tried))
+
+            found = minimize_scalar(
+                surprise, bounds=bounds, method="bounded", options={"xatol": 0.05}
+            )
+            logarithms[axis] = float(found.x)
+    return scaled(logarithms)
 
 
 def _gather(
@@ -253,26 +427,24 @@ def _usable(name: str, covariances: FloatArray) -> tuple[FloatArray, int]:
     return symmetric, int(np.count_nonzero(weak))
 
 
-def _controls(
-    times_s: FloatArray, path: FloatArray, settings: FuseSettings
-) -> tuple[FloatArray, FloatArray]:
-    """Movements between the nodes in the robot's frame, and their variances."""
-    controls = np.zeros((len(times_s), 3))
+def _controls(path: FloatArray) -> FloatArray:
+    """(N, 3) movements between nodes, in the robot's frame of the node before."""
+    controls = np.zeros((len(path), 3))
     change = np.diff(path, axis=0)
-    change[:, 2] = wrapped(change[:, 2])
     cos, sin = np.cos(path[:-1, 2]), np.sin(path[:-1, 2])
     controls[1:, 0] = cos * change[:, 0] + sin * change[:, 1]
     controls[1:, 1] = -sin * change[:, 0] + cos * change[:, 1]
-    controls[1:, 2] = change[:, 2]
-    distance = np.hypot(controls[:, 0], controls[:, 1])
+    controls[1:, 2] = wrapped(change[:, 2])
+    return controls
+
+
+def _variances(times_s: FloatArray, controls: FloatArray, noise: FloatArray) -> FloatArray:
+    """(N, 3) variances of movements, for odometry's random errors."""
+    way = np.hypot(controls[:, 0], controls[:, 1])
     passed = np.concatenate([[0.0], np.diff(times_s)])
     variances = np.empty((len(times_s), 3))
-    along = settings.distance_sigma**2 * distance + _CREEP_M2_PER_S * passed + 1e-14
-    variances[:, 0] = variances[:, 1] = along
+    variances[:, 0] = variances[:, 1] = noise[0] ** 2 * way + _CREEP_M2_PER_S * passed
     variances[:, 2] = (
-        settings.turn_sigma**2 * np.abs(controls[:, 2])
-        + settings.turn_per_metre_sigma**2 * distance
-        + _CREEP_RAD2_PER_S * passed
-        + 1e-14
+        noise[1] ** 2 * np.abs(controls[:, 2]) + noise[2] ** 2 * way + _CREEP_RAD2_PER_S * passed
     )
-    return controls, variances
+    return variances

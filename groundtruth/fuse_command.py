@@ -29,6 +29,7 @@ def perform(options: Fuse) -> int:
         distance_sigma=options.distance_sigma,
         turn_sigma=options.turn_sigma,
         turn_per_metre_sigma=options.turn_per_metre_sigma,
+        learn_noise=options.learn_noise,
         gate_probability=options.gate_probability,
         covariance_scale=dict(zip(named, options.covariance_scale)),
     )
@@ -45,6 +46,7 @@ def perform(options: Fuse) -> int:
             [options.odometry, *files.values(), *([options.clock] if options.clock else [])],
         ),
         "used": fusion.used,
+        "odometry": asdict(fusion.odometry),
         "covariances_repaired": fusion.repaired,
         "restarts_s": fusion.restarts_s,
         "rejected": [asdict(rejected) for rejected in fusion.rejected],

@@ -1,7 +1,9 @@
 """Kalman filter over poses and Rauch-Tung-Striebel smoother, compiled.
 
-State x, y (m), theta (rad, not wrapped); the control of a node is the movement since the one before
-in the robot's frame there.
+The state is x, y (m), theta (rad, not wrapped), and what odometry is off by systematically: the
+share by which turns are longer than it says, the turn that it misses per metre driven (rad/m), and
+the share by which ways are longer. The control of a node is the movement since the one before, in
+the robot's frame there.
 """
 
 from __future__ import annotations
@@ -16,14 +18,18 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
+#: Length of the state, and of the pose at its beginning.
+STATE = 6
+_POSE = 3
 
-@njit(cache=True, error_model="numpy", inline="never")
+
+@njit(cache=True, error_model="numpy")
 def _wrap(angle: float) -> float:
     return (angle + math.pi) % (2.0 * math.pi) - math.pi
 
 
 @njit(cache=True, error_model="numpy")
-def invert_3x3(m: FloatArray, inverse: FloatArray) -> float:
+def _invert_3x3(m: FloatArray, inverse: FloatArray) -> float:
     """Invert a symmetric 3x3 matrix by cofactors; returns its determinant."""
     a, b, c = m[0, 0], m[0, 1], m[0, 2]
     d, e, f = m[1, 1], m[1, 2], m[2, 2]
@@ -40,6 +46,72 @@ def invert_3x3(m: FloatArray, inverse: FloatArray) -> float:
 
 
 @njit(cache=True, error_model="numpy")
+def _predict(
+    x: FloatArray, p: FloatArray, f: FloatArray, control: FloatArray, variances: FloatArray
+) -> None:
+    """Move state and covariance on by a control; f becomes the derivative."""
+    dx, dy, turn = control[0], control[1], control[2]
+    way = math.sqrt(dx * dx + dy * dy)
+    cos, sin = math.cos(x[2]), math.sin(x[2])
+    east, north = cos * dx - sin * dy, sin * dx + cos * dy
+    longer = 1.0 + x[5]
+    x[0] += longer * east
+    x[1] += longer * north
+    x[2] += (1.0 + x[3]) * turn + x[4] * way
+    f[0, 2] = -longer * north
+    f[1, 2] = longer * east
+    f[0, 5] = east
+    f[1, 5] = north
+    f[2, 3] = turn
+    f[2, 4] = way
+    # f is the identity but for rows 0 to 2: p becomes f p f' row by row, then column by column.
+    for j in range(STATE):
+        p[0, j] += f[0, 2] * p[2, j] + f[0, 5] * p[5, j]
+        p[1, j] += f[1, 2] * p[2, j] + f[1, 5] * p[5, j]
+        p[2, j] += f[2, 3] * p[3, j] + f[2, 4] * p[4, j]
+    for i in range(STATE):
+        p[i, 0] += p[i, 2] * f[0, 2] + p[i, 5] * f[0, 5]
+        p[i, 1] += p[i, 2] * f[1, 2] + p[i, 5] * f[1, 5]
+        p[i, 2] += p[i, 3] * f[2, 3] + p[i, 4] * f[2, 4]
+    vx, vy = variances[0], variances[1]
+    p[0, 0] += cos * cos * vx + sin * sin * vy
+    p[0, 1] += cos * sin * (vx - vy)
+    p[1, 0] += cos * sin * (vx - vy)
+    p[1, 1] += sin * sin * vx + cos * cos * vy
+    p[2, 2] += variances[2]
+
+
+@njit(cache=True, error_model="numpy")
+def _update(
+    x: FloatArray,
+    p: FloatArray,
+    innovation: FloatArray,
+    s_inverse: FloatArray,
+    gain: FloatArray,
+    temporary: FloatArray,
+) -> None:
+    """Take a measured pose in; gain and temporary are work space."""
+    for i in range(STATE):
+        for j in range(_POSE):
+            total = 0.0
+            for n in range(_POSE):
+                total += p[i, n] * s_inverse[n, j]
+            gain[i, j] = total
+    for i in range(STATE):
+        for j in range(_POSE):
+            x[i] += gain[i, j] * innovation[j]
+        for j in range(STATE):
+            total = 0.0
+            for n in range(_POSE):
+                total += gain[i, n] * p[n, j]
+            temporary[i, j] = total
+    for i in range(STATE):
+        for j in range(i, STATE):
+            p[i, j] -= 0.5 * (temporary[i, j] + temporary[j, i])
+            p[j, i] = p[i, j]
+
+
+@njit(cache=True, error_model="numpy")
 def filter_forward(
     controls: FloatArray,
     control_variances: FloatArray,
@@ -50,7 +122,8 @@ def filter_forward(
     measured_covariances: FloatArray,
     gate: float,
     restart_after: int,
-    restart_covariance: FloatArray,
+    restart_variances: FloatArray,
+    keep: bool,
     predicted: FloatArray,
     predicted_covariance: FloatArray,
     filtered: FloatArray,
@@ -59,7 +132,7 @@ def filter_forward(
     squared_innovations: FloatArray,
     accepted: BoolArray,
     restarted: BoolArray,
-) -> None:
+) -> float:
     """Filter N nodes forward, with M measured poses at some of them.
 
     Parameters
@@ -68,7 +141,7 @@ def filter_forward(
         Movement to each node in the robot's frame of the node before; the first is not used.
     control_variances : (N, 3) array
         Of the movements, along the robot's axes and of the turn.
-    start, start_covariance : (3,), (3, 3) arrays
+    start, start_covariance : (6,), (6, 6) arrays
         Before the measurements at the first node.
     nodes : (M,) int array
         Ascending.
@@ -76,114 +149,110 @@ def filter_forward(
     gate : float
         Largest squared normalised innovation.
     restart_after : int
-        So many rejections in a row, and the filter takes `restart_covariance` for its own and
-        believes the measurements again.
-    restart_covariance : (3, 3) array
-    predicted, predicted_covariance, filtered, filtered_covariance : (N, 3), (N, 3, 3) arrays
-        Filled.
-    transitions : (N, 3, 3) array
-        Filled with the derivatives of each node's prediction by the node before.
+        So many rejections in a row, and the pose's variances become `restart_variances`: the
+        measurements are believed again.
+    restart_variances : (3,) array
+    keep : bool
+        Whether the next five arrays are filled; they may be of length 1 where they are not.
+    predicted, predicted_covariance, filtered, filtered_covariance : (N, 6), (N, 6, 6) arrays
+    transitions : (N, 6, 6) array
+        Derivatives of each node's prediction by the node before.
     squared_innovations, accepted : (M,) arrays
         Filled.
     restarted : (N,) array
         Filled: whether the filter began anew at a node.
+
+    Returns
+    -------
+    float
+        Minus twice the logarithm of the likelihood of the accepted innovations.
     """
     x = start.copy()
     p = start_covariance.copy()
-    s = np.empty((3, 3))
-    s_inverse = np.empty((3, 3))
-    gain = np.empty((3, 3))
-    innovation = np.empty(3)
-    f = np.eye(3)
-    joseph = np.empty((3, 3))
-    temporary = np.empty((3, 3))
+    f = np.eye(STATE)
+    s = np.empty((_POSE, _POSE))
+    s_inverse = np.empty((_POSE, _POSE))
+    innovation = np.empty(_POSE)
+    gain = np.empty((STATE, _POSE))
+    temporary = np.empty((STATE, STATE))
     m = 0
     rejections = 0
+    surprise = 0.0
     for k in range(controls.shape[0]):
         restarted[k] = False
         if k > 0:
-            dx, dy, turn = controls[k, 0], controls[k, 1], controls[k, 2]
-            cos, sin = math.cos(x[2]), math.sin(x[2])
-            moved_x, moved_y = cos * dx - sin * dy, sin * dx + cos * dy
-            x[0] += moved_x
-            x[1] += moved_y
-            x[2] += turn
-            f[0, 2] = -moved_y
-            f[1, 2] = moved_x
-            transitions[k] = f
-            _sandwich(f, p, temporary)
-            vx, vy = control_variances[k, 0], control_variances[k, 1]
-            p[0, 0] += cos * cos * vx + sin * sin * vy
-            p[0, 1] += cos * sin * (vx - vy)
-            p[1, 0] = p[0, 1]
-            p[1, 1] += sin * sin * vx + cos * cos * vy
-            p[2, 2] += control_variances[k, 2]
-        predicted[k] = x
-        predicted_covariance[k] = p
+            _predict(x, p, f, controls[k], control_variances[k])
+            if keep:
+                transitions[k] = f
+        if keep:
+            predicted[k] = x
+            predicted_covariance[k] = p
         while m < nodes.shape[0] and nodes[m] == k:
-            for i in range(3):
+            for i in range(_POSE):
                 innovation[i] = measured[m, i] - x[i]
             innovation[2] = _wrap(innovation[2])
             if rejections >= restart_after:
-                for i in range(3):
-                    for j in range(3):
-                        p[i, j] += restart_covariance[i, j]
+                for i in range(_POSE):
+                    for j in range(STATE):
+                        p[i, j] = 0.0
+                        p[j, i] = 0.0
+                for i in range(_POSE):
+                    p[i, i] = restart_variances[i]
                 rejections = 0
                 restarted[k] = True
-                predicted_covariance[k] = p
-            for i in range(3):
-                for j in range(3):
+                if keep:
+                    predicted_covariance[k] = p
+            for i in range(_POSE):
+                for j in range(_POSE):
                     s[i, j] = p[i, j] + measured_covariances[m, i, j]
-            invert_3x3(s, s_inverse)
+            determinant = _invert_3x3(s, s_inverse)
             squared = 0.0
-            for i in range(3):
-                for j in range(3):
+            for i in range(_POSE):
+                for j in range(_POSE):
                     squared += innovation[i] * s_inverse[i, j] * innovation[j]
             squared_innovations[m] = squared
             accepted[m] = squared <= gate
             if accepted[m]:
                 rejections = 0
-                for i in range(3):
-                    for j in range(3):
-                        total = 0.0
-                        for n in range(3):
-                            total += p[i, n] * s_inverse[n, j]
-                        gain[i, j] = total
-                for i in range(3):
-                    for j in range(3):
-                        x[i] += gain[i, j] * innovation[j]
-                        joseph[i, j] = (1.0 if i == j else 0.0) - gain[i, j]
-                _sandwich(joseph, p, temporary)
-                for i in range(3):
-                    for j in range(3):
-                        total = 0.0
-                        for n in range(3):
-                            for o in range(3):
-                                total += gain[i, n] * measured_covariances[m, n, o] * gain[j, o]
-                        p[i, j] += total
+                surprise += squared + math.log(determinant)
+                _update(x, p, innovation, s_inverse, gain, temporary)
             else:
                 rejections += 1
+                surprise += gate + math.log(determinant)
             m += 1
-        filtered[k] = x
-        filtered_covariance[k] = p
+        if keep:
+            filtered[k] = x
+            filtered_covariance[k] = p
+    return surprise
 
 
 @njit(cache=True, error_model="numpy")
-def _sandwich(a: FloatArray, p: FloatArray, temporary: FloatArray) -> None:
-    """Replace p by a p a', kept symmetric."""
-    for i in range(3):
-        for j in range(3):
-            total = 0.0
-            for n in range(3):
-                total += a[i, n] * p[n, j]
-            temporary[i, j] = total
-    for i in range(3):
-        for j in range(i, 3):
-            total = 0.0
-            for n in range(3):
-                total += temporary[i, n] * a[j, n]
-            p[i, j] = total
-            p[j, i] = total
+def _factor(p: FloatArray, lower: FloatArray) -> None:
+    """Cholesky factor of a covariance; directions without any variance are left out."""
+    for i in range(STATE):
+        for j in range(i + 1):
+            total = p[i, j]
+            for n in range(j):
+                total -= lower[i, n] * lower[j, n]
+            if i == j:
+                lower[i, i] = math.sqrt(total) if total > 1e-15 * p[i, i] else 0.0
+            else:
+                lower[i, j] = total / lower[j, j] if lower[j, j] > 0.0 else 0.0
+
+
+@njit(cache=True, error_model="numpy")
+def _solve(lower: FloatArray, right: FloatArray) -> None:
+    """Replace a vector by the covariance's inverse times it, given the factor."""
+    for i in range(STATE):
+        total = right[i]
+        for n in range(i):
+            total -= lower[i, n] * right[n]
+        right[i] = total / lower[i, i] if lower[i, i] > 0.0 else 0.0
+    for i in range(STATE - 1, -1, -1):
+        total = right[i]
+        for n in range(i + 1, STATE):
+            total -= lower[n, i] * right[n]
+        right[i] = total / lower[i, i] if lower[i, i] > 0.0 else 0.0
 
 
 @njit(cache=True, error_model="numpy")
@@ -199,47 +268,50 @@ def smooth_backward(
 ) -> None:
     """Smooth what `filter_forward` left, from the last node to the first.
 
-    Where the filter began anew, what came before learns nothing from what came after.
+    Where the filter began anew, the poses before learn nothing from what came after.
     """
     last = predicted.shape[0] - 1
     smoothed[last] = filtered[last]
     smoothed_covariance[last] = filtered_covariance[last]
-    inverse = np.empty((3, 3))
-    temporary = np.empty((3, 3))
-    gain = np.empty((3, 3))
-    difference = np.empty(3)
+    lower = np.zeros((STATE, STATE))
+    temporary = np.empty((STATE, STATE))
+    gain = np.empty((STATE, STATE))
+    difference = np.empty(STATE)
     for k in range(last - 1, -1, -1):
-        smoothed[k] = filtered[k]
-        smoothed_covariance[k] = filtered_covariance[k]
         if restarted[k + 1]:
+            smoothed[k] = filtered[k]
+            smoothed_covariance[k] = filtered_covariance[k]
             continue
-        invert_3x3(predicted_covariance[k + 1], inverse)
         p, f = filtered_covariance[k], transitions[k + 1]
-        for i in range(3):
-            for j in range(3):
-                total = 0.0
-                for n in range(3):
-                    total += p[i, n] * f[j, n]
-                temporary[i, j] = total
-        for i in range(3):
-            for j in range(3):
-                total = 0.0
-                for n in range(3):
-                    total += temporary[i, n] * inverse[n, j]
-                gain[i, j] = total
-        for i in range(3):
+        _factor(predicted_covariance[k + 1], lower)
+        # gain = p f' (predicted covariance)^-1, row by row.
+        for i in range(STATE):
+            gain[i, 0] = p[i, 0] + p[i, 2] * f[0, 2] + p[i, 5] * f[0, 5]
+            gain[i, 1] = p[i, 1] + p[i, 2] * f[1, 2] + p[i, 5] * f[1, 5]
+            gain[i, 2] = p[i, 2] + p[i, 3] * f[2, 3] + p[i, 4] * f[2, 4]
+            for j in range(_POSE, STATE):
+                gain[i, j] = p[i, j]
+            _solve(lower, gain[i])
+        for i in range(STATE):
             difference[i] = smoothed[k + 1, i] - predicted[k + 1, i]
         difference[2] = _wrap(difference[2])
-        for i in range(3):
-            for j in range(3):
-                smoothed[k, i] += gain[i, j] * difference[j]
-                temporary[i, j] = (
-                    smoothed_covariance[k + 1, i, j] - predicted_covariance[k + 1, i, j]
-                )
-        for i in range(3):
-            for j in range(3):
+        for i in range(STATE):
+            total = filtered[k, i]
+            for j in range(STATE):
+                total += gain[i, j] * difference[j]
+            smoothed[k, i] = total
+        for i in range(STATE):
+            for j in range(STATE):
                 total = 0.0
-                for n in range(3):
-                    for o in range(3):
-                        total += gain[i, n] * temporary[n, o] * gain[j, o]
-                smoothed_covariance[k, i, j] += total
+                for n in range(STATE):
+                    total += gain[i, n] * (
+                        smoothed_covariance[k + 1, n, j] - predicted_covariance[k + 1, n, j]
+                    )
+                temporary[i, j] = total
+        for i in range(STATE):
+            for j in range(i, STATE):
+                total = p[i, j]
+                for n in range(STATE):
+                    total += temporary[i, n] * gain[j, n]
+                smoothed_covariance[k, i, j] = total
+                smoothed_covariance[k, j, i] = total

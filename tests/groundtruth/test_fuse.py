@@ -75,10 +75,16 @@ def normalised_error(poses: PlanarPoses, truth: PlanarPoses) -> FloatArray:
     return np.asarray(np.einsum("ni,nij,nj->n", error, np.linalg.inv(poses.covariances), error))
 
 
-def test_it_is_the_least_squares_solution() -> None:
+@pytest.mark.parametrize("systematic", [0.0, 1.0])
+def test_it_is_the_least_squares_solution(systematic: float) -> None:
     """Filter and smoother together solve the batch problem, up to linearisation."""
     rng = np.random.default_rng(1)
-    settings = FuseSettings()
+    settings = FuseSettings(
+        learn_noise=False,
+        turn_scale_sigma=0.03 * systematic,
+        turn_bias_per_metre_sigma=0.01 * systematic,
+        distance_scale_sigma=0.03 * systematic,
+    )
     truth, odometry = drive(rng, 6.0, settings, rate_hz=5.0)
     laser = measure(rng, truth, truth.times_s[[0, 3, 4, 9, 20, 28]], LASER_COVARIANCE / 25)
     found = fuse(odometry, {"laser": laser}, settings).poses
@@ -108,23 +114,56 @@ def test_it_is_the_least_squares_solution() -> None:
     seen = np.searchsorted(odometry.times_s, laser.times_s)
 
     def residuals(flat: FloatArray) -> FloatArray:
-        path = flat.reshape(-1, 3)
-        off = movement(path) - steps
+        path, scaled = flat[:-3].reshape(-1, 3), flat[-3:] * systematic
+        turn_scale, bend, way_scale = 0.03 * scaled[0], 0.01 * scaled[1], 0.03 * scaled[2]
+        expected = steps * [1.0 + way_scale, 1.0 + way_scale, 1.0 + turn_scale]
+        expected[:, 2] += bend * distance
+        off = movement(path) - expected
         off[:, 2] = wrapped(off[:, 2])
         difference = path[seen] - laser.poses
         difference[:, 2] = wrapped(difference[:, 2])
         return np.concatenate(
-            [(off / np.column_stack([xy, xy, turn])).ravel(), (difference @ root.T).ravel()]
+            [
+                (off / np.column_stack([xy, xy, turn])).ravel(),
+                (difference @ root.T).ravel(),
+                flat[-3:],
+            ]
         )
 
-    solved = least_squares(residuals, found.poses.ravel(), x_scale="jac", xtol=1e-12, ftol=1e-12)
-    batch = solved.x.reshape(-1, 3)
+    begin = np.concatenate([found.poses.ravel(), np.zeros(3)])
+    solved = least_squares(residuals, begin, x_scale="jac", xtol=1e-12, ftol=1e-12)
+    batch = solved.x[:-3].reshape(-1, 3)
     covariance = np.linalg.inv(solved.jac.T @ solved.jac)
     assert found.covariances is not None
     np.testing.assert_allclose(found.poses, batch, atol=5e-4)
     for k in range(len(batch)):
         block = covariance[3 * k : 3 * k + 3, 3 * k : 3 * k + 3]
         np.testing.assert_allclose(found.covariances[k], block, rtol=0.05, atol=2e-6)
+
+
+def test_what_odometry_is_off_by_is_found_and_bridges_a_gap() -> None:
+    rng = np.random.default_rng(12)
+    exact = FuseSettings(distance_sigma=0.003, turn_sigma=0.003, turn_per_metre_sigma=0.001)
+    truth, odometry = drive(rng, 120.0, exact)
+    # Odometry that takes turns for 2 % and ways for 1 % shorter than they are, and bends.
+    steps = np.diff(odometry.poses, axis=0)
+    steps[:, 2] = wrapped(steps[:, 2])
+    c, s = np.cos(odometry.poses[:-1, 2]), np.sin(odometry.poses[:-1, 2])
+    along = (c * steps[:, 0] + s * steps[:, 1]) / 1.01
+    turn = (steps[:, 2] - 0.005 * along * 1.01) / 1.02
+    own = np.vstack([np.zeros((1, 3)), np.column_stack([along, 0 * along, turn])])
+    biased = PlanarPoses(odometry.times_s, chain(own, np.zeros(3)))
+    times = np.concatenate([np.arange(0.0, 50.0, 0.1), np.arange(70.0, 119.9, 0.1)])
+    fusion = fuse(biased, {"laser": measure(rng, truth, times, LASER_COVARIANCE / 100)})
+    learnt = fusion.odometry
+    assert abs(learnt.turn_scale - 0.02) < 4 * learnt.turn_scale_sigma < 0.02
+    assert abs(learnt.distance_scale - 0.01) < 4 * learnt.distance_scale_sigma < 0.01
+    assert abs(learnt.turn_bias_per_metre - 0.005) < 4 * learnt.turn_bias_per_metre_sigma < 0.01
+    assert learnt.turn_sigma < 0.01
+    exact_poses, _ = interpolate_poses(truth, fusion.poses.times_s)
+    off = np.linalg.norm((fusion.poses.poses - exact_poses.poses)[:, :2], axis=1)
+    assert np.max(off) < 0.12
+    assert np.mean(normalised_error(fusion.poses, truth)) < 9.0
 
 
 @pytest.mark.long
