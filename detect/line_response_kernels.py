@@ -15,6 +15,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from detect.line_vector_kernels import LANES, interpolate
+
 _ZERO = np.float32(0.0)
 #: Grey values about 0 keep the small variances exact in single precision.
 _MIDDLE = np.float32(128.0)
@@ -197,22 +199,22 @@ def band_response(
     grey = np.empty(pixel.shape, np.float32)
     square = np.empty(pixel.shape, np.float32)
     flat = image.reshape(-1)
-    for i in range(len(pixel)):
-        where = pixel[i]
-        share = part[i]
-        grey_row = grey[i]
-        square_row = square[i]
-        for c in range(width):
-            if where[c] >= 0:
-                j = np.uint32(where[c])
-                left = np.float32(flat[j]) - _MIDDLE
-                right = np.float32(flat[j + np.uint32(1)]) - _MIDDLE
-                grey_row[c] = left + share[c] * (right - left)
-                left *= left
-                square_row[c] = left + share[c] * (right * right - left)
-            else:
-                grey_row[c] = _ZERO
-                square_row[c] = _ZERO
+    flat_pixel = pixel.reshape(-1)
+    flat_part = part.reshape(-1)
+    flat_grey = grey.reshape(-1)
+    flat_square = square.reshape(-1)
+    whole = len(flat_pixel) // LANES * LANES
+    for i in range(0, whole, LANES):
+        interpolate(flat, flat_pixel, flat_part, flat_grey, flat_square, i)
+    for i in range(whole, len(flat_pixel)):
+        flat_grey[i] = _ZERO
+        flat_square[i] = _ZERO
+        if flat_pixel[i] >= 0:
+            left = np.float32(flat[flat_pixel[i]]) - _MIDDLE
+            right = np.float32(flat[flat_pixel[i] + 1]) - _MIDDLE
+            flat_grey[i] = left + flat_part[i] * (right - left)
+            left *= left
+            flat_square[i] = left + flat_part[i] * (right * right - left)
     grey_sum = np.empty(width, np.float32)
     square_sum = np.empty(width, np.float32)
     mean = np.empty(max(inner, 0), np.float32)

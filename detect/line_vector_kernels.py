@@ -22,8 +22,10 @@ ROW_NUMBERS = 3 * LANES
 #: Pixels that are read at once for each lane.
 WORD = 8
 
-_I8, _I32, _I64, _FLOAT = ir.IntType(8), ir.IntType(32), ir.IntType(64), ir.FloatType()
+_I8, _I16, _I32, _I64 = (ir.IntType(bits) for bits in (8, 16, 32, 64))
+_FLOAT = ir.FloatType()
 _BYTES = ir.VectorType(_I8, LANES)
+_SHORTS = ir.VectorType(_I16, LANES)
 _INTS = ir.VectorType(_I32, LANES)
 _LONGS = ir.VectorType(_I64, LANES)
 _ALL_BYTES = ir.VectorType(_I8, LANES * WORD)
@@ -361,4 +363,52 @@ def add_products(
         return context.get_dummy_value()
 
     result = types.void(pixels, types.int64, weights, types.int64, types.int64, sums, types.int64)
+    return result, generate
+
+
+@_operation
+def interpolate(
+    _typing: Any, pixels: Any, where: Any, part: Any, grey: Any, square: Any, at: Any
+) -> Any:
+    """Grey values between neighbouring pixels, and their squares, at `LANES` places.
+
+    Parameters
+    ----------
+    pixels : uint8, contiguous
+        The image in scan order.
+    where : int32, contiguous
+        The pixel on the left of each place; -1 for none: both results are 0.
+    part : float32, contiguous
+        How far to the right of it each lies, 0 to 1.
+    grey, square : float32, contiguous
+        Results; grey values count from 128.
+    at : int64
+        Index of the first place in all of these.
+    """
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        code = _Code(context, builder, signature, args)
+        left_of = code.load(1, args[5], _INTS)
+        zero = ir.Constant(_INTS, [0] * LANES)
+        some = builder.icmp_signed(">=", left_of, zero)
+        left_of = builder.sext(builder.select(some, left_of, zero), _LONGS)
+        pairs = ir.Constant(_SHORTS, ir.Undefined)
+        for lane in range(LANES):
+            number = ir.Constant(_I32, lane)
+            pair = code.load(0, builder.extract_element(left_of, number), _I16)
+            pairs = builder.insert_element(pairs, pair, number)
+        # x - 128 is x with its highest bit turned over, as a signed number.
+        pairs = builder.xor(pairs, ir.Constant(_SHORTS, [0x8080] * LANES))
+        left, right = (
+            builder.sitofp(builder.sext(builder.trunc(each, _BYTES), _INTS), _FLOATS)
+            for each in (pairs, builder.lshr(pairs, ir.Constant(_SHORTS, [8] * LANES)))
+        )
+        share = code.load(2, args[5], _FLOATS)
+        for argument in (3, 4):
+            between = code.add(left, code.mul(share, code.sub(right, left)))
+            code.store(argument, args[5], code.only(some, between))
+            left, right = code.mul(left, left), code.mul(right, right)
+        return context.get_dummy_value()
+
+    result = types.void(pixels, where, part, grey, square, types.int64)
     return result, generate
