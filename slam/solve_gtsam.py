@@ -88,7 +88,7 @@ def solve_gtsam(
         raise SlamError(f"GTSAM: no least squares: {reason}") from None
     if optimizer.iterations() >= most_steps:
         raise SlamError(f"GTSAM: no minimum within {most_steps} steps")
-    estimate = _estimate(graph, found, start)
+    estimate = estimate_of_values(graph, found, start)
     lowest = cost(graph, estimate, weighting)
     begun = cost(graph, start, weighting)
     return Solution(estimate, lowest, (begun, *[lowest] * int(optimizer.iterations())))
@@ -200,7 +200,8 @@ def _bearing_function(measured_rad: float, camera_xy: FloatArray) -> ErrorFuncti
     return error
 
 
-def _estimate(graph: Graph, values: Any, start: Estimate) -> Estimate:
+def estimate_of_values(graph: Graph, values: Any, start: Estimate) -> Estimate:
+    """GTSAM's values (see `gtsam_problem`) as an estimate; headings near those of the start."""
     discs, lines = len(graph.disc_ids), len(graph.line_ids)
     first_disc = len(start.poses)
     poses = [values.atPose2(k) for k in range(first_disc)]
