@@ -169,6 +169,11 @@ class EkfSlam:
             lines=self._landmarks(self.line_slots, self.line_rows),
         )
 
+    def map_covariance(self) -> FloatArray:
+        """Joint covariance of `landmark_map`: discs, then lines; (2 M, 2 M), m^2."""
+        slots = np.array([*self.disc_slots.values(), *self.line_slots.values()], dtype=np.int64)
+        return self.covariance.block((slots[:, None] + np.arange(2)).ravel())
+
     def _update(self, rows: FrameRows, discs: list[int], lines: list[int]) -> None:
         line_ids = [rows.line_ids[k] for k in lines]
         innovation, jacobian, noise, index = frame_innovation(

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import time
+from pathlib import Path
 
 from slam.ekf import EkfSlam, run_ekf
 from slam.errors import SlamError
 from slam.filter_association import Associator
 from slam.filter_input import default_output, read_reference, read_run
 from slam.filter_report import demand_free, map_distance, path_distance, summary, table, write_json
+from slam.map_covariance import covariance_file, write_joint_covariance
 from slam.map_file import read_map, write_map, write_path
 from slam.options import Ekf
 from slam.pictures import draw_errors, draw_map
@@ -28,7 +30,7 @@ def perform(command: Ekf) -> int:
 
     output = command.output or default_output(command.run, "ekf")
     names = (
-        *(PATH_NAME, MAP_NAME, JSON_NAME, MAP_PICTURE),
+        *(PATH_NAME, MAP_NAME, covariance_file(Path(MAP_NAME)).name, JSON_NAME, MAP_PICTURE),
         *([ERROR_PICTURE] if command.reference else []),
     )
     associator = Associator(command.association, command.gate_probability)
@@ -60,6 +62,7 @@ def perform(command: Ekf) -> int:
     comments = [f"slam ekf {slam.__version__}: {command.run}"]
     write_path(output / PATH_NAME, run.path, comments, overwrite=command.force)
     write_map(output / MAP_NAME, landmark_map, comments, overwrite=command.force)
+    write_joint_covariance(output / MAP_NAME, ekf.map_covariance(), overwrite=command.force)
     content = summary(run, command, distance)
     content["landmarks"] = {"discs": len(landmark_map.discs), "lines": len(landmark_map.lines)}
     if from_map is not None:

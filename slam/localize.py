@@ -3,9 +3,11 @@
 The map has errors of its own. They are the same each time a landmark is seen, so that adding its
 covariance to each measurement's would let the filter average them away, which it can't. By default
 the filter *considers* them: it carries the correlation of the pose with each landmark's error along
-without estimating the landmarks anew (Schmidt-Kalman filter). What a map file does not tell is the
-correlation of landmarks with each other, so an error that all landmarks have in common (the drift
-of a loop) is not covered: the covariance is that of the pose in the map, as the map stands.
+without estimating the landmarks anew (Schmidt-Kalman filter).
+
+Landmarks of a map made by driving have most of their error in common with their neighbours. That is
+told by the joint covariance (`slam.map_covariance`); without it landmarks are taken to be
+independent of each other.
 """
 
 from __future__ import annotations
@@ -47,6 +49,9 @@ class Localizer:
     map_errors : str
         `considered`: see above; `white`: each landmark's covariance is added to that of each of
         its rows, as if its error were another one each time; `ignored`: the map is exact.
+    joint_covariance : (2 M, 2 M) array, optional
+        Of all discs and then lines (m^2), for errors that are considered; by default landmarks are
+        independent.
     """
 
     def __init__(
@@ -57,6 +62,7 @@ class Localizer:
         camera_xy: ArrayLike = NO_CAMERA,
         *,
         map_errors: MapErrors = "considered",
+        joint_covariance: FloatArray | None = None,
     ) -> None:
         discs, lines = landmark_map.discs, landmark_map.lines
         self.camera_xy = np.asarray(camera_xy, dtype=np.float64)
@@ -71,9 +77,15 @@ class Localizer:
             [np.asarray(start, dtype=np.float64), discs.xy.ravel(), lines.xy.ravel()]
         )
         self._map_errors = map_errors
-        self._map_covariance = np.concatenate([discs.covariance, lines.covariance])
-        if map_errors == "ignored":
-            self._map_covariance = np.zeros_like(self._map_covariance)
+        self._predicted = np.array(start, dtype=np.float64)
+        numbers = len(self._state) - _POSE_SIZE
+        self._map_covariance = np.zeros((numbers, numbers))
+        if map_errors == "considered" and joint_covariance is not None:
+            self._map_covariance += joint_covariance
+        elif map_errors != "ignored":
+            for k, block in enumerate(np.concatenate([discs.covariance, lines.covariance])):
+                own = slice(2 * k, 2 * k + 2)
+                self._map_covariance[own, own] = block
         # Of the pose with the landmarks' errors.
         self._cross = np.zeros((_POSE_SIZE, len(self._state) - _POSE_SIZE))
 
@@ -99,18 +111,10 @@ class Localizer:
         -------
         (3 + 2 k, 3 + 2 k) float64
         """
-        block = np.zeros((len(index), len(index)))
-        block[:_POSE_SIZE, :_POSE_SIZE] = self.pose_covariance
-        if len(index) > _POSE_SIZE:
-            cross = self._cross[:, index[_POSE_SIZE:] - _POSE_SIZE]
-            block[:_POSE_SIZE, _POSE_SIZE:], block[_POSE_SIZE:, :_POSE_SIZE] = cross, cross.T
-            landmark = (index[_POSE_SIZE::2] - _POSE_SIZE) // 2
-            same = landmark[:, None] == landmark
-            blocks = same[:, :, None, None] * self._map_covariance[landmark]
-            block[_POSE_SIZE:, _POSE_SIZE:] = blocks.transpose(0, 2, 1, 3).reshape(
-                2 * len(landmark), -1
-            )
-        return block
+        landmarks = index[_POSE_SIZE:] - _POSE_SIZE
+        cross = self._cross[:, landmarks]
+        own = self._map_covariance[landmarks[:, None], landmarks]
+        return np.block([[self.pose_covariance, cross], [cross.T, own]])
 
     def predict(self, step: FloatArray, noise: FloatArray) -> None:
         """The robot moves by an odometry step.
@@ -124,6 +128,12 @@ class Localizer:
         """
         by_pose, by_step = move_jacobians(self.pose, step)
         self._state[:_POSE_SIZE] = move(self.pose, step)
+        if self._map_errors == "considered":
+            # From prediction to prediction, as with first estimates in EKF-SLAM: else corrections
+            # would look like knowledge of how the map as a whole is turned.
+            by_pose[0, 2] = self._predicted[1] - self._state[1]
+            by_pose[1, 2] = self._state[0] - self._predicted[0]
+            self._predicted = self.pose.copy()
         moved = by_pose @ self.pose_covariance @ by_pose.T + by_step @ noise @ by_step.T
         self.pose_covariance = 0.5 * (moved + moved.T)
         self._cross = by_pose @ self._cross
@@ -178,21 +188,15 @@ class Localizer:
         factor = np.linalg.solve(root, jacobian @ block[:, :_POSE_SIZE]).T
         self._state[:_POSE_SIZE] += factor @ whitened
         if self._map_errors == "considered":
-            seen = np.linalg.solve(root, self._by_map(jacobian, index))
-            self._cross -= factor @ seen
+            # Of the measurement with the landmarks' errors: H P[index, landmarks].
+            by_map = jacobian[:, :_POSE_SIZE] @ self._cross
+            by_map += (
+                jacobian[:, _POSE_SIZE:] @ self._map_covariance[index[_POSE_SIZE:] - _POSE_SIZE]
+            )
+            self._cross -= factor @ np.linalg.solve(root, by_map)
         self.pose_covariance = self.pose_covariance - factor @ factor.T
         self.count.innovation_squared += float(whitened @ whitened)
         self.count.innovation_numbers += len(innovation)
-
-    def _by_map(self, jacobian: FloatArray, index: IntArray) -> FloatArray:
-        """Covariance of the measurement with the landmarks' errors: H P[index, landmarks]."""
-        product = jacobian[:, :_POSE_SIZE] @ self._cross
-        for column in range(_POSE_SIZE, len(index), 2):
-            place = index[column] - _POSE_SIZE
-            product[:, place : place + 2] += (
-                jacobian[:, column : column + 2] @ self._map_covariance[place // 2]
-            )
-        return product
 
     def _count(self, rows: FrameRows, discs: list[int], lines: list[int]) -> None:
         used_discs, used_lines = set(discs), set(lines)

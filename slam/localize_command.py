@@ -10,7 +10,8 @@ from slam.errors import SlamError
 from slam.filter_association import Associator
 from slam.filter_input import default_output, read_reference, read_run
 from slam.filter_report import demand_free, path_distance, summary, table, write_json
-from slam.localize import Localizer, run_localizer
+from slam.localize import Localizer, MapErrors, run_localizer
+from slam.map_covariance import covariance_file, read_joint_covariance
 from slam.map_file import read_map, write_path
 from slam.options import Localize
 from slam.pictures import draw_errors, draw_map
@@ -39,6 +40,9 @@ def perform(command: Localize) -> int:
             "standard deviations not below 0"
         )
     landmark_map = read_map(command.map)
+    map_errors = _map_errors(command)
+    considered = map_errors == "considered"
+    joint = read_joint_covariance(command.map, landmark_map) if considered else None
     recording, camera_xy = read_run(
         command.run,
         circles=command.circles,
@@ -52,7 +56,8 @@ def perform(command: Localize) -> int:
         command.start,
         np.diag(np.square(command.start_sigma)),
         camera_xy,
-        map_errors=command.map_errors,
+        map_errors=map_errors,
+        joint_covariance=joint,
     )
     began = time.perf_counter()
     run = run_localizer(recording, localizer, associator)
@@ -70,8 +75,12 @@ def perform(command: Localize) -> int:
         [f"slam localize {slam.__version__}: {command.run} in {command.map}"],
         overwrite=command.force,
     )
-    write_json(output / JSON_NAME, summary(run, command, distance), overwrite=command.force)
+    content = summary(run, command, distance)
+    content["map_errors"] = map_errors if joint is None else f"{map_errors}, jointly"
+    write_json(output / JSON_NAME, content, overwrite=command.force)
     print("\n".join(table(run, distance)))
+    if considered and joint is None:
+        print(f"errors of the map taken as independent: no {covariance_file(command.map).name}")
     print(f"time              {seconds:.2f} s, {len(recording) / seconds:.0f} steps/s")
     draw_map(
         output / MAP_PICTURE,
@@ -92,3 +101,12 @@ def perform(command: Localize) -> int:
             interactive=command.interactive,
         )
     return 0
+
+
+def _map_errors(command: Localize) -> MapErrors:
+    """How the map's errors are treated, where that is not said."""
+    if command.map_errors != "auto":
+        return command.map_errors
+    # Considering them makes the filter slow to pull itself back onto the map, which costs little
+    # as long as the pairs are right, and the track if they are to be found.
+    return "considered" if command.association == "known" else "ignored"

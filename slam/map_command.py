@@ -15,6 +15,7 @@ import slam
 from slam.chi_squared import as_json, table_lines
 from slam.errors import SlamError
 from slam.graph_terms import Weighting
+from slam.map_covariance import covariance_file, joint_covariance, write_joint_covariance
 from slam.map_file import LandmarkMap, Path2D, no_landmarks, write_map, write_path
 from slam.mapping import LeftOut, MappedRun, Mounting, landmark_map, map_run, path_of
 from slam.options import Map
@@ -31,7 +32,8 @@ def perform(command: Map) -> int:
     output = (
         command.output or (command.run if command.run.is_dir() else command.run.parent) / "slam"
     )
-    for name in (MAP_NAME, PATH_NAME, TABLE_NAME, PICTURE_NAME):
+    joint_name = covariance_file(Path(MAP_NAME)).name
+    for name in (MAP_NAME, joint_name, PATH_NAME, TABLE_NAME, PICTURE_NAME):
         if (output / name).exists() and not command.force:
             raise OutputExistsError(output / name)
     recording = read_recording(
@@ -59,6 +61,8 @@ def perform(command: Map) -> int:
     final = landmark_map(mapped.graph, mapped.estimate, mapped.covariance)
     path = path_of(recording, mapped.estimate, mapped.covariance)
     write_map(output / MAP_NAME, final, head, overwrite=command.force)
+    joint = joint_covariance(mapped.graph, mapped.estimate, weighting)
+    write_joint_covariance(output / MAP_NAME, joint, overwrite=command.force)
     write_path(output / PATH_NAME, path, head, overwrite=command.force)
     with write_whole(output / TABLE_NAME, overwrite=command.force) as stream:
         stream.write((json.dumps(_results(mapped, command), indent=1) + "\n").encode())

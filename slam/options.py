@@ -100,7 +100,8 @@ class Localize:
         Share of right rows that pass the gate.
     map_errors : str
         `considered`: the map's covariances are errors that stay the same each time a landmark is
-        seen; `white`: errors that are new each time; `ignored`: the map is exact.
+        seen; `white`: errors that are new each time; `ignored`: the map is exact. By default
+        (`auto`) considered with known association, else ignored.
     start : three floats
         Pose at the start in the map (m, m, rad).
     start_sigma : three floats
@@ -124,7 +125,7 @@ class Localize:
     camera: MaybePath = None
     association: Literal["known", "nearest", "joint"] = "known"
     gate_probability: float = 0.999
-    map_errors: Literal["considered", "white", "ignored"] = "considered"
+    map_errors: Literal["auto", "considered", "white", "ignored"] = "auto"
     start: tuple[float, float, float] = (0.0, 0.0, 0.0)
     start_sigma: tuple[float, float, float] = (0.0, 0.0, 0.0)
     reference: MaybePath = None
@@ -216,7 +217,8 @@ class Associate:
     gate_probability : float
         Share of right rows that pass the gate.
     sigma_scale : float
-        Factor on the rows' standard deviations; above 1 where the file's are optimistic.
+        Factor on the rows' standard deviations: a robot that sways moves its rows by more than
+        the file says.
     noise : several floats
         Score once more with so much noise added to the measurements (factor on their standard
         deviation).
@@ -237,7 +239,7 @@ class Associate:
     method: Literal["nearest", "joint"] = "joint"
     map_level: bool = True
     gate_probability: float = 0.999
-    sigma_scale: float = 1.0
+    sigma_scale: float = 1.4
     noise: tuple[float, ...] = ()
     seed: int = 1
     output: Annotated[MaybePath, arg(aliases=["-o"])] = None

@@ -60,6 +60,7 @@ def test_map_then_localise(run: Path, capsys: pytest.CaptureFixture[str]) -> Non
         "errors.png",
     }
     content = json.loads((second / "localize.json").read_text())
+    assert content["map_errors"] == "considered, jointly"
     distance = content["figures"]["distance_from_reference"]
     assert distance["position_rms_m"] < 0.1
     path = read_path(second / "path.csv")
@@ -87,6 +88,7 @@ def test_identities_are_found_in_the_demo_run(run: Path, method: str) -> None:
     some_map = ["--map", str(run / "slam/ekf/map.csv")]
     assert main(["localize", str(run), "--association", method, *some_map, *reference]) == 0
     content = json.loads((run / "slam/localize/localize.json").read_text())
+    assert content["map_errors"] == "ignored"
     assert content["figures"]["disc_rows_used"] > 290
     assert content["figures"]["distance_from_reference"]["position_max_m"] < 0.15
     assert main(["ekf", str(run), "--association", method, "-o", str(run / "found")]) == 0

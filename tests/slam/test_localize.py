@@ -87,7 +87,10 @@ def drive(seed: int, *, noise: float = 1.0) -> tuple[Recording, LandmarkMap, Flo
 
 
 def dense(
-    recording: Recording, some: LandmarkMap, map_errors: MapErrors
+    recording: Recording,
+    some: LandmarkMap,
+    map_errors: MapErrors,
+    joint: FloatArray | None = None,
 ) -> tuple[FloatArray, FloatArray]:
     """Poses and covariances by full matrices of pose and map, the map's gain set to zero."""
     places = np.concatenate([some.discs.xy, some.lines.xy])
@@ -98,12 +101,18 @@ def dense(
         blocks[3 + 2 * i : 5 + 2 * i, 3 + 2 * i : 5 + 2 * i] = block
     if map_errors == "considered":
         P += blocks
+        if joint is not None:
+            P[3:, 3:] = joint
+    predicted = pose
     poses, covariances = [pose], [P[:3, :3]]
     for k, rows in enumerate(frames_of(recording)):
         by_pose, by_step = move_jacobians(pose, recording.steps[k])
         pose = move(pose, recording.steps[k])
         F = np.eye(size)
         F[:3, :3] = by_pose
+        if map_errors == "considered":
+            F[0, 2], F[1, 2] = predicted[1] - pose[1], pose[0] - predicted[0]
+            predicted = pose
         P = F @ P @ F.T
         P[:3, :3] += by_step @ recording.step_covariance[k] @ by_step.T
         H, v, R = [], [], []
@@ -154,6 +163,43 @@ def test_the_localizer_is_the_plain_dense_filter(map_errors: MapErrors) -> None:
     np.testing.assert_allclose(run.path.covariance, covariances, rtol=0, atol=1e-12)
     assert (run.count.discs, run.count.lines) == (len(recording.circles), len(recording.lines))
     assert not run.count.left_out
+
+
+def test_errors_that_landmarks_have_in_common_are_considered() -> None:
+    recording, some, _ = drive(8)
+    joint = spd(np.random.default_rng(8), 40, 0.1)
+    localizer = Localizer(some, camera_xy=CAMERA_XY, joint_covariance=joint)
+    run = run_localizer(recording, localizer)
+    poses, covariances = dense(recording, some, "considered", joint)
+    np.testing.assert_allclose(run.path.poses, poses, rtol=0, atol=1e-10)
+    assert run.path.covariance is not None
+    np.testing.assert_allclose(run.path.covariance, covariances, rtol=0, atol=1e-12)
+
+
+def test_a_map_moved_as_a_whole_moves_the_path() -> None:
+    """The pose is as uncertain as the map's place, but its landmarks are trusted to each other."""
+    recording, some, truth = drive(9, noise=0.0)
+    places = np.concatenate([some.discs.xy, some.lines.xy])
+    # How landmarks and poses move when the map is shifted and turned about the origin.
+    by_frame = np.zeros((len(places), 2, 3))
+    by_frame[:, :, :2] = np.eye(2)
+    by_frame[:, 0, 2], by_frame[:, 1, 2] = -places[:, 1], places[:, 0]
+    flat = by_frame.reshape(-1, 3)
+    frame = np.diag([0.3**2, 0.2**2, 0.1**2])
+    joint = flat @ frame @ flat.T + 1e-8 * np.eye(len(flat))
+    # Next to nothing is known of the start, so that all there is to know comes from the map.
+    start = 1e4 * np.eye(3)
+    localizer = Localizer(some, start_covariance=start, camera_xy=CAMERA_XY, joint_covariance=joint)
+    run = run_localizer(recording, localizer)
+    np.testing.assert_allclose(run.path.poses, truth, atol=1e-6)
+    assert run.path.covariance is not None
+    for pose, found in zip(truth[20:], run.path.covariance[20:]):
+        by = np.array([[1.0, 0.0, -pose[1]], [0.0, 1.0, pose[0]], [0.0, 0.0, 1.0]])
+        least = by @ frame @ by.T
+        # Never surer than the map is of its own place, and hardly less sure.
+        assert np.min(np.linalg.eigvalsh(found - 0.999 * least)) > -1e-9
+        assert found[2, 2] < 1.2 * least[2, 2]
+    assert localizer.pose_covariance[2, 2] == pytest.approx(0.1**2, rel=0.2)
 
 
 def test_without_noise_the_path_is_the_true_one() -> None:
