@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from camera import Camera
 from landmarks import read_frames
@@ -32,7 +33,12 @@ def _with_camera_place(camera: Camera) -> Camera:
     """The camera, standing where the small run's bearings are taken from."""
     matrix = np.array(camera.robot_from_camera)
     matrix[:2, 3] = CAMERA_XY
-    return replace(camera, robot_from_camera=matrix)
+    return _mounted(camera, matrix)
+
+
+def _mounted(camera: Camera, matrix: NDArray[np.float64]) -> Camera:
+    first, second, third = (tuple(float(x) for x in row) for row in matrix)
+    return replace(camera, robot_from_camera=(first, second, third))  # type: ignore[arg-type]
 
 
 def test_exact_rows_give_the_truth_back(published_camera: Camera) -> None:
@@ -52,7 +58,10 @@ def test_exact_rows_give_the_truth_back(published_camera: Camera) -> None:
 @pytest.mark.long
 def test_errors_and_chi_squared_are_as_the_covariances_say(published_camera: Camera) -> None:
     camera = _with_camera_place(published_camera)
-    chi_squared, expected, disc_nees, line_nees, pose_nees = 0.0, 0, [], [], []
+    chi_squared, expected = 0.0, 0
+    disc_nees: list[float] = []
+    line_nees: list[float] = []
+    pose_nees: list[float] = []
     for seed in range(30):
         run = small_run(seed)
         mapped = map_run(run.recording, camera)
@@ -75,7 +84,8 @@ def test_errors_and_chi_squared_are_as_the_covariances_say(published_camera: Cam
                 pose_nees,
             ),
         ):
-            into.append(np.mean(np.einsum("ni,nij,nj->n", off, np.linalg.inv(spread), off)))
+            squared = np.einsum("ni,nij,nj->n", off, np.linalg.inv(spread), off)
+            into.append(float(np.mean(squared)))
     # 95 % of chi-squared / its degrees of freedom lies within 1.96 sqrt(2 / dof); twice that here.
     assert chi_squared / expected == pytest.approx(1.0, abs=4 * np.sqrt(2 / expected))
     # Landmarks of one run err together: as if each run gave a few independent ones.
@@ -88,7 +98,7 @@ def test_gtsam_finds_the_same_minimum(published_camera: Camera) -> None:
     pytest.importorskip("gtsam")
     mapped = map_run(small_run(2).recording, _with_camera_place(published_camera))
     for loss in ("none", "cauchy"):
-        weighting = Weighting(loss=loss)  # type: ignore[arg-type]
+        weighting = Weighting(loss=loss)
         ours = solve(mapped.graph, mapped.estimate, weighting)
         theirs = solve_gtsam(mapped.graph, mapped.estimate, weighting)
         # Its error of a step is a logarithm: other in the second order.
@@ -135,15 +145,9 @@ def test_calibration_recovers_a_wrong_mounting(published_camera: Camera, row_err
     # The rows that this camera would write, mounted otherwise than the file says.
     run = small_run(7, noise=0.0, steps=90)
     circles = run.recording.circles
-    mounted = replace(
-        published_camera,
-        robot_from_camera=np.column_stack(
-            [
-                turn @ published_camera.rotation,
-                published_camera.centre + np.array([0.0, 0.0, true[3]]),
-            ]
-        ),
-    )
+    place = published_camera.centre + np.array([0.0, 0.0, true[3]])
+    matrix = np.column_stack([turn @ published_camera.rotation, place])
+    mounted = _mounted(published_camera, matrix)
     backward = np.column_stack([published_camera.rotation, published_camera.centre])
     written, _ = rows_through_mounting(mounted, directions_of_rows(mounted, circles.xy), backward)
     spoilt = replace(_only_discs(run), circles=replace(circles, xy=written))
