@@ -9,6 +9,23 @@ from numba import njit
 from numpy.typing import NDArray
 
 
+@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"}, forceinline=True)
+def _votes(
+    x: NDArray[np.float64],
+    y: NDArray[np.float64],
+    z: NDArray[np.float64],
+    weight: NDArray[np.float64],
+    pitch: float,
+    roll: float,
+) -> float:
+    """Votes of lines, whose normals are given in units of their tolerances, for a tilt."""
+    votes = 0.0
+    for line in range(len(weight)):
+        off = z[line] + pitch * y[line] - roll * x[line]
+        votes += weight[line] * max(1.0 - off * off, 0.0)
+    return votes
+
+
 @njit(cache=True, error_model="numpy")
 def vote_for_tilt(
     normal: NDArray[np.float64],
@@ -46,6 +63,9 @@ def vote_for_tilt(
     best_pitch = 0.0
     best_roll = 0.0
     best = -math.inf
+    x = normal[:, 0] / tolerance
+    y = normal[:, 1] / tolerance
+    z = normal[:, 2] / tolerance
     for i in range(-1, len(proposer)):
         for k in range(i + 1, len(proposer) if i >= 0 else 1):
             pitch = 0.0
@@ -62,11 +82,7 @@ def vote_for_tilt(
                 if not (abs(pitch) <= limit and abs(roll) <= limit):
                     continue
             votes = -0.5 * (pitch * pitch + roll * roll) / (prior * prior)
-            for line in range(len(weight)):
-                off = normal[line, 2] + pitch * normal[line, 1] - roll * normal[line, 0]
-                off /= tolerance[line]
-                if off * off < 1.0:
-                    votes += weight[line] * (1.0 - off * off)
+            votes += _votes(x, y, z, weight, pitch, roll)
             if votes > best:
                 best = votes
                 best_pitch = pitch
