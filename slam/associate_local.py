@@ -46,7 +46,8 @@ class LocalSettings:
     gate_probability : float
         Share of right rows (or sets of rows) that pass the gate.
     sigma_scale : float
-        Factor on the rows' standard deviations, where the file's are known to be optimistic.
+        Factor on the rows' standard deviations: tilt and calibration move a frame's rows together
+        by more than the file says.
     forget_frames : int
         A landmark unseen for longer is forgotten.
     forget_sigma_m : float
@@ -59,11 +60,11 @@ class LocalSettings:
 
     method: Method = "joint"
     gate_probability: float = 0.999
-    sigma_scale: float = 1.0
+    sigma_scale: float = 1.4
     forget_frames: int = 60
     forget_sigma_m: float = 0.35
     most_landmarks: int = 40
-    most_nodes: int = 3000
+    most_nodes: int = 30_000
 
 
 @dataclass(eq=False)

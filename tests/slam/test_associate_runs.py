@@ -1,0 +1,221 @@
+"""Association of whole small runs whose truth is known, and the transformations in it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from landmarks import wrap_angle
+from slam.associate import AssociateSettings, associate_run
+from slam.associate_local import LocalMap, LocalSettings, Method, associate_locally, moved
+from slam.association_score import score_association
+from slam.measurement import bearing_of_vertical, disc_in_robot
+from slam.motion import chain_steps, relative_pose
+from slam.recording import CircleRows, LineRows, Recording
+
+FloatArray = NDArray[np.float64]
+CAMERA_XY = (0.02, -0.08)
+STEP_SIGMA = np.array([0.004, 0.004, 0.006])
+DISC_SIGMA, LINE_SIGMA = 0.03, 0.002
+
+
+def circuit(laps: float, side_m: float = 8.0) -> FloatArray:
+    """Poses along a square, a step every 0.2 m and eight steps to turn at a corner."""
+    per_side = round(side_m / 0.2)
+    steps: list[tuple[float, float, float]] = []
+    while len(steps) < laps * 4 * (per_side + 8):
+        steps += [(0.0, -0.2, 0.0)] * per_side + [(0.0, 0.0, np.pi / 16)] * 8
+    return chain_steps(np.array(steps[: int(laps * 4 * (per_side + 8))]))
+
+
+def drive(
+    path: FloatArray, discs: FloatArray, lines: FloatArray, seed: int, bias_rad: float = 0.0
+) -> Recording:
+    """What a robot on a path measures: discs within 3.5 m ahead, lines within 6 m."""
+    rng = np.random.default_rng(seed)
+    count = len(path) - 1
+    steps = relative_pose(path[:-1], path[1:]) + STEP_SIGMA * rng.normal(size=(count, 3))
+    steps[:, 2] += bias_rad
+    sigma = STEP_SIGMA + np.array([0.0, 0.0, abs(bias_rad)])
+    seen: list[tuple[int, int, FloatArray]] = []
+    upright: list[tuple[int, int, float]] = []
+    for k, pose in enumerate(path[1:]):
+        place = disc_in_robot(pose, discs)
+        for i in np.flatnonzero((place[:, 1] < -0.7) & (place[:, 1] > -3.5)):
+            if abs(place[i, 0]) < 0.3 - 0.6 * place[i, 1] and rng.random() < 0.85:
+                seen.append((k, int(i), place[i] + DISC_SIGMA * rng.normal(size=2)))
+        bearing = bearing_of_vertical(pose, lines, CAMERA_XY) if len(lines) else np.zeros(0)
+        reach = np.linalg.norm(lines - pose[:2], axis=1)
+        for i in np.flatnonzero((np.abs(bearing) < 0.9) & (reach < 6.0)):
+            upright.append((k, int(i), float(bearing[i] + LINE_SIGMA * rng.normal())))
+    n, m = len(seen), len(upright)
+    return Recording(
+        prefixes=tuple(f"s.{k}" for k in range(count)),
+        steps=steps,
+        step_covariance=np.tile(np.diag(sigma**2), (count, 1, 1)),
+        circles=CircleRows(
+            np.array([k for k, _, _ in seen], dtype=np.int64),
+            np.array([xy for _, _, xy in seen]).reshape(-1, 2),
+            np.tile(DISC_SIGMA**2 * np.eye(2), (n, 1, 1)),
+            np.array([i for _, i, _ in seen], dtype=np.int64),
+        ),
+        lines=LineRows(
+            np.array([k for k, _, _ in upright], dtype=np.int64),
+            wrap_angle(np.array([b for _, _, b in upright])),
+            np.full(m, LINE_SIGMA),
+            tuple((i,) for _, i, _ in upright),
+        ),
+    )
+
+
+def scattered(seed: int, count: int, apart_m: float, side_m: float = 8.0) -> FloatArray:
+    """Random places along the square, none nearer to another than a distance."""
+    rng = np.random.default_rng(seed)
+    path = circuit(1.0, side_m)
+    places: list[FloatArray] = []
+    while len(places) < count:
+        place = path[rng.integers(len(path)), :2] + rng.uniform(-2.0, 2.0, 2)
+        if all(np.linalg.norm(place - other) > apart_m for other in places):
+            places.append(place)
+    return np.array(places)
+
+
+def ids_of(recording: Recording) -> list[tuple[int, ...]]:
+    return [(int(i),) for i in recording.circles.ids]
+
+
+NO_LINES = np.zeros((0, 2))
+
+
+@given(seed=st.integers(0, 2**32 - 1), is_line=st.booleans())
+def test_moving_the_map_moves_places_exactly_and_covariances_to_first_order(
+    seed: int, is_line: bool
+) -> None:
+    rng = np.random.default_rng(seed)
+    place = rng.uniform([-2.0, -5.0], [2.0, -1.5], (2, 2))
+    step = np.array([*rng.uniform(-0.2, 0.2, 2), rng.uniform(-0.3, 0.3)])
+    root = rng.normal(size=(4, 4)) * 0.05
+    covariance, step_root = root @ root.T, rng.normal(size=(3, 3)) * 0.02
+    number = np.arange(2)
+
+    def state(robot_xy: FloatArray) -> FloatArray:
+        if not is_line:
+            return robot_xy
+        bearing = bearing_of_vertical(np.zeros(3), robot_xy, CAMERA_XY)
+        reach = np.linalg.norm(robot_xy - CAMERA_XY, axis=1)
+        return np.stack([bearing, 1.0 / reach], axis=1)
+
+    def after(mean: FloatArray, by: FloatArray) -> FloatArray:
+        local = LocalMap(mean, covariance, np.full(2, is_line), number, number)
+        return moved(local, by, step_root @ step_root.T, CAMERA_XY).mean
+
+    mean = state(place)
+    assert after(mean, step) == pytest.approx(state(disc_in_robot(step, place)), abs=1e-12)
+    small = 1e-6
+    by_mean = np.zeros((4, 4))
+    for k in range(4):
+        change = np.zeros(4)
+        change[k] = small
+        up, down = (
+            after(mean + change.reshape(2, 2), step),
+            after(mean - change.reshape(2, 2), step),
+        )
+        by_mean[:, k] = (up - down).reshape(-1) / (2 * small)
+    by_step = np.zeros((4, 3))
+    for k in range(3):
+        change = np.zeros(3)
+        change[k] = small
+        by_step[:, k] = (after(mean, step + change) - after(mean, step - change)).reshape(-1)
+    by_step /= 2 * small
+    expected = by_mean @ covariance @ by_mean.T + by_step @ step_root @ step_root.T @ by_step.T
+    local = LocalMap(mean, covariance, np.full(2, is_line), number, number)
+    found = moved(local, step, step_root @ step_root.T, CAMERA_XY).covariance
+    assert found == pytest.approx(expected, rel=1e-4, abs=1e-8)
+
+
+@pytest.mark.parametrize("method", ["nearest", "joint"])
+def test_well_separated_landmarks_are_followed_without_a_mistake(method: Method) -> None:
+    path = circuit(0.9)
+    recording = drive(path, scattered(1, 60, 0.6), scattered(2, 25, 1.0), seed=3)
+    found = associate_locally(recording, LocalSettings(method=method), camera_xy=CAMERA_XY)
+    discs = score_association(found.circle_labels, ids_of(recording))
+    assert (discs.pair_precision, discs.wrong_merges) == (1.0, 0)
+    assert discs.pair_recall > 0.98
+    lines = score_association(found.line_labels, list(recording.lines.ids))
+    assert lines.pair_precision > (0.99 if method == "joint" else 0.95)
+    assert lines.pair_recall > 0.8
+
+
+def test_ids_in_the_file_are_not_looked_at_and_the_result_is_the_same_every_time() -> None:
+    recording = drive(circuit(0.5), scattered(4, 40, 0.4), NO_LINES, seed=5)
+    blind = replace(
+        recording, circles=replace(recording.circles, ids=recording.circles.ids * 0 - 1)
+    )
+    one, other = associate_run(recording), associate_run(blind)
+    assert one.circle_labels.tolist() == other.circle_labels.tolist()
+    assert one.circle_labels.tolist() == associate_run(recording).circle_labels.tolist()
+
+
+def test_lines_get_the_place_where_they_stand() -> None:
+    path = circuit(0.2)
+    places = scattered(6, 12, 1.0)
+    recording = drive(path, scattered(7, 40, 0.6), places, seed=8)
+    found = associate_locally(recording, camera_xy=CAMERA_XY)
+    counts = np.bincount(found.line_labels)
+    checked = 0
+    for label in np.flatnonzero(counts >= 12):
+        true = recording.lines.ids[int(np.flatnonzero(found.line_labels == label)[0])][0]
+        frame = found.line_frames[label]
+        expected = disc_in_robot(path[frame + 1], places[true])
+        if np.isfinite(found.line_places[label]).all() and np.linalg.norm(expected) < 3.0:
+            assert found.line_places[label] == pytest.approx(expected, abs=0.4)
+            checked += 1
+    assert checked >= 2
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("bias_rad", [0.0, 0.004])
+def test_a_second_lap_is_recognised_though_odometry_drifts(bias_rad: float) -> None:
+    """By a bias of 0.004 rad a step the second lap is turned by 0.8 rad and metres away."""
+    discs = scattered(9, 150, 0.3)
+    path = circuit(2.0)
+    recording = drive(path, discs, NO_LINES, seed=10, bias_rad=bias_rad)
+    found = associate_run(recording)
+    before = score_association(found.local_circle_labels, ids_of(recording))
+    after = score_association(found.circle_labels, ids_of(recording))
+    assert before.pair_recall < 0.7
+    assert after.pair_precision > 0.999
+    assert after.pair_recall > 0.99
+    assert found.path is not None
+    assert np.linalg.norm(found.path[-1, :2] - path[-1, :2]) < 0.15
+
+
+@pytest.mark.long
+def test_two_places_that_only_look_alike_in_part_stay_apart() -> None:
+    """No loop: a straight way past 120 discs at random; nothing may be merged over a distance."""
+    rng = np.random.default_rng(11)
+    path = chain_steps(np.tile([0.0, -0.2, 0.0], (300, 1)))
+    discs = np.stack([rng.uniform(-2, 2, 120), rng.uniform(-63, 0, 120)], axis=1)
+    recording = drive(path, discs, NO_LINES, seed=12)
+    found = associate_run(recording)
+    assert found.matches == ()
+    assert score_association(found.circle_labels, ids_of(recording)).pair_precision > 0.99
+
+
+def test_without_map_level_the_labels_are_the_local_ones() -> None:
+    recording = drive(circuit(0.5), scattered(4, 40, 0.4), NO_LINES, seed=5)
+    found = associate_run(recording, AssociateSettings(map_level=False))
+    assert found.circle_labels.tolist() == found.local_circle_labels.tolist()
+    assert found.path is None
+
+
+def test_a_run_without_landmarks_is_associated_to_nothing() -> None:
+    recording = drive(circuit(0.1), np.zeros((0, 2)), NO_LINES, seed=1)
+    found = associate_run(recording)
+    assert len(found.circle_labels) == 0
+    assert len(found.line_labels) == 0
