@@ -9,6 +9,7 @@ from importlib import import_module
 STUDIES = {
     "map": "tools.slam_evaluation.map_study",
     "map-speed": "tools.slam_evaluation.map_speed",
+    "map-calibration": "tools.slam_evaluation.map_calibration",
     "map-redetected": "tools.slam_evaluation.map_redetected",
     "consistency": "tools.slam_evaluation.consistency",
 }

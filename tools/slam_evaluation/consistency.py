@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -48,9 +48,9 @@ class Settings:
     """
 
     runs: int = 50
-    steps: int = 300
+    steps: int = 240
     seed: int = 1
-    turn_sigma_deg: tuple[float, ...] = (0.1, 0.3, 1.0, 2.0, 4.0)
+    turn_sigma_deg: tuple[float, ...] = (0.1, 1.0, 3.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,15 +178,17 @@ def mapped(jacobians: JacobiansAt) -> Callable[[SimulatedRun, int], FilterRun]:
     return estimate
 
 
-def report(settings: Settings) -> list[str]:
+def report(settings: Settings) -> Iterator[str]:
     """The table, line by line."""
     low, high = band(settings.runs)
-    lines = [
+    yield (
         f"NEES of the pose, mean of {settings.runs} runs of {settings.steps} steps; expected "
-        f"{POSE_NUMBERS}, 95 % band {low:.2f} to {high:.2f}",
-        f"{'heading noise':>13}  {'landmarks':<14}  {'filter':<36} {'NEES':>7} {'last':>7} "
-        f"{'in band':>8}  {'largest turn':>12}",
-    ]
+        f"{POSE_NUMBERS}, 95 % band {low:.2f} to {high:.2f}"
+    )
+    yield (
+        f"{'heading noise':>13}  {'landmarks':<12}  {'filter':<34} {'NEES':>7} {'last':>7} "
+        f"{'in band':>8}  {'heading error':>13}"
+    )
     filters = [
         ("localizer, exact map", localized(0.0, "considered")),
         ("localizer, map of 5 cm, considered", localized(_MAP_SIGMA_M, "considered")),
@@ -203,18 +205,18 @@ def report(settings: Settings) -> list[str]:
             )
             for name, estimate in filters:
                 found = assess(scenario, estimate, settings.runs, settings.seed)
-                lines.append(
-                    f"{degrees:9.1f} deg  {landmarks:<14}  {name:<36} {found.overall:7.2f} "
+                yield (
+                    f"{degrees:9.1f} deg  {landmarks:<12}  {name:<34} {found.overall:7.2f} "
                     f"{found.mean[-1]:7.2f} {found.inside:8.1%}  "
-                    f"{np.degrees(found.heading_error_rad):8.1f} deg"
+                    f"{np.degrees(found.heading_error_rad):9.1f} deg"
                 )
-    return lines
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Print the table."""
     settings = tyro.cli(Settings, prog="consistency", args=arguments)
-    print("\n".join(report(settings)))
+    for line in report(settings):
+        print(line, flush=True)
     return 0
 
 

@@ -3,7 +3,7 @@
 Each detected row gets the identifier of the true disc next to it, within its gate; rows of no disc
 have none. The same rows at their true places, with errors drawn from their own covariances, say
 what a detector could reach whose covariances are right. Or the file's own identifiers are taken
-(`slam associate`), and a disc of the map is held against the true one nearest to it.
+(`slam associate`), and a disc of the map is held against the true one that most of its rows show.
 """
 
 from __future__ import annotations
@@ -77,14 +77,22 @@ def with_true_places(recording: Recording, ids: IntArray, truth: Truth, seed: in
     return replace(recording, circles=replace(circles, xy=xy, ids=ids))
 
 
-def errors_of(mapped: MappedRun, truth: Truth) -> FloatArray:
-    """Root mean square errors of discs seen more than once, and of the path (m)."""
-    known = np.array(list(truth.discs.values()))
-    often = mapped.graph.disc_row_counts > 1
-    off = mapped.estimate.disc_xy[often, None] - known
-    nearest = np.min(np.linalg.norm(off, axis=2), axis=1)
+def shown(used: IntArray, ids: IntArray, numbers: IntArray) -> IntArray:
+    """(M,) the true disc that most rows of each landmark show, -1 where they show none."""
+    majority = []
+    for number in numbers:
+        values, counts = np.unique(ids[used == number], return_counts=True)
+        majority.append(values[np.argmax(counts)])
+    return np.array(majority, dtype=np.int64)
+
+
+def errors_of(mapped: MappedRun, discs: IntArray, truth: Truth) -> FloatArray:
+    """Root mean square errors of true discs seen more than once, and of the path (m)."""
+    often = (mapped.graph.disc_row_counts > 1) & (discs != UNKNOWN_ID)
+    true = np.array([truth.discs[int(i)] for i in discs[often]])
+    off = np.sum((mapped.estimate.disc_xy[often] - true) ** 2, axis=1)
     path, _ = path_distance(mapped.estimate.poses, truth)
-    return np.array([np.sqrt(np.mean(nearest**2)), path])
+    return np.array([np.sqrt(np.mean(off)), path])
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -92,7 +100,7 @@ def main(arguments: list[str] | None = None) -> int:
     settings = tyro.cli(Settings, prog="map-redetected", args=arguments)
     truth = read_truth(settings.run)
     print(
-        f"{'rows':<26}{'used':>6}{'discs':>7}{'factor':>8}"
+        f"{'rows':<26}{'used':>6}{'discs':>7}{'false':>7}{'factor':>8}"
         f"{'discs off':>11}{'path off':>11}{'true discs':>12}{'path':>9}{'ratios':>13}"
     )
     for path in settings.detected:
@@ -106,14 +114,16 @@ def main(arguments: list[str] | None = None) -> int:
         mapped = map_run(
             replace(recording, circles=replace(recording.circles, ids=used)), name=str(path)
         )
-        off = errors_of(mapped, truth)
-        ideal = [
-            errors_of(map_run(with_true_places(recording, ids, truth, seed)), truth) ** 2
-            for seed in range(settings.seeds)
-        ]
+        discs = shown(used, ids, mapped.graph.disc_ids)
+        off = errors_of(mapped, discs, truth)
+        ideal = []
+        for seed in range(settings.seeds):
+            true = map_run(with_true_places(recording, ids, truth, seed))
+            ideal.append(errors_of(true, true.graph.disc_ids, truth) ** 2)
         best = np.sqrt(np.mean(ideal, axis=0))
         print(
             f"{path.name:<26}{mapped.table.measurements:>6}{mapped.table.landmarks:>7}"
+            f"{int(np.sum(discs == UNKNOWN_ID)):>7}"
             f"{mapped.table.factor:>8.2f}{off[0]:>9.4f} m{off[1]:>9.4f} m{best[0]:>10.4f} m"
             f"{best[1]:>7.4f} m{off[0] / best[0]:>7.2f}{off[1] / best[1]:>6.2f}"
         )
