@@ -10,6 +10,7 @@ STUDIES = {
     "map": "tools.slam_evaluation.map_study",
     "map-speed": "tools.slam_evaluation.map_speed",
     "map-calibration": "tools.slam_evaluation.map_calibration",
+    "map-modelling": "tools.slam_evaluation.map_modelling",
     "map-redetected": "tools.slam_evaluation.map_redetected",
     "consistency": "tools.slam_evaluation.consistency",
 }
