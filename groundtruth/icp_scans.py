@@ -42,6 +42,8 @@ class ScanMatchSettings:
         So many of the coarse poses are refined.
     kept : float
         Share of the pairs within the gate that counts: the best.
+    largest_shift_m : float
+        A pose farther than this from its start is none: the robot cannot have moved so far (m).
     normal_radius_m, normal_reach, normal_spread : float, int, float
         A point's line comes from the points up to so many beams to either side, without a step
         longer than the radius, if they extend across it by no more than this share of along it.
@@ -57,6 +59,7 @@ class ScanMatchSettings:
     coarse_thinning: int = 2
     refined: int = 4
     kept: float = 0.95
+    largest_shift_m: float = 1.0
     normal_radius_m: float = 0.3
     normal_reach: int = 4
     normal_spread: float = 0.25
@@ -146,7 +149,7 @@ def match_scans(
         pose, _, _ = align_scans(
             thin, fixed, normals, good, start, np.array(s.coarse_gates_m), s.kept, 1e-3
         )
-        if np.isfinite(pose).all():
+        if math.hypot(pose[0] - start[0], pose[1] - start[1]) <= s.largest_shift_m:  # NaN is not
             coarse.append((explained(thin, fixed, pose, s.coarse_sigma_m), pose))
     coarse.sort(key=lambda found: -found[0])
     fine: list[tuple[float, FloatArray]] = []

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 FloatArray = NDArray[np.float64]
 
 #: So many readings that hide the robot, or of things beside it, mark a set as disturbed.
-_DISTURBED = 4
+_DISTURBED = 3
 
 _SUSPECT_SIGMA, _SUSPECT_M, _SUSPECT_RAD = 5.0, 0.005, 0.002
 

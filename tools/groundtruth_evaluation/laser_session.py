@@ -22,6 +22,7 @@ import numpy as np
 import tyro
 from numpy.typing import NDArray
 
+from groundtruth.errors import GroundTruthError
 from groundtruth.icp_motion import wrapped
 from groundtruth.laser_blocks import combined_poses
 from groundtruth.laser_command import load_session, track_robot
@@ -76,7 +77,12 @@ def perform(options: LaserSessions) -> int:
         if folder is None:
             folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         for seed in range(options.first, options.first + options.seeds):
-            row = one_session(_session(options, seed, folder), options)
+            try:
+                session = _session(options, seed, folder)
+            except GroundTruthError as error:
+                print(f"{seed:4d} not simulated: {error}")
+                continue
+            row = one_session(session, options)
             rows.append(row)
             print(
                 f"{seed:4d} {row['sets']:6.0f} {100 * row['found']:5.1f} {row['mm']:8.2f} "
