@@ -103,6 +103,8 @@ class Sync:
         Bound of the drift: the clocks' rates differ by at most this share.
     segment_gap_s : float
         A longer pause in the ground truth begins a new segment (s).
+    use_movement : bool
+        Refine what the headings tell by the whole movement, where the ground truth has covariances.
     ptpd : Path
         Log of ptpd, to compare with.
     apply : Path
@@ -118,6 +120,7 @@ class Sync:
     largest_offset_s: float = 1.0
     largest_drift: float = 0.01
     segment_gap_s: float = 5.0
+    use_movement: bool = True
     ptpd: MaybePath = None
     apply: MaybePath = None
     output: Annotated[Path, arg(aliases=["-o"])] = Path("clock.json")

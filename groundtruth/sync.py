@@ -21,6 +21,7 @@ from scipy.optimize import Bounds, direct, minimize
 from groundtruth.clock import ClockSegment, Status
 from groundtruth.clock_jump import find_jump
 from groundtruth.clock_line import on_one_line
+from groundtruth.clock_refinement import refine_by_movement
 from groundtruth.errors import GroundTruthError
 from groundtruth.heading_pair import HeadingPair, pair_headings, without_turns
 from groundtruth.headings import continuous_headings, segments_between_gaps
@@ -53,6 +54,8 @@ class SyncSettings:
         The clocks' rates differ by at most this share.
     segment_gap_s : float
         A longer pause in the ground truth begins a new segment (s).
+    use_movement : bool
+        Refine what the headings tell by the whole movement, where the ground truth has covariances.
 
     Raises
     ------
@@ -63,6 +66,7 @@ class SyncSettings:
     largest_offset_s: float = 1.0
     largest_drift: float = 0.01
     segment_gap_s: float = 5.0
+    use_movement: bool = True
 
     def __post_init__(self) -> None:
         for name in ("largest_offset_s", "largest_drift", "segment_gap_s"):
@@ -115,6 +119,8 @@ def synchronise(
             f"truth from {groundtruth.times_s[0]:.3f} s to {groundtruth.times_s[-1]:.3f} s do not "
             f"overlap within {bounds.largest_offset_s:g} s"
         )
+    if bounds.use_movement:
+        found = refine_by_movement(found, odometry, groundtruth)
     return tuple(_told_by_the_others(on_one_line(found)))
 
 

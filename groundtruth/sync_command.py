@@ -26,6 +26,7 @@ def perform(options: Sync) -> int:
         largest_offset_s=options.largest_offset_s,
         largest_drift=options.largest_drift,
         segment_gap_s=options.segment_gap_s,
+        use_movement=options.use_movement,
     )
     odometry = read_planar_poses(options.odometry)
     truth = read_planar_poses(options.groundtruth)
