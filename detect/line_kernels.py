@@ -1,7 +1,7 @@
 """Compiled loops that follow edges through the strip image: starts and tracks.
 
-The strip image is that of `detect.line_response_kernels`. Tracks evaluate the filter where they go:
-first its moments across the vertical, which are kept, then along it.
+The strip image is that of `detect.line_response_kernels`. Tracks evaluate the filter where they go,
+for a group of neighbouring verticals at a time (`detect.line_group_kernels`).
 """
 
 from __future__ import annotations
