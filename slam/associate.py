@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.associate_local import LocalSettings, associate_locally
+from slam.associate_local import LocalSettings, associate_locally, tilt_jacobian
 from slam.loops import LoopSettings, Match, find_matches, stretches_of
 from slam.loops_closing import closed_path, in_order, merge_labels, pairs_by_votes, pairs_in_place
 from slam.loops_path import Solution, intersect_bearings, solve_path
@@ -184,7 +184,7 @@ def _solved(
         line_xy = intersect_bearings(recording, start, labels, camera_xy=camera_xy)
     none = np.zeros(len(recording.lines), dtype=np.int64)
     return solve_path(
-        recording,
+        _swayed(recording, setting.local),
         labels if by_discs else none[:0],
         none if by_discs else labels,
         path,
@@ -192,6 +192,15 @@ def _solved(
         camera_xy=camera_xy,
         sigma_scale=setting.local.sigma_scale,
     )
+
+
+def _swayed(recording: Recording, setting: LocalSettings) -> Recording:
+    """The run with the robot's sway in its discs' covariances."""
+    if setting.tilt_sigma_rad == 0.0:
+        return recording
+    moving = setting.tilt_sigma_rad * tilt_jacobian(recording.circles.xy, setting.camera_height_m)
+    covariance = recording.circles.covariance + moving @ moving.swapaxes(1, 2)
+    return replace(recording, circles=replace(recording.circles, covariance=covariance))
 
 
 def _merged_lines(

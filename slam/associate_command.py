@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -40,11 +41,14 @@ def perform(options: Associate) -> int:
             method=options.method,
             gate_probability=options.gate_probability,
             sigma_scale=options.sigma_scale,
+            tilt_sigma_rad=math.radians(options.tilt_sigma_deg),
         ),
         map_level=options.map_level,
     )
     if not options.sigma_scale > 0.0:
         raise SlamError(f"sigma scale is {options.sigma_scale}: expected above 0")
+    if not options.tilt_sigma_deg >= 0.0:
+        raise SlamError(f"tilt sigma is {options.tilt_sigma_deg}: expected 0 or more")
     sources = _sources(options, circles)
     targets = [_target(options.output, source, len(sources) > 1) for source in sources]
     report = targets[0].with_suffix(".json")

@@ -46,8 +46,13 @@ class LocalSettings:
     gate_probability : float
         Share of right rows (or sets of rows) that pass the gate.
     sigma_scale : float
-        Factor on the rows' standard deviations: tilt and calibration move a frame's rows together
-        by more than the file says.
+        Factor on the discs' standard deviations: tilt and calibration move a frame's discs
+        together by more than the file says. Bearings are compensated for tilt.
+    tilt_sigma_rad : float
+        Standard deviation of the robot's sway about both axes of the floor, which moves all discs
+        of a frame together.
+    camera_height_m : float
+        Above the floor; with the sway it says by how much.
     forget_frames : int
         A landmark unseen for longer is forgotten.
     forget_sigma_m : float
@@ -61,6 +66,8 @@ class LocalSettings:
     method: Method = "joint"
     gate_probability: float = 0.999
     sigma_scale: float = 1.4
+    tilt_sigma_rad: float = 0.0
+    camera_height_m: float = 1.5
     forget_frames: int = 60
     forget_sigma_m: float = 0.35
     most_landmarks: int = 40
@@ -253,12 +260,33 @@ def moved(
     return LocalMap(mean, covariance, local.is_line, local.number, local.last_frame)
 
 
+def tilt_jacobian(disc_xy: FloatArray, height_m: float) -> FloatArray:
+    """How a small tilt of the robot moves the places on the floor that a camera seems to see.
+
+    Parameters
+    ----------
+    disc_xy : (n, 2) float64
+        Places in the robot frame (m); the camera is taken to be above its origin.
+    height_m : float
+        Height of the camera (m).
+
+    Returns
+    -------
+    (n, 2, 2) float64
+        Derivatives of x, y by the turns about the robot's x and y axis (m/rad).
+    """
+    x, y = disc_xy.T
+    rows = (x * y / height_m, -height_m - x**2 / height_m)
+    others = (height_m + y**2 / height_m, -x * y / height_m)
+    return np.stack([np.stack(rows, -1), np.stack(others, -1)], axis=1)
+
+
 def _measured(
     circles: CircleRows, lines: LineRows, rows: slice, is_line: bool, setting: LocalSettings
 ) -> tuple[FloatArray, FloatArray]:
     """What rows of a frame measure (n, d), and their covariances (n, d, d)."""
     if is_line:
-        variance = (setting.sigma_scale * lines.sigma_rad[rows]) ** 2
+        variance = lines.sigma_rad[rows] ** 2
         return lines.bearing_rad[rows][:, None], variance[:, None, None]
     return circles.xy[rows], setting.sigma_scale**2 * circles.covariance[rows]
 
@@ -279,14 +307,24 @@ def _observed(
     innovations = seen[:, None] - local.mean[candidates, :width][None]
     if is_line:
         innovations = wrap_angle(innovations)
-    pairing = _pairing(innovations, local.covariance[np.ix_(index, index)], noise, setting)
+    # A sway is the same for all rows of the frame: it correlates what they measure.
+    sway = np.zeros((len(index), 2))
+    sway_of_rows = np.zeros((len(seen), width, 2))
+    if not is_line:
+        sway = setting.tilt_sigma_rad * tilt_jacobian(
+            local.mean[candidates], setting.camera_height_m
+        ).reshape(-1, 2)
+        sway_of_rows = setting.tilt_sigma_rad * tilt_jacobian(seen, setting.camera_height_m)
+    predicted = local.covariance[np.ix_(index, index)] + sway @ sway.T
+    pairing = _pairing(innovations, predicted, noise, setting)
     rows = np.flatnonzero(pairing.landmark >= 0)
     paired = pairing.landmark[rows]
     mean, covariance = local.mean, local.covariance
     last_frame = local.last_frame.copy()
     if len(rows):
         chosen = (2 * candidates[paired][:, None] + np.arange(width)).reshape(-1)
-        innovation_covariance = covariance[np.ix_(chosen, chosen)]
+        moving = sway.reshape(-1, width, 2)[paired].reshape(-1, 2)
+        innovation_covariance = covariance[np.ix_(chosen, chosen)] + moving @ moving.T
         for k, row in enumerate(rows):
             block = slice(k * width, (k + 1) * width)
             innovation_covariance[block, block] += noise[row]
@@ -312,7 +350,9 @@ def _observed(
         added[:, 1] = _INVERSE_DISTANCE_PRIOR[0]
     for number, row in enumerate(fresh):
         at = 2 * (m + number)
-        grown[at : at + width, at : at + width] = noise[row]
+        grown[at : at + width, at : at + width] = (
+            noise[row] + sway_of_rows[row] @ sway_of_rows[row].T
+        )
         if is_line:
             grown[at + 1, at + 1] = _INVERSE_DISTANCE_PRIOR[1] ** 2
     local = LocalMap(

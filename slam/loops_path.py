@@ -184,7 +184,7 @@ def solve_path(
     camera_xy : (2,)
         The camera's centre in the robot frame (m).
     sigma_scale : float
-        Factor on the rows' standard deviations.
+        Factor on the discs' standard deviations.
     most_steps : int
         Bound of the steps.
     tolerance : float
@@ -208,7 +208,7 @@ def solve_path(
         camera_xy=camera_xy,
         step_root=_information_root(recording.step_covariance),
         circle_root=_information_root(sigma_scale**2 * recording.circles.covariance),
-        line_root=1.0 / (sigma_scale * recording.lines.sigma_rad),
+        line_root=1.0 / recording.lines.sigma_rad,
         line_start=lines.copy(),
     )
     known_lines = np.flatnonzero(known)

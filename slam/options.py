@@ -217,8 +217,11 @@ class Associate:
     gate_probability : float
         Share of right rows that pass the gate.
     sigma_scale : float
-        Factor on the rows' standard deviations: a robot that sways moves its rows by more than
-        the file says.
+        Factor on the discs' standard deviations: a robot that sways moves them by more than the
+        file says.
+    tilt_sigma_deg : float
+        Standard deviation of the robot's sway, which moves all discs of a frame together: for rows
+        whose covariances leave it out and are smaller than that.
     noise : several floats
         Score once more with so much noise added to the measurements (factor on their standard
         deviation).
@@ -240,6 +243,7 @@ class Associate:
     map_level: bool = True
     gate_probability: float = 0.999
     sigma_scale: float = 1.4
+    tilt_sigma_deg: float = 0.0
     noise: tuple[float, ...] = ()
     seed: int = 1
     output: Annotated[MaybePath, arg(aliases=["-o"])] = None

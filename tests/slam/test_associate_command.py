@@ -85,6 +85,7 @@ def test_existing_files_and_settings_without_sense_are_refused(
     for setting, message in (
         (["--gate-probability", "1.5"], "gate probability is 1.5"),
         (["--sigma-scale", "0"], "sigma scale is 0"),
+        (["--tilt-sigma-deg", "-1"], "tilt sigma is -1"),
         (["--noise", "-1"], "expected 0 or more"),
     ):
         assert main(["associate", run, "-o", str(target), *setting]) == 1

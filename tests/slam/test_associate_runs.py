@@ -12,7 +12,14 @@ from numpy.typing import NDArray
 
 from landmarks import wrap_angle
 from slam.associate import AssociateSettings, associate_run
-from slam.associate_local import LocalMap, LocalSettings, Method, associate_locally, moved
+from slam.associate_local import (
+    LocalMap,
+    LocalSettings,
+    Method,
+    associate_locally,
+    moved,
+    tilt_jacobian,
+)
 from slam.association_score import score_association
 from slam.measurement import bearing_of_vertical, disc_in_robot
 from slam.motion import chain_steps, relative_pose
@@ -136,6 +143,39 @@ def test_moving_the_map_moves_places_exactly_and_covariances_to_first_order(
     local = LocalMap(mean, covariance, np.full(2, is_line), number, number)
     found = moved(local, step, step_root @ step_root.T, CAMERA_XY).covariance
     assert found == pytest.approx(expected, rel=1e-4, abs=1e-8)
+
+
+def test_tilt_moves_discs_as_rays_through_the_camera_do() -> None:
+    discs = np.array([[0.4, -2.0], [-1.1, -3.5], [0.0, -0.8]])
+    height, small = 1.5, 1e-6
+    for axis in (0, 1):
+        turn = np.zeros(3)
+        turn[axis] = small
+        rays = np.concatenate([discs, np.full((3, 1), -height)], axis=1)
+        rays = rays + np.cross(turn, rays)
+        hit = rays[:, :2] * (height / -rays[:, 2:])
+        found = tilt_jacobian(discs, height)[:, :, axis]
+        assert found == pytest.approx((hit - discs) / small, rel=1e-4, abs=1e-4)
+
+
+def test_a_swaying_robot_is_followed_where_the_sway_is_told() -> None:
+    """Rows far more precise than the sway that moves them."""
+    recording = drive(circuit(0.3), scattered(13, 60, 0.5), NO_LINES, seed=14)
+    rng = np.random.default_rng(15)
+    tilt = 0.012 * rng.normal(size=(len(recording), 2))
+    circles = recording.circles
+    place = circles.xy + np.einsum(
+        "nij,nj->ni", tilt_jacobian(circles.xy, 1.5), tilt[circles.frame]
+    )
+    # What is left of the measurement noise is told; the sway is not.
+    swaying = replace(recording, circles=replace(circles, xy=place))
+    ids = ids_of(swaying)
+    blind = associate_locally(swaying, LocalSettings(sigma_scale=1.0))
+    told = associate_locally(swaying, LocalSettings(sigma_scale=1.0, tilt_sigma_rad=0.012))
+    assert score_association(blind.circle_labels, ids).pair_recall < 0.9
+    score = score_association(told.circle_labels, ids)
+    assert score.pair_recall > 0.95
+    assert score.pair_precision > 0.98
 
 
 @pytest.mark.parametrize("method", ["nearest", "joint"])

@@ -47,7 +47,7 @@ class Study:
     noise : several floats
         Added noise as a factor on the rows' own standard deviations.
     sigma_scale : float
-        Factor on the rows' standard deviations in all gates.
+        Factor on the discs' standard deviations in all gates.
     seed : int
         Of the noise.
     output : Path
