@@ -6,14 +6,21 @@ otherwise, the same pixel's ray meets the floor elsewhere.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera
-from slam.calibration_model import skew
+from slam.calibration_model import rotation_exp, skew
 from slam.errors import SlamError
 
 FloatArray = NDArray[np.float64]
+
+
+def nominal_mounting(camera: Camera) -> FloatArray:
+    """(3, 4) robot_from_camera as calibrated."""
+    return np.column_stack([camera.rotation, camera.centre])
 
 
 def directions_of_rows(camera: Camera, floor_xy: FloatArray) -> FloatArray:
@@ -67,6 +74,72 @@ def rows_through_mounting(
     by_ray[:, :, 2] = centre[2] * slope / ray[:, 2:]
     by_mounting = np.concatenate([-by_ray @ skew(ray), -slope[:, :, None]], axis=2)
     return centre[:2] - centre[2] * slope, by_mounting
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedJacobians:
+    """Derivatives of n rows as recorded.
+
+    Attributes
+    ----------
+    floor : (n, 2, 2) float64
+        By the disc in the robot frame.
+    tilt : (n, 2, 2) float64
+        By the frame's pitch and roll.
+    mounting : (n, 2, 4) float64
+        By a rotation vector in the robot frame, applied to the mounting from the left, and by the
+        height.
+    """
+
+    floor: FloatArray
+    tilt: FloatArray
+    mounting: FloatArray
+
+
+def rows_as_recorded(
+    camera: Camera, floor_xy: FloatArray, mounting: FloatArray, tilt: FloatArray
+) -> tuple[FloatArray, RecordedJacobians]:
+    """What the camera as calibrated writes of discs that it sees as mounted and tilted.
+
+    The lens cancels: the ray that shows a disc is put on the floor from where the calibration has
+    the camera.
+
+    Parameters
+    ----------
+    camera : Camera
+        As calibrated.
+    floor_xy : (n, 2) float64
+        Discs in the robot frame (m).
+    mounting : (3, 4) float64
+        robot_from_camera as mounted.
+    tilt : (n, 2) float64
+        Pitch and roll of the robot: x and y of a rotation vector in the robot frame (rad).
+
+    Returns
+    -------
+    rows_xy : (n, 2) float64
+        In the robot frame (m); NaN where the ray does not go down for the calibrated camera.
+    jacobians : RecordedJacobians
+    """
+    unturn = np.linalg.inv(mounting[:, :3] @ np.linalg.inv(camera.rotation))
+    from_centre = np.column_stack([floor_xy, np.zeros(len(floor_xy))]) - mounting[:, 3]
+    turn, left = rotation_exp(np.column_stack([tilt, np.zeros(len(tilt))]))
+    level = np.swapaxes(turn, 1, 2)
+    untilted = np.einsum("nij,nj->ni", level, from_centre)
+    ray = untilted @ unturn.T
+    ray = np.where(ray[:, 2:] < 0.0, ray, np.nan)
+    height = float(camera.centre[2])
+    slope = ray[:, :2] / ray[:, 2:]
+    by_ray = np.zeros((len(ray), 2, 3))
+    by_ray[:, 0, 0] = by_ray[:, 1, 1] = -height / ray[:, 2]
+    by_ray[:, :, 2] = height * slope / ray[:, 2:]
+    by_untilted = by_ray @ unturn
+    by_robot = by_untilted @ level
+    return camera.centre[:2] - height * slope, RecordedJacobians(
+        floor=by_robot[:, :, :2],
+        tilt=(by_robot @ skew(from_centre) @ left)[:, :, :2],
+        mounting=np.concatenate([by_untilted @ skew(untilted), -by_robot[:, :, 2:]], axis=2),
+    )
 
 
 def mounting_change(camera: Camera, mounting: FloatArray) -> FloatArray:

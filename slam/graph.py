@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera
-from slam.calibration_model import Geometry
 from slam.measurement import disc_in_map
 from slam.motion import chain_steps
 from slam.recording import LineRows, Recording
@@ -101,18 +100,6 @@ class Estimate:
     line_xy: FloatArray
     mounting: FloatArray | None = None
     tilt: FloatArray | None = None
-
-    def geometry(self, camera: Camera) -> Geometry:
-        """The unknowns as `slam.calibration_model.predict_pixels` takes them."""
-        nominal = np.concatenate([camera.rotation, np.reshape(camera.centre, (3, 1))], axis=1)
-        mounting = nominal if self.mounting is None else self.mounting
-        return Geometry(
-            poses=self.poses,
-            disc_xy=self.disc_xy,
-            rotation=mounting[:, :3],
-            centre=mounting[:, 3],
-            tilt=np.zeros((len(self.poses), 2)) if self.tilt is None else self.tilt,
-        )
 
 
 def whitening(covariance: FloatArray) -> FloatArray:

@@ -11,8 +11,14 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from landmarks import wrap_angle
-from slam.calibration import directions_of_rows, rows_through_mounting, turn_to_the_left
-from slam.calibration_model import predict_pixels
+from slam.calibration import (
+    RecordedJacobians,
+    directions_of_rows,
+    nominal_mounting,
+    rows_as_recorded,
+    rows_through_mounting,
+    turn_to_the_left,
+)
 from slam.graph import Estimate, Graph
 from slam.measurement import (
     bearing_jacobians,
@@ -255,9 +261,18 @@ def _disc_errors(graph: Graph, estimate: Estimate, weighting: Weighting) -> Floa
         directions = directions_of_rows(graph.camera, graph.disc_xy)
         rows, _ = rows_through_mounting(graph.camera, directions, estimate.mounting)
         return _seen_discs(graph, estimate) - rows
-    geometry = estimate.geometry(graph.camera)
-    pixels, _ = predict_pixels(graph.camera, geometry, graph.disc_pose, graph.disc_index)
-    return np.asarray(graph.camera.floor_from_pixel(pixels) - graph.disc_xy)
+    return _as_recorded(graph, estimate)[0] - graph.disc_xy
+
+
+def _as_recorded(graph: Graph, estimate: Estimate) -> tuple[FloatArray, RecordedJacobians]:
+    assert graph.camera is not None
+    tilt = np.zeros((len(estimate.poses), 2)) if estimate.tilt is None else estimate.tilt
+    mounting = estimate.mounting
+    if mounting is None:
+        mounting = nominal_mounting(graph.camera)
+    return rows_as_recorded(
+        graph.camera, _seen_discs(graph, estimate), mounting, tilt[graph.disc_pose]
+    )
 
 
 def _seen_discs(graph: Graph, estimate: Estimate) -> FloatArray:
@@ -269,23 +284,20 @@ def _disc_blocks(
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Derivatives of whitened disc errors by pose, tilt, disc and mounting."""
     whiten = graph.disc_whitening
-    upright = estimate.mounting is None and estimate.tilt is None
-    if upright or (estimate.mounting is not None and weighting.row_errors == "corrected"):
-        by_pose, by_disc = disc_jacobians(
-            estimate.poses[graph.disc_pose], estimate.disc_xy[graph.disc_index]
-        )
-        by_mounting = np.zeros((len(whiten), 2, 0))
-        if estimate.mounting is not None and graph.camera is not None:
-            directions = directions_of_rows(graph.camera, graph.disc_xy)
-            _, moves = rows_through_mounting(graph.camera, directions, estimate.mounting)
-            by_mounting = -moves
-        none = np.zeros((len(whiten), 2, 0))
-        return whiten @ by_pose, none, whiten @ by_disc, whiten @ by_mounting
+    by_pose, by_disc = disc_jacobians(
+        estimate.poses[graph.disc_pose], estimate.disc_xy[graph.disc_index]
+    )
+    none = np.zeros((len(whiten), 2, 0))
+    if estimate.mounting is None and estimate.tilt is None:
+        return whiten @ by_pose, none, whiten @ by_disc, none
     assert graph.camera is not None
-    geometry = estimate.geometry(graph.camera)
-    pixels, by = predict_pixels(graph.camera, geometry, graph.disc_pose, graph.disc_index)
-    whiten = whiten @ graph.camera.floor_jacobian(pixels)
-    return whiten @ by.pose, whiten @ by.tilt, whiten @ by.disc, whiten @ by.mounting
+    if estimate.mounting is not None and weighting.row_errors == "corrected":
+        directions = directions_of_rows(graph.camera, graph.disc_xy)
+        _, moves = rows_through_mounting(graph.camera, directions, estimate.mounting)
+        return whiten @ by_pose, none, whiten @ by_disc, -whiten @ moves
+    _, by = _as_recorded(graph, estimate)
+    by_floor = whiten @ by.floor
+    return by_floor @ by_pose, whiten @ by.tilt, by_floor @ by_disc, whiten @ by.mounting
 
 
 def _members(graph: Graph) -> tuple[IntArray, FloatArray]:

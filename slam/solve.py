@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import SuperLU, splu
 
+from slam.calibration import nominal_mounting
 from slam.calibration_model import rotation_exp
 from slam.errors import SlamError
 from slam.graph import Estimate, Graph
@@ -218,9 +219,7 @@ def _with_unknowns(graph: Graph, start: Estimate, weighting: Weighting) -> Estim
     if graph.camera is None:
         raise SlamError("the mounting cannot be estimated without a calibration: expected a .cam")
     if weighting.calibrate and start.mounting is None:
-        geometry = start.geometry(graph.camera)
-        mounting = np.concatenate([geometry.rotation, geometry.centre[:, None]], axis=1)
-        start = replace(start, mounting=mounting)
+        start = replace(start, mounting=nominal_mounting(graph.camera))
     if weighting.tilt_sigma_rad > 0.0:
         if weighting.calibrate and weighting.row_errors != "recorded":
             raise SlamError("a tilt of its own for each pose: expected row errors as recorded")

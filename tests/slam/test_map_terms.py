@@ -9,8 +9,8 @@ import pytest
 from scipy import sparse
 
 from camera import Camera
-from slam.calibration import mounting_change
-from slam.calibration_model import rotation_exp
+from slam.calibration import mounting_change, rows_as_recorded
+from slam.calibration_model import Geometry, predict_pixels, rotation_exp
 from slam.graph import Estimate, Graph, first_sight, graph_of_recording, with_lines
 from slam.graph_terms import Loss, RowErrors, Weighting, errors, layout_of, linearise, robust
 from slam.marginal_kernels import filled_pattern
@@ -61,11 +61,9 @@ def test_jacobians_are_those_of_finite_differences(
     graph, estimate = _problem(published_camera)
     rng = np.random.default_rng(8)
     if calibrate:
-        geometry = estimate.geometry(published_camera)
         turn, _ = rotation_exp(np.array([-0.02, 0.01, 0.03]))
-        estimate = replace(
-            estimate, mounting=np.column_stack([turn @ geometry.rotation, geometry.centre])
-        )
+        mounting = np.column_stack([turn @ published_camera.rotation, published_camera.centre])
+        estimate = replace(estimate, mounting=mounting)
     if tilt:
         tilts = np.vstack([np.zeros(2), 0.01 * rng.standard_normal((60, 2))])
         estimate = replace(estimate, tilt=tilts)
@@ -73,15 +71,15 @@ def test_jacobians_are_those_of_finite_differences(
     problem = linearise(graph, estimate, weighting)
     for _ in range(4):
         step = rng.standard_normal(layout.size)
-        mounting = rng.standard_normal(4 if calibrate else 0)
+        change = rng.standard_normal(4 if calibrate else 0)
         h = 1e-6
-        ahead = moved(estimate, layout, h * step, h * mounting)
-        behind = moved(estimate, layout, -h * step, -h * mounting)
+        ahead = moved(estimate, layout, h * step, h * change)
+        behind = moved(estimate, layout, -h * step, -h * change)
         numeric = [
             np.concatenate([e.odometry.ravel(), e.discs.ravel(), e.lines.ravel(), e.tilt.ravel()])
             for e in (errors(graph, ahead, weighting), errors(graph, behind, weighting))
         ]
-        analytic = problem.jacobian @ step + problem.border @ mounting
+        analytic = problem.jacobian @ step + problem.border @ change
         np.testing.assert_allclose(
             (numeric[0] - numeric[1]) / (2 * h), analytic, rtol=2e-5, atol=1e-4
         )
@@ -161,6 +159,24 @@ def test_mounting_change_is_what_was_applied(published_camera: Camera) -> None:
     found = mounting_change(published_camera, mounting)
     # The file's rotation has six digits.
     np.testing.assert_allclose(found, [*vector, -0.045], atol=1e-5)
+
+
+def test_rows_as_recorded_go_through_the_lens_and_back(published_camera: Camera) -> None:
+    rng = np.random.default_rng(2)
+    floor = np.column_stack([rng.uniform(-1, 1, 20), rng.uniform(-3.5, -1.2, 20)])
+    tilt = 0.02 * rng.standard_normal((20, 2))
+    turn, _ = rotation_exp(np.array([-0.04, 0.01, 0.002]))
+    centre = published_camera.centre + np.array([0.0, 0.0, -0.02])
+    geometry = Geometry(np.zeros((20, 3)), floor, turn @ published_camera.rotation, centre, tilt)
+    every = np.arange(20)
+    pixels, by = predict_pixels(published_camera, geometry, every, every)
+    mounting = np.column_stack([geometry.rotation, centre])
+    rows, by_rows = rows_as_recorded(published_camera, floor, mounting, tilt)
+    np.testing.assert_allclose(rows, published_camera.floor_from_pixel(pixels), atol=1e-5)
+    into = published_camera.floor_jacobian(pixels)
+    np.testing.assert_allclose(by_rows.mounting, into @ by.mounting, rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(by_rows.tilt, into @ by.tilt, rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(by_rows.floor, into @ by.disc, rtol=1e-4, atol=1e-4)
 
 
 def test_first_sight_places_each_disc_where_its_first_row_does() -> None:
