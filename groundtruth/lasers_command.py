@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 import sys
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from groundtruth.options import Lasers
+
+if TYPE_CHECKING:
+    from groundtruth.scans import Scanner
+
+#: A scanner so many standard deviations from where it was measured is named.
+_FAR_OFF_SIGMA = 5.0
 
 
 def perform(options: Lasers) -> int:
@@ -32,6 +38,9 @@ def perform(options: Lasers) -> int:
     empties = [read_scans(find_scans(session / "empty", s.name), s.readings) for s in measured]
     alignment = align_scanners(measured, empties, building, settings)
 
+    far_off = [
+        a.name for b, a in zip(measured, alignment.scanners) if _sigmas(b, a) > _FAR_OFF_SIGMA
+    ]
     steps = {name: poses.tolist() for name, poses in alignment.steps.items()}
     pairs = [
         {"scanners": [measured[i].name, measured[j].name], "explained": share}
@@ -43,6 +52,7 @@ def perform(options: Lasers) -> int:
         "pairs": pairs,
         "beams_on_map": alignment.matched.tolist(),
         "rms_m": alignment.rms_m.tolist(),
+        "far_off_measured": far_off,
         "undetermined": list(alignment.undetermined),
         "inconsistent": list(alignment.inconsistent),
     }
@@ -60,6 +70,11 @@ def perform(options: Lasers) -> int:
             f"{1e3 * sigma[1]:.2f} mm, {np.degrees(sigma[2]):.4f} deg; {alignment.matched[k]} "
             f"beams on the map, rms {1e3 * alignment.rms_m[k]:.2f} mm"
         )
+    for name in far_off:
+        print(
+            f"warning: scanner {name}: was measured wrong, or the map shows another place like it",
+            file=sys.stderr,
+        )
     for name in alignment.undetermined:
         print(f"warning: scanner {name}: the map leaves a direction open", file=sys.stderr)
     for name in alignment.inconsistent:
@@ -68,3 +83,13 @@ def perform(options: Lasers) -> int:
             file=sys.stderr,
         )
     return 0
+
+
+def _sigmas(before: Scanner, after: Scanner) -> float:
+    """How far a scanner is from where it was measured, in the measurement's standard deviations."""
+    shift = after.pose - before.pose
+    shift[2] = (shift[2] + np.pi) % (2.0 * np.pi) - np.pi
+    covariance = before.covariance + after.covariance
+    if not np.any(before.covariance):
+        return 0.0
+    return float(np.sqrt(shift @ np.linalg.pinv(covariance) @ shift))

@@ -16,7 +16,7 @@ from groundtruth.icp_motion import between, wrapped
 from groundtruth.lasers_alignment import STEPS, AlignmentSettings, align_scanners, still_scan
 from groundtruth.lasers_command import perform
 from groundtruth.options import Lasers
-from groundtruth.scans import Scanner, Scans, read_scanners
+from groundtruth.scans import Scanner, Scans, read_scanners, write_scans
 from tests.groundtruth.laser_scene import (
     FRONTED,
     ROOM,
@@ -88,6 +88,29 @@ def test_covariances_are_right() -> None:
     assert 0.5 < float(np.mean(squared)) < 1.25
 
 
+@pytest.mark.long
+def test_a_scanner_measured_far_off_is_found_and_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Half a metre and 8 degrees off: five times what its sigma says."""
+    scanners = four_scanners()
+    shifts = 0.5 * SHIFTS
+    shifts[2] = [0.4, -0.3, 0.15]
+    write_session(
+        tmp_path, by_hand(scanners, shifts), record(scanners, circle, (0.0, 0.05), FRONTED, 6),
+        FRONTED,
+    )  # fmt: skip
+    for one, empty in zip(scanners, empty_scans(scanners, 8)):
+        write_scans(tmp_path / "empty" / f"{one.name}.scans.npz", empty, overwrite=True)
+    write_building(tmp_path / "building.csv", Building(ROOM))
+    assert perform(Lasers(tmp_path)) == 0
+    content = json.loads((tmp_path / "aligned.json").read_text())
+    assert content["far_off_measured"] == ["fixed2"]
+    assert "fixed2: was measured wrong" in capsys.readouterr().err
+    found = read_scanners(tmp_path / "aligned.json")[2]
+    assert found.pose[:2] == pytest.approx(scanners[2].pose[:2], abs=1e-3)
+
+
 def test_one_scanner_alone() -> None:
     lone = (four_scanners()[0],)
     found = align_scanners(by_hand(lone, SHIFTS[:1]), empty_scans(lone, 3), ROOM)
@@ -141,8 +164,6 @@ def test_the_command(tmp_path: Path) -> None:
     scans = record(scanners, circle, (0.0, 0.1), FRONTED, 6)
     write_session(tmp_path, by_hand(scanners), scans, FRONTED)
     # The session's empty scans are from where the scanners stand in truth.
-    from groundtruth.scans import write_scans
-
     for one, empty in zip(scanners, empty_scans(scanners, 8)):
         write_scans(tmp_path / "empty" / f"{one.name}.scans.npz", empty, overwrite=True)
     with pytest.raises(GroundTruthError, match="building"):
