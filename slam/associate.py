@@ -111,6 +111,11 @@ def associate_run(
         camera_xy=camera_xy,
         progress=lambda done: tell(f"frame {done} of {len(recording)}"),
     )
+    incomplete = local.incomplete
+    if len(recording.circles) and len(recording.lines):
+        # Discs help to tell lines apart; lines, often mistaken, would only harm the discs.
+        discs_alone = associate_locally(_without_lines(recording), setting.local)
+        local = replace(local, circle_labels=discs_alone.circle_labels)
     circle_labels, line_labels = local.circle_labels, local.line_labels
     matches: list[Match] = []
     path = None
@@ -163,7 +168,7 @@ def associate_run(
         in_order(local.line_labels),
         tuple(matches),
         path,
-        local.incomplete,
+        incomplete,
     )
 
 
@@ -192,6 +197,14 @@ def _solved(
         camera_xy=camera_xy,
         sigma_scale=setting.local.sigma_scale,
     )
+
+
+def _without_lines(recording: Recording) -> Recording:
+    none = recording.lines
+    empty = replace(
+        none, frame=none.frame[:0], bearing_rad=none.bearing_rad[:0], sigma_rad=none.sigma_rad[:0]
+    )
+    return replace(recording, lines=replace(empty, ids=()))
 
 
 def _swayed(recording: Recording, setting: LocalSettings) -> Recording:

@@ -92,7 +92,7 @@ def perform(options: Associate) -> int:
     for source, target in zip(sources, targets):
         rows = list(read_rows(source))
         write_rows(target, identified_rows(rows, result, source), overwrite=options.force)
-        print(target)
+        print(f"{target}: {_counted(rows, result)}")
     content = {
         "version": slam.__version__,
         "run": str(options.run),
@@ -199,6 +199,18 @@ def identified_rows(rows: Sequence[Row], found: RunAssociation, source: Path) ->
             yield row.with_record(replace(row.record, ids=(next(line) + 1,)))
         else:
             yield row
+
+
+def _counted(rows: Sequence[Row], found: RunAssociation) -> str:
+    """How many landmarks of each kind in a file were found."""
+    parts = []
+    for kind, labels, name in (
+        (CircleLandmark, found.circle_labels, "discs"),
+        (LineLandmark, found.line_labels, "lines"),
+    ):
+        if any(isinstance(row.record, kind) for row in rows):
+            parts.append(f"{labels.max() + 1} {name}")
+    return ", ".join(parts) or "no landmarks"
 
 
 def _sources(options: Associate, circles: bool) -> list[Path]:

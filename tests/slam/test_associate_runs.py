@@ -201,6 +201,16 @@ def test_ids_in_the_file_are_not_looked_at_and_the_result_is_the_same_every_time
     assert one.circle_labels.tolist() == associate_run(recording).circle_labels.tolist()
 
 
+def test_lines_do_not_change_what_becomes_of_the_discs() -> None:
+    discs = scattered(7, 40, 0.4)
+    recording = drive(circuit(0.2), discs, scattered(16, 60, 0.02), seed=8)
+    none = LineRows(np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros(0), ())
+    alone = associate_run(replace(recording, lines=none))
+    both = associate_run(recording, camera_xy=CAMERA_XY)
+    assert both.circle_labels.tolist() == alone.circle_labels.tolist()
+    assert len(both.line_labels) == len(recording.lines)
+
+
 def test_lines_get_the_place_where_they_stand() -> None:
     path = circuit(0.2)
     places = scattered(6, 12, 1.0)
