@@ -59,9 +59,9 @@ def perform(command: Localize) -> int:
         map_errors=map_errors,
         joint_covariance=joint,
     )
-    began = time.perf_counter()
+    began, began_working = time.perf_counter(), time.thread_time()
     run = run_localizer(recording, localizer, associator)
-    seconds = time.perf_counter() - began
+    seconds, working = time.perf_counter() - began, time.thread_time() - began_working
     if not run.count.discs and not run.count.lines:
         raise SlamError(
             f"{command.run}: no row shows a landmark of {command.map}: expected identifiers of the "
@@ -81,7 +81,10 @@ def perform(command: Localize) -> int:
     print("\n".join(table(run, distance)))
     if considered and joint is None:
         print(f"errors of the map taken as independent: no {covariance_file(command.map).name}")
-    print(f"time              {seconds:.2f} s, {len(recording) / seconds:.0f} steps/s")
+    print(
+        f"time              {seconds:.2f} s, {len(recording) / seconds:.0f} steps/s; of processor "
+        f"{working:.2f} s, {len(recording) / working:.0f} steps/s"
+    )
     draw_map(
         output / MAP_PICTURE,
         landmark_map,
