@@ -39,6 +39,8 @@ _COARSE_SIGMA_RAD = 0.02
 _LEAST_DETERMINED = 0.1
 _MOST_JUMPS = 3
 _JUMP_SIGMAS = 3.5
+_LEAST_JUMP_S = 0.004
+_LARGEST_DRIFT_OF_A_QUARTZ = 2e-4
 _FEWEST_SAMPLES = 20
 
 
@@ -111,16 +113,25 @@ def synchronise(
             )
     found: list[ClockSegment] = []
     for part in segments_between_gaps(groundtruth.times_s, bounds.segment_gap_s):
-        segment = PlanarPoses(groundtruth.times_s[part], groundtruth.poses[part])
-        found.extend(_segment(odometry, segment, bounds, _MOST_JUMPS))
+        covariances = groundtruth.covariances
+        segment = PlanarPoses(
+            groundtruth.times_s[part],
+            groundtruth.poses[part],
+            covariances[part] if covariances is not None and bounds.use_movement else None,
+        )
+        told = refine_by_movement(
+            _segment(odometry, segment, bounds, _MOST_JUMPS), odometry, segment
+        )
+        if len(told) > 1 and not _differ(told):
+            # What looked like a jump of the clock to the headings is none to the whole movement.
+            told = refine_by_movement(_segment(odometry, segment, bounds, 0), odometry, segment)
+        found.extend(told)
     if all(segment.turned_rad == 0.0 and segment.note == "no odometry" for segment in found):
         raise GroundTruthError(
             f"odometry from {odometry.times_s[0]:.3f} s to {odometry.times_s[-1]:.3f} s and ground "
             f"truth from {groundtruth.times_s[0]:.3f} s to {groundtruth.times_s[-1]:.3f} s do not "
             f"overlap within {bounds.largest_offset_s:g} s"
         )
-    if bounds.use_movement:
-        found = refine_by_movement(found, odometry, groundtruth)
     return tuple(_told_by_the_others(on_one_line(found)))
 
 
@@ -200,13 +211,21 @@ def _segment(
 
 
 def _differ(parts: list[ClockSegment]) -> bool:
-    """Whether the clock before a jump and after it are told, and are not the same."""
+    """Whether the clock before a jump and after it are told, and are not the same there."""
     told = [part for part in parts if part.status != "no turns"]
-    return any(
-        abs(after.offset_s - before.offset_s)
-        > _JUMP_SIGMAS * math.hypot(after.sigma_offset_s, before.sigma_offset_s)
-        for before, after in pairwise(told)
-    )
+    for before, after in pairwise(told):
+        place = 0.5 * (before.to_s + after.from_s)
+        offsets, variances = [], []
+        for part in (before, after):
+            away = place - part.reference_s
+            offsets.append(part.offset_s + (part.rate - 1.0) * away)
+            # A clock's drift is far smaller than the bounds that stand for not knowing it.
+            rate_sigma = min(part.sigma_rate, _LARGEST_DRIFT_OF_A_QUARTZ)
+            variances.append(part.sigma_offset_s**2 + (rate_sigma * away) ** 2)
+        jump = abs(offsets[1] - offsets[0])
+        if jump > _LEAST_JUMP_S and jump > _JUMP_SIGMAS * math.sqrt(sum(variances)):
+            return True
+    return False
 
 
 def _smoothed(headings: FloatArray) -> FloatArray:
