@@ -12,6 +12,7 @@ STUDIES = {
     "map-calibration": "tools.slam_evaluation.map_calibration",
     "map-modelling": "tools.slam_evaluation.map_modelling",
     "map-redetected": "tools.slam_evaluation.map_redetected",
+    "association": "tools.slam_evaluation.association",
     "consistency": "tools.slam_evaluation.consistency",
 }
 
