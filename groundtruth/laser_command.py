@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -42,12 +43,12 @@ def perform(options: Laser) -> int:
     if options.scanners is None and not calibration.is_file():
         calibration = options.session / "scanners.json"
     scanners, robot, tables, sets = load_session(options.session, calibration)
-    track = track_robot(sets, tables, robot, settings)
+    track, left_out = track_without_suspects(sets, tables, robot, scanners, settings)
 
     poses = combined_poses(track, options.average)
     write_planar_poses(output, poses, overwrite=options.force)
     _write(account, account_lines(track), options.force)
-    described = describe(track, scanners)
+    described = describe(track, scanners, left_out)
     files = [calibration, options.session / "robot.json"]
     content = {**provenance(settings, files), "sets_per_pose": options.average, **described}
     _write(summary, [json.dumps(content, indent=1)], options.force)
@@ -67,7 +68,8 @@ def perform(options: Laser) -> int:
             print(
                 f"warning: scanner {scanner['name']} does not fit the others: its readings ask for "
                 f"a shift of {1e3 * shift[0]:.1f}, {1e3 * shift[1]:.1f} mm and "
-                f"{np.degrees(shift[2]):.2f} deg",
+                f"{np.degrees(shift[2]):.2f} deg; "
+                + ("it was left out" if scanner["left_out"] else "it was used all the same"),
                 file=sys.stderr,
             )
     return 0 if len(poses) else 1
@@ -135,6 +137,52 @@ def track_robot(
     ).run()
 
 
+def track_without_suspects(
+    sets: ScanSets,
+    tables: ScannerTables,
+    robot: Robot,
+    scanners: tuple[Scanner, ...],
+    settings: Any = None,
+) -> tuple[LaserTrack, dict[str, FloatArray]]:
+    """Follow the robot, leaving out scanners whose readings do not fit the others'.
+
+    One at a time, the worst first, and only while three scanners or more are left to say so.
+
+    Returns
+    -------
+    track : LaserTrack
+    left_out : dict of str to (2, 3) float64
+        By scanner, the shift its readings asked for and its standard deviations.
+    """
+    left_out: dict[str, FloatArray] = {}
+    track = track_robot(sets, tables, robot, settings)
+    while len(scanners) - len(left_out) >= 3:
+        excess = _excess(track, scanners)
+        worst = int(np.argmax(excess))
+        if excess[worst] <= 1.0:
+            break
+        left_out[scanners[worst].name] = np.stack(
+            [track.corrections[worst], track.correction_sigma[worst]]
+        )
+        rows = sets.rows.copy()
+        rows[:, worst] = -1
+        sets = replace(sets, rows=rows)
+        track = track_robot(sets, tables, robot, settings)
+    return track, left_out
+
+
+def _excess(track: LaserTrack, scanners: tuple[Scanner, ...]) -> FloatArray:
+    """(scanners,) how far beyond what is allowed their shifts are; above 1 is suspect."""
+    least = np.array([_SUSPECT_M, _SUSPECT_M, _SUSPECT_RAD])
+    excess = np.zeros(len(scanners))
+    for k, scanner in enumerate(scanners):
+        shift, sigma = track.corrections[k], track.correction_sigma[k]
+        if np.isfinite(shift).all():
+            allowed = _SUSPECT_SIGMA * np.sqrt(sigma**2 + np.diag(scanner.covariance))
+            excess[k] = float(np.max(np.abs(shift) / np.maximum(allowed, least)))
+    return excess
+
+
 def account_lines(track: LaserTrack) -> list[str]:
     """A line of JSON for every set of scans."""
     from groundtruth.laser_tracking import COASTING, LOST, STATUS, UNDETERMINED
@@ -160,7 +208,9 @@ def account_lines(track: LaserTrack) -> list[str]:
     return lines
 
 
-def describe(track: LaserTrack, scanners: tuple[Scanner, ...]) -> dict[str, Any]:
+def describe(
+    track: LaserTrack, scanners: tuple[Scanner, ...], left_out: dict[str, FloatArray]
+) -> dict[str, Any]:
     """Visits and how their front was found; what each scanner's residuals say of its pose."""
     segments = []
     for segment, front in sorted(track.fronts.items()):
@@ -169,21 +219,19 @@ def describe(track: LaserTrack, scanners: tuple[Scanner, ...]) -> dict[str, Any]
             {"visit": segment, "from_s": float(times[0]), "to_s": float(times[-1]), "front": front}
         )
     entries = []
-    least = np.array([_SUSPECT_M, _SUSPECT_M, _SUSPECT_RAD])
+    excess = _excess(track, scanners)
     for k, scanner in enumerate(scanners):
-        shift, sigma = track.corrections[k], track.correction_sigma[k]
-        suspect = False
-        if np.isfinite(shift).all():
-            allowed = np.sqrt(sigma**2 + np.diag(scanner.covariance))
-            suspect = bool(
-                np.any((np.abs(shift) > _SUSPECT_SIGMA * allowed) & (abs(shift) > least))
-            )
+        out = scanner.name in left_out
+        shift, sigma = (
+            left_out[scanner.name] if out else (track.corrections[k], track.correction_sigma[k])
+        )
         entries.append(
             {
                 "name": scanner.name,
                 "correction": [float(v) if np.isfinite(v) else None for v in shift],
                 "sigma": [float(v) if np.isfinite(v) else None for v in sigma],
-                "suspect": suspect,
+                "suspect": bool(out or excess[k] > 1.0),
+                "left_out": out,
             }
         )
     return {"segments": segments, "scanners": entries}

@@ -15,7 +15,7 @@ from groundtruth.errors import GroundTruthError
 from groundtruth.icp_motion import compose, invert, wrapped
 from groundtruth.laser_acquisition import AGREES_M, Seen, acquire, explain, refine, robot_body
 from groundtruth.laser_blocks import combined_poses
-from groundtruth.laser_command import perform, track_robot
+from groundtruth.laser_command import perform, track_robot, track_without_suspects
 from groundtruth.laser_kernels import explain_set, fit_outline, new_points
 from groundtruth.laser_sets import ScannerTables, ScanSets, scanner_tables, sets_of_scans
 from groundtruth.laser_settings import LaserSettings
@@ -439,6 +439,11 @@ def test_a_wrong_scanner_is_marked_and_its_effect_bounded(
     assert int(np.argmax(size)) == 2
     assert size[2] > 0.005
     assert np.hypot(track.corrections[:, 0], track.corrections[:, 1]).max() < 0.002
+    without, left_out = track_without_suspects(recorded, moved, Robot(FRONTED, 1.0, 1.0), wrong)
+    assert list(left_out) == ["fixed2"]
+    good = np.isin(without.status, (OK, REACQUIRED))
+    error = errors(without.times_s[good], without.poses[good])
+    assert np.hypot(error[:, 0], error[:, 1]).mean() < 0.006
     good = np.isin(off.status, (OK, REACQUIRED))
     error = errors(off.times_s[good], off.poses[good])
     assert np.hypot(error[:, 0], error[:, 1]).max() < 0.1

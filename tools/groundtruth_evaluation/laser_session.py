@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from groundtruth.errors import GroundTruthError
 from groundtruth.icp_motion import wrapped
 from groundtruth.laser_blocks import combined_poses
-from groundtruth.laser_command import load_session, track_robot
+from groundtruth.laser_command import load_session, track_robot, track_without_suspects
 from groundtruth.laser_tracking import OK, REACQUIRED, UNDETERMINED, LaserTrack
 from groundtruth.scans import Scanner, read_scanners
 from groundtruth.streams import read_planar_poses
@@ -99,7 +99,7 @@ def perform(options: LaserSessions) -> int:
         f"|.| {mean['abs_deg']:.3f} deg, NEES {mean['nees']:.3f} (sessions scatter by "
         f"{spread:.3f}), found {100 * mean['found']:.2f} %, scanners {mean['scanner_mm']:.2f} mm "
         f"{mean['scanner_deg']:.3f} deg NEES {mean['scanner_nees']:.2f}, "
-        f"{mean['set_ms']:.3f} ms per set"
+        f"{mean['set_ms']:.3f} ms per set, {100 * mean['disturbed']:.1f} % disturbed"
     )
     return 0
 
@@ -107,16 +107,20 @@ def perform(options: LaserSessions) -> int:
 def one_session(session: Path, options: LaserSessions) -> dict[str, float]:
     """Errors of one session."""
     calibration, scanner_errors = _calibration(session, options)
-    _, robot, tables, sets = load_session(session, calibration)
+    scanners, robot, tables, sets = load_session(session, calibration)
     track_robot(_first(sets), tables, robot)  # compiles
     began = time.process_time()
-    track = track_robot(sets, tables, robot)
+    track, left_out = track_without_suspects(sets, tables, robot, scanners)
     elapsed = time.process_time() - began
+    if left_out:
+        print(f"     left out: {', '.join(left_out)}")
+    disturbed = np.sum((track.beams[:, 3] + track.beams[:, 5]) >= 3)
     span_s = float(sets.times_s[-1] - sets.times_s[0])
     return {
         "sets": float(len(sets)),
         **errors_in_room(session, track, options.average),
         **scanner_errors,
+        "disturbed": float(disturbed / len(sets)),
         "set_ms": 1e3 * elapsed / len(sets),
         "speed": span_s / elapsed,
     }
