@@ -99,6 +99,7 @@ def chi_squared(graph: Graph, estimate: Estimate, weighting: Weighting) -> ChiSq
 
 def table_lines(table: ChiSquared) -> list[str]:
     """The table as text, its rows in the report's order."""
+    redundant = table.expected > 0
     rows = [
         ("poses p", f"{table.poses}"),
         ("landmarks n", f"{table.landmarks}"),
@@ -106,8 +107,8 @@ def table_lines(table: ChiSquared) -> list[str]:
         ("landmark rows m", f"{table.measurements}"),
         ("chi-squared", f"{table.chi_squared:,.2f}"),
         ("expected dim(z) - dim(x)", f"{table.expected:,}"),
-        ("factor", f"{table.factor:.2f}"),
-        ("root of the factor", f"{table.root:.2f}"),
+        ("factor", f"{table.factor:.2f}" if redundant else "-"),
+        ("root of the factor", f"{table.root:.2f}" if redundant else "-"),
     ]
     return [f"{name:<28}{value:>12}" for name, value in rows]
 

@@ -156,6 +156,11 @@ def map_run(
     placed = InitialLines(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0, np.int64))
     if more:
         placed = place_lines(estimate.poses, recording.lines, graph.camera_xy)
+        if not len(placed.ids) and not len(graph.disc_ids):
+            raise SlamError(
+                f"{name}: none of {len(placed.unplaced)} lines is seen, alone in a row, under "
+                "enough parallax: there is nothing to map"
+            )
         graph = with_lines(graph, recording.lines, placed.ids)
         estimate = replace(estimate, line_xy=placed.xy)
     if only_start:

@@ -91,7 +91,6 @@ def inverse_blocks(
     Parameters
     ----------
     matrix : (n, n) sparse
-        Each block asked for must be full.
     blocks : list of (width, (b,) int64)
         Width and first index of blocks.
 
@@ -105,9 +104,18 @@ def inverse_blocks(
         raise RuntimeError("the matrix is not positive definite")
     # Row i of the matrix is row order[i] of the factor's.
     entries = matrix.tocoo()
-    permuted = sparse.csc_array((entries.data, (order[entries.row], order[entries.col])))
+    # What is asked for has to be in the pattern even where the matrix has a zero.
+    asked = [
+        (first + i, first + j)
+        for width, first in blocks
+        for i in range(width)
+        for j in range(width)
+    ]
+    row = order[np.concatenate([entries.row, *(i for i, _ in asked)])]
+    column = order[np.concatenate([entries.col, *(j for _, j in asked)])]
+    pattern = sparse.csc_array((np.ones(len(row)), (row, column)))
     indptr, indices = filled_pattern(
-        permuted.indptr.astype(np.int64), permuted.indices.astype(np.int64)
+        pattern.indptr.astype(np.int64), pattern.indices.astype(np.int64)
     )
     columns = np.repeat(np.arange(len(order), dtype=np.int64), np.diff(indptr))
     keys = columns * len(order) + indices

@@ -135,3 +135,33 @@ def test_calibrating_without_a_calibration_is_refused(
     shutil.copy(demo_run / "map.circles", tmp_path / "map.circles")
     assert main(["map", str(tmp_path), "--calibrate"]) == 1
     assert "no calibration" in capsys.readouterr().err
+
+
+def test_a_single_row_gives_a_map_without_a_factor(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = tmp_path / "one.circles"
+    run.write_text(
+        "STEP a 0.1 0 0 0.01 0 0.01 0 0 0.01\nLANDMARK_C 1 -1 1 0.1 0 0.1 3\n", encoding="ascii"
+    )
+    assert main(["map", str(run), "-o", str(tmp_path / "out")]) == 0
+    assert "nan" not in capsys.readouterr().out
+    table = json.loads((tmp_path / "out" / "table.json").read_text(encoding="utf-8"))["table"]
+    assert (table["expected"], table["factor"]) == (0, None)
+    path = read_path(tmp_path / "out" / "path.csv")
+    assert path.covariance is not None
+    np.testing.assert_allclose(path.covariance[1], 0.01 * np.eye(3), atol=1e-12)
+
+
+def test_lines_that_cannot_be_placed_leave_nothing_to_map(
+    tmp_path: Path, project_root: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = tmp_path / "one.lines"
+    run.write_text(
+        "STEP a 0.1 0 0 0.01 0 0.01 0 0 0.01\nLANDMARK_L 0 0 0 0 0.3 0 0 0.002 3\n",
+        encoding="ascii",
+    )
+    camera = project_root / "images" / "e" / "e.cam"
+    arguments = ["map", str(run), "--camera", str(camera), "-o", str(tmp_path / "out")]
+    assert main(arguments) == 1
+    assert "none of 1 lines" in capsys.readouterr().err

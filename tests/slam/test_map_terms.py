@@ -134,6 +134,17 @@ def test_inverse_blocks_are_those_of_the_dense_inverse() -> None:
         np.testing.assert_allclose(block, dense[at : at + 3, at : at + 3], rtol=1e-8)
 
 
+def test_inverse_blocks_are_right_where_the_matrix_has_zeros() -> None:
+    matrix = np.diag([4.0, 3.0, 5.0, 2.0])
+    matrix[0, 3] = matrix[3, 0] = matrix[1, 3] = matrix[3, 1] = 1.0
+    (found,) = inverse_blocks(sparse.csc_array(matrix), [(2, np.array([0, 2]))])
+    dense = np.linalg.inv(matrix)
+    np.testing.assert_allclose(found[0], dense[:2, :2], rtol=1e-12)
+    np.testing.assert_allclose(found[1], dense[2:, 2:], rtol=1e-12)
+    (alone,) = inverse_blocks(sparse.csc_array(np.diag([4.0, 2.0, 8.0])), [(3, np.array([0]))])
+    np.testing.assert_allclose(alone[0], np.diag([0.25, 0.5, 0.125]))
+
+
 def test_marginals_with_mounting_are_those_of_the_dense_inverse(published_camera: Camera) -> None:
     weighting = Weighting(calibrate=True)
     graph, estimate = _problem(published_camera)
