@@ -141,7 +141,7 @@ def test_streams_that_never_meet_are_refused() -> None:
 @pytest.mark.parametrize("value", [0.0, -1.0, math.nan, math.inf])
 def test_settings_that_mean_nothing_are_refused(name: str, value: float) -> None:
     with pytest.raises(GroundTruthError, match=name):
-        SyncSettings(**{name: value})
+        replace(SyncSettings(), **{name: value})
 
 
 @given(
