@@ -267,15 +267,16 @@ def _clock(inputs: Inputs) -> list[Element]:
                 f"{math.degrees(s.angle_rad):+.3f}",
                 f"{math.degrees(s.turned_rad):.0f}",
                 s.status,
-                s.note,
             )
         )
     head = (
         "from / s", "to / s", "offset / ms", "sigma", "drift / ppm", "sigma", "angle / deg",
-        "turned / deg", "status", "note",
+        "turned / deg", "status",
     )  # fmt: skip
     caption = "The robot's clock minus the ground truth's, by segment"
-    content = [table(caption, head, rows, text=(8, 9))]
+    content = [table(caption, head, rows, text=(8,))]
+    for note in dict.fromkeys(s.note for s in inputs.clock.segments[:_MOST_ROWS] if s.note):
+        content.append(paragraph(f"Note: {note}.", kind="note"))
     left_out = len(inputs.clock.segments) - len(rows)
     if left_out > 0:
         content.append(paragraph(f"{left_out} more segments are in clock.json.", kind="note"))

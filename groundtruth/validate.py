@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from groundtruth.errors import GeometryError, GroundTruthError
 from groundtruth.reference_poses import DistancePose
-from groundtruth.scoring import interpolate_poses, wrapped
+from groundtruth.scoring import wrapped
 from groundtruth.streams import PlanarPoses, is_positive_definite
 
 if TYPE_CHECKING:
@@ -246,7 +246,7 @@ def stream_of(references: Sequence[ReferencePose]) -> PlanarPoses:
 
 
 def pose_errors(
-    references: Sequence[ReferencePose], poses: PlanarPoses, largest_gap_s: float = 0.5
+    references: Sequence[ReferencePose], poses: PlanarPoses, farthest_s: float = 0.5
 ) -> tuple[list[PoseError], list[Refused]]:
     """Errors of a ground truth at reference poses.
 
@@ -255,9 +255,10 @@ def pose_errors(
     references : sequence of ReferencePose
         In order of time.
     poses : PlanarPoses
-        The ground truth, interpolated at the references' times.
-    largest_gap_s : float
-        Not across longer gaps.
+        The ground truth. The one nearest in time counts, as the robot stands: between two poses
+        the covariance would depend on how their errors go together, which is not known.
+    farthest_s : float
+        But not one farther away in time (s).
 
     Returns
     -------
@@ -266,7 +267,7 @@ def pose_errors(
         References at whose time there is no ground truth.
     """
     stream = stream_of(references)
-    at_times, known = interpolate_poses(poses, stream.times_s, largest_gap_s)
+    at_times, known = _nearest(poses, stream.times_s, farthest_s)
     without = [
         Refused(r.index, r.time_s, "no ground truth", "no pose of the ground truth at this time")
         for r, there in zip(references, known)
@@ -293,6 +294,20 @@ def pose_errors(
         for r, e, n, s in zip(there, error, nees, sigma)
     ]  # fmt: skip
     return errors, without
+
+
+def _nearest(
+    poses: PlanarPoses, times_s: FloatArray, farthest_s: float
+) -> tuple[PlanarPoses, NDArray[np.bool_]]:
+    """The poses nearest to times, and which times have one."""
+    after = np.clip(np.searchsorted(poses.times_s, times_s), 0, len(poses) - 1)
+    before = np.maximum(after - 1, 0)
+    earlier = np.abs(times_s - poses.times_s[before]) <= np.abs(poses.times_s[after] - times_s)
+    index = np.where(earlier, before, after)
+    known = np.abs(poses.times_s[index] - times_s) <= farthest_s
+    chosen = index[known]
+    covariances = None if poses.covariances is None else poses.covariances[chosen]
+    return PlanarPoses(poses.times_s[chosen], poses.poses[chosen], covariances), known
 
 
 def figures_of(errors: Sequence[PoseError]) -> Figures:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 #: What stands in the folder.
 OUTPUTS = ("table.csv", "reference.csv", "errors.png", "validation.json")
 
-_LARGEST_GAP_S = 0.5
+_FARTHEST_S = 0.5
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class _Settings:
     refine: str
     distances: DistanceSettings = field(default_factory=DistanceSettings)
     scans: Any = None
-    largest_gap_s: float = _LARGEST_GAP_S
+    farthest_s: float = _FARTHEST_S
 
 
 def perform(options: Validate) -> int:
@@ -87,7 +87,7 @@ def perform(options: Validate) -> int:
     if not references:
         print("error: not a single reference pose", file=sys.stderr)
         return 1
-    errors, without = pose_errors(references, poses, settings.largest_gap_s)
+    errors, without = pose_errors(references, poses, settings.farthest_s)
     for entry in without:
         print(f"pose {entry.index} at {entry.time_s:.3f} s: {entry.reason}", file=sys.stderr)
     if not errors:

@@ -133,6 +133,21 @@ def test_a_reference_without_ground_truth_is_named() -> None:
         figures_of([])
 
 
+def test_the_nearest_pose_counts_as_it_is() -> None:
+    """A mean of two poses would be surer than each, by how much depends on their correlation."""
+    references, _ = reference_poses(poses_from_distances(SURVEY, distances_at(STANDS)))
+    times = np.array([-0.3, 0.1, 9.4, 10.6, 19.9, 20.1, 30.0])
+    rows = np.repeat(STANDS, 2, axis=0)[[0, 1, 2, 3, 4, 5, 6]].copy()
+    rows[:, 0] += [0.5, 0.001, 0.5, 0.5, 0.002, 0.5, 0.003]
+    covariances = np.arange(1.0, 8.0)[:, None, None] * 1e-6 * np.eye(3)
+    errors, without = pose_errors(references, PlanarPoses(times, rows, covariances))
+    assert [entry.index for entry in without] == [1]  # both are more than half a second away
+    assert [error.index for error in errors] == [0, 2, 3]
+    np.testing.assert_allclose([error.x_m for error in errors], [0.001, 0.002, 0.003], atol=1e-7)
+    extra = references[0].covariance[0, 0] + references[0].covariance[1, 1]
+    assert errors[0].sigma_linear_m == pytest.approx(math.sqrt(2 * 2e-6 + extra))
+
+
 def test_the_command_writes_the_folder(session: Path, capsys: pytest.CaptureFixture[str]) -> None:
     covariance = np.diag([0.002, 0.002, 0.002]) ** 2
     rng = np.random.default_rng(4)
