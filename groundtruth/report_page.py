@@ -148,9 +148,12 @@ def _errors(inputs: Inputs) -> list[Element]:
         place.append(Series(short, colour, dashes, mine.times_s, far))
         turn.append(Series(short, colour, dashes, mine.times_s, bent))
     fused = inputs.streams.get("fused")
-    if fused is not None and len(in_visits(fused, inputs.visits)) < len(fused):
-        mine, theirs, _ = matched_streams(fused, inputs.truth)
-        rows.append(("fused, pauses included", *_score_words(score_poses(mine, theirs))))
+    if place and fused is not None and len(in_visits(fused, inputs.visits)) < len(fused):
+        try:
+            mine, theirs, _ = matched_streams(fused, inputs.truth)
+            rows.append(("fused, pauses included", *_score_words(score_poses(mine, theirs))))
+        except ValueError as fault:
+            faults.append(paragraph(f"fused, pauses included: {fault}", kind="problem"))
     head = (
         "stream", "poses", "mean / mm", "sigma", "rmse", "worst", "mean / deg", "sigma", "worst",
         "NEES / 3", "poses with it",

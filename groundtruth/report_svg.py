@@ -136,7 +136,7 @@ def draw_series(
         return np.asarray(height - bottom - share * (height - bottom - top))
 
     total = sum(max(b - a, 1e-3) for a, b in visits)
-    pause = 14.0 if len(visits) <= 12 else 4.0
+    pause = min(14.0, 0.3 * (width - left) / len(visits))
     room = width - left - 6.0 - pause * (len(visits) - 1)
     for power in range(least, most + 1):
         y = float(level(np.array([10.0**power]))[0])

@@ -242,6 +242,10 @@ def matched_streams(
     GroundTruthError
         If no pose has a truth at its time.
     """
+    if len(poses) == 0 or len(truth) == 0:
+        raise GroundTruthError(
+            f"{len(poses)} poses and {len(truth)} of the truth: expected at least one of each"
+        )
     still, moving = (poses, truth) if interpolate == "truth" else (truth, poses)
     at_times, known = interpolate_poses(moving, still.times_s, largest_gap_s)
     kept = PlanarPoses(

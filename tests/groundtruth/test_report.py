@@ -212,6 +212,32 @@ def test_streams_without_covariances_or_truth_in_common(session: Path) -> None:
     assert_harmless(page)
 
 
+def test_streams_of_other_times_and_many_visits_are_survived(session: Path) -> None:
+    fused = stream(0.001, 5)
+    elsewhere = PlanarPoses(fused.times_s + 1e5, fused.poses, fused.covariances)
+    write_planar_poses(session / "fused.csv", elsewhere, overwrite=True)
+    write_planar_poses(session / "odometry.csv", elsewhere)
+    inputs = gather(session)
+    assert inputs.odometry is None
+    page = Page(report_page(inputs, "1"))
+    assert "fused: 0 poses and" in page.text
+    assert "fused, pauses included: no pose has the truth beside it" in page.text
+    assert_harmless(page)
+    times = np.repeat(np.arange(400.0) * 60.0, 3) + np.tile([0.0, 0.1, 0.2], 400)
+    many = PlanarPoses(times, np.zeros((1200, 3)), np.zeros((1200, 3, 3)))
+    for name in ("laser", "truth"):
+        write_planar_poses(session / f"{name}.csv", many, overwrite=True)
+    (session / "camera.csv").unlink()
+    inputs = gather(session)
+    assert len(inputs.visits) == 400
+    series = Series("a", "red", "", times, np.ones(1200))
+    drawing = draw_series("s", "mm", [series], inputs.visits)
+    points = " ".join(line.attrib["points"] for line in drawing.iter("polyline"))
+    across = [float(point.split(",")[0]) for point in points.split()]
+    assert 70.0 < min(across) < max(across) < 760.0
+    assert "400 visits" in Page(report_page(inputs, "1")).text
+
+
 def test_odometry_is_brought_to_the_truth(session: Path) -> None:
     truth = gather(session).truth
     assert truth is not None

@@ -15,7 +15,7 @@ from groundtruth.streams import PlanarPoses, read_planar_poses
 
 
 def poses_of(times: list[float], rows: list[list[float]]) -> PlanarPoses:
-    return PlanarPoses(np.array(times), np.array(rows, dtype=float))
+    return PlanarPoses(np.array(times, dtype=float), np.array(rows, dtype=float).reshape(-1, 3))
 
 
 @pytest.mark.parametrize("session", ["Bicocca_2009-02-25a", "Bicocca_2009-02-26a"])
@@ -100,5 +100,8 @@ def test_streams_without_a_common_time_are_refused() -> None:
     b = poses_of([5, 6], [[0, 0, 0], [1, 0, 0]])
     with pytest.raises(GroundTruthError, match="has the truth beside it"):
         compare_streams(a, b)
+    for pair in ((poses_of([], []), a), (a, poses_of([], []))):
+        with pytest.raises(GroundTruthError, match="at least one of each"):
+            compare_streams(*pair)
     with pytest.raises(GroundTruthError, match="expected as many"):
         score_poses(a, poses_of([0], [[0, 0, 0]]))
