@@ -65,7 +65,7 @@ def detect_all_run(
     files = [
         tilt_file(tilt_output, version),
         lines_file(lines_output, lines, version, run),
-        circles_file(circles_output, circles, version, run),
+        circles_file(circles_output, circles, version, run, levelled=True),
     ]
     return detect_run(
         run, plan, files, overwrite=overwrite, workers=workers, on_progress=on_progress

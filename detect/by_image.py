@@ -9,6 +9,7 @@ from pathlib import Path
 from detect.compare_pairing import image_name
 from detect.name_index import NameIndex
 from landmarks import (
+    Frame,
     FrameTilt,
     LineLandmark,
     Step,
@@ -54,8 +55,8 @@ class TiltsByImage:
         return FrameTilt(prefix, pitch, roll, cpp, cpr, crr, self._lines[place])
 
 
-class LinesByImage:
-    """The lines of a ``.lines`` file, by the name of their image; 12 bytes a frame, and the name.
+class FramesByImage:
+    """The frames of a landmark file, by the name of their image; 12 bytes each, and the name.
 
     The file is read once to learn where each frame stands, and there again when it is asked for.
 
@@ -84,14 +85,26 @@ class LinesByImage:
 
         self._index = NameIndex(names())
 
-    def get(self, prefix: str) -> Sequence[LineLandmark] | None:
-        """The lines of a frame; None if the file does not know it."""
+    def get(self, prefix: str) -> Frame | None:
+        """A frame; None if the file does not know it."""
         place = self._index.find(_bytes(image_name(prefix)))
         if place is None:
             return None
         with self._path.open("rb") as stream:
             stream.seek(self._offsets[place])
-            return next(frames_of_rows(parse_rows(stream, str(self._path)))).lines
+            return next(frames_of_rows(parse_rows(stream, str(self._path))))
+
+
+class LinesByImage:
+    """The lines of a ``.lines`` file, by the name of their image; see `FramesByImage`."""
+
+    def __init__(self, path: Path) -> None:
+        self._frames = FramesByImage(path)
+
+    def get(self, prefix: str) -> Sequence[LineLandmark] | None:
+        """The lines of a frame; None if the file does not know it."""
+        frame = self._frames.get(prefix)
+        return None if frame is None else frame.lines
 
 
 def _bytes(text: str) -> bytes:

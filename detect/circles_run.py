@@ -72,7 +72,7 @@ def detect_circles_run(
     return detect_run(
         run,
         plan,
-        [*as_json, circles_file(output, settings, version, run)],
+        [*as_json, circles_file(output, settings, version, run, levelled=tilts is not None)],
         overwrite=overwrite,
         tilts=tilts,
         pictures=pictures,
@@ -81,7 +81,13 @@ def detect_circles_run(
     )
 
 
-def circles_file(path: Path, settings: CircleSettings, version: str, run: Run) -> Output:
+#: Stands in the head of files whose positions are corrected for the tilt.
+LEVELLED = "corrected for the tilt of the frames that have one"
+
+
+def circles_file(
+    path: Path, settings: CircleSettings, version: str, run: Run, *, levelled: bool = False
+) -> Output:
     """A ``.circles`` file: what the rows mean and how they were made stands at its head."""
     odometry = run.odometry.name if run.odometry is not None else "none: the steps are zeros"
     position = "fitted to the grey values" if settings.refine else "that of the pixel in the middle"
@@ -93,6 +99,7 @@ def circles_file(path: Path, settings: CircleSettings, version: str, run: Run) -
         f"  odometry: {odometry}; the image was taken after the step",
         "LANDMARK_C <pX> <pY> <quality> <cXX> <cXY> <cYY> <ID>",
         f"  position {position}; quality is Otsu's, 0 to 1; ID -1: unknown",
+        *([f"  positions are {LEVELLED}"] if levelled else []),
         f"camera {run.camera}",
         f"settings {values}",
     ]

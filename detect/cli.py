@@ -27,6 +27,7 @@ from detect.line_settings import LineSettings
 from detect.markers.settings import PRESETS as MARKER_PRESETS
 from detect.markers.settings import MarkerSettings
 from detect.settings import PUBLISHED, CircleSettings
+from detect.viewing_options import Draw
 
 Preset = Literal["default", "published"]
 
@@ -265,6 +266,9 @@ class Compare:
     options: OmitArgPrefixes[CompareOptions] = field(default_factory=CompareOptions)
 
 
+Command = Circles | Lines | Markers | All | Compare | Draw
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
     with interrupts_noted() as interrupted:
@@ -294,7 +298,7 @@ def main(arguments: list[str] | None = None) -> int:
     return EXIT_INTERRUPTED
 
 
-def _parsed(given: list[str]) -> Circles | Lines | Markers | All | Compare:
+def _parsed(given: list[str]) -> Command:
     preset = _preset(given)
     circles = _CIRCLE_PRESETS.get(preset, CircleSettings())
     lines = LINE_PRESETS.get(preset, LineSettings())
@@ -317,7 +321,8 @@ def _parsed(given: list[str]) -> Circles | Lines | Markers | All | Compare:
                 All,
                 subcommand("all", default=All(run=tyro.MISSING, circles=circles, lines=lines)),
             ]
-            | Annotated[Compare, subcommand("compare")],
+            | Annotated[Compare, subcommand("compare")]
+            | Annotated[Draw, subcommand("draw")],
             arg(name=""),
         ],
         prog="detect",

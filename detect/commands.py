@@ -8,13 +8,24 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from detect.announcing import show_announcements
-from detect.cli import EXIT_ERROR, EXIT_FRAMES_FAILED, All, Circles, Compare, Lines, Markers
+from detect.cli import (
+    EXIT_ERROR,
+    EXIT_FRAMES_FAILED,
+    All,
+    Circles,
+    Command,
+    Compare,
+    Lines,
+    Markers,
+)
 from detect.errors import WorkerError
 from detect.progress import print_failures, progress_bar
+from detect.viewing_options import PERFORMED_BY
 
 if TYPE_CHECKING:
     from rich.console import Group
@@ -25,7 +36,7 @@ if TYPE_CHECKING:
     from detect.stream import RunSummary
 
 
-def carry_out(command: Circles | Lines | Markers | All | Compare) -> int:
+def carry_out(command: Command) -> int:
     """Carry out a command; returns the exit code."""
     show_announcements()
     if isinstance(command, Circles):
@@ -36,7 +47,9 @@ def carry_out(command: Circles | Lines | Markers | All | Compare) -> int:
         return _markers(command)
     if isinstance(command, All):
         return _all(command)
-    return _compare(command)
+    if isinstance(command, Compare):
+        return _compare(command)
+    return int(import_module(PERFORMED_BY[type(command)]).perform(command))
 
 
 def _circles(command: Circles) -> int:

@@ -39,7 +39,7 @@ from landmarks import (
     squared_mahalanobis,
 )
 
-__all__ = ["DISTANCE_EDGES_M", "compare_frames", "compare_runs", "image_name"]
+__all__ = ["DISTANCE_EDGES_M", "compare_frames", "compare_runs", "image_name", "pair_discs"]
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -171,14 +171,29 @@ def _match_frame(
         name,
         reference,
         detected,
-        lambda some, others: _pair_up(some, others, options),
+        lambda some, others: pair_discs(some, others, options),
         only_identified=options.only_identified,
     )
 
 
-def _pair_up(
+def pair_discs(
     reference: Sequence[CircleLandmark], detected: Sequence[CircleLandmark], options: CompareOptions
 ) -> Association:
+    """Pair discs one to one.
+
+    Parameters
+    ----------
+    reference, detected : sequence of CircleLandmark
+        Rows of one frame.
+    options : CompareOptions
+        The gate.
+
+    Returns
+    -------
+    Association
+        As many pairs of reference (first) and detected rows (second) as possible, and of those with
+        the least sum of squared distances.
+    """
     first, second = circle_arrays(reference), circle_arrays(detected)
     if options.sigma is None:
         return associate_positions(first.xy, second.xy, gate_m=options.gate_m)

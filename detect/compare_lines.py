@@ -169,8 +169,30 @@ def _count_joined(match: LineMatch, options: LineCompareOptions) -> int:
     """Count the unpaired reference rows within the sigmas of a paired detected row."""
     left = [match.reference[i] for i in match.pairs.first_alone]
     paired = [match.detected[i] for i in match.pairs.second]
+    return int(joined_lines(left, paired, options).sum())
+
+
+def joined_lines(
+    left: Sequence[LineLandmark], paired: Sequence[LineLandmark], options: LineCompareOptions
+) -> NDArray[np.bool_]:
+    """Tell which reference rows are found with another's match.
+
+    Parameters
+    ----------
+    left : sequence of LineLandmark
+        Reference rows of a frame without a pair.
+    paired : sequence of LineLandmark
+        Its detected rows that are in pairs.
+    options : LineCompareOptions
+        Within how many of their sigmas.
+
+    Returns
+    -------
+    (N,) bool
+        For each of `left`.
+    """
     reach = _numbers(paired, "sigma") * options.sigmas
-    return int((np.abs(_differences(left, paired)) <= reach).any(axis=1).sum())
+    return np.asarray((np.abs(_differences(left, paired)) <= reach).any(axis=1))
 
 
 def _differences(reference: Sequence[LineLandmark], detected: Sequence[LineLandmark]) -> FloatArray:

@@ -2,17 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
 import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera
-from detect.circles import CircleDetections
+from detect.draw_strokes import Colour, draw_curve, draw_text
 from detect.settings import CircleSettings
 
+if TYPE_CHECKING:
+    from detect.circles import CircleDetections
+
+FloatArray = NDArray[np.float64]
+
 _POINTS = 64
-_INNER_COLOUR, _EDGE_COLOUR, _OUTER_COLOUR = (60, 200, 60), (0, 170, 255), (60, 200, 60)
-_TEXT_COLOUR = (0, 230, 255)
-_SUBPIXEL_BITS = 4
+EDGE_COLOUR: Colour = (0, 170, 255)
+_OUTLINE_COLOUR: Colour = (60, 200, 60)
+_TEXT_COLOUR: Colour = (0, 230, 255)
 
 
 def draw_circles(
@@ -39,27 +47,50 @@ def draw_circles(
     (H, W, 3) uint8
         In OpenCV's order blue, green, red.
     """
-    import cv2
-
     canvas = np.repeat(image[:, :, None], 3, axis=2)
-    angle = 2.0 * np.pi * np.arange(_POINTS) / _POINTS
-    circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    outlines = (
-        (settings.inner_radius_m, _INNER_COLOUR),
-        (settings.radius_m, _EDGE_COLOUR),
-        (settings.outer_radius_m, _OUTER_COLOUR),
-    )
     for centre, quality in zip(found.floor_xy, found.quality):
-        for radius, colour in outlines:
-            points = camera.project_floor(centre + radius * circle)
-            if np.all(np.isfinite(points)):
-                fixed = np.rint(points * (1 << _SUBPIXEL_BITS)).astype(np.int32)
-                cv2.polylines(canvas, [fixed], True, colour, 1, cv2.LINE_AA, _SUBPIXEL_BITS)
-        u, v = camera.project_floor(centre + np.array([0.0, -settings.outer_radius_m]))
-        if np.isfinite(u) and np.isfinite(v):
-            origin = (round(float(u)) - 14, max(10, round(float(v)) - 3))
-            cv2.putText(
-                canvas, f"{quality:.2f}", origin, cv2.FONT_HERSHEY_SIMPLEX, 0.35, _TEXT_COLOUR, 1,
-                cv2.LINE_AA,
-            )  # fmt: skip
+        outline_disc(canvas, camera.project_floor, centre, settings, f"{quality:.2f}")
     return canvas
+
+
+def outline_disc(
+    canvas: NDArray[np.uint8],
+    project: Callable[[FloatArray], FloatArray],
+    centre_xy: FloatArray,
+    settings: CircleSettings,
+    text: str,
+    *,
+    edge_colour: Colour = EDGE_COLOUR,
+) -> None:
+    """Draw a disc's edge and its two outlines, and a word above.
+
+    Parameters
+    ----------
+    canvas : (H, W, 3) uint8
+        Drawn into.
+    project : callable
+        From (N, 2) places on the floor (m) to (N, 2) pixels; NaN where they are not seen.
+    centre_xy : (2,) float64
+        The disc's centre (m).
+    settings : CircleSettings
+        The radii.
+    text : str
+        Stands above.
+    edge_colour : Colour
+        Of the edge.
+    """
+    for radius, colour in (
+        (settings.inner_radius_m, _OUTLINE_COLOUR),
+        (settings.radius_m, edge_colour),
+        (settings.outer_radius_m, _OUTLINE_COLOUR),
+    ):
+        draw_curve(canvas, project(circle_on_floor(centre_xy, radius)), colour, closed=True)
+    u, v = project(centre_xy + np.array([0.0, -settings.outer_radius_m]))
+    if np.isfinite(u) and np.isfinite(v):
+        draw_text(canvas, text, (round(float(u)) - 14, max(10, round(float(v)) - 3)), _TEXT_COLOUR)
+
+
+def circle_on_floor(centre_xy: FloatArray, radius_m: float) -> FloatArray:
+    """(N, 2) points round a circle on the floor (m)."""
+    angle = 2.0 * np.pi * np.arange(_POINTS) / _POINTS
+    return np.asarray(centre_xy + radius_m * np.stack([np.cos(angle), np.sin(angle)], axis=-1))

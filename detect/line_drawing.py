@@ -6,15 +6,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera
+from detect.draw_strokes import Colour, draw_curve
 from detect.line_tracks import LineTracks
 from detect.lines import ACCEPTED, JOINED, LineDetections
 from lut.verticals import VerticalTable
 
 FloatArray = NDArray[np.float64]
-Colour = tuple[int, int, int]
 
 _POINTS = 33
-_SUBPIXEL_BITS = 4
 _LINE_COLOUR: Colour = (60, 220, 60)
 _JOINED_COLOUR: Colour = (255, 190, 0)
 _SIGMA_COLOUR: Colour = (0, 170, 255)
@@ -63,13 +62,13 @@ def draw_lines(
     share = np.linspace(0.0, 1.0, _POINTS)[:, None]
     for ends, sigma, members in zip(found.ends, found.sigma_rad, found.members):
         points = camera.distort((1.0 - share) * ends[:2] + share * ends[2:])
-        _draw_curve(canvas, points, _LINE_COLOUR if len(members) == 1 else _JOINED_COLOUR)
+        draw_curve(canvas, points, _LINE_COLOUR if len(members) == 1 else _JOINED_COLOUR)
         u, v = _horizon_crossing(table, found, members[0])
         reach = sigma / found.fits.pixel_rad[members[0]]
         bar = np.array([[u - reach, v], [u + reach, v]])
-        _draw_curve(canvas, bar, _SIGMA_COLOUR)
+        draw_curve(canvas, bar, _SIGMA_COLOUR)
         for end in bar:
-            _draw_curve(canvas, end + np.array([[0.0, -2.0], [0.0, 2.0]]), _SIGMA_COLOUR)
+            draw_curve(canvas, end + np.array([[0.0, -2.0], [0.0, 2.0]]), _SIGMA_COLOUR)
     if found.tilt is None:
         text = "no tilt"
     else:
@@ -183,11 +182,3 @@ def _colour(fate: str) -> Colour:
     if fate == ACCEPTED:
         return _LINE_COLOUR
     return _JOINED_COLOUR if fate == JOINED else _REJECTED_COLOURS[fate]
-
-
-def _draw_curve(canvas: NDArray[np.uint8], points: FloatArray, colour: Colour) -> None:
-    import cv2
-
-    if np.all(np.isfinite(points)):
-        fixed = np.rint(points * (1 << _SUBPIXEL_BITS)).astype(np.int32)
-        cv2.polylines(canvas, [fixed], False, colour, 1, cv2.LINE_AA, _SUBPIXEL_BITS)

@@ -50,18 +50,7 @@ def draw_markers(
             if candidate.fate not in (ACCEPTED, SAME_MARKER):
                 _draw_quadrangle(canvas, candidate.outline, _CANDIDATE_COLOUR)
     for number, corners, covariance in zip(found.ids, found.corners, found.covariance):
-        _draw_quadrangle(canvas, corners, _EDGE_COLOUR)
-        for place, spread in zip(corners, covariance):
-            _draw_ellipse(canvas, place, spread, _EDGE_COLOUR)
-        cv2.circle(
-            canvas, _fixed(corners[0]), 3 << _SUBPIXEL_BITS, _TOP_LEFT_COLOUR, 1, cv2.LINE_AA,
-            _SUBPIXEL_BITS,
-        )  # fmt: skip
-        middle = corners.mean(axis=0)
-        cv2.putText(
-            canvas, f"{number}", (round(float(middle[0])) - 8, round(float(middle[1])) + 5),
-            cv2.FONT_HERSHEY_SIMPLEX, 0.45, _TEXT_COLOUR, 1, cv2.LINE_AA,
-        )  # fmt: skip
+        mark_marker(canvas, number, corners, covariance)
     per_row = max(1, image.shape[1] // 210)
     causes = sorted(found.rejected.items())
     rows = -(-len(causes) // per_row)
@@ -73,6 +62,38 @@ def draw_markers(
             _CANDIDATE_COLOUR, 1, cv2.LINE_AA,
         )  # fmt: skip
     return np.concatenate([canvas, legend])
+
+
+def mark_marker(
+    canvas: NDArray[np.uint8], number: int, corners: FloatArray, covariance: FloatArray
+) -> None:
+    """Draw a marker's edges, a circle at its top left corner, ellipses and its number.
+
+    Parameters
+    ----------
+    canvas : (H, W, 3) uint8
+        Drawn into.
+    number : int
+        The marker's ID.
+    corners : (4, 2) float64
+        Pixels, from the top left clockwise.
+    covariance : (4, 2, 2) float64
+        Of the corners, pixels squared; ellipses show 20 standard deviations.
+    """
+    import cv2
+
+    _draw_quadrangle(canvas, corners, _EDGE_COLOUR)
+    for place, spread in zip(corners, covariance):
+        _draw_ellipse(canvas, place, spread, _EDGE_COLOUR)
+    cv2.circle(
+        canvas, _fixed(corners[0]), 3 << _SUBPIXEL_BITS, _TOP_LEFT_COLOUR, 1, cv2.LINE_AA,
+        _SUBPIXEL_BITS,
+    )  # fmt: skip
+    middle = corners.mean(axis=0)
+    cv2.putText(
+        canvas, f"{number}", (round(float(middle[0])) - 8, round(float(middle[1])) + 5),
+        cv2.FONT_HERSHEY_SIMPLEX, 0.45, _TEXT_COLOUR, 1, cv2.LINE_AA,
+    )  # fmt: skip
 
 
 def _fixed(place: FloatArray) -> tuple[int, int]:

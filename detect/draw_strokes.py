@@ -1,0 +1,34 @@
+"""Strokes and words on pictures, at fractions of a pixel."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+Colour = tuple[int, int, int]
+
+_SUBPIXEL_BITS = 4
+# OpenCV's fixed-point coordinates are 32 bits; far beyond any picture, less is as good.
+_FARTHEST_PX = 1e6
+
+
+def draw_curve(
+    canvas: NDArray[np.uint8], points: FloatArray, colour: Colour, *, closed: bool = False
+) -> None:
+    """Draw a curve through (N, 2) points u, v; nothing is drawn if one is not finite."""
+    import cv2
+
+    if np.all(np.abs(points) < _FARTHEST_PX):
+        fixed = np.rint(points * (1 << _SUBPIXEL_BITS)).astype(np.int32)
+        cv2.polylines(canvas, [fixed], closed, colour, 1, cv2.LINE_AA, _SUBPIXEL_BITS)
+
+
+def draw_text(
+    canvas: NDArray[np.uint8], text: str, at: tuple[int, int], colour: Colour, size: float = 0.35
+) -> None:
+    """Write at the left end of the base line; what is no ASCII is a question mark."""
+    import cv2
+
+    plain = text.encode("ascii", "replace").decode()
+    cv2.putText(canvas, plain, at, cv2.FONT_HERSHEY_SIMPLEX, size, colour, 1, cv2.LINE_AA)

@@ -1,0 +1,279 @@
+"""The flags of the commands that look at what was found: one frozen dataclass per command.
+
+Nothing heavy is imported: `--help` needs it all.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields, make_dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Optional
+
+from tyro.conf import OmitArgPrefixes, Positional, arg
+
+from detect.compare_result import CompareOptions
+from detect.line_settings import LineSettings
+from detect.settings import CircleSettings
+
+# For `X | None` tyro imports another library that takes a tenth of a second.
+MaybePath = Optional[Path]  # noqa: UP045
+MaybeInt = Optional[int]  # noqa: UP045
+MaybeStr = Optional[str]  # noqa: UP045
+
+
+@dataclass(frozen=True)
+class RowFiles:
+    """Which files' rows are looked at.
+
+    Parameters
+    ----------
+    rows : Path
+        Folder with detected.circles, detected.lines, detected.markers and detected.tilt, as far as
+        they exist; by default the run's.
+    circles : Path
+        Rows of discs, if not detected.circles there.
+    lines : Path
+        Rows of verticals, if not detected.lines there.
+    markers : Path
+        Rows of square markers, if not detected.markers there.
+    tilt : Path
+        Tilts of the frames, if not detected.tilt there.
+    reference : Path
+        Reference rows of discs, by default map.circles in the run folder if it exists.
+    reference_lines : Path
+        Reference rows of verticals, by default map.lines in the run folder if it exists.
+    no_reference : bool
+        Hold nothing against reference rows, not even where there are some.
+    """
+
+    rows: MaybePath = None
+    circles: MaybePath = None
+    lines: MaybePath = None
+    markers: MaybePath = None
+    tilt: MaybePath = None
+    reference: MaybePath = None
+    reference_lines: MaybePath = None
+    no_reference: bool = False
+
+
+@dataclass(frozen=True)
+class Gates:
+    """What counts as the same landmark as one of the reference.
+
+    Parameters
+    ----------
+    gate_m : float
+        Largest distance between a detected and a reference disc that are the same, metres.
+    tolerance_deg : float
+        Bearings of the same vertical differ by at most this,
+    sigmas : float
+        or by this many standard deviations of the detected one.
+    """
+
+    gate_m: float = 0.10
+    tolerance_deg: float = 0.5
+    sigmas: float = 2.0
+
+    @property
+    def discs(self) -> CompareOptions:
+        """The same for `detect.compare`; raises CompareError for gates that are none."""
+        return CompareOptions(gate_m=self.gate_m)
+
+
+@dataclass(frozen=True)
+class Draw:
+    """Draw rows from files into the images: PNG files, or a video. Nothing is detected again.
+
+    Example: detect all images/e, then: detect draw images/e -o /tmp/drawn --every 10
+
+    Parameters
+    ----------
+    run : Path
+        Run folder of the data set's layout, or a folder of images.
+    output : Path
+        Folder for a PNG file per frame.
+    video : Path
+        Write an MP4 file as well, or instead.
+    fps : float
+        Frames of the video per second.
+    camera : Path
+        Calibration, if it is not the one in the run folder.
+    every : int
+        Only every so manieth frame.
+    frames : tuple of str
+        Only these frames: names of images, positions in the run, and ranges FROM:TO or
+        FROM:TO:STEP of positions without the last.
+    force : bool
+        Replace existing files.
+    """
+
+    run: Positional[Path]
+    output: Annotated[MaybePath, arg(aliases=["-o"])] = None
+    video: MaybePath = None
+    fps: float = 10.0
+    camera: MaybePath = None
+    every: int = 1
+    frames: tuple[str, ...] = ()
+    force: bool = False
+    files: OmitArgPrefixes[RowFiles] = field(default_factory=RowFiles)
+    gates: OmitArgPrefixes[Gates] = field(default_factory=Gates)
+
+
+@dataclass(frozen=True)
+class View:
+    """Frames, landmarks, tilt, path and map over time in Rerun (extra [view]).
+
+    Example: detect all images/e, then: detect view images/e -o /tmp/e.rrd
+
+    Parameters
+    ----------
+    run : Path
+        Run folder of the data set's layout, or a folder of images.
+    output : Path
+        The recording (.rrd) to write; without it, the viewer is started.
+    camera : Path
+        Calibration, if it is not the one in the run folder.
+    path : Path
+        The robot's path (path.csv of `slam map`); by default the sum of the STEP rows.
+    map : Path
+        Map to show (map.csv of `slam map`), in the frame of --path.
+    every : int
+        Only every so manieth frame.
+    frames : tuple of str
+        Only these frames, as for `detect draw`.
+    force : bool
+        Replace an existing recording.
+    """
+
+    run: Positional[Path]
+    output: Annotated[MaybePath, arg(aliases=["-o"])] = None
+    camera: MaybePath = None
+    path: MaybePath = None
+    map: MaybePath = None
+    every: int = 1
+    frames: tuple[str, ...] = ()
+    force: bool = False
+    files: OmitArgPrefixes[RowFiles] = field(default_factory=RowFiles)
+
+
+@dataclass(frozen=True)
+class Report:
+    """One HTML page about a run: what was found, and how good it is against reference rows.
+
+    Example: detect all images/e, then: detect report images/e -o /tmp/e.html
+
+    Parameters
+    ----------
+    run : Path
+        Run folder of the data set's layout, or a folder of images.
+    output : Path
+        The page; by default report.html in the run folder.
+    camera : Path
+        Calibration, if it is not the one in the run folder.
+    worst : int
+        How many of the worst frames are shown.
+    time_frames : int
+        Detect so many frames again, with the settings that the files name, and state how long that
+        takes beside decoding; 0 measures nothing.
+    force : bool
+        Replace an existing page.
+    """
+
+    run: Positional[Path]
+    output: Annotated[MaybePath, arg(aliases=["-o"])] = None
+    camera: MaybePath = None
+    worst: int = 5
+    time_frames: int = 0
+    force: bool = False
+    files: OmitArgPrefixes[RowFiles] = field(default_factory=RowFiles)
+    gates: OmitArgPrefixes[Gates] = field(default_factory=Gates)
+
+
+if TYPE_CHECKING:
+
+    class Grid:
+        """One `str` or None for each field of `CircleSettings` and of `LineSettings`."""
+
+else:
+
+    def _grid() -> type:
+        def values_of(name: str) -> object:
+            return Annotated[MaybeStr, arg(metavar="VALUES", help=f"Values of {name}.")]
+
+        names = {f.name: None for kind in (CircleSettings, LineSettings) for f in fields(kind)}
+        # Pairs of numbers are no values of a grid.
+        del names["refine_steps_px"]
+        return make_dataclass(
+            "Grid",
+            [(name, values_of(name), field(default=None)) for name in names],
+            namespace={"__doc__": "Parameters to be varied: FROM:TO:STEP, or values with commas."},
+            frozen=True,
+        )
+
+    Grid = _grid()
+
+
+@dataclass(frozen=True)
+class Tune:
+    """Try parameters over a grid against a reference file: precision and recall, knee marked.
+
+    Example: detect tune images/e --threshold 0.3:0.7:0.1 --every 8 -o /tmp/tuned
+
+    Any parameter of `detect circles` (with --verticals: of `detect lines`) can be varied: by
+    FROM:TO:STEP, both ends included, or by values with commas between them. All combinations are
+    tried.
+
+    Parameters
+    ----------
+    run : Path
+        Run folder of the data set's layout, or a folder of images.
+    output : Path
+        Folder for table.csv, table.json and curve.png; by default `tune` in the run folder.
+    verticals : bool
+        Tune the detector of verticals instead of that of discs.
+    preset : str
+        `default` or `published`: the values of all parameters that are not varied.
+    camera : Path
+        Calibration, if it is not the one in the run folder.
+    reference : Path
+        Reference rows; by default map.circles (map.lines) in the run folder.
+    tilt : Path
+        Tilts of the frames: positions of discs are corrected for them.
+    only_identified : bool
+        Count only reference rows that have an ID.
+    every : int
+        Only every so manieth frame.
+    frames : tuple of str
+        Only these frames, as for `detect draw`.
+    most : int
+        Refuse grids of more combinations than this.
+    jobs : int
+        Processes that share the work, 1 for none beside this one.
+    force : bool
+        Replace existing files.
+    """
+
+    run: Positional[Path]
+    output: Annotated[MaybePath, arg(aliases=["-o"])] = None
+    verticals: bool = False
+    preset: str = "default"
+    camera: MaybePath = None
+    reference: MaybePath = None
+    tilt: MaybePath = None
+    only_identified: bool = False
+    every: int = 1
+    frames: tuple[str, ...] = ()
+    most: int = 1000
+    jobs: int = 1
+    force: bool = False
+    gates: OmitArgPrefixes[Gates] = field(default_factory=Gates)
+    grid: OmitArgPrefixes[Grid] = field(default_factory=Grid)
+
+
+#: The module whose `perform` carries a command out.
+PERFORMED_BY: dict[type, str] = {
+    Draw: "detect.draw_command",
+    View: "detect.view_command",
+    Report: "detect.report_command",
+    Tune: "detect.tune_command",
+}
