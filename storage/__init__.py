@@ -6,28 +6,25 @@ Every room writes its files through `write_whole`.
 from __future__ import annotations
 
 import os
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
+from storage.parts import OutputExistsError, named, new_part
+
 __all__ = ["OutputExistsError", "write_whole"]
 
 
-class OutputExistsError(FileExistsError):
-    """A file that would be overwritten stands where a result should go."""
-
-    def __init__(self, path: Path) -> None:
-        super().__init__(f"{path}: exists already: give --force to overwrite it")
-
-
 @contextmanager
-def write_whole(path: str | os.PathLike[str], *, overwrite: bool) -> Iterator[BinaryIO]:
+def write_whole(
+    path: str | os.PathLike[str], *, overwrite: bool, mode: int = 0o666
+) -> Iterator[BinaryIO]:
     """Open a binary stream whose content appears at `path` only once it is complete.
 
-    The bytes go to a temporary file in the same folder, which takes the place of `path` in one step
-    when the block ends, and is removed when the block raises.
+    The bytes go to a temporary file in the same folder (see `storage.parts`), which takes the place
+    of `path` in one step when the block ends, and is removed when the block raises. What a killed
+    process left of the same result is removed.
 
     Parameters
     ----------
@@ -35,6 +32,8 @@ def write_whole(path: str | os.PathLike[str], *, overwrite: bool) -> Iterator[Bi
         Where the file will be.
     overwrite : bool
         Whether an existing file may be replaced.
+    mode : int
+        Who may read and write it, as far as the user's umask lets them.
 
     Yields
     ------
@@ -51,36 +50,15 @@ def write_whole(path: str | os.PathLike[str], *, overwrite: bool) -> Iterator[Bi
     path = Path(path)
     if not overwrite and os.path.lexists(path):
         raise OutputExistsError(path)
+    part = new_part(path)
     try:
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
-    except OSError as error:
-        # The temporary file's name would mean nothing to whoever reads the message.
-        raise type(error)(error.errno, error.strerror, str(path)) from None
-    temporary = Path(name)
-    try:
-        with os.fdopen(handle, "wb") as stream:
+        with os.fdopen(part.fileno(), "wb", closefd=False) as stream:
             yield stream
-            stream.flush()
-            os.fsync(stream.fileno())
-        # mkstemp makes files that only their owner can read; results follow the user's umask.
-        umask = os.umask(0)
-        os.umask(umask)
-        temporary.chmod(0o666 & ~umask)
-        if overwrite:
-            temporary.replace(path)
-        else:
-            _place_new(temporary, path)
+            try:
+                stream.flush()
+            except OSError as error:
+                raise named(error, path) from None
+        part.sync()
+        part.place(overwrite=overwrite)
     finally:
-        temporary.unlink(missing_ok=True)
-
-
-def _place_new(temporary: Path, path: Path) -> None:
-    """Give the file its name unless somebody took it meanwhile."""
-    try:
-        os.link(temporary, path)
-    except FileExistsError:
-        raise OutputExistsError(path) from None
-    except OSError:  # a file system without hard links
-        if os.path.lexists(path):
-            raise OutputExistsError(path) from None
-        temporary.replace(path)
+        part.discard()

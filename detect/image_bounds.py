@@ -1,0 +1,94 @@
+"""No image takes more memory than images of its run do, whatever its file is or claims to be."""
+
+from __future__ import annotations
+
+import os
+import stat
+from pathlib import Path
+
+from detect.errors import FrameError
+from detect.image_header import claimed_size
+
+#: The largest image that there can be: it fills as many bytes as grey values.
+MOST_PIXELS = 1 << 27
+
+# A file has at most what its pixels have uncompressed, 16 bits in four channels, twice over for
+# formats that grow, and room for thumbnails and whatever else cameras write.
+_BYTES_PER_PIXEL = 16
+_BYTES_BESIDE = 1 << 23
+
+
+def bounded_content(path: Path, name: object, size: tuple[int, int] | None) -> bytes:
+    """The content of an image file that may be anything: a pipe, a device, a film.
+
+    Parameters
+    ----------
+    path : path
+        The file.
+    name : object
+        What messages call it.
+    size : (int, int) or None
+        Width and height that are expected.
+
+    Returns
+    -------
+    bytes
+
+    Raises
+    ------
+    FrameError
+        If it cannot be read, is no file, or has more bytes than such an image can have.
+    """
+    pixels = MOST_PIXELS if size is None else size[0] * size[1]
+    limit = _BYTES_BESIDE + _BYTES_PER_PIXEL * pixels
+    try:
+        with open(path, "rb", opener=_without_waiting) as stream:
+            status = os.fstat(stream.fileno())
+            if not stat.S_ISREG(status.st_mode):
+                raise FrameError(f"{name}: cannot be read: is no file, but a pipe or a device")
+            if status.st_size > limit:
+                raise FrameError(
+                    f"{name}: has {status.st_size} bytes: expected an image, at most {limit}"
+                )
+            return stream.read(limit)
+    except OSError as error:
+        raise FrameError(f"{name}: cannot be read: {error.strerror}") from None
+
+
+def demand_bounded(content: bytes, name: object, size: tuple[int, int] | None) -> None:
+    """Refuse an image by its header, before it is decoded.
+
+    Parameters
+    ----------
+    content : bytes
+        The file.
+    name : object
+        What messages call it.
+    size : (int, int) or None
+        Width and height that are expected. Those of the file may be exchanged: it may say that it
+        is to be turned.
+
+    Raises
+    ------
+    FrameError
+        If the file is no JPEG, PNG, PNM, BMP or TIFF, claims another size, or more than
+        `MOST_PIXELS`.
+    """
+    claimed = claimed_size(content)
+    if claimed is None:
+        raise FrameError(f"{name}: cannot be decoded: expected an image")
+    width, height = claimed
+    if width * height > MOST_PIXELS:
+        raise FrameError(
+            f"{name}: cannot be decoded: claims {width}x{height} px: "
+            f"expected at most {MOST_PIXELS} pixels"
+        )
+    if size is not None and sorted(claimed) != sorted(size):
+        raise FrameError(
+            f"{name}: is {width}x{height} px: expected {size[0]}x{size[1]}, the calibration's size"
+        )
+
+
+def _without_waiting(path: str, flags: int) -> int:
+    """Open a file; opening a pipe would wait for somebody at its other end."""
+    return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))

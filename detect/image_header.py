@@ -1,0 +1,101 @@
+"""What the header of an image file claims, without decoding it.
+
+A file of some hundred bytes can claim an image of gigabytes; a decoder takes the memory before it
+notices. So the size is read from the header by itself, for the formats that runs are made of:
+JPEG (ISO/IEC 10918-1), PNG, PNM (P1 to P6), BMP, and TIFF (6.0 and BigTIFF).
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+
+#: The start-of-frame markers of a JPEG: C0 to CF but for tables (C4), extensions (C8, CC).
+_JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+_JPEG_WITHOUT_LENGTH = frozenset({0x01, *range(0xD0, 0xD9)})
+_PNG = b"\x89PNG\r\n\x1a\n"
+_PNM = re.compile(rb"P[1-6](?:\s|#[^\n]*\n)+(\d{1,10})(?:\s|#[^\n]*\n)+(\d{1,10})(?=[\s#])")
+_PNM_HEADER_BYTES = 4096
+_TIFF_ENTRIES = 512
+_TIFF_SIZES = (256, 257, 322, 323)  # width, height, and those of a tile
+
+
+def claimed_size(content: bytes) -> tuple[int, int] | None:
+    """Width and height that the header of an image file claims.
+
+    Parameters
+    ----------
+    content : bytes
+        The file.
+
+    Returns
+    -------
+    (int, int) or None
+        Pixels; of a TIFF with tiles that are larger than the image, those of a tile. None if this
+        is no JPEG, PNG, PNM, BMP or TIFF, or its header is damaged.
+    """
+    try:
+        if content.startswith(b"\xff\xd8"):
+            return _jpeg_size(content)
+        if content.startswith(_PNG):
+            width, height = struct.unpack_from(">II", content, 16)
+            return (width, height) if content[12:16] == b"IHDR" else None
+        if content.startswith(b"BM"):
+            return _bmp_size(content)
+        if content[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
+            return _tiff_size(content)
+        found = _PNM.match(content[:_PNM_HEADER_BYTES])
+        return None if found is None else (int(found[1]), int(found[2]))
+    except (struct.error, IndexError):  # the header ends too early
+        return None
+
+
+def _jpeg_size(content: bytes) -> tuple[int, int] | None:
+    place = 2
+    while content[place] == 0xFF:
+        marker = content[place + 1]
+        if marker == 0xFF:  # fill
+            place += 1
+        elif marker in _JPEG_WITHOUT_LENGTH:
+            place += 2
+        elif marker in _JPEG_FRAMES:
+            height, width = struct.unpack_from(">HH", content, place + 5)
+            return width, height
+        elif marker in (0xD9, 0xDA):  # the image's end, or its data, before its size
+            return None
+        else:
+            (length,) = struct.unpack_from(">H", content, place + 2)
+            place += 2 + length
+    return None
+
+
+def _bmp_size(content: bytes) -> tuple[int, int]:
+    (header_bytes,) = struct.unpack_from("<I", content, 14)
+    if header_bytes == 12:  # that of OS/2
+        width, height = struct.unpack_from("<HH", content, 18)
+    else:
+        width, height = struct.unpack_from("<ii", content, 18)
+    return abs(width), abs(height)  # a negative height: rows from the top
+
+
+def _tiff_size(content: bytes) -> tuple[int, int] | None:
+    order = "<" if content.startswith(b"II") else ">"
+    big = content[2:4] in (b"+\0", b"\0+")
+    offset_type, count_type, entry_bytes = ("Q", "Q", 20) if big else ("I", "H", 12)
+    (directory,) = struct.unpack_from(order + offset_type, content, 8 if big else 4)
+    (count,) = struct.unpack_from(order + count_type, content, directory)
+    first = directory + struct.calcsize(order + count_type)
+    value_place = 12 if big else 8
+    sizes = dict.fromkeys(_TIFF_SIZES, 0)
+    for entry in range(min(count, _TIFF_ENTRIES)):
+        place = first + entry * entry_bytes
+        tag, kind = struct.unpack_from(order + "HH", content, place)
+        if tag in sizes:
+            number_type = {3: "H", 4: "I", 16: "Q"}.get(kind)
+            if number_type is None:
+                return None
+            (sizes[tag],) = struct.unpack_from(order + number_type, content, place + value_place)
+    image, tile = (sizes[256], sizes[257]), (sizes[322], sizes[323])
+    if not all(image):
+        return None
+    return max(image, tile, key=lambda size: size[0] * size[1])

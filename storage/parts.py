@@ -1,0 +1,241 @@
+"""Files that grow beside the place where they will be.
+
+A result is written to ``.NAME.part`` in the folder of ``NAME``, and takes its place in one step
+when it is complete. Whoever writes it holds a lock on it, which the operating system takes back
+however the process ends: a part that nobody has locked is what a killed process left behind. The
+next one that writes the same result removes it; beside one that is being written, the next part is
+``.NAME.1.part``.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import stat
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+#: So many places for parts are looked at for what killed processes left.
+_PLACES_LOOKED_AT = 8
+
+_NEW = os.O_RDWR | os.O_CREAT | os.O_EXCL | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
+# What stands in the place of a part may be anything: no link is followed, no pipe waited for.
+_OLD = os.O_RDWR | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
+
+
+class OutputExistsError(FileExistsError):
+    """A file that would be overwritten stands where a result should go."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(f"{path}: exists already: give --force to overwrite it")
+
+
+class PartFile:
+    """A result while it grows: locked, and removed unless it is kept or takes its place.
+
+    Attributes
+    ----------
+    path : path
+        Where the result will be.
+    temporary : path
+        Where it grows.
+    number : int
+        Which of the parts of this result it is; 0 unless others were being written.
+    """
+
+    def __init__(self, path: Path, number: int, handle: int) -> None:
+        self.path = path
+        self.number = number
+        self.temporary = part_place(path, number)
+        self._handle = handle
+
+    def fileno(self) -> int:
+        """The descriptor, for reading what is there and for cutting it off."""
+        return self._handle
+
+    def write(self, content: bytes) -> None:
+        """Write at once, all of it.
+
+        Raises
+        ------
+        OSError
+            That names the result, not the part.
+        """
+        left = memoryview(content)
+        try:
+            while left:
+                left = left[os.write(self._handle, left) :]
+        except OSError as error:
+            raise named(error, self.path) from None
+
+    def sync(self) -> None:
+        """Have it on the disk."""
+        try:
+            os.fsync(self._handle)
+        except OSError as error:
+            raise named(error, self.path) from None
+
+    def place(self, *, overwrite: bool) -> None:
+        """Take the place of the result.
+
+        Raises
+        ------
+        OutputExistsError
+            If something stands there that must not be overwritten.
+        """
+        if sys.platform == "win32":
+            self.close()  # a file that is open keeps its name there
+        try:
+            if overwrite:
+                self.temporary.replace(self.path)
+            else:
+                _place_new(self.temporary, self.path)
+        except OutputExistsError:
+            raise
+        except OSError as error:
+            raise named(error, self.path) from None
+
+    def discard(self) -> None:
+        """Remove it, unless it took its place."""
+        if self._handle >= 0:
+            if _is_at(self._handle, self.temporary):
+                self.temporary.unlink(missing_ok=True)
+            self.close()
+
+    def close(self) -> None:
+        """Leave it where it is, and take the lock off."""
+        if self._handle >= 0:
+            os.close(self._handle)
+            self._handle = -1
+
+
+def new_part(path: Path) -> PartFile:
+    """An empty part for a result; parts that killed processes left are removed.
+
+    Raises
+    ------
+    OSError
+        If the folder cannot be written to; names the result.
+    """
+    try:
+        number = 0
+        while (handle := _new_locked(part_place(path, number))) is None:
+            number += 1
+        for other in range(number + 1, _PLACES_LOOKED_AT):
+            remove_left_part(path, other)
+    except OSError as error:
+        raise named(error, path) from None
+    return PartFile(path, number, handle)
+
+
+def left_part(path: Path, number: int = 0) -> PartFile | None:
+    """The part of a result that an ended process left; None if there is none or it is in use."""
+    handle = _old_locked(part_place(path, number))
+    return None if handle is None else PartFile(path, number, handle)
+
+
+def remove_left_part(path: Path, number: int = 0) -> None:
+    """Remove the part of a result that an ended process left, if there is one."""
+    if os.path.lexists(part_place(path, number)):
+        left = left_part(path, number)
+        if left is not None:
+            left.discard()
+
+
+def part_place(path: Path, number: int) -> Path:
+    """Where the parts of a result are."""
+    return path.with_name(f".{path.name}.{number}.part" if number else f".{path.name}.part")
+
+
+def named(error: OSError, path: Path) -> OSError:
+    """The error with the name of the result: that of its part would mean nothing to a reader."""
+    return type(error)(error.errno, error.strerror, str(path))
+
+
+@contextmanager
+def folder_locked(folder: Path) -> Iterator[None]:
+    """Wait until nobody else has the folder locked, and lock it for the time of a block."""
+    if sys.platform == "win32":
+        yield
+        return
+    import fcntl
+
+    handle = os.open(folder, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        # Without locks on this file system, results of runs at once may be mixed; each is whole.
+        with contextlib.suppress(OSError):
+            fcntl.flock(handle, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(handle)
+
+
+def _new_locked(place: Path) -> int | None:
+    """A new file, locked; None if another process writes there, or what is there is no part."""
+    while True:
+        try:
+            handle = os.open(place, _NEW, 0o666)
+        except FileExistsError:
+            left = _old_locked(place)
+            if left is None:
+                if not os.path.lexists(place):
+                    continue  # it has just taken its place
+                return None
+            place.unlink(missing_ok=True)
+            os.close(left)
+            continue
+        if _lock(handle) is not False and _is_at(handle, place):
+            return handle
+        os.close(handle)  # taken for something left behind before it was locked
+
+
+def _old_locked(place: Path) -> int | None:
+    """A file that was left behind, locked; None if there is none or it is no such file."""
+    try:
+        handle = os.open(place, _OLD)
+    except OSError:
+        return None
+    if stat.S_ISREG(os.fstat(handle).st_mode) and _lock(handle) and _is_at(handle, place):
+        return handle  # nobody writes it any more
+    os.close(handle)
+    return None
+
+
+def _lock(handle: int) -> bool | None:
+    """Lock a file; False if somebody else has, None where there are no locks: nobody knows then."""
+    if sys.platform == "win32":
+        return None
+    import fcntl
+
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:
+        return None
+    return True
+
+
+def _is_at(handle: int, place: Path) -> bool:
+    try:
+        return os.path.samestat(os.fstat(handle), os.lstat(place))
+    except OSError:
+        return False
+
+
+def _place_new(temporary: Path, path: Path) -> None:
+    """Give the file its name unless somebody took it meanwhile."""
+    try:
+        os.link(temporary, path)
+    except FileExistsError:
+        if not path.is_file() or not temporary.samefile(path):
+            raise OutputExistsError(path) from None
+        temporary.unlink(missing_ok=True)  # a process was killed after it had placed the file
+    except OSError:  # a file system without hard links
+        if os.path.lexists(path):
+            raise OutputExistsError(path) from None
+        temporary.replace(path)
+    else:
+        temporary.unlink(missing_ok=True)
