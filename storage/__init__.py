@@ -17,9 +17,7 @@ __all__ = ["OutputExistsError", "write_whole"]
 
 
 @contextmanager
-def write_whole(
-    path: str | os.PathLike[str], *, overwrite: bool, mode: int = 0o666
-) -> Iterator[BinaryIO]:
+def write_whole(path: str | os.PathLike[str], *, overwrite: bool) -> Iterator[BinaryIO]:
     """Open a binary stream whose content appears at `path` only once it is complete.
 
     The bytes go to a temporary file in the same folder (see `storage.parts`), which takes the place
@@ -32,8 +30,6 @@ def write_whole(
         Where the file will be.
     overwrite : bool
         Whether an existing file may be replaced.
-    mode : int
-        Who may read and write it, as far as the user's umask lets them.
 
     Yields
     ------
