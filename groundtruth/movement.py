@@ -29,6 +29,7 @@ _RESTART_VARIANCES = np.array([25.0, 25.0, math.pi**2])
 _NOISE_FACTORS = (0.05, 20.0)
 _MOST_NODES_TO_LEARN_FROM = 30_000
 _LEARNING_ROUNDS = 2
+_RELINEARISATIONS = 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +108,7 @@ class MovementProblem:
         """Minus twice the logarithm of the measurements' likelihood."""
         empty = np.empty((1, STATE)), np.empty((1, STATE, STATE))
         return self._forward(
-            noise, False, empty[0], empty[1], empty[0], empty[1], empty[1]
+            noise, empty[0], False, empty[0], empty[1], empty[0], empty[1], empty[1]
         ).surprise
 
     def smooth(self, noise: FloatArray) -> tuple[FloatArray, FloatArray, MeasurementAccount]:
@@ -115,24 +116,30 @@ class MovementProblem:
         count = len(self.times_s)
         predicted, filtered, smoothed = (np.empty((count, STATE)) for _ in range(3))
         spreads = [np.empty((count, STATE, STATE)) for _ in range(4)]
-        account = self._forward(
-            noise, True, predicted, spreads[0], filtered, spreads[1], spreads[2]
-        )
-        smooth_backward(
-            predicted,
-            spreads[0],
-            filtered,
-            spreads[1],
-            spreads[2],
-            account.restarted,
-            smoothed,
-            spreads[3],
-        )
+        points = np.empty((1, STATE))
+        # Again, linearised along the smoothed path: where a gap was bridged, the filter alone was
+        # too far off on its way for its derivatives to hold.
+        for _ in range(1 + _RELINEARISATIONS):
+            account = self._forward(
+                noise, points, True, predicted, spreads[0], filtered, spreads[1], spreads[2]
+            )
+            smooth_backward(
+                predicted,
+                spreads[0],
+                filtered,
+                spreads[1],
+                spreads[2],
+                account.restarted,
+                smoothed,
+                spreads[3],
+            )
+            points = smoothed.copy()
         return smoothed, spreads[3], account
 
     def _forward(
         self,
         noise: FloatArray,
+        points: FloatArray,
         keep: bool,
         predicted: FloatArray,
         predicted_covariance: FloatArray,
@@ -159,6 +166,7 @@ class MovementProblem:
             float(chi2.ppf(self.settings.gate_probability, 3)),
             _RESTART_AFTER,
             _RESTART_VARIANCES,
+            points,
             keep,
             predicted,
             predicted_covariance,

@@ -47,16 +47,22 @@ def _invert_3x3(m: FloatArray, inverse: FloatArray) -> float:
 
 @njit(cache=True, error_model="numpy")
 def _predict(
-    x: FloatArray, p: FloatArray, f: FloatArray, control: FloatArray, variances: FloatArray
+    x: FloatArray,
+    p: FloatArray,
+    f: FloatArray,
+    control: FloatArray,
+    variances: FloatArray,
+    point: FloatArray,
 ) -> None:
-    """Move state and covariance on by a control; f becomes the derivative."""
+    """Move state and covariance on by a control, linearised at a point; f: the derivative."""
     dx, dy, turn = control[0], control[1], control[2]
     way = math.sqrt(dx * dx + dy * dy)
-    cos, sin = math.cos(x[2]), math.sin(x[2])
+    cos, sin = math.cos(point[2]), math.sin(point[2])
     east, north = cos * dx - sin * dy, sin * dx + cos * dy
-    longer = 1.0 + x[5]
-    x[0] += longer * east
-    x[1] += longer * north
+    longer = 1.0 + point[5]
+    off_heading, off_scale = x[2] - point[2], x[5] - point[5]
+    x[0] += longer * east - longer * north * off_heading + east * off_scale
+    x[1] += longer * north + longer * east * off_heading + north * off_scale
     x[2] += (1.0 + x[3]) * turn + x[4] * way
     f[0, 2] = -longer * north
     f[1, 2] = longer * east
@@ -123,6 +129,7 @@ def filter_forward(
     gate: float,
     restart_after: int,
     restart_variances: FloatArray,
+    points: FloatArray,
     keep: bool,
     predicted: FloatArray,
     predicted_covariance: FloatArray,
@@ -152,6 +159,9 @@ def filter_forward(
         So many rejections in a row, and the pose's variances become `restart_variances`: the
         measurements are believed again.
     restart_variances : (3,) array
+    points : (N, 6) array
+        States at which each movement away from a node is linearised; of length 1: at the filter's
+        own.
     keep : bool
         Whether the next five arrays are filled; they may be of length 1 where they are not.
     predicted, predicted_covariance, filtered, filtered_covariance : (N, 6), (N, 6, 6) arrays
@@ -181,7 +191,10 @@ def filter_forward(
     for k in range(controls.shape[0]):
         restarted[k] = False
         if k > 0:
-            _predict(x, p, f, controls[k], control_variances[k])
+            if points.shape[0] > 1:
+                _predict(x, p, f, controls[k], control_variances[k], points[k - 1])
+            else:
+                _predict(x, p, f, controls[k], control_variances[k], x.copy())
             if keep:
                 transitions[k] = f
         if keep:

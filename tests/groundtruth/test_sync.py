@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -141,7 +142,7 @@ def test_streams_that_never_meet_are_refused() -> None:
 @pytest.mark.parametrize("value", [0.0, -1.0, math.nan, math.inf])
 def test_settings_that_mean_nothing_are_refused(name: str, value: float) -> None:
     with pytest.raises(GroundTruthError, match=name):
-        replace(SyncSettings(), **{name: value})
+        SyncSettings(**dict[str, Any]({name: value}))
 
 
 @given(
