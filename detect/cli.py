@@ -27,7 +27,8 @@ from detect.line_settings import LineSettings
 from detect.markers.settings import PRESETS as MARKER_PRESETS
 from detect.markers.settings import MarkerSettings
 from detect.settings import PUBLISHED, CircleSettings
-from detect.viewing_options import Draw
+from detect.sources.options import SourceOptions
+from detect.viewing_options import Draw, Tune
 
 Preset = Literal["default", "published"]
 
@@ -55,18 +56,22 @@ _CIRCLE_PRESETS = {"default": CircleSettings(), "published": PUBLISHED}
 class Circles:
     """Detect the discs of a run and write them to a .circles file.
 
-    Example: detect circles images/e --draw /tmp/discs
+    Example: detect circles images/e --draw /tmp/discs, or:
+    detect circles drive.mcap --camera front.cam --odometry /odom
 
     Parameters
     ----------
     run : Path
-        Run folder of the data set's layout, or a folder of images with a .cam in it.
+        Run folder of the data set's layout; a folder of images, or a pattern in quotes
+        ('drive/*.png'); a video; a ROS 1 or 2 bag or MCAP file; or a camera of this machine,
+        camera:0. With a .cam beside it, or named by --camera.
     preset : str
         Values that the other flags start from: `published` is the report's detector to the letter.
     camera : Path
         Calibration, if it is not the one in the run folder.
     output : Path
-        The file to write; by default detected.circles in the run folder.
+        The file to write; by default detected.circles in the run folder, or named after the video
+        or bag and beside it.
     tilt : Path
         Tilts of the frames (written by `detect lines`): positions are corrected for them.
     force : bool
@@ -92,6 +97,7 @@ class Circles:
     json: MaybePath = None
     jobs: MaybeInt = None
     cluster: MaybeStr = None
+    source: OmitArgPrefixes[SourceOptions] = field(default_factory=SourceOptions)
     settings: OmitArgPrefixes[CircleSettings] = field(default_factory=CircleSettings)
 
 
@@ -99,18 +105,22 @@ class Circles:
 class Lines:
     """Detect the verticals of a run and write them to a .lines file, and the tilt to a .tilt file.
 
-    Example: detect lines images/e --join-threshold 0.006
+    Example: detect lines images/e --join-threshold 0.006, or:
+    detect lines drive.avi --camera front.cam --frames 100
 
     Parameters
     ----------
     run : Path
-        Run folder of the data set's layout, or a folder of images with a .cam in it.
+        Run folder of the data set's layout; a folder of images, or a pattern in quotes
+        ('drive/*.png'); a video; a ROS 1 or 2 bag or MCAP file; or a camera of this machine,
+        camera:0. With a .cam beside it, or named by --camera.
     preset : str
         Values that the other flags start from: `published` is the report's parameters.
     camera : Path
         Calibration, if it is not the one in the run folder.
     output : Path
-        The file to write; by default detected.lines in the run folder.
+        The file to write; by default detected.lines in the run folder, or named after the video
+        or bag and beside it.
     tilt : Path
         The tilt file to write; by default the output's name with the ending .tilt.
     ids_from : Path
@@ -145,6 +155,7 @@ class Lines:
     response: bool = False
     jobs: MaybeInt = None
     cluster: MaybeStr = None
+    source: OmitArgPrefixes[SourceOptions] = field(default_factory=SourceOptions)
     settings: OmitArgPrefixes[LineSettings] = field(default_factory=LineSettings)
 
 
@@ -152,19 +163,23 @@ class Lines:
 class Markers:
     """Detect the square markers of a run and write them to a .markers file.
 
-    Example: detect markers images/m/a --dictionary rawseeds
+    Example: detect markers images/m/a --dictionary rawseeds, or:
+    detect markers camera:0 --frames 100
 
     Parameters
     ----------
     run : Path
-        Run folder of the data set's layout, or a folder of images. With a .cam in it, the lens's
-        distortion is taken off; without one, edges are taken to be straight in the images.
+        Run folder of the data set's layout; a folder of images, or a pattern in quotes
+        ('drive/*.png'); a video; a ROS 1 or 2 bag or MCAP file; or a camera of this machine,
+        camera:0. With a .cam beside it, or named by --camera, the lens's distortion is taken off;
+        without one, edges are taken to be straight in the images.
     preset : str
         Values that the other flags start from: `published` is the report's detector.
     camera : Path
         Calibration, if it is not the one in the run folder.
     output : Path
-        The file to write; by default detected.markers in the run folder.
+        The file to write; by default detected.markers in the run folder, or named after the video
+        or bag and beside it.
     force : bool
         Replace existing files.
     draw : Path
@@ -184,6 +199,7 @@ class Markers:
     draw: MaybePath = None
     jobs: MaybeInt = None
     cluster: MaybeStr = None
+    source: OmitArgPrefixes[SourceOptions] = field(default_factory=SourceOptions)
     settings: OmitArgPrefixes[MarkerSettings] = field(default_factory=MarkerSettings)
 
 
@@ -191,18 +207,22 @@ class Markers:
 class All:
     """Detect verticals, tilt and discs of a run; the discs' positions are corrected for the tilt.
 
-    Example: detect all images/e --circles.polarity light
+    Example: detect all images/e --circles.polarity light, or:
+    detect all 'drive/*.png' --camera front.cam --times drive.times --odometry drive.tum
 
     Parameters
     ----------
     run : Path
-        Run folder of the data set's layout, or a folder of images with a .cam in it.
+        Run folder of the data set's layout; a folder of images, or a pattern in quotes
+        ('drive/*.png'); a video; a ROS 1 or 2 bag or MCAP file; or a camera of this machine,
+        camera:0. With a .cam beside it, or named by --camera.
     preset : str
         Values that the other flags start from.
     camera : Path
         Calibration, if it is not the one in the run folder.
     output : Path
-        Folder for detected.circles, detected.lines and detected.tilt; by default the run's.
+        Folder for detected.circles, detected.lines and detected.tilt; by default the run's, or
+        named after the video or bag and beside it.
     force : bool
         Replace existing files.
     jobs : int
@@ -219,6 +239,7 @@ class All:
     force: bool = False
     jobs: MaybeInt = None
     cluster: MaybeStr = None
+    source: OmitArgPrefixes[SourceOptions] = field(default_factory=SourceOptions)
     circles: CircleSettings = field(default_factory=CircleSettings)
     lines: LineSettings = field(default_factory=LineSettings)
 
@@ -266,7 +287,7 @@ class Compare:
     options: OmitArgPrefixes[CompareOptions] = field(default_factory=CompareOptions)
 
 
-Command = Circles | Lines | Markers | All | Compare | Draw
+Command = Circles | Lines | Markers | All | Compare | Draw | Tune
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -322,7 +343,8 @@ def _parsed(given: list[str]) -> Command:
                 subcommand("all", default=All(run=tyro.MISSING, circles=circles, lines=lines)),
             ]
             | Annotated[Compare, subcommand("compare")]
-            | Annotated[Draw, subcommand("draw")],
+            | Annotated[Draw, subcommand("draw")]
+            | Annotated[Tune, subcommand("tune")],
             arg(name=""),
         ],
         prog="detect",

@@ -56,14 +56,14 @@ def _circles(command: Circles) -> int:
     from detect import __version__
     from detect.by_image import TiltsByImage
     from detect.circles_run import detect_circles_run
-    from detect.run import open_run
+    from detect.sources.opening import open_calibrated
 
-    run = open_run(command.run, command.camera)
-    output = command.output if command.output is not None else command.run / "detected.circles"
-    _demand_new([output, command.json], command.force)
+    run = open_calibrated(command.run, command.camera, command.source)
+    output = command.output if command.output is not None else run.output("circles")
+    _demand_new([output, command.json], command.force, run)
     if command.draw is not None:
         command.draw.mkdir(parents=True, exist_ok=True)
-    with progress_bar("discs", len(run.frames)) as advance:
+    with progress_bar("discs", run.frames.expected) as advance:
         summary = detect_circles_run(
             run,
             command.settings,
@@ -77,19 +77,19 @@ def _circles(command: Circles) -> int:
             on_progress=advance,
         )
     print(f"{output}: {summary.discs} discs in {summary.frames} frames")
-    return _exit_code(summary)
+    return _exit_code(summary, run)
 
 
 def _lines(command: Lines) -> int:
     from detect import __version__
     from detect.by_image import LinesByImage
     from detect.lines_run import detect_lines_run
-    from detect.run import open_run
+    from detect.sources.opening import open_calibrated
 
-    run = open_run(command.run, command.camera)
-    output = command.output if command.output is not None else command.run / "detected.lines"
+    run = open_calibrated(command.run, command.camera, command.source)
+    output = command.output if command.output is not None else run.output("lines")
     tilt = command.tilt if command.tilt is not None else output.with_suffix(".tilt")
-    _demand_new([output, tilt], command.force)
+    _demand_new([output, tilt], command.force, run)
     settings = command.settings
     if command.join_threshold is not None:
         # On the horizon straight ahead, a bearing of one radian is scale_x pixels wide.
@@ -99,7 +99,7 @@ def _lines(command: Lines) -> int:
         reference = LinesByImage(command.ids_from)
     if command.draw is not None:
         command.draw.mkdir(parents=True, exist_ok=True)
-    with progress_bar("lines", len(run.frames)) as advance:
+    with progress_bar("lines", run.frames.expected) as advance:
         summary = detect_lines_run(
             run,
             settings,
@@ -116,20 +116,20 @@ def _lines(command: Lines) -> int:
         )
     print(f"{output}: {summary.lines} lines in {summary.frames} frames")
     print(f"{tilt}: the tilt of {summary.tilts} frames")
-    return _exit_code(summary)
+    return _exit_code(summary, run)
 
 
 def _markers(command: Markers) -> int:
     from detect import __version__
     from detect.markers_run import detect_markers_run
-    from detect.run import open_images
+    from detect.sources.opening import open_source
 
-    run = open_images(command.run, command.camera)
-    output = command.output if command.output is not None else command.run / "detected.markers"
-    _demand_new([output], command.force)
+    run = open_source(command.run, command.camera, command.source)
+    output = command.output if command.output is not None else run.output("markers")
+    _demand_new([output], command.force, run)
     if command.draw is not None:
         command.draw.mkdir(parents=True, exist_ok=True)
-    with progress_bar("markers", len(run.frames)) as advance:
+    with progress_bar("markers", run.frames.expected) as advance:
         summary = detect_markers_run(
             run,
             command.settings,
@@ -144,19 +144,21 @@ def _markers(command: Markers) -> int:
     if summary.rejected:
         causes = ", ".join(f"{cause} {count}" for cause, count in sorted(summary.rejected.items()))
         print(f"rejected: {causes}")
-    return _exit_code(summary)
+    return _exit_code(summary, run)
 
 
 def _all(command: All) -> int:
     from detect import __version__
     from detect.all_run import detect_all_run
-    from detect.run import open_run
+    from detect.sources.opening import open_calibrated
 
-    run = open_run(command.run, command.camera)
-    folder = command.output if command.output is not None else command.run
-    lines, tilt, circles = (folder / f"detected.{kind}" for kind in ("lines", "tilt", "circles"))
-    _demand_new([lines, tilt, circles], command.force)
-    with progress_bar("lines, tilt and discs", len(run.frames)) as advance:
+    run = open_calibrated(command.run, command.camera, command.source)
+    lines, tilt, circles = (
+        run.output(kind) if command.output is None else command.output / f"detected.{kind}"
+        for kind in ("lines", "tilt", "circles")
+    )
+    _demand_new([lines, tilt, circles], command.force, run)
+    with progress_bar("lines, tilt and discs", run.frames.expected) as advance:
         summary = detect_all_run(
             run,
             command.lines,
@@ -172,34 +174,40 @@ def _all(command: All) -> int:
     print(f"{lines}: {summary.lines} lines in {summary.frames} frames")
     print(f"{tilt}: the tilt of {summary.tilts} frames")
     print(f"{circles}: {summary.discs} discs in {summary.frames} frames")
-    return _exit_code(summary)
+    return _exit_code(summary, run)
 
 
 def _workers(command: Circles | Lines | Markers | All, run: ImageRun) -> Workers:
     """Who does the work of a command."""
     from detect.workers import cluster_workers, default_jobs, local_workers
 
+    # Tasks that carry images, or bring pictures back, are kept small.
     draws = not isinstance(command, All) and command.draw is not None
+    large = draws or run.frames.ships_images
     if command.cluster is not None:
         if command.jobs is not None:
             raise WorkerError("--jobs and --cluster: expected one of them")
-        return cluster_workers(command.cluster, pictures=draws)
-    jobs = command.jobs if command.jobs is not None else default_jobs(len(run.frames))
-    return local_workers(jobs, pictures=draws)
+        return cluster_workers(command.cluster, pictures=large)
+    jobs = command.jobs if command.jobs is not None else default_jobs(run.frames.expected or 0)
+    return local_workers(jobs, pictures=large)
 
 
-def _demand_new(outputs: Sequence[Path | None], force: bool) -> None:
+def _demand_new(outputs: Sequence[Path | None], force: bool, run: ImageRun) -> None:
+    """Refuse to overwrite results before there is any work done."""
+    from detect.stream import times_file
     from storage import OutputExistsError
 
+    if run.has_times:
+        outputs = [*outputs, *(times_file(path).path for path in outputs if path is not None)]
     for path in outputs:
         if path is not None and path.exists() and not force:
             raise OutputExistsError(path)
 
 
-def _exit_code(summary: RunSummary) -> int:
+def _exit_code(summary: RunSummary, run: ImageRun) -> int:
     """Tell what is wrong with a run; returns the exit code."""
     if summary.images_without_step:
-        print(f"{summary.images_without_step} images are not named by a STEP row: left out")
+        print(f"{summary.images_without_step} {run.frames.why_left_out}")
     print_failures(summary.failed, summary.failures)
     return EXIT_FRAMES_FAILED if summary.failed else 0
 

@@ -18,7 +18,7 @@ from detect.draw_inputs import find_files, open_rows, picture_name
 from detect.draw_selection import select_frames
 from detect.errors import DetectError, FrameError
 from detect.progress import print_failures, progress_bar
-from detect.run import Run, open_images, read_image
+from detect.run import Run, RunFrames, open_images, read_image
 from detect.settings import CircleSettings
 from detect.stream import KEPT_FAILURES
 from detect.viewing_options import Draw
@@ -35,6 +35,7 @@ def perform(options: Draw) -> int:
         raise DetectError(f"fps is {options.fps:g}: expected above 0")
     files = find_files(options.run, options.files)
     run = open_images(options.run, options.camera)
+    assert isinstance(run.frames, RunFrames)
     camera = run.camera if isinstance(run, Run) else None
     if camera is None and set(files.detected) != {"markers"}:
         raise DetectError(

@@ -19,6 +19,7 @@ from detect.errors import FrameError
 from detect.frame import FrameDetections, FramePlan, Tables, detect_frame
 from detect.line_identity import carry_ids
 from detect.run import RunFrame
+from detect.sources.times import format_time
 from landmarks import (
     Frame,
     FrameTilt,
@@ -55,7 +56,7 @@ class FrameRows:
 
     Attributes
     ----------
-    circles, lines, tilt, markers, json : bytes
+    circles, lines, tilt, markers, json, times : bytes
         The frame's rows in each of the files.
     pictures : tuple of (name, PNG)
         Drawings.
@@ -72,6 +73,7 @@ class FrameRows:
     tilt: bytes = b""
     markers: bytes = b""
     json: bytes = b""
+    times: bytes = b""
     pictures: tuple[tuple[str, bytes], ...] = ()
     disc_count: int = 0
     line_count: int = 0
@@ -118,6 +120,7 @@ def rows_of_frame(task: FrameTask, plan: FramePlan, tables: Tables) -> FrameRows
         tilt=tilt,
         markers=markers,
         json=record,
+        times=_time_row(task),
         pictures=tuple(_pictures(step.prefix, found, plan, tables)),
         disc_count=0 if found.discs is None else len(found.discs),
         line_count=len(verticals),
@@ -137,8 +140,14 @@ def rows_of_failure(task: FrameTask, reason: str) -> FrameRows:
         tilt=_line(format_no_tilt(step.prefix, 0)),
         markers=rows,
         json=_json({"frame": step.prefix, "error": reason}),
+        times=_time_row(task),
         error=reason,
     )
+
+
+def _time_row(task: FrameTask) -> bytes:
+    frame = task.frame
+    return b"" if frame.time_s is None else _line(format_time(frame.step.prefix, frame.time_s))
 
 
 def _line(text: str) -> bytes:

@@ -5,6 +5,7 @@ A run may have a million frames: what is kept of one is the name of its image, t
 
 from __future__ import annotations
 
+import fnmatch
 import os
 import re
 from pathlib import Path
@@ -26,16 +27,19 @@ class ImageNames:
     ----------
     folder : path
         Where the images are. It is listed once.
+    pattern : str
+        What the names of files must match, as in `fnmatch`.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, pattern: str = "*") -> None:
         self.folder = folder
         suffixes = set()
         keys = []
+        matches = re.compile("" if pattern == "*" else fnmatch.translate(pattern)).match
         with os.scandir(folder) as entries:
             for entry in entries:
                 suffix = os.path.splitext(entry.name)[1]  # noqa: PTH122 - a Path for each is slow
-                if suffix.lower() in IMAGE_SUFFIXES:
+                if suffix.lower() in IMAGE_SUFFIXES and matches(entry.name):
                     suffixes.add(os.fsencode(suffix))
                     keys.append(_natural_order(entry.name))
         keys.sort()

@@ -12,10 +12,12 @@ _SHOWN_FAILURES = 10
 
 
 @contextmanager
-def progress_bar(label: str, total: int) -> Iterator[Callable[[], None]]:
+def progress_bar(label: str, total: int | None) -> Iterator[Callable[[], None]]:
     """A progress bar with the rate, on a terminal; yields what to call after every frame.
 
     Calling it raises an interrupt that got lost (see `detect.interrupts`).
+
+    Without a total, it shows how many there were.
 
     It appears with the first frame: until then, workers may have something to say.
     """

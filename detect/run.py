@@ -12,94 +12,185 @@ before any work is done.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Generator, Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera, read_camera
 from detect.errors import DetectError, FrameError
-from detect.image_bounds import bounded_content, demand_bounded
+from detect.image_bounds import bounded_content
 from detect.image_names import IMAGE_SUFFIXES, ImageNames
+from detect.sources.gray import decode_gray
 from landmarks import Step, read_rows
-
-_JPEG_BEGIN, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
 
 
 @dataclass(frozen=True, slots=True)
 class RunFrame:
-    """One frame of a run: its STEP row, and the image taken after it (None where there is none)."""
+    """One frame of a run: its STEP row, and the image taken after it.
+
+    Attributes
+    ----------
+    step : Step
+    image : path or None
+        The image's file; None where there is none.
+    content : bytes or (H, W) uint8 array or None
+        The encoded image or its grey values, where it comes from no file of its own.
+    time_s : float or None
+        When it was taken, where that is known.
+    bits : int
+        Significant bits of a file with more than 8.
+    failure : str or None
+        Why there is no image, although there should be.
+    """
 
     step: Step
     image: Path | None
+    content: bytes | NDArray[np.uint8] | None = field(default=None, compare=False, repr=False)
+    time_s: float | None = None
+    bits: int = 16
+    failure: str | None = None
+
+
+class Frames(Protocol):
+    """The frames of a run, made as they are asked for.
+
+    Iterating again begins anew (with a live camera: from then on).
+    """
+
+    #: Whether frames carry contents of images, not paths.
+    ships_images: bool
+
+    @property
+    def expected(self) -> int | None:
+        """About how many frames there will be; None if nobody knows."""
+        ...
+
+    @property
+    def left_out(self) -> int:
+        """How many images, so far, are no part of the run."""
+        ...
+
+    @property
+    def why_left_out(self) -> str:
+        """What is told of them, after their number."""
+        ...
+
+    def __iter__(self) -> Generator[RunFrame, None, None]: ...
 
 
 class RunFrames:
-    """The frames of a run, made as they are asked for: in the order of the odometry, or of names.
+    """The frames of a run folder: in the order of the odometry, or of names.
 
-    Iterating again begins anew.
+    Parameters
+    ----------
+    images : ImageNames
+    odometry : path or None
+        The file of STEP rows.
+    count, left_out : int
+        How many frames there are, and images that the odometry does not name.
+    bits : int
+        Significant bits of 16-bit images.
     """
 
-    def __init__(self, images: ImageNames, odometry: Path | None, count: int) -> None:
+    ships_images = False
+    why_left_out = "images are not named by a STEP row: left out"
+
+    def __init__(
+        self, images: ImageNames, odometry: Path | None, count: int, left_out: int, bits: int
+    ) -> None:
         self._images = images
         self._odometry = odometry
         self._count = count
+        self._bits = bits
+        self.left_out = left_out
 
     def __len__(self) -> int:
         return self._count
 
-    def __iter__(self) -> Iterator[RunFrame]:
+    @property
+    def expected(self) -> int | None:
+        """How many frames there are."""
+        return self._count
+
+    def __iter__(self) -> Generator[RunFrame, None, None]:
         if self._odometry is None:
             for place in range(len(self._images)):
                 path = self._images.path(place)
-                yield RunFrame(_standing_still(path.stem), path)
+                yield RunFrame(_standing_still(path.stem), path, bits=self._bits)
             return
         for step in _steps(self._odometry):
             found = self._images.find(_base_name(step.prefix))
-            yield RunFrame(step, None if found is None else self._images.path(found))
+            image = None if found is None else self._images.path(found)
+            yield RunFrame(step, image, bits=self._bits)
 
 
 @dataclass(frozen=True)
 class ImageRun:
-    """A run folder that was looked through, whether or not there is a calibration.
+    """A run that was looked through, whether or not there is a calibration.
 
     Attributes
     ----------
     folder : path
-    frames : RunFrames
+        The run folder; of another source the folder that it is in.
+    frames : Frames
         In the order of the odometry, or of the images' names.
     odometry : path or None
         Where the STEP rows come from.
-    images_without_step : int
-        How many images the odometry does not name: they are not part of the run.
+    output_base : path
+        Results are called this, with an ending of their own.
+    has_times : bool
+        Whether the frames' times are known and to be written beside the results.
     """
 
     folder: Path
-    frames: RunFrames
+    frames: Frames
     odometry: Path | None
-    images_without_step: int
+    output_base: Path
+    has_times: bool = False
 
     @property
     def name(self) -> str:
         """The folder's own name."""
         return self.folder.resolve().name
 
+    @property
+    def images_without_step(self) -> int:
+        """How many images, so far, are not part of the run, as there are no steps of theirs."""
+        return self.frames.left_out
+
+    def output(self, kind: str) -> Path:
+        """The file that a kind of result is written to."""
+        return self.output_base.with_name(f"{self.output_base.name}.{kind}")
+
+    def calibrated(self, camera: Camera) -> Run:
+        """The run with a calibration."""
+        return Run(
+            self.folder,
+            self.frames,
+            self.odometry,
+            self.output_base,
+            self.has_times,
+            camera=camera,
+        )
+
 
 @dataclass(frozen=True)
 class Run(ImageRun):
-    """A run folder with a calibration.
+    """A run with a calibration.
 
     Attributes
     ----------
     camera : Camera
     """
 
-    camera: Camera
+    camera: Camera = field(kw_only=True)
 
 
-def open_run(folder: Path, camera_path: Path | None = None) -> Run:
+def open_run(folder: Path, camera_path: Path | None = None, *, bits: int | None = None) -> Run:
     """Look through a run folder.
 
     Parameters
@@ -109,6 +200,8 @@ def open_run(folder: Path, camera_path: Path | None = None) -> Run:
     camera_path : path, optional
         The calibration; by default the one ``.cam`` in the folder (``<run>.cam`` if there are
         several).
+    bits : int, optional
+        Significant bits of 16-bit images; by default what some of them need.
 
     Returns
     -------
@@ -123,16 +216,17 @@ def open_run(folder: Path, camera_path: Path | None = None) -> Run:
     """
     _demand_folder(folder)
     camera = read_camera(camera_path if camera_path is not None else _only_camera(folder))
-    run = _image_run(folder)
-    return Run(folder, run.frames, run.odometry, run.images_without_step, camera)
+    return _image_run(folder, bits).calibrated(camera)
 
 
-def open_images(folder: Path, camera_path: Path | None = None) -> ImageRun:
+def open_images(
+    folder: Path, camera_path: Path | None = None, *, bits: int | None = None
+) -> ImageRun:
     """Look through a run folder that may be without a calibration.
 
     Parameters
     ----------
-    folder, camera_path
+    folder, camera_path, bits
         As in `open_run`.
 
     Returns
@@ -147,8 +241,8 @@ def open_images(folder: Path, camera_path: Path | None = None) -> ImageRun:
     """
     _demand_folder(folder)
     if camera_path is None and not any(folder.glob("*.cam")):
-        return _image_run(folder)
-    return open_run(folder, camera_path)
+        return _image_run(folder, bits)
+    return open_run(folder, camera_path, bits=bits)
 
 
 def _demand_folder(folder: Path) -> None:
@@ -156,20 +250,41 @@ def _demand_folder(folder: Path) -> None:
         raise DetectError(f"{folder}: no such folder: expected a run folder or a folder of images")
 
 
-def _image_run(folder: Path) -> ImageRun:
-    images = _images(folder)
+def images_of_folder(folder: Path) -> ImageNames:
+    """The images in ``images/`` or, failing that, in the folder itself.
+
+    Raises
+    ------
+    DetectError
+        If there are none.
+    """
+    for place in (folder / "images", folder):
+        if place.is_dir():
+            found = ImageNames(place)
+            if len(found):
+                return found
+    kinds = " ".join(sorted(IMAGE_SUFFIXES))
+    raise DetectError(f"{folder}: no images: expected {kinds} in it or in {folder / 'images'}")
+
+
+def _image_run(folder: Path, bits: int | None) -> ImageRun:
+    from detect.sources.pictures import bits_of_images
+
+    images = images_of_folder(folder)
     odometry = _odometry(folder)
+    bits = bits_of_images(images) if bits is None else bits
     if odometry is None:
-        return ImageRun(folder, RunFrames(images, None, len(images)), None, 0)
-    named = np.zeros(len(images), bool)
-    count = 0
-    for step in _steps(odometry):
-        count += 1
-        found = images.find(_base_name(step.prefix))
-        if found is not None:
-            named[found] = True
-    frames = RunFrames(images, odometry, count)
-    return ImageRun(folder, frames, odometry, int(np.count_nonzero(~named)))
+        frames = RunFrames(images, None, len(images), 0, bits)
+    else:
+        named = np.zeros(len(images), bool)
+        count = 0
+        for step in _steps(odometry):
+            count += 1
+            found = images.find(_base_name(step.prefix))
+            if found is not None:
+                named[found] = True
+        frames = RunFrames(images, odometry, count, int(np.count_nonzero(~named)), bits)
+    return ImageRun(folder, frames, odometry, folder / "detected")
 
 
 def read_image(
@@ -177,7 +292,7 @@ def read_image(
 ) -> NDArray[np.uint8]:
     """The grey image of a frame.
 
-    Colour images are converted, 16-bit images brought to 8 bits.
+    Colour images are converted, 16-bit images brought to 8 bits (see `detect.sources.gray`).
 
     Parameters
     ----------
@@ -196,29 +311,27 @@ def read_image(
     FrameError
         If there is no image, it cannot be read, or has another size than the calibration.
     """
-    import cv2
-
-    if frame.image is None:
-        raise FrameError(f"{frame.step.prefix}: no image of that name in the run")
+    name: object = frame.image or frame.step.prefix
     size = None if camera is None else (camera.width, camera.height)
-    content = bounded_content((working_folder or Path()) / frame.image, frame.image, size)
-    if not content:
-        raise FrameError(f"{frame.image}: is empty: expected an image")
-    if content.startswith(_JPEG_BEGIN) and _JPEG_END not in content[len(content) // 2 :]:
-        raise FrameError(f"{frame.image}: the JPEG is cut off: its end is missing")
-    demand_bounded(content, frame.image, size)
-    try:
-        image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_GRAYSCALE)
-    except cv2.error:  # sizes beyond OpenCV's bounds are no None
-        image = None
-    if image is None:
-        raise FrameError(f"{frame.image}: cannot be decoded: expected an image")
+    if frame.failure is not None:
+        raise FrameError(frame.failure)
+    if isinstance(frame.content, np.ndarray):
+        image = frame.content
+    elif frame.content is not None:
+        image = decode_gray(frame.content, name, frame.bits, size)
+    elif frame.image is None:
+        raise FrameError(f"{frame.step.prefix}: no image of that name in the run")
+    else:
+        path = (working_folder or Path()).joinpath(frame.image)
+        content = bounded_content(path, frame.image, size)
+        image = decode_gray(content, name, frame.bits, size)
     if camera is not None and image.shape != (camera.height, camera.width):
         raise FrameError(
-            f"{frame.image}: is {image.shape[1]}x{image.shape[0]} px: "
-            f"expected {camera.width}x{camera.height}, the calibration's size"
+            f"{name}: is {image.shape[1]}x{image.shape[0]} px: "
+            f"expected {camera.width}x{camera.height}, the calibration's size: "
+            "name the calibration of these images by --camera"
         )
-    return np.asarray(image, dtype=np.uint8)
+    return image
 
 
 def _only_camera(folder: Path) -> Path:
@@ -234,17 +347,6 @@ def _only_camera(folder: Path) -> Path:
         names = ", ".join(path.name for path in cameras[:4])
         raise DetectError(f"{folder}: several calibrations ({names}): name one by --camera")
     return cameras[0]
-
-
-def _images(folder: Path) -> ImageNames:
-    """Images in ``images/`` or, failing that, in the folder."""
-    for place in (folder / "images", folder):
-        if place.is_dir():
-            found = ImageNames(place)
-            if len(found):
-                return found
-    kinds = " ".join(sorted(IMAGE_SUFFIXES))
-    raise DetectError(f"{folder}: no images: expected {kinds} in it or in {folder / 'images'}")
 
 
 def _steps(odometry: Path) -> Iterator[Step]:

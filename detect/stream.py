@@ -11,7 +11,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,8 +21,9 @@ from detect.dispatch import Workers, detect_frames
 from detect.frame import FramePlan, tables_of
 from detect.frame_rows import FrameRows, FrameTask
 from detect.run import ImageRun
+from detect.sources.times import TIMES_HEAD
 from detect.workers import local_workers
-from landmarks import FrameTilt, LineLandmark
+from landmarks import FrameTilt, LineLandmark, format_head
 from storage import write_whole
 
 #: So many failures are kept word for word.
@@ -57,7 +58,7 @@ class Output:
     """
 
     path: Path
-    part: Literal["circles", "lines", "tilt", "markers", "json"]
+    part: Literal["circles", "lines", "tilt", "markers", "json", "times"]
     head: bytes = b""
     tail: bytes = b""
     between: bytes = b""
@@ -79,7 +80,7 @@ class RunSummary:
     failures : list of str
         A line for each of the first `KEPT_FAILURES` of them.
     images_without_step : int
-        Images that the odometry does not name.
+        Images that are no part of the run: the odometry knows nothing of them.
     """
 
     frames: int = 0
@@ -127,7 +128,7 @@ def detect_run(
     plan : FramePlan
         What to look for.
     outputs : sequence of Output
-        The files to write.
+        The files to write. Where the frames' times are known, they go beside the last one.
     overwrite : bool
         Whether existing files may be replaced.
     tilts : mapping, optional
@@ -156,14 +157,16 @@ def detect_run(
     """
     tables_of(plan)  # whatever is wrong with them is wrong with every frame
     workers = local_workers(1) if workers is None else workers
-    summary = RunSummary(images_without_step=run.images_without_step)
+    summary = RunSummary()
+    if run.has_times:
+        outputs = [*outputs, times_file(outputs[-1].path)]
     with ExitStack() as stack:
         streams: list[tuple[Output, BinaryIO]] = []
         for output in outputs:
             stream = stack.enter_context(write_whole(output.path, overwrite=overwrite))
             stream.write(output.head)
             streams.append((output, stream))
-        tasks = _tasks(run, tilts, reference)
+        tasks = stack.enter_context(closing(_tasks(run, tilts, reference)))
         found = stack.enter_context(closing(detect_frames(tasks, plan, workers)))
         for rows in found:
             for output, stream in streams:
@@ -177,12 +180,18 @@ def detect_run(
             summary.add(rows)
             if on_progress is not None:
                 on_progress()
+        summary.images_without_step = run.images_without_step
         for output, stream in streams:
             stream.write(output.tail)
         # A full disk is to be noticed before the first of the files has its name.
         for _, stream in streams:
             stream.flush()
     return summary
+
+
+def times_file(output: Path) -> Output:
+    """The file of the frames' times that stands beside a result: its name and ``.times``."""
+    return Output(output.with_name(f"{output.name}.times"), "times", format_head(TIMES_HEAD))
 
 
 def json_file(path: Path, plan: FramePlan, version: str) -> Output:
@@ -201,11 +210,12 @@ def json_file(path: Path, plan: FramePlan, version: str) -> Output:
 
 def _tasks(
     run: ImageRun, tilts: TiltSource | None, reference: LineSource | None
-) -> Iterator[FrameTask]:
-    for frame in run.frames:
-        prefix = frame.step.prefix
-        yield FrameTask(
-            frame,
-            tilt=None if tilts is None else tilts.get(prefix),
-            reference=None if reference is None else tuple(reference.get(prefix) or ()),
-        )
+) -> Generator[FrameTask, None, None]:
+    with closing(iter(run.frames)) as frames:
+        for frame in frames:
+            prefix = frame.step.prefix
+            yield FrameTask(
+                frame,
+                tilt=None if tilts is None else tilts.get(prefix),
+                reference=None if reference is None else tuple(reference.get(prefix) or ()),
+            )

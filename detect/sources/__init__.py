@@ -1,0 +1,12 @@
+"""Where frames come from: one small module per source, behind one interface (`interface`).
+
+    source             module       what it is named by
+    run folder         detect.run   the folder
+    images             pictures     a folder, one image, or a pattern such as 'drive/*.png'
+    video file         video        the file
+    ROS bag, MCAP      bag          the .bag or .mcap file, or the folder of a ROS 2 bag
+    live camera        live         camera:0
+
+A source gives images in order, with their times where it knows them. Odometry is laid over it
+(`odometry`), so that any source may be combined with any odometry; `opening` puts both together.
+"""

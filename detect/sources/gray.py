@@ -1,0 +1,134 @@
+"""Images of any kind as the 8-bit grey images that the detectors look at.
+
+Colour becomes 0.299 R + 0.587 G + 0.114 B, as OpenCV has it (of a JPEG, the brightness that it
+stores). Of images with more than 8 bits, the 8 highest of their *significant* bits are kept: a
+12-bit camera's values stand in 16-bit files, and would be nearly black if all 16 were taken.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from detect.errors import FrameError
+from detect.image_bounds import bounded_content, demand_bounded
+
+#: What an image of 16 bits may hold.
+BIT_DEPTHS = (8, 10, 12, 14, 16)
+
+#: Only files of these kinds can hold more than 8 bits.
+DEEP_SUFFIXES = frozenset({".png", ".pgm", ".ppm", ".tif", ".tiff"})
+
+_JPEG_BEGIN, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
+
+
+def decode_gray(
+    content: bytes, name: object, bits: int = 16, size: tuple[int, int] | None = None
+) -> NDArray[np.uint8]:
+    """Decode the content of an image file to grey values.
+
+    Parameters
+    ----------
+    content : bytes
+        JPEG, PNG, PGM, TIFF or whatever else OpenCV decodes.
+    name : object
+        What messages call it.
+    bits : int
+        Significant bits of images that have more than 8 bits.
+    size : (int, int) or None
+        Width and height that are expected: an image that claims others is not decoded.
+
+    Returns
+    -------
+    (H, W) uint8 array
+
+    Raises
+    ------
+    FrameError
+        If there is no image in it, it is cut off, or its values need more bits.
+    """
+    if not content:
+        raise FrameError(f"{name}: is empty: expected an image")
+    if content.startswith(_JPEG_BEGIN) and _JPEG_END not in content[len(content) // 2 :]:
+        raise FrameError(f"{name}: the JPEG is cut off: its end is missing")
+    demand_bounded(content, name, size)
+    image = _decoded(content, deep=bits < 16)
+    if image is None:
+        raise FrameError(f"{name}: cannot be decoded: expected an image")
+    return gray_of_pixels(image, name, bits)
+
+
+def gray_of_pixels(pixels: NDArray[Any], name: object, bits: int = 16) -> NDArray[np.uint8]:
+    """Bring pixels to 8-bit grey values.
+
+    Parameters
+    ----------
+    pixels : (H, W), (H, W, 3) or (H, W, 4) uint8 or uint16 array
+        Grey values, or blue, green, red and perhaps opacity.
+    name : object
+        What messages call the image.
+    bits : int
+        Significant bits of uint16.
+
+    Returns
+    -------
+    (H, W) uint8 array
+
+    Raises
+    ------
+    FrameError
+        If there are other numbers in it, or values that need more bits.
+    """
+    if pixels.dtype not in (np.uint8, np.uint16):
+        raise FrameError(f"{name}: holds {pixels.dtype}: expected images of 8 or 16 bits")
+    if pixels.ndim == 3:
+        import cv2
+
+        code = cv2.COLOR_BGR2GRAY if pixels.shape[2] == 3 else cv2.COLOR_BGRA2GRAY
+        pixels = cv2.cvtColor(pixels, code)
+    if pixels.dtype == np.uint8:
+        return np.ascontiguousarray(pixels, dtype=np.uint8)
+    largest = int(pixels.max(initial=0))
+    if largest >> bits:
+        raise FrameError(
+            f"{name}: a value of {largest} needs more than {bits} bits: "
+            "name the significant bits of these images by --bits"
+        )
+    return np.ascontiguousarray(pixels >> (bits - 8), dtype=np.uint8)
+
+
+def significant_bits(pixels: NDArray[Any]) -> int:
+    """The smallest of `BIT_DEPTHS` that holds all values of an image; 8 for an 8-bit image."""
+    if pixels.dtype == np.uint8:
+        return 8
+    largest = int(pixels.max(initial=0))
+    return next(bits for bits in BIT_DEPTHS if not largest >> bits or bits == BIT_DEPTHS[-1])
+
+
+def significant_bits_of_file(path: Path) -> int | None:
+    """The significant bits of an image file; None if it is no image of 16 bits."""
+    if path.suffix.lower() not in DEEP_SUFFIXES:
+        return None
+    try:
+        content = bounded_content(path, path, None)
+        demand_bounded(content, path, None)
+    except FrameError:
+        return None  # told when it is the file's turn
+    image = _decoded(content, deep=True)
+    return None if image is None or image.dtype != np.uint16 else significant_bits(image)
+
+
+def _decoded(content: bytes, *, deep: bool) -> NDArray[Any] | None:
+    import cv2
+
+    if not content:
+        return None
+    flags = cv2.IMREAD_GRAYSCALE | (cv2.IMREAD_ANYDEPTH if deep else 0)
+    try:
+        image = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
+    except cv2.error:  # sizes beyond OpenCV's bounds are no None
+        return None
+    return image

@@ -1,0 +1,172 @@
+"""A camera of this machine as a source: what it shows now, until somebody says stop.
+
+The camera is read all the time, so that an image's time is that of its arrival; images that nobody
+had time for are passed over. The first Ctrl-C ends the stream: what was seen is worked on to the
+end and written. A second one ends the program, which then writes nothing.
+"""
+
+from __future__ import annotations
+
+import logging
+import signal
+import threading
+import time
+from collections.abc import Generator, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import Any, Protocol
+
+from numpy.typing import NDArray
+
+from detect.errors import DetectError
+from detect.sources.gray import gray_of_pixels
+from detect.sources.interface import PoseStream, SourceImage, numbered_prefix
+from detect.sources.video import quiet_opencv
+
+_log = logging.getLogger("redetect")
+
+#: How long a camera may be silent (s).
+PATIENCE_S = 10.0
+
+_LOOK_S = 0.1
+
+
+class Capture(Protocol):
+    """What is asked of an OpenCV capture."""
+
+    def read(self) -> tuple[bool, NDArray[Any] | None]: ...
+
+    def release(self) -> None: ...
+
+
+class LiveCamera:
+    """Images of a camera as they come, named ``camera0.0000`` and so on; times are UNIX time.
+
+    Parameters
+    ----------
+    index : int
+        OpenCV's number of the camera.
+    """
+
+    ships_images = True
+
+    def __init__(self, index: int) -> None:
+        self.name = f"camera:{index}"
+        self.output_base = Path(f"camera{index}.detected")
+        self._index = index
+        _open_camera(index).release()
+
+    @property
+    def expected(self) -> int | None:
+        """Nobody knows."""
+        return None
+
+    def images(self) -> Generator[SourceImage, None, None]:
+        """The camera's images from now on, until it is interrupted or gone."""
+        with _watched(_open_camera(self._index)) as newest, _stoppable() as stop:
+            number = 0
+            while (taken := newest.next(stop)) is not None:
+                time_s, pixels = taken
+                prefix = numbered_prefix(f"camera{self._index}", number)
+                gray = gray_of_pixels(pixels, prefix)
+                yield SourceImage(prefix, time_s, content=gray)
+                number += 1
+
+    def calibration(self) -> Path | None:
+        """There is none: it is named."""
+        return None
+
+    def poses(self, topic: str | None) -> PoseStream | None:
+        """There are none."""
+        if topic is not None:
+            raise DetectError(f"{self.name}: holds no topic {topic}: only bags do")
+        return None
+
+
+class _Newest:
+    """The newest image of a camera that a thread reads."""
+
+    def __init__(self, capture: Capture) -> None:
+        self._capture = capture
+        self._changed = threading.Condition()
+        self._image: tuple[float, NDArray[Any]] | None = None
+        self._ended = False
+        self._thread = threading.Thread(target=self._read, daemon=True)
+        self._thread.start()
+
+    def next(self, stop: threading.Event) -> tuple[float, NDArray[Any]] | None:
+        """Wait for an image that was not given yet; None when there will be none."""
+        latest_s = time.monotonic() + PATIENCE_S
+        with self._changed:
+            while not stop.is_set() and time.monotonic() < latest_s:
+                if self._image is not None:
+                    image, self._image = self._image, None
+                    return image
+                if self._ended:
+                    _log.info("the camera gives no more images: what was seen is written")
+                    return None
+                self._changed.wait(_LOOK_S)  # an interrupt is noticed in between
+        if not stop.is_set():
+            _log.info(f"no image came within {PATIENCE_S:g} s: what was seen is written")
+        return None
+
+    def end(self) -> None:
+        with self._changed:
+            self._ended = True
+        self._thread.join(PATIENCE_S)
+
+    def _read(self) -> None:
+        while True:
+            there, pixels = self._capture.read()
+            with self._changed:
+                if not there or pixels is None:
+                    self._ended = True
+                else:
+                    self._image = (time.time(), pixels)
+                self._changed.notify()
+                if self._ended:
+                    return
+
+
+@contextmanager
+def _watched(capture: Capture) -> Iterator[_Newest]:
+    newest = _Newest(capture)
+    try:
+        yield newest
+    finally:
+        newest.end()
+        capture.release()
+
+
+@contextmanager
+def _stoppable() -> Iterator[threading.Event]:
+    """Take an interrupt as the wish to stop, for the time of a block."""
+    stop = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield stop
+        return
+    before = signal.getsignal(signal.SIGINT)
+
+    def note(_: int, __: FrameType | None) -> None:
+        stop.set()
+        signal.signal(signal.SIGINT, before)  # the next one is meant
+
+    signal.signal(signal.SIGINT, note)
+    try:
+        yield stop
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _open_camera(index: int) -> Capture:
+    import cv2
+
+    with quiet_opencv():
+        capture = cv2.VideoCapture(index)
+    if not capture.isOpened():
+        raise DetectError(
+            f"camera:{index}: no camera of that number answers: "
+            "expected one that is plugged in and not in use (try camera:0)"
+        )
+    return capture

@@ -1,0 +1,54 @@
+"""The flags that say how a source is to be read. Nothing heavy is imported: `--help` needs them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from detect.errors import DetectError
+
+#: Axes of a robot's poses: X forward and Y left, or the data set's X left and Y backward.
+Axes = Literal["robotics", "dataset"]
+
+
+@dataclass(frozen=True)
+class SourceOptions:
+    """What is to be known of a source beyond its name.
+
+    Parameters
+    ----------
+    odometry : str
+        Where the steps come from, if not from the source itself: a TUM trajectory (.tum; rows t x y
+        z qx qy qz qw), a file of STEP rows, a nav_msgs/Odometry topic of the bag (/odom), or none.
+    odometry_axes : str
+        Axes of the robot in a TUM trajectory: robotics (X forward, Y left) or dataset (X left, Y
+        backward).
+    times : str
+        File of the images' times, rows `prefix seconds`; by default <folder>.times among the
+        images.
+    image_topic : str
+        The images of a bag, if there are several topics of them.
+    frames : int
+        Stop after so many frames; 0 for all of them (of a live camera: until Ctrl-C).
+    bits : int
+        Significant bits of 16-bit images, 8 to 16; 0: the fewest of 8, 10, 12, 14 or 16 that hold
+        the values of the first images.
+    """
+
+    odometry: str = ""
+    odometry_axes: Axes = "robotics"
+    times: str = ""
+    image_topic: str = ""
+    frames: int = 0
+    bits: int = 0
+
+    def __post_init__(self) -> None:
+        if self.frames < 0:
+            raise DetectError(f"frames is {self.frames}: expected 1 or more, or 0 for all")
+        if self.bits and not 8 <= self.bits <= 16:
+            raise DetectError(f"bits is {self.bits}: expected 8 to 16, or 0")
+
+    @property
+    def plain(self) -> bool:
+        """Whether nothing is said of steps and times."""
+        return not (self.odometry or self.times or self.image_topic)

@@ -1,0 +1,117 @@
+"""A video file as a source: its frames in order, decoded by OpenCV as they are asked for."""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+from collections.abc import Generator, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from detect.errors import DetectError
+from detect.sources.gray import gray_of_pixels
+from detect.sources.interface import PoseStream, SourceImage, numbered_prefix, only_calibration
+
+if TYPE_CHECKING:
+    import cv2
+
+_log = logging.getLogger("redetect")
+
+
+class VideoFile:
+    """Frames of a video file, named ``<stem>.0000`` and so on; times count from its beginning.
+
+    Parameters
+    ----------
+    path : path
+
+    Raises
+    ------
+    DetectError
+        If OpenCV cannot read a video from it.
+    """
+
+    ships_images = True
+
+    def __init__(self, path: Path) -> None:
+        import cv2
+
+        self.path = path
+        self.name = str(path)
+        self.output_base = path.with_name(f"{path.stem}.detected")
+        with _opened(path) as capture:
+            count = capture.get(cv2.CAP_PROP_FRAME_COUNT)
+            self.size = (
+                int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)),
+                int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT)),
+            )
+        self._count = int(count) if math.isfinite(count) and 0 < count < 2**31 else None
+
+    @property
+    def expected(self) -> int | None:
+        """How many frames the file says it has."""
+        return self._count
+
+    def images(self) -> Generator[SourceImage, None, None]:
+        """The frames as grey values, with their presentation times."""
+        import cv2
+
+        with _opened(self.path) as capture:
+            per_second = capture.get(cv2.CAP_PROP_FPS)
+            number, last_s = 0, -math.inf
+            while True:
+                there, pixels = capture.read()
+                if not there:
+                    break
+                time_s = 1e-3 * capture.get(cv2.CAP_PROP_POS_MSEC)
+                if time_s <= last_s and per_second > 0.0:  # a container without time stamps
+                    time_s = number / per_second
+                prefix = numbered_prefix(self.path.stem, number)
+                gray = gray_of_pixels(pixels, f"{self.name}: {prefix}")
+                yield SourceImage(prefix, time_s, content=gray)
+                number, last_s = number + 1, time_s
+        if self._count is not None and number < self._count:
+            _log.info(f"{self.name}: {number} of the {self._count} frames it speaks of are there")
+
+    def calibration(self) -> Path | None:
+        """The ``.cam`` file beside it: of its name, or the only one."""
+        return only_calibration(self.path.parent, self.path.stem)
+
+    def poses(self, topic: str | None) -> PoseStream | None:
+        """There are none in a video."""
+        if topic is not None:
+            raise DetectError(f"{self.name}: holds no topic {topic}: only bags do")
+        return None
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[cv2.VideoCapture]:
+    import cv2
+
+    with quiet_opencv():
+        capture = cv2.VideoCapture(str(path))
+    try:
+        if not capture.isOpened():
+            raise DetectError(
+                f"{path}: no video that OpenCV can read: expected a run folder, images, a video "
+                "(avi, mp4, mkv), or a bag (.bag, .mcap, or the folder of a ROS 2 bag)"
+            )
+        yield capture
+    finally:
+        capture.release()
+
+
+@contextmanager
+def quiet_opencv() -> Iterator[None]:
+    """Keep OpenCV, and FFmpeg in it, from telling in their own words what is told in ours."""
+    import cv2
+
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    before = cv2.utils.logging.getLogLevel()
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    try:
+        yield
+    finally:
+        cv2.utils.logging.setLogLevel(before)
