@@ -36,7 +36,7 @@ JacobiansAt = Literal["first", "latest"]
 
 #: A line joins the state when its distance is known to this share, so that bearings are nearly
 #: linear in its place.
-LARGEST_RANGE_SIGMA = 0.1
+LARGEST_RANGE_SIGMA = 0.05
 
 _GIVEN_UP = "line without parallax"
 _POSE = np.arange(POSE_SIZE)
