@@ -2,9 +2,9 @@
 
 Only what `--help` needs is imported at once; everything heavy waits for the command that uses it.
 
-Exit codes: 0 all went well; 1 the command could not be carried out, or a demand of `compare` was
-not met; 2 the command line was wrong; 3 some frames could not be worked on (the others were);
-130 it was interrupted, and wrote nothing.
+Exit codes: 0 all went well; 1 the command could not be carried out, or a demand of `compare` or
+`--strict` was not met; 2 the command line was wrong; 3 some frames could not be worked on (the
+others were); 130 it was interrupted, and wrote nothing but what `--resume` goes on with.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ import tyro
 from tyro.conf import OmitArgPrefixes, Positional, arg, subcommand
 
 from detect.compare_result import CompareOptions
+from detect.conduct import ConductOptions
 from detect.errors import WorkerError
 from detect.interrupts import interrupts_noted
 from detect.line_settings import PRESETS as LINE_PRESETS
@@ -98,6 +99,7 @@ class Circles:
     jobs: MaybeInt = None
     cluster: MaybeStr = None
     source: OmitArgPrefixes[SourceOptions] = field(default_factory=SourceOptions)
+    conduct: OmitArgPrefixes[ConductOptions] = field(default_factory=ConductOptions)
     settings: OmitArgPrefixes[CircleSettings] = field(default_factory=CircleSettings)
 
 
@@ -156,6 +158,7 @@ class Lines:
     jobs: MaybeInt = None
     cluster: MaybeStr = None
     source: OmitArgPrefixes[SourceOptions] = field(default_factory=SourceOptions)
+    conduct: OmitArgPrefixes[ConductOptions] = field(default_factory=ConductOptions)
     settings: OmitArgPrefixes[LineSettings] = field(default_factory=LineSettings)
 
 
@@ -200,6 +203,7 @@ class Markers:
     jobs: MaybeInt = None
     cluster: MaybeStr = None
     source: OmitArgPrefixes[SourceOptions] = field(default_factory=SourceOptions)
+    conduct: OmitArgPrefixes[ConductOptions] = field(default_factory=ConductOptions)
     settings: OmitArgPrefixes[MarkerSettings] = field(default_factory=MarkerSettings)
 
 
@@ -240,6 +244,7 @@ class All:
     jobs: MaybeInt = None
     cluster: MaybeStr = None
     source: OmitArgPrefixes[SourceOptions] = field(default_factory=SourceOptions)
+    conduct: OmitArgPrefixes[ConductOptions] = field(default_factory=ConductOptions)
     circles: CircleSettings = field(default_factory=CircleSettings)
     lines: LineSettings = field(default_factory=LineSettings)
 

@@ -18,8 +18,9 @@ from detect.draw_inputs import find_files, open_rows, picture_name
 from detect.draw_selection import select_frames
 from detect.errors import DetectError, FrameError
 from detect.progress import print_failures, progress_bar
-from detect.run import Run, RunFrames, open_images, read_image
+from detect.run import Run, read_image
 from detect.settings import CircleSettings
+from detect.sources.opening import open_source
 from detect.stream import KEPT_FAILURES
 from detect.viewing_options import Draw
 from storage import OutputExistsError, write_whole
@@ -33,9 +34,8 @@ def perform(options: Draw) -> int:
         raise DetectError("nowhere to draw to: expected a folder (-o) or a file (--video)")
     if not (isfinite(options.fps) and options.fps > 0.0):
         raise DetectError(f"fps is {options.fps:g}: expected above 0")
-    files = find_files(options.run, options.files)
-    run = open_images(options.run, options.camera)
-    assert isinstance(run.frames, RunFrames)
+    run = open_source(options.run, options.camera, options.source)
+    files = find_files(run, options.files)
     camera = run.camera if isinstance(run, Run) else None
     if camera is None and set(files.detected) != {"markers"}:
         raise DetectError(
@@ -55,12 +55,11 @@ def perform(options: Draw) -> int:
 
     drawn, failed = 0, 0
     failures: list[str] = []
-    total = sum(1 for _ in selection.of(run.frames))
     with ExitStack() as stack:
         video = None
         if options.video is not None:
             video = stack.enter_context(mp4(options.video, options.fps, overwrite=options.force))
-        advance = stack.enter_context(progress_bar("pictures", total))
+        advance = stack.enter_context(progress_bar("pictures", selection.expected(run.frames)))
         for _, frame in selection.of(run.frames):
             try:
                 image = read_image(frame, camera)

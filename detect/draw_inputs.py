@@ -9,6 +9,7 @@ from detect.by_image import FramesByImage, TiltsByImage
 from detect.compare_pairing import image_name
 from detect.draw_head import FileHead, read_head
 from detect.errors import DetectError
+from detect.run import ImageRun
 from detect.viewing_options import RowFiles
 from landmarks import CircleLandmark, FrameTilt, LineLandmark, MarkerLandmark
 
@@ -85,13 +86,13 @@ class RowSource:
         )
 
 
-def find_files(run: Path, options: RowFiles) -> SeenFiles:
+def find_files(run: ImageRun, options: RowFiles) -> SeenFiles:
     """Find the files of a run's rows, and read their heads.
 
     Parameters
     ----------
-    run : path
-        The run's folder.
+    run : ImageRun
+        The run.
     options : RowFiles
         What a command line says of them.
 
@@ -104,25 +105,26 @@ def find_files(run: Path, options: RowFiles) -> SeenFiles:
     DetectError
         If one that is named does not exist, or there is none at all.
     """
-    folder = run if options.rows is None else options.rows
     detected: dict[str, Path] = {}
     for kind in KINDS:
         named: Path | None = getattr(options, kind)
-        path = folder / f"detected.{kind}" if named is None else named
+        path = run.output(kind) if options.rows is None else options.rows / f"detected.{kind}"
+        path = path if named is None else named
         if path.is_file():
             detected[kind] = path
         elif named is not None:
             raise DetectError(f"{path}: no such file: expected detected {kind}")
     if not detected:
+        usual = run.output("circles") if options.rows is None else options.rows / "detected.circles"
         raise DetectError(
-            f"{folder}: no detected.circles, .lines, .markers or .tilt: expected one of them; "
-            f"run detect all {run} (or circles, lines, markers) first"
+            f"{usual}: no such file, nor .lines, .markers or .tilt: expected one of them: run "
+            "detect all (or circles, lines, markers) on the same images first, or name files"
         )
     return SeenFiles(
         detected,
         {kind: read_head(path) for kind, path in detected.items()},
-        _reference(run / "map.circles", options.reference, options.no_reference),
-        _reference(run / "map.lines", options.reference_lines, options.no_reference),
+        _reference(run.folder / "map.circles", options.reference, options.no_reference),
+        _reference(run.folder / "map.lines", options.reference_lines, options.no_reference),
     )
 
 

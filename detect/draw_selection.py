@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from detect.compare_pairing import image_name
 from detect.errors import DetectError
-from detect.run import RunFrame, RunFrames
+from detect.run import Frames, RunFrame
 
 _RANGE = re.compile(r"(\d*):(\d*)(?::(\d+))?")
 
@@ -33,7 +33,13 @@ class FrameSelection:
     ranges: tuple[range, ...] = ()
     names: frozenset[str] = frozenset()
 
-    def of(self, frames: RunFrames) -> Iterator[tuple[int, RunFrame]]:
+    def expected(self, frames: Frames) -> int | None:
+        """About how many frames that will be; None if nobody knows."""
+        if self.ranges or self.names or frames.expected is None:
+            return None
+        return -(-frames.expected // self.every)
+
+    def of(self, frames: Frames) -> Iterator[tuple[int, RunFrame]]:
         """The selected frames, each with its position in the run, in the run's order."""
         everything = not (self.ranges or self.names)
         count = 0
@@ -48,12 +54,12 @@ class FrameSelection:
                 count += 1
 
 
-def select_frames(frames: RunFrames, wanted: Sequence[str], every: int) -> FrameSelection:
+def select_frames(frames: Frames, wanted: Sequence[str], every: int) -> FrameSelection:
     """Read what a command line says about frames.
 
     Parameters
     ----------
-    frames : RunFrames
+    frames : Frames
         The run's.
     wanted : sequence of str
         Names of images, positions, and ranges FROM:TO[:STEP] of positions without the last. What is
@@ -75,8 +81,9 @@ def select_frames(frames: RunFrames, wanted: Sequence[str], every: int) -> Frame
     if not wanted:
         return FrameSelection(every)
     asked = {image_name(word): word for word in wanted}
-    known = {name for frame in frames if (name := image_name(frame.step.prefix)) in asked}
-    ranges = [_positions(word, len(frames)) for name, word in asked.items() if name not in known]
+    names = [image_name(frame.step.prefix) for frame in frames]
+    known = asked.keys() & set(names)
+    ranges = [_positions(word, len(names)) for name, word in asked.items() if name not in known]
     return FrameSelection(every, tuple(ranges), frozenset(known))
 
 

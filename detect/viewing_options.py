@@ -7,13 +7,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, make_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Optional
+from typing import TYPE_CHECKING, Annotated, Literal, Optional
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from detect.compare_result import CompareOptions
 from detect.line_settings import LineSettings
 from detect.settings import CircleSettings
+from detect.sources.options import SourceOptions
 
 # For `X | None` tyro imports another library that takes a tenth of a second.
 MaybePath = Optional[Path]  # noqa: UP045
@@ -89,7 +90,7 @@ class Draw:
     Parameters
     ----------
     run : Path
-        Run folder of the data set's layout, or a folder of images.
+        Run folder, folder or pattern of images, video or bag, as for `detect circles`.
     output : Path
         Folder for a PNG file per frame.
     video : Path
@@ -115,6 +116,7 @@ class Draw:
     every: int = 1
     frames: tuple[str, ...] = ()
     force: bool = False
+    source: SourceOptions = field(default_factory=SourceOptions)
     files: OmitArgPrefixes[RowFiles] = field(default_factory=RowFiles)
     gates: OmitArgPrefixes[Gates] = field(default_factory=Gates)
 
@@ -128,7 +130,7 @@ class View:
     Parameters
     ----------
     run : Path
-        Run folder of the data set's layout, or a folder of images.
+        Run folder, folder or pattern of images, video or bag, as for `detect circles`.
     output : Path
         The recording (.rrd) to write; without it, the viewer is started.
     camera : Path
@@ -153,6 +155,7 @@ class View:
     every: int = 1
     frames: tuple[str, ...] = ()
     force: bool = False
+    source: SourceOptions = field(default_factory=SourceOptions)
     files: OmitArgPrefixes[RowFiles] = field(default_factory=RowFiles)
 
 
@@ -165,9 +168,9 @@ class Report:
     Parameters
     ----------
     run : Path
-        Run folder of the data set's layout, or a folder of images.
+        Run folder, folder or pattern of images, video or bag, as for `detect circles`.
     output : Path
-        The page; by default report.html in the run folder.
+        The page; by default detected.html in the run folder.
     camera : Path
         Calibration, if it is not the one in the run folder.
     worst : int
@@ -185,6 +188,7 @@ class Report:
     worst: int = 5
     time_frames: int = 0
     force: bool = False
+    source: SourceOptions = field(default_factory=SourceOptions)
     files: OmitArgPrefixes[RowFiles] = field(default_factory=RowFiles)
     gates: OmitArgPrefixes[Gates] = field(default_factory=Gates)
 
@@ -226,9 +230,10 @@ class Tune:
     Parameters
     ----------
     run : Path
-        Run folder of the data set's layout, or a folder of images.
+        Run folder, folder or pattern of images, video or bag, as for `detect circles`.
     output : Path
-        Folder for table.csv, table.json and curve.png; by default `tune` in the run folder.
+        Folder for table.csv, table.json and curve.png; by default `detected.tune`
+        in the run folder.
     verticals : bool
         Tune the detector of verticals instead of that of discs.
     preset : str
@@ -248,7 +253,8 @@ class Tune:
     most : int
         Refuse grids of more combinations than this.
     jobs : int
-        Processes that share the work, 1 for none beside this one.
+        Processes that share the work, 1 for none beside this one; by default one for every 500
+        frames to be looked at, at most as many as there are cores. What is written is the same.
     force : bool
         Replace existing files.
     """
@@ -256,7 +262,7 @@ class Tune:
     run: Positional[Path]
     output: Annotated[MaybePath, arg(aliases=["-o"])] = None
     verticals: bool = False
-    preset: str = "default"
+    preset: Literal["default", "published"] = "default"
     camera: MaybePath = None
     reference: MaybePath = None
     tilt: MaybePath = None
@@ -264,8 +270,9 @@ class Tune:
     every: int = 1
     frames: tuple[str, ...] = ()
     most: int = 1000
-    jobs: int = 1
+    jobs: MaybeInt = None
     force: bool = False
+    source: SourceOptions = field(default_factory=SourceOptions)
     gates: OmitArgPrefixes[Gates] = field(default_factory=Gates)
     grid: OmitArgPrefixes[Grid] = field(default_factory=Grid)
 
