@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from detect.circles_run import circles_file
+from detect.conduct import PLAIN, Conduct
 from detect.dispatch import Workers
 from detect.frame import FramePlan
 from detect.line_settings import LineSettings
@@ -27,6 +28,7 @@ def detect_all_run(
     overwrite: bool = False,
     workers: Workers | None = None,
     on_progress: Callable[[], None] | None = None,
+    conduct: Conduct = PLAIN,
 ) -> RunSummary:
     """Detect the verticals, the tilt and the discs of a run, each image decoded once.
 
@@ -47,7 +49,7 @@ def detect_all_run(
         The program's version, for the files' heads.
     overwrite : bool
         Whether existing files may be replaced.
-    workers, on_progress
+    workers, on_progress, conduct
         As in `detect.stream.detect_run`.
 
     Returns
@@ -68,5 +70,11 @@ def detect_all_run(
         circles_file(circles_output, circles, version, run, levelled=True),
     ]
     return detect_run(
-        run, plan, files, overwrite=overwrite, workers=workers, on_progress=on_progress
+        run,
+        plan,
+        files,
+        overwrite=overwrite,
+        workers=workers,
+        on_progress=on_progress,
+        conduct=conduct,
     )

@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 
+from detect.conduct import PLAIN, Conduct
 from detect.dispatch import Workers
 from detect.frame import FramePlan
 from detect.run import Run
@@ -26,6 +27,7 @@ def detect_circles_run(
     pictures: Path | None = None,
     workers: Workers | None = None,
     on_progress: Callable[[], None] | None = None,
+    conduct: Conduct = PLAIN,
 ) -> RunSummary:
     """Detect the discs of a run and write them.
 
@@ -47,7 +49,7 @@ def detect_circles_run(
         Tilts by image prefix: the positions of frames that have one are corrected for it.
     pictures : path, optional
         Folder for images with the discs drawn in.
-    workers, on_progress
+    workers, on_progress, conduct
         As in `detect.stream.detect_run`.
 
     Returns
@@ -78,6 +80,7 @@ def detect_circles_run(
         pictures=pictures,
         workers=workers,
         on_progress=on_progress,
+        conduct=conduct,
     )
 
 

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from rich.console import Group
 
     from detect.compare_result import Rates
+    from detect.conduct import Conduct
     from detect.dispatch import Workers
     from detect.run import ImageRun
     from detect.stream import RunSummary
@@ -56,11 +57,13 @@ def _circles(command: Circles) -> int:
     from detect import __version__
     from detect.by_image import TiltsByImage
     from detect.circles_run import detect_circles_run
+    from detect.run_log import log_place
     from detect.sources.opening import open_calibrated
 
     run = open_calibrated(command.run, command.camera, command.source)
     output = command.output if command.output is not None else run.output("circles")
-    _demand_new([output, command.json], command.force, run)
+    conduct = _conduct(command, log_place(output))
+    _demand_new([output, command.json], command.force, run, conduct)
     if command.draw is not None:
         command.draw.mkdir(parents=True, exist_ok=True)
     with progress_bar("discs", run.frames.expected) as advance:
@@ -75,6 +78,7 @@ def _circles(command: Circles) -> int:
             pictures=command.draw,
             workers=_workers(command, run),
             on_progress=advance,
+            conduct=conduct,
         )
     print(f"{output}: {summary.discs} discs in {summary.frames} frames")
     return _exit_code(summary, run)
@@ -84,12 +88,14 @@ def _lines(command: Lines) -> int:
     from detect import __version__
     from detect.by_image import LinesByImage
     from detect.lines_run import detect_lines_run
+    from detect.run_log import log_place
     from detect.sources.opening import open_calibrated
 
     run = open_calibrated(command.run, command.camera, command.source)
     output = command.output if command.output is not None else run.output("lines")
     tilt = command.tilt if command.tilt is not None else output.with_suffix(".tilt")
-    _demand_new([output, tilt], command.force, run)
+    conduct = _conduct(command, log_place(output))
+    _demand_new([output, tilt], command.force, run, conduct)
     settings = command.settings
     if command.join_threshold is not None:
         # On the horizon straight ahead, a bearing of one radian is scale_x pixels wide.
@@ -113,6 +119,7 @@ def _lines(command: Lines) -> int:
             draw_response=command.response,
             workers=_workers(command, run),
             on_progress=advance,
+            conduct=conduct,
         )
     print(f"{output}: {summary.lines} lines in {summary.frames} frames")
     print(f"{tilt}: the tilt of {summary.tilts} frames")
@@ -122,11 +129,13 @@ def _lines(command: Lines) -> int:
 def _markers(command: Markers) -> int:
     from detect import __version__
     from detect.markers_run import detect_markers_run
+    from detect.run_log import log_place
     from detect.sources.opening import open_source
 
     run = open_source(command.run, command.camera, command.source)
     output = command.output if command.output is not None else run.output("markers")
-    _demand_new([output], command.force, run)
+    conduct = _conduct(command, log_place(output))
+    _demand_new([output], command.force, run, conduct)
     if command.draw is not None:
         command.draw.mkdir(parents=True, exist_ok=True)
     with progress_bar("markers", run.frames.expected) as advance:
@@ -139,6 +148,7 @@ def _markers(command: Markers) -> int:
             pictures=command.draw,
             workers=_workers(command, run),
             on_progress=advance,
+            conduct=conduct,
         )
     print(f"{output}: {summary.markers} markers in {summary.frames} frames")
     if summary.rejected:
@@ -150,6 +160,7 @@ def _markers(command: Markers) -> int:
 def _all(command: All) -> int:
     from detect import __version__
     from detect.all_run import detect_all_run
+    from detect.run_log import log_place
     from detect.sources.opening import open_calibrated
 
     run = open_calibrated(command.run, command.camera, command.source)
@@ -157,7 +168,8 @@ def _all(command: All) -> int:
         run.output(kind) if command.output is None else command.output / f"detected.{kind}"
         for kind in ("lines", "tilt", "circles")
     )
-    _demand_new([lines, tilt, circles], command.force, run)
+    conduct = _conduct(command, log_place(lines.with_suffix("")))
+    _demand_new([lines, tilt, circles], command.force, run, conduct)
     with progress_bar("lines, tilt and discs", run.frames.expected) as advance:
         summary = detect_all_run(
             run,
@@ -170,6 +182,7 @@ def _all(command: All) -> int:
             overwrite=command.force,
             workers=_workers(command, run),
             on_progress=advance,
+            conduct=conduct,
         )
     print(f"{lines}: {summary.lines} lines in {summary.frames} frames")
     print(f"{tilt}: the tilt of {summary.tilts} frames")
@@ -192,11 +205,24 @@ def _workers(command: Circles | Lines | Markers | All, run: ImageRun) -> Workers
     return local_workers(jobs, pictures=large)
 
 
-def _demand_new(outputs: Sequence[Path | None], force: bool, run: ImageRun) -> None:
+def _conduct(command: Circles | Lines | Markers | All, log: Path) -> Conduct:
+    """How a command is carried out."""
+    from detect import __version__
+    from detect.conduct import conduct_of
+
+    return conduct_of(command.conduct, log, type(command).__name__.lower(), __version__)
+
+
+def _demand_new(
+    outputs: Sequence[Path | None], force: bool, run: ImageRun, conduct: Conduct
+) -> None:
     """Refuse to overwrite results before there is any work done."""
+    from detect.resume_journal import journal_place
     from detect.stream import times_file
     from storage import OutputExistsError
 
+    if conduct.log is not None and journal_place(conduct.log).exists():
+        return  # the results may be half of those of a run that was killed: told when that is over
     if run.has_times:
         outputs = [*outputs, *(times_file(path).path for path in outputs if path is not None)]
     for path in outputs:

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Literal
 
+from detect.conduct import PLAIN, Conduct
 from detect.dispatch import Workers
 from detect.frame import FramePlan
 from detect.line_settings import LineSettings
@@ -29,6 +30,7 @@ def detect_lines_run(
     draw_response: bool = False,
     workers: Workers | None = None,
     on_progress: Callable[[], None] | None = None,
+    conduct: Conduct = PLAIN,
 ) -> RunSummary:
     """Detect the verticals of a run and write them, with the tilt that they show.
 
@@ -52,7 +54,7 @@ def detect_lines_run(
         or with all tracks,
     draw_response : bool
         and for images of the filter's response.
-    workers, on_progress
+    workers, on_progress, conduct
         As in `detect.stream.detect_run`.
 
     Returns
@@ -80,6 +82,7 @@ def detect_lines_run(
         pictures=pictures,
         workers=workers,
         on_progress=on_progress,
+        conduct=conduct,
     )
 
 

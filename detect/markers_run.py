@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 
+from detect.conduct import PLAIN, Conduct
 from detect.dispatch import Workers
 from detect.frame import FramePlan
 from detect.markers.settings import MarkerSettings
@@ -25,6 +26,7 @@ def detect_markers_run(
     pictures: Path | None = None,
     workers: Workers | None = None,
     on_progress: Callable[[], None] | None = None,
+    conduct: Conduct = PLAIN,
 ) -> RunSummary:
     """Detect the square markers of a run and write them.
 
@@ -42,7 +44,7 @@ def detect_markers_run(
         Whether existing files may be replaced.
     pictures : path, optional
         Folder for images with the markers drawn in.
-    workers, on_progress
+    workers, on_progress, conduct
         As in `detect.stream.detect_run`.
 
     Returns
@@ -71,6 +73,7 @@ def detect_markers_run(
         pictures=pictures,
         workers=workers,
         on_progress=on_progress,
+        conduct=conduct,
     )
 
 

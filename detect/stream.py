@@ -15,11 +15,13 @@ from collections.abc import Callable, Generator, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import BinaryIO, Literal, Protocol
+from typing import Literal, Protocol
 
+from detect.conduct import PLAIN, Conduct
 from detect.dispatch import Workers, detect_frames
 from detect.frame import FramePlan, tables_of
 from detect.frame_rows import FrameRows, FrameTask
+from detect.resume import RunFiles
 from detect.run import ImageRun
 from detect.sources.times import TIMES_HEAD
 from detect.workers import local_workers
@@ -118,6 +120,7 @@ def detect_run(
     pictures: Path | None = None,
     workers: Workers | None = None,
     on_progress: Callable[[], None] | None = None,
+    conduct: Conduct = PLAIN,
 ) -> RunSummary:
     """Do with every frame of a run what a plan says, and write what comes of it.
 
@@ -141,6 +144,9 @@ def detect_run(
         Who does the work; by default this process (see `detect.workers`).
     on_progress : callable, optional
         Called once after every frame.
+    conduct : Conduct
+        Whether there are a log and a journal, how bad frames are met, and whether an unfinished run
+        is resumed.
 
     Returns
     -------
@@ -154,6 +160,8 @@ def detect_run(
         If an output exists and must not be replaced.
     WorkerError
         If there is nobody to do the work.
+    DetectError
+        If another run is writing the same files, or a frame fails where every frame is demanded.
     """
     tables_of(plan)  # whatever is wrong with them is wrong with every frame
     workers = local_workers(1) if workers is None else workers
@@ -161,31 +169,25 @@ def detect_run(
     if run.has_times:
         outputs = [*outputs, times_file(outputs[-1].path)]
     with ExitStack() as stack:
-        streams: list[tuple[Output, BinaryIO]] = []
-        for output in outputs:
-            stream = stack.enter_context(write_whole(output.path, overwrite=overwrite))
-            stream.write(output.head)
-            streams.append((output, stream))
+        files = stack.enter_context(RunFiles(outputs, plan, conduct, overwrite=overwrite))
         tasks = stack.enter_context(closing(_tasks(run, tilts, reference)))
-        found = stack.enter_context(closing(detect_frames(tasks, plan, workers)))
+        for rows in files.kept(tasks):
+            summary.add(rows)
+            if on_progress is not None:
+                on_progress()
+        found = stack.enter_context(closing(detect_frames(files.left(tasks), plan, workers)))
         for rows in found:
-            for output, stream in streams:
-                if summary.frames:
-                    stream.write(output.between)
-                stream.write(getattr(rows, output.part))
             if pictures is not None:
+                redraw = overwrite or files.may_be_drawn_already
                 for name, picture in rows.pictures:
-                    with write_whole(pictures / name, overwrite=overwrite) as stream:
+                    with write_whole(pictures / name, overwrite=redraw) as stream:
                         stream.write(picture)
+            files.add(rows)
             summary.add(rows)
             if on_progress is not None:
                 on_progress()
         summary.images_without_step = run.images_without_step
-        for output, stream in streams:
-            stream.write(output.tail)
-        # A full disk is to be noticed before the first of the files has its name.
-        for _, stream in streams:
-            stream.flush()
+        files.finish(summary)
     return summary
 
 

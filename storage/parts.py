@@ -70,6 +70,22 @@ class PartFile:
         except OSError as error:
             raise named(error, self.path) from None
 
+    def read(self, place: int, length: int) -> bytes:
+        """What stands at a place; less than asked for where the part ends."""
+        left = max(0, os.fstat(self._handle).st_size - place)
+        os.lseek(self._handle, place, os.SEEK_SET)
+        wanted = min(length, left)
+        pieces = []
+        while wanted and (piece := os.read(self._handle, wanted)):
+            pieces.append(piece)
+            wanted -= len(piece)
+        return b"".join(pieces)
+
+    def cut(self, size: int) -> None:
+        """Cut it off; it grows on from there."""
+        os.ftruncate(self._handle, size)
+        os.lseek(self._handle, size, os.SEEK_SET)
+
     def sync(self) -> None:
         """Have it on the disk."""
         try:
@@ -121,7 +137,7 @@ def new_part(path: Path) -> PartFile:
     """
     try:
         number = 0
-        while (handle := _new_locked(part_place(path, number))) is None:
+        while (handle := new_locked(part_place(path, number))) is None:
             number += 1
         for other in range(number + 1, _PLACES_LOOKED_AT):
             remove_left_part(path, other)
@@ -132,7 +148,7 @@ def new_part(path: Path) -> PartFile:
 
 def left_part(path: Path, number: int = 0) -> PartFile | None:
     """The part of a result that an ended process left; None if there is none or it is in use."""
-    handle = _old_locked(part_place(path, number))
+    handle = old_locked(part_place(path, number))
     return None if handle is None else PartFile(path, number, handle)
 
 
@@ -172,13 +188,13 @@ def folder_locked(folder: Path) -> Iterator[None]:
         os.close(handle)
 
 
-def _new_locked(place: Path) -> int | None:
+def new_locked(place: Path) -> int | None:
     """A new file, locked; None if another process writes there, or what is there is no part."""
     while True:
         try:
             handle = os.open(place, _NEW, 0o666)
         except FileExistsError:
-            left = _old_locked(place)
+            left = old_locked(place)
             if left is None:
                 if not os.path.lexists(place):
                     continue  # it has just taken its place
@@ -191,7 +207,7 @@ def _new_locked(place: Path) -> int | None:
         os.close(handle)  # taken for something left behind before it was locked
 
 
-def _old_locked(place: Path) -> int | None:
+def old_locked(place: Path) -> int | None:
     """A file that was left behind, locked; None if there is none or it is no such file."""
     try:
         handle = os.open(place, _OLD)
