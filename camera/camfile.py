@@ -13,6 +13,7 @@ from pathlib import Path
 from camera.errors import CameraError
 from camera.model import Camera, Pose
 from storage import write_whole
+from storage.bounded import read_bounded
 
 CLASS_NAME = "SmRadialDistortedCamera"
 _LARGEST_FILE_BYTES = 1 << 20
@@ -48,13 +49,13 @@ def read_camera(path: str | os.PathLike[str]) -> Camera:
     """
     path = Path(path)
     try:
-        if path.stat().st_size > _LARGEST_FILE_BYTES:
-            raise CameraError(f"{path}: larger than {_LARGEST_FILE_BYTES} bytes: not a .cam file")
-        text = path.read_text(encoding="utf-8-sig")
+        text = read_bounded(path, _LARGEST_FILE_BYTES).decode("utf-8-sig")
     except FileNotFoundError:
         raise CameraError(f"{path}: no such calibration file") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise CameraError(f"{path}: cannot be read as a .cam file: {error}") from None
+    except OSError as error:
+        raise CameraError(f"{path}: cannot be read as a .cam file: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise CameraError(f"{path}: cannot be read as a .cam file: it is no text") from None
     return parse_camera(text, name=str(path))
 
 

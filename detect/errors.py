@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+from storage.messages import OneLineError
 
-class DetectError(ValueError):
+
+class DetectError(OneLineError, ValueError):
     """A run or setting that cannot be worked on.
 
     The message names the file or the setting, its value and what was expected.
     """
 
 
-class FrameError(ValueError):
+class FrameError(OneLineError, ValueError):
     """One image that cannot be worked on; it costs its frame only."""
 
 
-class WorkerError(RuntimeError):
+class WorkerError(OneLineError, RuntimeError):
     """The processes or machines that should do the work cannot; one line says what is missing."""

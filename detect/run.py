@@ -11,8 +11,10 @@ before any work is done.
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Generator, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
@@ -26,6 +28,8 @@ from detect.image_bounds import bounded_content
 from detect.image_names import IMAGE_SUFFIXES, ImageNames
 from detect.sources.gray import decode_gray
 from landmarks import Step, read_rows
+from storage.inside import leads_out, link_out
+from storage.messages import excerpt
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,10 +124,20 @@ class RunFrames:
         if self._odometry is None:
             for place in range(len(self._images)):
                 path = self._images.path(place)
-                yield RunFrame(_standing_still(path.stem), path, bits=self._bits)
+                step = _standing_still(path.stem)
+                try:
+                    _demand_no_link_out(path, self._images)
+                except FrameError as error:
+                    yield RunFrame(step, None, failure=str(error))
+                    continue
+                yield RunFrame(step, path, bits=self._bits)
             return
         for step in _steps(self._odometry):
-            found = self._images.find(_base_name(step.prefix))
+            try:
+                found = _image_of(step, self._images)
+            except FrameError as error:
+                yield RunFrame(step, None, failure=str(error))
+                continue
             image = None if found is None else self._images.path(found)
             yield RunFrame(step, image, bits=self._bits)
 
@@ -280,9 +294,10 @@ def _image_run(folder: Path, bits: int | None) -> ImageRun:
         count = 0
         for step in _steps(odometry):
             count += 1
-            found = images.find(_base_name(step.prefix))
-            if found is not None:
-                named[found] = True
+            with suppress(FrameError):  # told when it is the frame's turn
+                found = _image_of(step, images)
+                if found is not None:
+                    named[found] = True
         frames = RunFrames(images, odometry, count, int(np.count_nonzero(~named)), bits)
     return ImageRun(folder, frames, odometry, folder / "detected")
 
@@ -360,8 +375,37 @@ def _odometry(folder: Path) -> Path | None:
     return None
 
 
-def _base_name(prefix: str) -> str:
-    return prefix.strip('"').replace("\\", "/").rsplit("/", 1)[-1]
+def _image_of(step: Step, images: ImageNames) -> int | None:
+    """The place of a step's image; None if there is none.
+
+    Raises
+    ------
+    FrameError
+        If the step's prefix, or a link of that name, leads out of the run: whoever made the file of
+        steps does not decide which other files are read.
+    """
+    name = step.prefix.strip('"')
+    why = leads_out(name, *_homes(images))
+    if why is not None:
+        raise FrameError(f"{excerpt(step.prefix)}: the prefix {why}: expected an image of the run")
+    found = images.find(name.replace("\\", "/").rsplit("/", 1)[-1])
+    if found is not None:
+        _demand_no_link_out(images.path(found), images)
+    return found
+
+
+def _demand_no_link_out(path: Path, images: ImageNames) -> None:
+    if path.is_symlink() and link_out(path, *map(Path, _homes(images))):
+        raise FrameError(
+            f"{path}: cannot be read: is a link that leads out of the run: expected an image in it"
+        )
+
+
+def _homes(images: ImageNames) -> tuple[str, ...]:
+    """Where a run's images may be: their folder, and that of the run."""
+    folder = os.path.abspath(images.folder)  # noqa: PTH100 - links are not followed yet
+    above, name = os.path.split(folder)
+    return (folder, above) if name == "images" else (folder,)
 
 
 def _standing_still(prefix: str) -> Step:

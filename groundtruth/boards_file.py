@@ -26,10 +26,14 @@ from groundtruth.calibration import parse_covariance, parse_pose, read_json
 from groundtruth.checkerboard import Checkerboard, find_checkerboard
 from groundtruth.errors import GeometryError, GroundTruthError
 from groundtruth.network_estimation import BoardView, DoubleBoard
+from storage.bounded import read_bounded
+from storage.inside import path_inside
+from storage.messages import excerpt
 
 FloatArray = NDArray[np.float64]
 
 BOARDS_NAME = "boards.json"
+_LARGEST_IMAGE_BYTES = 1 << 28
 FIRST, SECOND, WORLD = "first", "second", "world"
 
 
@@ -118,7 +122,7 @@ def read_boards(path: Path) -> BoardsFile:
         boards,
         world,
         double,
-        {name: read_camera(path.parent / calibrations[name]) for name in names},
+        {name: read_camera(_inside(str(path), path.parent, calibrations[name])) for name in names},
         calibrations,
         images,
     )
@@ -138,7 +142,7 @@ def find_boards(image: BoardImage, board: Checkerboard, camera: Camera) -> Board
         return BoardView(image.camera, image.board, image.corners)
     assert image.image is not None
     try:
-        content = np.frombuffer(image.image.read_bytes(), np.uint8)
+        content = np.frombuffer(read_bounded(image.image, _LARGEST_IMAGE_BYTES), np.uint8)
     except OSError as error:
         raise GroundTruthError(f"{image.image}: cannot be read: {error.strerror}") from None
     try:
@@ -157,6 +161,13 @@ def find_boards(image: BoardImage, board: Checkerboard, camera: Camera) -> Board
     except GeometryError as error:
         raise GroundTruthError(f"{image.image}: {error}") from None
     return BoardView(image.camera, image.board, corners)
+
+
+def _inside(place: str, folder: Path, name: str) -> Path:
+    try:
+        return path_inside(folder, name)
+    except ValueError as error:
+        raise GroundTruthError(f"{place}: {excerpt(name)} {error}: expected a file in it") from None
 
 
 def _objects(place: str, value: Any) -> dict[str, Any]:
@@ -182,23 +193,28 @@ def _image(place: str, row: Any, folder: Path, boards: dict[str, Checkerboard]) 
     entry = row if isinstance(row, dict) else {}
     camera, board, placement = entry.get("camera"), entry.get("board"), entry.get("placement")
     if not isinstance(camera, str) or not camera:
-        raise GroundTruthError(f"{place}: camera is {camera!r}: expected its name")
-    if board not in boards:
-        raise GroundTruthError(f"{place}: board is {board!r}: expected one of {sorted(boards)}")
+        raise GroundTruthError(f"{place}: camera is {excerpt(camera)}: expected its name")
+    if not isinstance(board, str) or board not in boards:
+        raise GroundTruthError(
+            f"{place}: board is {excerpt(board)}: expected one of {sorted(boards)}"
+        )
     if not isinstance(placement, int) or isinstance(placement, bool):
-        raise GroundTruthError(f"{place}: placement is {placement!r}: expected a whole number")
+        raise GroundTruthError(
+            f"{place}: placement is {excerpt(placement)}: expected a whole number"
+        )
     image, corners = entry.get("image"), entry.get("corners")
     if (image is None) == (corners is None):
         raise GroundTruthError(f"{place}: expected either image or corners")
     if image is not None:
         if not isinstance(image, str):
-            raise GroundTruthError(f"{place}: image is {image!r}: expected a file's name")
-        return BoardImage(camera, str(board), placement, folder / image, None)
+            raise GroundTruthError(f"{place}: image is {excerpt(image)}: expected a file's name")
+        path = _inside(place, folder, image)
+        return BoardImage(camera, board, placement, path, None)
     try:
         array = np.asarray(corners, dtype=np.float64)
     except (TypeError, ValueError):
         array = np.zeros(0)
-    expected = (boards[str(board)].rows * boards[str(board)].columns, 2)
+    expected = (boards[board].rows * boards[board].columns, 2)
     if array.shape != expected or not np.all(np.isfinite(array)):
         raise GroundTruthError(f"{place}: corners: expected {expected[0]} pairs of finite numbers")
-    return BoardImage(camera, str(board), placement, None, array)
+    return BoardImage(camera, board, placement, None, array)

@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 
 from groundtruth.errors import GroundTruthError, StreamError
 from storage import write_whole
+from storage.bounded import read_bounded
+from storage.messages import excerpt, one_line
 
 FloatArray = NDArray[np.float64]
 
@@ -104,12 +106,11 @@ def read_building(
         If the file cannot be read, has no walls, or more than `MOST_SEGMENTS` pieces.
     """
     try:
-        if Path(path).stat().st_size > _LARGEST_FILE_BYTES:
-            raise GroundTruthError(f"{path}: larger than {_LARGEST_FILE_BYTES} bytes")
+        content = read_bounded(path, _LARGEST_FILE_BYTES)
         if Path(path).suffix.lower() == ".dxf":
             segments = _read_drawing(path, layers, unit_m)
         else:
-            segments = _read_rows(path)
+            segments = _read_rows(path, content)
     except FileNotFoundError:
         raise GroundTruthError(f"{path}: no such file") from None
     except OSError as error:
@@ -145,9 +146,9 @@ def write_drawing(
         stream.write("".join(lines).encode())
 
 
-def _read_rows(path: str | os.PathLike[str]) -> FloatArray:
+def _read_rows(path: str | os.PathLike[str], file: bytes) -> FloatArray:
     try:
-        text = Path(path).read_text(encoding="utf-8-sig")
+        text = file.decode("utf-8-sig")
     except UnicodeDecodeError:
         raise StreamError(path, None, "is no text: expected rows of numbers") from None
     rows: list[list[float]] = []
@@ -165,7 +166,7 @@ def _read_rows(path: str | os.PathLike[str]) -> FloatArray:
             raise StreamError(
                 path,
                 number,
-                f"{content[:60]!r}: expected x1, y1, x2, y2 within {_FARTHEST_M:.0e} m",
+                f"{excerpt(content)}: expected x1, y1, x2, y2 within {_FARTHEST_M:.0e} m",
             )
         if len(rows) == MOST_SEGMENTS:
             raise StreamError(path, number, f"more than {MOST_SEGMENTS} walls")
@@ -196,8 +197,8 @@ def _read_drawing(
     except (FileNotFoundError, GroundTruthError):
         raise
     except Exception as error:  # a damaged drawing may fail anywhere within the library
-        text = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise GroundTruthError(f"{path}: is no DXF that can be read: {text[:200]}") from None
+        text = one_line(str(error).partition("\n")[0] or type(error).__name__, 200)
+        raise GroundTruthError(f"{path}: is no DXF that can be read: {text}") from None
     if not pieces:
         where = "" if layers is None else f" on the layers {', '.join(layers)}"
         raise GroundTruthError(f"{path}: no lines or curves{where}: expected walls")

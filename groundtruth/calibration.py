@@ -7,7 +7,6 @@ each camera; both may say how uncertain that is (see docs/groundtruth.md).
 from __future__ import annotations
 
 import json
-import math
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -21,10 +20,14 @@ from camera import Camera, read_camera
 from groundtruth.errors import GroundTruthError
 from groundtruth.transforms import quaternion_xyzw, transform_from_quaternion
 from storage import write_whole
+from storage.bounded import read_bounded
+from storage.inside import path_inside
+from storage.messages import excerpt
 
 FloatArray = NDArray[np.float64]
 
 _LARGEST_FILE_BYTES = 1 << 26
+_LARGEST_NUMBER = 1e100
 _QUATERNION_TOLERANCE = 1e-3
 _LARGEST_NEGATIVE_EIGENVALUE = 1e-6
 
@@ -109,7 +112,7 @@ def read_rig(path: str | os.PathLike[str]) -> Rig:
     content = read_json(path)
     dictionary = content.get("dictionary")
     if not isinstance(dictionary, str) or not dictionary:
-        raise GroundTruthError(f"{path}: dictionary is {dictionary!r}: expected its name")
+        raise GroundTruthError(f"{path}: dictionary is {excerpt(dictionary)}: expected its name")
     markers = _entries(path, content, "markers")
     try:
         by_id = {int(key): entry for key, entry in markers.items()}
@@ -123,7 +126,7 @@ def read_rig(path: str | os.PathLike[str]) -> Rig:
         width = by_id[marker].get("width_m")
         if width is None or not _is_number(width) or not width > 0.0:
             raise GroundTruthError(
-                f"{path}: marker {marker}: width_m is {width!r}: expected metres above 0"
+                f"{path}: marker {marker}: width_m is {excerpt(width)}: expected metres above 0"
             )
         widths.append(float(width))
     poses = np.stack([_pose(f"{path}: marker {m}", by_id[m]) for m in ids])
@@ -155,16 +158,24 @@ def read_network(path: str | os.PathLike[str]) -> Network:
     cameras = _entries(path, content, "cameras")
     names = tuple(sorted(cameras))
     calibrations = []
+    paths = []
     for name in names:
         calibration = cameras[name].get("calibration")
         if not isinstance(calibration, str) or not calibration:
             raise GroundTruthError(
-                f"{path}: camera {name}: calibration is {calibration!r}: expected a .cam file"
+                f"{path}: camera {name}: calibration is {excerpt(calibration)}: expected a file"
             )
+        try:
+            paths.append(path_inside(Path(path).parent, calibration))
+        except ValueError as error:
+            raise GroundTruthError(
+                f"{path}: camera {name}: calibration {excerpt(calibration)} {error}: expected a "
+                ".cam file in the network's own"
+            ) from None
         calibrations.append(calibration)
     return Network(
         names,
-        tuple(read_camera(Path(path).parent / calibration) for calibration in calibrations),
+        tuple(read_camera(place) for place in paths),
         tuple(calibrations),
         np.stack([_pose(f"{path}: camera {name}", cameras[name]) for name in names]),
         _joint_covariance(
@@ -252,9 +263,7 @@ def read_json(path: str | os.PathLike[str]) -> dict[str, Any]:
         If it cannot be read or is none.
     """
     try:
-        if Path(path).stat().st_size > _LARGEST_FILE_BYTES:
-            raise GroundTruthError(f"{path}: larger than {_LARGEST_FILE_BYTES} bytes")
-        content = json.loads(Path(path).read_text(encoding="utf-8-sig"))
+        content = json.loads(read_bounded(path, _LARGEST_FILE_BYTES).decode("utf-8-sig"))
     except FileNotFoundError:
         raise GroundTruthError(f"{path}: no such file") from None
     except json.JSONDecodeError as error:
@@ -263,6 +272,8 @@ def read_json(path: str | os.PathLike[str]) -> dict[str, Any]:
         raise GroundTruthError(f"{path}: is no JSON that can be read: nested too deep") from None
     except UnicodeDecodeError:
         raise GroundTruthError(f"{path}: is no text: expected JSON") from None
+    except ValueError:  # Python converts no more than some thousand digits
+        raise GroundTruthError(f"{path}: is no JSON that can be read: a number too long") from None
     except OSError as error:
         raise GroundTruthError(f"{path}: cannot be read: {error.strerror}") from None
     if not isinstance(content, dict):
@@ -283,12 +294,14 @@ def _entries(
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    if not isinstance(value, int | float) or isinstance(value, bool):
+        return False
+    return abs(value) <= _LARGEST_NUMBER  # NaN fails this; a whole number may fit no double
 
 
 def _vector(place: str, value: Any, length: int) -> FloatArray:
     if not isinstance(value, list) or len(value) != length or not all(map(_is_number, value)):
-        raise GroundTruthError(f"{place} is {value!r}: expected {length} finite numbers")
+        raise GroundTruthError(f"{place} is {excerpt(value)}: expected {length} finite numbers")
     return np.array(value, dtype=np.float64)
 
 

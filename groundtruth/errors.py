@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 
+from storage.messages import OneLineError
 
-class GroundTruthError(ValueError):
+
+class GroundTruthError(OneLineError, ValueError):
     """A session, calibration or setting that cannot be worked on.
 
     The message names the file, frame or setting, its value and what was expected.
@@ -30,5 +32,5 @@ class StreamError(GroundTruthError):
         super().__init__(f"{place}: {problem}")
 
 
-class GeometryError(ValueError):
+class GeometryError(OneLineError, ValueError):
     """Observations from which no pose follows; it costs its frame only."""

@@ -10,7 +10,6 @@ import os
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,6 +18,8 @@ from numpy.typing import NDArray
 from groundtruth.calibration import read_json, write_json
 from groundtruth.errors import GroundTruthError, StreamError
 from storage import write_whole
+from storage.bounded import read_bounded
+from storage.messages import excerpt
 
 FloatArray = NDArray[np.float64]
 
@@ -79,10 +80,10 @@ def read_survey(path: str | os.PathLike[str]) -> Survey:
     """
     content = read_json(path)
     if content.get("version") != 1:
-        raise GroundTruthError(f"{path}: version is {content.get('version')!r}: expected 1")
+        raise GroundTruthError(f"{path}: version is {excerpt(content.get('version'))}: expected 1")
     sigma = content.get("sigma_m")
     if sigma is None or not _is_number(sigma) or not 0.0 < sigma < _FARTHEST_M:
-        raise GroundTruthError(f"{path}: sigma_m is {sigma!r}: expected metres above 0")
+        raise GroundTruthError(f"{path}: sigma_m is {excerpt(sigma)}: expected metres above 0")
     points = [_points(path, content, key) for key in ("fiducials", "robot_points")]
     return Survey(points[0], points[1], float(sigma))
 
@@ -125,9 +126,7 @@ def read_distances(path: str | os.PathLike[str], survey: Survey) -> list[Distanc
         If the file cannot be read, a row is malformed or names a point that is not known.
     """
     try:
-        if Path(path).stat().st_size > _LARGEST_FILE_BYTES:
-            raise StreamError(path, None, f"larger than {_LARGEST_FILE_BYTES} bytes")
-        text = Path(path).read_text(encoding="utf-8-sig")
+        text = read_bounded(path, _LARGEST_FILE_BYTES).decode("utf-8-sig")
     except FileNotFoundError:
         raise StreamError(path, None, "no such file") from None
     except UnicodeDecodeError:
@@ -162,9 +161,13 @@ def _points(
     for name, value in entries.items():
         good = isinstance(value, list) and len(value) == 2 and all(map(_is_number, value))
         if not good or not all(abs(x) < _FARTHEST_M for x in value):
-            raise GroundTruthError(f"{path}: {key}: {name!r} is {str(value)[:60]}: expected [x, y]")
+            raise GroundTruthError(
+                f"{path}: {key}: {excerpt(name)} is {excerpt(value)}: expected [x, y]"
+            )
         if not _NAME.fullmatch(name):
-            raise GroundTruthError(f"{path}: {key}: {name[:80]!r}: expected a name without blanks")
+            raise GroundTruthError(
+                f"{path}: {key}: {excerpt(name)}: expected a name without blanks"
+            )
         points[name] = np.array(value, dtype=np.float64)
     return points
 
@@ -182,7 +185,7 @@ def _distance(
         raise StreamError(path, number, "expected a pose and a distance of 0 or more, finite")
     for name, known in ((words[2], survey.robot_points), (words[3], survey.fiducials)):
         if name not in known:
-            raise StreamError(path, number, f"{name[:60]!r}: expected one of {', '.join(known)}")
+            raise StreamError(path, number, f"{excerpt(name)}: expected one of {', '.join(known)}")
     return Distance(pose, time, words[2], words[3], distance)
 
 

@@ -18,10 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from groundtruth.errors import StreamError
+from storage.bounded import read_bounded
 
 FloatArray = NDArray[np.float64]
 
-_LARGEST_FILE_BYTES = 1 << 30
+_LARGEST_FILE_BYTES = 1 << 28
 _NUMBER = r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
 _OFFSET_MESSAGE = re.compile(
     r"offset from master:\s*([+-]?[0-9]{1,12})\s*s(?:ec)?\s+([+-]?[0-9]{1,12})\s*n"
@@ -36,6 +37,7 @@ _CALENDAR = (
     "%m/%d/%y %H:%M:%S:%f",
 )
 _PARTS_PER_BILLION = 1e-9
+_OFFSET = "offset from master"
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +108,8 @@ def _rows(path: Path) -> Iterator[tuple[float, float, float]]:
             pending = None
         elif "offset from master" in lowered and "," in lowered:
             names = [name.strip(" #\t") for name in lowered.split(",")]
-            columns = {name: k for k, name in enumerate(names)}
+            found = {name: k for k, name in enumerate(names)}
+            columns = found if _OFFSET in found else {}
         elif columns:
             row = _table_row(line, columns)
             if row is not None:
@@ -118,10 +121,11 @@ def _rows(path: Path) -> Iterator[tuple[float, float, float]]:
 def _table_row(line: str, columns: dict[str, int]) -> tuple[float, float, float] | None:
     """A row of the comma-separated layout; None for states in which there is no offset."""
     words = [word.strip() for word in line.split(",")]
-    at = columns["offset from master"]
+    at = columns[_OFFSET]
     if at >= len(words) or not re.fullmatch(_NUMBER, words[at]):
         return None
-    time = _calendar_time(words[columns["timestamp"]]) if "timestamp" in columns else math.nan
+    time_at = columns.get("timestamp", len(words))
+    time = _calendar_time(words[time_at]) if time_at < len(words) else math.nan
     drift_at = columns.get("observed drift", columns.get("drift"))
     drift = math.nan
     if drift_at is not None and drift_at < len(words) and re.fullmatch(_NUMBER, words[drift_at]):
@@ -147,9 +151,7 @@ def _calendar_time(text: str) -> float:
 
 def _lines(path: Path) -> Iterator[str]:
     try:
-        if path.stat().st_size > _LARGEST_FILE_BYTES:
-            raise StreamError(path, None, f"larger than {_LARGEST_FILE_BYTES} bytes")
-        text = path.read_text(encoding="utf-8", errors="replace")
+        text = read_bounded(path, _LARGEST_FILE_BYTES).decode("utf-8", errors="replace")
     except OSError as error:
         raise StreamError(path, None, f"cannot be read: {error.strerror}") from None
     yield from text.splitlines()

@@ -17,10 +17,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from groundtruth.errors import GroundTruthError
+from storage.messages import excerpt
 
 FloatArray = NDArray[np.float64]
 
 MOST_READINGS = 4096
+MOST_SCANNERS = 256
 
 _MILLIMETRE = 1e-3
 
@@ -62,7 +64,7 @@ class Scanner:
     sigma_m: float
 
     def __post_init__(self) -> None:
-        place = f"scanner {self.name!r}"
+        place = f"scanner {excerpt(self.name)}"
         if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}", self.name):
             raise GroundTruthError(f"{place}: expected a name of letters, digits, '-', '_', '.'")
         if self.pose.shape != (3,) or self.covariance.shape != (3, 3):
@@ -230,24 +232,26 @@ def _scanner_entry(scanner: Scanner) -> dict[str, Any]:
 
 def _scanners(path: str | os.PathLike[str], content: dict[str, Any]) -> tuple[Scanner, ...]:
     if content.get("version") != 1:
-        raise GroundTruthError(f"{path}: version is {content.get('version')!r}: expected 1")
+        raise GroundTruthError(f"{path}: version is {excerpt(content.get('version'))}: expected 1")
     entries = content.get("scanners")
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
         raise GroundTruthError(f"{path}: scanners: expected a list of objects")
+    if len(entries) > MOST_SCANNERS:
+        raise GroundTruthError(f"{path}: {len(entries)} scanners: expected at most {MOST_SCANNERS}")
     scanners = tuple(_scanner(f"{path}: scanners[{i}]", e) for i, e in enumerate(entries))
     names = [scanner.name for scanner in scanners]
     for name in names:
         if names.count(name) > 1:
-            raise GroundTruthError(f"{path}: scanner {name!r} stands there more than once")
+            raise GroundTruthError(f"{path}: scanner {excerpt(name)} stands there more than once")
     return scanners
 
 
 def _scanner(place: str, entry: dict[str, Any]) -> Scanner:
     name, readings = entry.get("name"), entry.get("readings")
     if not isinstance(name, str):
-        raise GroundTruthError(f"{place}: name is {name!r}: expected a text")
+        raise GroundTruthError(f"{place}: name is {excerpt(name)}: expected a text")
     if not isinstance(readings, int) or isinstance(readings, bool):
-        raise GroundTruthError(f"{place}: readings is {readings!r}: expected a whole number")
+        raise GroundTruthError(f"{place}: readings is {excerpt(readings)}: expected a whole number")
     pose = _numbers(f"{place}: pose", [entry.get("pose")], 1, 3)[0]
     numbers = [
         _number(f"{place}: {key}", entry.get(key))
@@ -296,5 +300,5 @@ def _numbers(place: str, value: Any, rows: int | None, columns: int) -> FloatArr
             good = good and isinstance(number, int | float) and not isinstance(number, bool)
             good = good and abs(number) < 1e12  # NaN fails this
     if not good:
-        raise GroundTruthError(f"{place} is {str(value)[:80]}: expected {expected}")
+        raise GroundTruthError(f"{place} is {excerpt(value)}: expected {expected}")
     return np.array(value, dtype=np.float64).reshape(-1, columns)

@@ -17,7 +17,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +33,8 @@ from groundtruth.scanners import (
     write_scanners,
 )
 from storage import write_whole
+from storage.messages import excerpt, one_line
+from storage.plain_arrays import read_plain_array
 
 __all__ = [
     "MOST_READINGS",
@@ -53,6 +55,7 @@ FloatArray = NDArray[np.float64]
 _LARGEST_FILE_BYTES = 1 << 30
 _LONGEST_LINE = 1 << 17
 _MILLIMETRE = 1e-3
+_FARTHEST_M = 1e3
 _ROW = re.compile(r"[-+0-9.eE,\s]+")
 _ENDINGS = (".scans.npz", ".scans.csv", ".scans.csv.gz")
 
@@ -114,8 +117,8 @@ def find_scans(folder: str | os.PathLike[str], name: str) -> Path:
     if len(found) != 1:
         what = "no scans" if not found else f"scans in {len(found)} files"
         raise GroundTruthError(
-            f"{Path(folder)}: {what} of scanner {name!r}: expected one file {name}{_ENDINGS[0]}, "
-            f"{_ENDINGS[1]} or {_ENDINGS[2]}"
+            f"{Path(folder)}: {what} of scanner {excerpt(name)}: expected one file "
+            f"{name}{_ENDINGS[0]}, {_ENDINGS[1]} or {_ENDINGS[2]}"
         )
     return found[0]
 
@@ -179,7 +182,8 @@ def _read_npz(path: str | os.PathLike[str]) -> Scans:
     except OSError as error:
         raise GroundTruthError(f"{path}: cannot be read: {error.strerror}") from None
     except (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError) as error:
-        raise GroundTruthError(f"{path}: is no .npz that can be read: {error}") from None
+        said = one_line(str(error), 200)
+        raise GroundTruthError(f"{path}: is no .npz that can be read: {said}") from None
     try:
         return Scans(times, ranges)
     except GroundTruthError as error:
@@ -195,8 +199,6 @@ def _member(
 ) -> NDArray[Any]:
     import zlib
 
-    from numpy.lib import format as npy
-
     place = f"{path}: {name}"
     try:
         info = archive.getinfo(f"{name}.npy")
@@ -206,27 +208,9 @@ def _member(
         raise GroundTruthError(f"{place}: larger than {_LARGEST_FILE_BYTES} bytes")
     try:
         with archive.open(info) as stream:
-            version = npy.read_magic(stream)
-            if version not in ((1, 0), (2, 0)):
-                raise ValueError(f"version {version} of its header is not known")
-            read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
-            shape, fortran, stored = read(stream)
-            size = dtype.itemsize
-            for length in shape:
-                size *= length
-            if stored.hasobject or stored != dtype or len(shape) != dimensions or fortran:
-                raise ValueError(f"it is {stored} of shape {shape}")
-            if min(shape) < 0 or size > info.file_size:
-                raise ValueError(f"shape {shape} does not fit its {info.file_size} bytes")
-            data = stream.read(size + 1)
-    except (ValueError, SyntaxError, TypeError, zlib.error, UnicodeDecodeError) as error:
-        text = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise GroundTruthError(
-            f"{place}: {text[:200]}: expected {dimensions}-dimensional {dtype}, row by row"
-        ) from None
-    if len(data) != size:
-        raise GroundTruthError(f"{place}: {len(data)} bytes of data: expected {size}")
-    return np.frombuffer(bytearray(data), dtype=dtype).reshape(shape)
+            return read_plain_array(cast(BinaryIO, stream), dtype, dimensions, info.file_size)
+    except (ValueError, zlib.error) as error:
+        raise GroundTruthError(f"{place}: {error}") from None
 
 
 def _read_rows(path: str | os.PathLike[str], readings: int | None) -> Scans:
@@ -247,7 +231,7 @@ def _read_rows(path: str | os.PathLike[str], readings: int | None) -> Scans:
             raise StreamError(path, number, f"{len(words)} numbers: expected {wanted}")
         if np.any(values[1:] < 0.0):
             raise StreamError(path, number, "a reading below 0: expected metres")
-        millimetres = np.rint(values[1:] / _MILLIMETRE)
+        millimetres = np.rint(np.minimum(values[1:], _FARTHEST_M) / _MILLIMETRE)
         times.append(float(values[0]))
         rows.append(np.where(millimetres < 65536.0, millimetres, 0.0).astype(np.uint16))
     if not rows:
@@ -264,7 +248,7 @@ def _row(path: str | os.PathLike[str], number: int, line: str, words: list[str])
     except ValueError:
         values = None
     if values is None or not np.isfinite(values).all():
-        raise StreamError(path, number, f"{line.strip()[:40]!r}...: expected finite numbers")
+        raise StreamError(path, number, f"{excerpt(line)}: expected finite numbers")
     return values
 
 

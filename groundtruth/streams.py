@@ -18,6 +18,8 @@ from numpy.typing import NDArray
 from groundtruth.errors import GroundTruthError, StreamError
 from groundtruth.transforms import quaternion_xyzw
 from storage import write_whole
+from storage.bounded import read_bounded
+from storage.messages import excerpt
 
 FloatArray = NDArray[np.float64]
 
@@ -26,7 +28,7 @@ RAWSEEDS_ROUNDING = 5e-7
 
 _POSE_COLUMNS = 4
 _COVARIANCE_COLUMNS = 13
-_LARGEST_FILE_BYTES = 1 << 30
+_LARGEST_FILE_BYTES = 1 << 28
 _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
 
 
@@ -215,7 +217,7 @@ def read_times(path: str | os.PathLike[str]) -> dict[str, float]:
             raise StreamError(path, line, f"{len(words)} words: expected a prefix and seconds")
         prefix = words[0]
         if prefix in times:
-            raise StreamError(path, line, f"prefix {prefix!r} stands here a second time")
+            raise StreamError(path, line, f"prefix {excerpt(prefix)} stands here a second time")
         times[prefix] = _numbers(path, line, words[1:])[0]
     return times
 
@@ -253,9 +255,7 @@ def read_rows_of_numbers(path: str | os.PathLike[str], columns: int, expected: s
 def _rows(path: str | os.PathLike[str]) -> Iterator[tuple[int, list[str]]]:
     """Yield line numbers and words, without comments and blank lines."""
     try:
-        if Path(path).stat().st_size > _LARGEST_FILE_BYTES:
-            raise StreamError(path, None, f"larger than {_LARGEST_FILE_BYTES} bytes")
-        text = Path(path).read_text(encoding="utf-8-sig")
+        text = read_bounded(path, _LARGEST_FILE_BYTES).decode("utf-8-sig")
     except FileNotFoundError:
         raise StreamError(path, None, "no such file") from None
     except UnicodeDecodeError:
@@ -273,6 +273,6 @@ def _numbers(path: str | os.PathLike[str], line: int, words: list[str]) -> list[
     for word in words:
         value = float(word) if _NUMBER.fullmatch(word) else float("nan")
         if not np.isfinite(value):
-            raise StreamError(path, line, f"{word[:40]!r}: expected a finite number")
+            raise StreamError(path, line, f"{excerpt(word)}: expected a finite number")
         numbers.append(value)
     return numbers

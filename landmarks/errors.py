@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import os
 
+from storage.messages import OneLineError
+
 _LONGEST_EXCERPT = 40
 
 
-class LandmarkError(ValueError):
+class LandmarkError(OneLineError, ValueError):
     """A record that cannot be; the message names the quantity, its value and what was expected."""
 
 

@@ -1,7 +1,11 @@
 """Tables on disk, so that they are computed once per calibration.
 
 A cached table is a file named by the hash of everything that decides its content. It begins with
-the hash of the bytes that follow, so damage of any kind is noticed, and the table computed again.
+a hash of that name and of the bytes that follow, so damage of any kind is noticed, and so is a
+table under another's name. What passes is looked through before it is used (`lut.table_checks`).
+None of this tells a table that somebody else made on purpose: only files and folders count that
+belong to the user and that nobody else can write to. Whatever fails is computed again, and said.
+
 Files appear whole or not at all, so any number of processes may share a cache. A cache that cannot
 be written to is no error: the next run just computes again.
 """
@@ -13,6 +17,7 @@ import hashlib
 import io
 import logging
 import os
+import stat
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -23,17 +28,21 @@ import numpy as np
 from camera import Camera
 from lut.floor import floor_positions
 from lut.outlines import DiscShape, DiscTable, build_disc_table
+from lut.table_checks import check_disc_table, check_vertical_table
 from lut.verticals import VerticalTable, build_vertical_table
 from storage import write_whole
 
 #: Raised with every change of what tables hold or how they are computed.
-TABLE_VERSION = 6
+TABLE_VERSION = 7
 
 Table = TypeVar("Table", DiscTable, VerticalTable)
 
 _log = logging.getLogger("redetect")
 
 _DIGEST_BYTES = hashlib.sha256().digest_size
+#: The largest table that is read; that of a 20-megapixel camera has a tenth of it.
+_LARGEST_FILE_BYTES = 1 << 32
+_OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
 
 
 def cache_folder() -> Path:
@@ -71,7 +80,9 @@ def cached_disc_table(camera: Camera, shape: DiscShape, folder: Path | None = No
     path = folder / f"discs-{_key(camera, shape)}.table"
 
     def complete(**fields: Any) -> DiscTable:
-        return DiscTable(**fields, floor_xy=floor_positions(camera).astype(np.float32))
+        table = DiscTable(**fields, floor_xy=floor_positions(camera).astype(np.float32))
+        check_disc_table(table, camera, shape)
+        return table
 
     table = _read(path, complete)
     if table is None:
@@ -98,7 +109,13 @@ def cached_vertical_table(camera: Camera, folder: Path | None = None) -> Vertica
         Equal to that of `lut.build_vertical_table`.
     """
     path = (cache_folder() if folder is None else folder) / f"verticals-{_key(camera)}.table"
-    table = _read(path, VerticalTable)
+
+    def complete(**fields: Any) -> VerticalTable:
+        table = VerticalTable(**fields)
+        check_vertical_table(table, camera)
+        return table
+
+    table = _read(path, complete)
     if table is None:
         _log.info("computing the table of verticals, once for this calibration")
         table = build_vertical_table(camera)
@@ -114,21 +131,65 @@ def _key(camera: Camera, shape: DiscShape | None = None) -> str:
 
 
 def _read(path: Path, make: Callable[..., Table]) -> Table | None:
-    """The table made of a file's fields; None if there is no file or it is damaged."""
-    try:
-        content = path.read_bytes()
-    except OSError:
+    """The table made of a file's fields; None if there is no file or it must not be used."""
+    content = _own_content(path)
+    if content is None:
         return None
     digest, payload = content[:_DIGEST_BYTES], content[_DIGEST_BYTES:]
-    if hashlib.sha256(payload).digest() != digest:
-        return None
     try:
+        if _digest(path, payload) != digest:
+            raise ValueError("damaged")
         with np.load(io.BytesIO(payload), allow_pickle=False) as arrays:
             # Numbers were stored as arrays without dimensions.
             fields = {name: arrays[name] for name in arrays.files}
         return make(**{name: a if a.ndim else a.item() for name, a in fields.items()})
-    except (ValueError, KeyError, TypeError, EOFError, OSError, BadZipFile):
+    except (ValueError, KeyError, TypeError, AttributeError, EOFError, OSError, BadZipFile):
+        _log.info("%s: is damaged: it is computed again", path)
         return None
+
+
+def _own_content(path: Path) -> bytes | None:
+    """The bytes of a file that nobody but the user can have written; None if there is none."""
+    try:
+        if (why := _foreign(path.parent.stat())) is not None:
+            _log.warning("cache %s: %s: its tables are not used", path.parent, why)
+            return None
+        # Whatever stands there is not waited for, and what is looked at is what is read.
+        handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+    except OSError:
+        return None
+    try:
+        state = os.fstat(handle)
+        why = _foreign(state)
+        if not stat.S_ISREG(state.st_mode):
+            why = "is no file"
+        elif state.st_size > _LARGEST_FILE_BYTES:
+            why = f"is larger than {_LARGEST_FILE_BYTES} bytes"
+        if why is not None:
+            _log.warning("%s: %s: it is computed again", path, why)
+            return None
+        with os.fdopen(handle, "rb", closefd=False) as stream:
+            return stream.read(_LARGEST_FILE_BYTES)
+    except OSError:
+        return None
+    finally:
+        os.close(handle)
+
+
+def _foreign(state: os.stat_result) -> str | None:
+    """Why somebody else may have written to it; None if nobody can have."""
+    if state.st_uid != os.geteuid():
+        return f"belongs to user {state.st_uid}, not {os.geteuid()}"
+    if state.st_mode & _OTHERS_WRITE:
+        return f"can be written to by others (mode {stat.S_IMODE(state.st_mode):o})"
+    return None
+
+
+def _digest(path: Path, payload: bytes) -> bytes:
+    """What stands at the beginning of a file: a hash of its name and of what follows."""
+    digest = hashlib.sha256(path.name.encode() + b"\0")
+    digest.update(payload)
+    return digest.digest()
 
 
 def _keep(path: Path, table: DiscTable | VerticalTable, without: Sequence[str] = ()) -> None:
@@ -138,9 +199,11 @@ def _keep(path: Path, table: DiscTable | VerticalTable, without: Sequence[str] =
     np.savez(buffer, allow_pickle=False, **fields)
     payload = buffer.getvalue()
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         with write_whole(path, overwrite=True) as stream:
-            stream.write(hashlib.sha256(payload).digest())
+            stream.write(_digest(path, payload))
             stream.write(payload)
+        # Some users' files can be written to by their group unless told otherwise.
+        path.chmod(0o600)
     except OSError:
         pass

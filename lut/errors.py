@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from storage.messages import OneLineError
 
-class TableError(ValueError):
+
+class TableError(OneLineError, ValueError):
     """A table that cannot be made; the message names the quantity and what was expected."""

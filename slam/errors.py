@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from storage.messages import OneLineError
 
-class SlamError(ValueError):
+
+class SlamError(OneLineError, ValueError):
     """A run, map or setting that cannot be worked on.
 
     The message names the file, step, landmark or setting, its value and what was expected.

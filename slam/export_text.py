@@ -53,7 +53,7 @@ def text_rows(path: str | os.PathLike[str]) -> Iterator[tuple[int, str]]:
                         f"{place}:{number}: longer than {_LONGEST_ROW_BYTES} bytes: expected a "
                         "row of text"
                     )
-                text = source.decode("utf-8", "surrogateescape").strip(" \t\r\n\v\f")
+                text = source.decode("utf-8", "surrogateescape").strip()
                 if text:
                     yield number, text
     except OSError as error:

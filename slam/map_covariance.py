@@ -19,12 +19,14 @@ from slam.graph_terms import Weighting, layout_of, linearise
 from slam.map_file import LandmarkMap
 from slam.solve import factor, normal_equations
 from storage import write_whole
+from storage.plain_arrays import read_plain_array
 
 FloatArray = NDArray[np.float64]
 
 # Columns of the inverse that are computed at once.
 _CHUNK = 128
 # Both files are written in full precision; sums may be in another order.
+_SMALL_BYTES = 1 << 20
 _SAME = 1e-6
 
 
@@ -81,8 +83,13 @@ def read_joint_covariance(map_file: Path, landmark_map: LandmarkMap) -> FloatArr
         return None
     own = np.concatenate([landmark_map.discs.covariance, landmark_map.lines.covariance])
     try:
-        found = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
+        with path.open("rb") as stream:
+            found = read_plain_array(
+                stream, np.dtype(np.float64), 2, max(32 * len(own) ** 2, _SMALL_BYTES)
+            )
+    except OSError as error:
+        raise SlamError(f"{path}: cannot be read: {error.strerror}") from None
+    except ValueError as error:
         raise SlamError(f"{path}: cannot be read: {error}") from None
     if found.shape != (2 * len(own), 2 * len(own)) or found.dtype != np.float64:
         raise SlamError(

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from slam.errors import SlamError
 from storage import write_whole
+from storage.bounded import read_bounded
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -35,7 +36,7 @@ _COVARIANCE = (
     "cthetatheta",
 )
 PATH_COLUMNS = ("prefix", "x_m", "y_m", "theta_rad", *_COVARIANCE)
-_LARGEST_FILE_BYTES = 1 << 30
+_LARGEST_FILE_BYTES = 1 << 28
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,7 +158,11 @@ def read_map(path: str | os.PathLike[str]) -> LandmarkMap:
         rows = _whole(path, line, "rows", words[7])
         if number in found[words[0]]:
             raise SlamError(f"{path}:{line}: {words[0]} {number} stands in the map already")
-        if values[2] < 0.0 or values[4] < 0.0 or values[3] ** 2 > values[2] * values[4] * 1.000001:
+        if (
+            values[2] < 0.0
+            or values[4] < 0.0
+            or values[3] * values[3] > (values[2] * values[4] * 1.000001)
+        ):
             raise SlamError(f"{path}:{line}: {words[0]} {number}: covariance is negative")
         found[words[0]][number] = (values, rows)
     return LandmarkMap(discs=_landmarks(found["disc"]), lines=_landmarks(found["line"]))
@@ -240,9 +245,7 @@ def _read(
     """Rows of a file with their line numbers, after its head was checked."""
     place = Path(path)
     try:
-        if place.stat().st_size > _LARGEST_FILE_BYTES:
-            raise SlamError(f"{place}: larger than {_LARGEST_FILE_BYTES} bytes")
-        text = place.read_bytes().decode("utf-8", "surrogateescape")
+        text = read_bounded(place, _LARGEST_FILE_BYTES).decode("utf-8", "surrogateescape")
     except OSError as error:
         raise SlamError(f"{place}: cannot be read: {error.strerror or error}") from None
     head: list[str] | None = None

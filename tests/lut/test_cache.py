@@ -154,9 +154,19 @@ class Dangerous:
         return (pytest.fail, ("unpickled a file of the cache",))
 
 
-def signed(payload: bytes) -> bytes:
-    """A file as sound as a hash can tell."""
-    return hashlib.sha256(payload).digest() + payload
+@dataclasses.dataclass(frozen=True)
+class Signed:
+    """Content of a file that is as sound as a hash can tell, whatever the file's name."""
+
+    payload: bytes
+
+    def under(self, name: str) -> bytes:
+        """The file's bytes."""
+        return hashlib.sha256(name.encode() + b"\0" + self.payload).digest() + self.payload
+
+
+def signed(payload: bytes) -> Signed:
+    return Signed(payload)
 
 
 def archive(**arrays: object) -> bytes:
@@ -191,13 +201,18 @@ def test_damage_of_any_kind_is_noticed_and_repaired(
     tmp_path: Path,
     camera: Camera,
     computed: list[DiscShape],
-    damage: Callable[[bytes], bytes],
+    damage: Callable[[bytes], bytes | Signed],
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     built = cached_disc_table(camera, SHAPE, tmp_path)
     path = only_file(tmp_path)
     sound = path.read_bytes()
-    assert damage(sound) != sound
-    path.write_bytes(damage(sound))
+    damaged = damage(sound)
+    if isinstance(damaged, Signed):
+        damaged = damaged.under(path.name)
+    assert damaged != sound
+    path.write_bytes(damaged)
+    assert caplog.messages == []
     assert_same(cached_disc_table(camera, SHAPE, tmp_path), built)
     assert computed == [SHAPE, SHAPE]
     assert path.read_bytes() == sound

@@ -69,7 +69,7 @@ def test_file(tmp_path: Path, some: LandmarkMap) -> None:
     ("content", "message"),
     [
         (np.eye(6), "expected float64 of"),
-        (np.eye(4, dtype=np.float32), "expected float64 of"),
+        (np.eye(4, dtype=np.float32), "expected 2-dimensional float64"),
         (np.eye(4), "not the covariance of"),
         (np.full((4, 4), np.nan), "not the covariance of"),
         (np.array([None]), "cannot be read"),

@@ -1,0 +1,133 @@
+"""Whether the arrays of a table are such that the compiled loops may index by them.
+
+The loops check nothing: a table that came from a file is looked through once, before they get it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from camera import Camera
+from lut.errors import TableError
+from lut.kernels import ADVANCE_BITS, BLOCK, GROUP, LEAST_COPIES
+from lut.outlines import DiscShape, DiscTable
+from lut.verticals import VerticalTable
+
+
+def check_disc_table(table: DiscTable, camera: Camera, shape: DiscShape) -> None:
+    """Refuse a disc table by which a loop would leave the image, or its own arrays.
+
+    Parameters
+    ----------
+    table : DiscTable
+    camera : Camera
+        The calibration that it should be of.
+    shape : DiscShape
+        Outlines and limits that it should be of.
+
+    Raises
+    ------
+    TableError
+        If a type, shape or index is impossible; the message names it.
+    """
+    height, width = camera.height, camera.width
+    pixels = height * width
+    fits = (pixels + 1) << ADVANCE_BITS <= np.iinfo(np.uint32).max + 1
+    _demand(type(table.samples) is int and table.samples == shape.samples, "samples")
+    for name, dtype, dimensions in (
+        ("copies", np.uint32 if fits else np.uint64, 1),
+        ("block_copies", np.int64, 1),
+        ("block_row", np.int32, 1),
+        ("block_column", np.int32, 1),
+        ("block_pattern", np.int32, 1),
+        ("patterns", np.uint8, 3),
+        ("floor_xy", np.float32, 3),
+    ):
+        _demand_array(getattr(table, name), name, dtype, dimensions)
+    blocks, patterns = len(table.block_row), len(table.patterns)
+    _demand(table.floor_xy.shape == (height, width, 2), "floor_xy")
+    _demand(patterns >= 1 and table.patterns.shape[1:] == (2, BLOCK), "patterns")
+    _demand(len(table.block_column) == blocks == len(table.block_pattern), "block_row")
+    _demand(len(table.block_copies) == blocks + 1, "block_copies")
+    for name, length in (
+        ("block_row", height), ("block_column", width), ("block_pattern", patterns),
+    ):  # fmt: skip
+        values = getattr(table, name)
+        _demand(bool(np.all((values >= 0) & (values < length))), name)
+
+    _demand(bool(np.all(table.patterns <= table.samples)), "patterns")
+    _demand(bool(np.all(table.patterns[0] == table.samples)), "patterns")
+    # A row's last block may reach past the image's border, but nothing votes there.
+    past = table.block_column[:, None] + np.arange(BLOCK) >= width
+    block, place = np.nonzero(past)
+    _demand(not table.patterns[table.block_pattern[block], :, place].any(), "patterns")
+
+    padded = -(-table.samples // GROUP) * GROUP
+    first = table.block_copies
+    _demand(first[0] == 0 and first[-1] == len(table.copies), "block_copies")
+    counts = np.diff(first)
+    least = padded // GROUP * LEAST_COPIES
+    _demand(bool(np.all((counts >= least) & (counts % GROUP == 0))), "block_copies")
+    if not blocks:
+        return
+    _demand(int(table.copies.max()) >> ADVANCE_BITS <= pixels, "copies")
+    advance = (table.copies & ((1 << ADVANCE_BITS) - 1)).astype(np.uint8)
+    _demand(int(advance.max()) <= BLOCK, "copies")
+    filled = np.add.reduceat(advance, first[:-1], dtype=np.int64)
+    _demand(bool(np.all(filled == 2 * padded * BLOCK)), "copies")
+
+
+def check_vertical_table(table: VerticalTable, camera: Camera) -> None:
+    """Refuse a table of verticals by which a loop would leave the image, or its own arrays.
+
+    Parameters
+    ----------
+    table : VerticalTable
+    camera : Camera
+        The calibration that it should be of.
+
+    Raises
+    ------
+    TableError
+        If a type, shape, index or number is impossible; the message names it.
+    """
+    height, width = camera.height, camera.width
+    for name, dtype, shape in (
+        ("horizon_row", np.float64, (width,)),
+        ("bearing_rad", np.float64, (width,)),
+        ("first_row", np.int32, (width,)),
+        ("last_row", np.int32, (width,)),
+        ("column", np.float32, (height, width)),
+        ("elevation_tan", np.float32, (height, width)),
+        ("robot_from_camera", np.float64, (3, 3)),
+    ):
+        array = getattr(table, name)
+        _demand_array(array, name, dtype, len(shape))
+        _demand(array.shape == shape, name)
+    for name in ("column", "elevation_tan"):
+        _demand(bool(getattr(table, name).flags.f_contiguous), name)
+    _demand(np.array_equal(table.robot_from_camera, camera.rotation), "robot_from_camera")
+    _demand(table.row_aspect == camera.scale_x / camera.scale_y, "row_aspect")
+    with_horizon = np.isfinite(table.horizon_row)
+    inside = (table.horizon_row >= 0.0) & (table.horizon_row <= height - 1.0)
+    _demand(bool(np.all(inside | np.isnan(table.horizon_row))), "horizon_row")
+    _demand(bool(np.all(np.isfinite(table.bearing_rad[with_horizon]))), "bearing_rad")
+
+    usable = table.usable
+    _demand(bool(np.all(with_horizon[usable])), "first_row")
+    _demand(bool(np.all((table.first_row >= 0) & (table.last_row < height))), "last_row")
+    row = np.arange(height)[:, None]
+    followed = usable & (row >= table.first_row) & (row <= table.last_row)
+    seen = (table.column >= 0.0) & (table.column <= width - 1.0)  # NaN fails this
+    _demand(bool(np.all(seen == followed)), "column")
+    _demand(bool(np.all(np.isfinite(table.elevation_tan) == followed)), "elevation_tan")
+
+
+def _demand_array(array: object, name: str, dtype: type[np.generic], dimensions: int) -> None:
+    right = isinstance(array, np.ndarray) and array.dtype == dtype and array.ndim == dimensions
+    _demand(right, name)
+
+
+def _demand(condition: bool, name: str) -> None:
+    if not condition:
+        raise TableError(f"the table's {name} cannot be: expected one for this calibration")

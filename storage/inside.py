@@ -1,0 +1,69 @@
+"""Names of files that other files give: they must not lead out of the folder they are given for."""
+
+from __future__ import annotations
+
+import os
+import posixpath
+import re
+from pathlib import Path
+
+_DRIVE = re.compile(r"[A-Za-z]:")
+# What Windows takes for a device in any folder, whatever the ending.
+_DEVICE = re.compile(r"(con|prn|aux|nul|com[0-9]|lpt[0-9])( *\..*)?", re.IGNORECASE | re.DOTALL)
+
+
+def leads_out(name: str, *folders: str) -> str | None:
+    r"""Why a name may not be taken for one of a file within a folder, by its letters alone.
+
+    Parameters
+    ----------
+    name : str
+        With / or \ between folders.
+    folders : str
+        Absolute paths of folders in any of which the file may be; without them any folder will do,
+        and its name is not known.
+
+    Returns
+    -------
+    str or None
+        What it does, to stand after the name; None if it may.
+    """
+    parts = name.replace("\\", "/")
+    if "\0" in name:
+        return "has a NUL in it"
+    if parts.startswith("/") or _DRIVE.match(parts):
+        return "is an absolute path"
+    if ".." in parts and not any(_within(parts, home) for home in folders or ("/any/folder",)):
+        return "leads out of the folder"
+    if any(_DEVICE.fullmatch(part) for part in parts.split("/")):
+        return "is the name of a device"
+    return None
+
+
+def _within(name: str, home: str) -> bool:
+    return posixpath.normpath(f"{home}/{name}").startswith(home.rstrip("/") + "/")
+
+
+def link_out(path: Path, *folders: Path) -> bool:
+    """Whether a path, links followed, lies in none of the folders, theirs followed too."""
+    real = os.path.realpath(path)
+    return not any(
+        real == home or real.startswith(home.rstrip("/") + "/")
+        for home in (os.path.realpath(folder) for folder in folders)
+    )
+
+
+def path_inside(folder: Path, name: str) -> Path:
+    """The file of a name that stands in a file, in that file's folder.
+
+    Raises
+    ------
+    ValueError
+        If it would lie elsewhere; the message says why, to stand after the name.
+    """
+    why = leads_out(name)
+    if why is None and link_out(folder / name, folder):
+        why = "is a link that leads out of the folder"
+    if why is not None:
+        raise ValueError(why)
+    return folder / name

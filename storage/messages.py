@@ -1,0 +1,66 @@
+"""What is shown of files whose content nobody vouches for: escaped, bounded, on one line.
+
+A terminal acts upon control characters, so none of a file's own may reach it; and a file may hold
+a word of a gigabyte. Every typed error of the project passes its message through `one_line`.
+"""
+
+from __future__ import annotations
+
+import reprlib
+
+#: Characters of a message at most; a path may be the most of it.
+LONGEST_MESSAGE = 1000
+_LONGEST_EXCERPT = 60
+_ELLIPSIS = " ... "
+
+
+def one_line(text: str, longest: int = LONGEST_MESSAGE) -> str:
+    """Make a text printable: control characters escaped, the middle left out where it is too long.
+
+    Parameters
+    ----------
+    text : str
+    longest : int
+        Characters that are left at most.
+
+    Returns
+    -------
+    str
+        What is printable already comes back as it is.
+    """
+    if len(text) > longest:
+        # Escapes make a text longer, never shorter: no more than this can be shown.
+        text = text[:longest] + _ELLIPSIS + text[-longest:]
+    if not text.isprintable():
+        text = "".join(c if c.isprintable() else _escaped(c) for c in text)
+    if len(text) > longest:
+        tail = (longest - len(_ELLIPSIS)) // 3
+        text = text[: longest - len(_ELLIPSIS) - tail] + _ELLIPSIS + text[len(text) - tail :]
+    return text
+
+
+def excerpt(value: object) -> str:
+    """Show a value of a file, however large and deep it is, in some 60 characters."""
+    return one_line(_SHORT.repr(value), _LONGEST_EXCERPT)
+
+
+class OneLineError(Exception):
+    """An error whose message is one printable line of bounded length.
+
+    Parameters
+    ----------
+    message : str
+        Passed through `one_line`.
+    """
+
+    def __init__(self, message: str = "") -> None:
+        super().__init__(one_line(message))
+
+
+def _escaped(character: str) -> str:
+    return character.encode("unicode_escape", "surrogatepass").decode("ascii")
+
+
+_SHORT = reprlib.Repr()
+_SHORT.maxlevel = 3
+_SHORT.maxstring = _SHORT.maxother = _SHORT.maxlong = 40

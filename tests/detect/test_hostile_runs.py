@@ -1,0 +1,131 @@
+"""Runs from strangers: what a file of steps or a link names is read only if it is in the run."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from camera import Camera
+from detect.cli import main
+from detect.errors import FrameError
+from detect.run import open_run, read_image
+
+STEP = "STEP {} 0 0 0 1e-6 0 1e-6 0 0 1e-6\n"
+
+
+@pytest.fixture
+def run(small_run: Path) -> Path:
+    """The small run, with an image of the right size beside it that is none of its business."""
+    first = next((small_run / "images").iterdir())
+    (small_run.parent / "secret.png").write_bytes(first.read_bytes())
+    return small_run
+
+
+@pytest.mark.parametrize(
+    ("prefix", "why"),
+    [
+        ("../../etc/passwd", "leads out"),
+        ("../secret", "leads out"),
+        ("../secret.png", "leads out"),
+        ("..\\secret.png", "leads out"),
+        ("images/../../secret", "leads out"),
+        ("images/../../s/../secret", "leads out"),
+        ("..", "leads out"),
+        ("/etc/passwd", "absolute"),
+        ("/s.0000", "absolute"),
+        ("C:\\s.0000", "absolute"),
+        ("\\\\server\\s.0000", "absolute"),
+        ("s.0000\0", "NUL"),
+        ("/dev/zero", "absolute"),
+        ("NUL", "device"),
+        ("images/con.jpg", "device"),
+        ("com1", "device"),
+    ],
+)
+def test_prefixes_do_not_lead_out(run: Path, prefix: str, why: str) -> None:
+    """One that does costs its frame, even where an image in the run has its last part's name."""
+    (run / "s.txt").write_text(STEP.format(prefix) + STEP.format("s.0000"))
+    (run / "images" / "secret.png").write_bytes((run / "images" / "s.0000.png").read_bytes())
+    opened = open_run(run)
+    refused, good = opened.frames
+    assert refused.image is None
+    with pytest.raises(FrameError, match=why) as refusal:
+        read_image(refused, opened.camera)
+    assert str(refusal.value).isprintable()
+    assert read_image(good, opened.camera).shape == (288, 768)
+
+
+@pytest.mark.parametrize(
+    "prefix", ["s.0000", "s.0000.png", "images/s.0000", "../s/images/s.0000", "images\\s.0000.png",
+               "./s.0000", "a..b/../s.0000", '"s.0000"'],
+)  # fmt: skip
+def test_prefixes_that_stay_are_followed(run: Path, prefix: str) -> None:
+    (run / "s.txt").write_text(STEP.format(prefix))
+    (frame,) = open_run(run).frames
+    assert frame.image == run / "images" / "s.0000.png"
+
+
+@pytest.mark.parametrize("odometry", [True, False])
+@pytest.mark.parametrize("target", ["../../secret.png", "/etc/passwd", "/dev/zero", "../../gone"])
+def test_links_do_not_lead_out(
+    run: Path, published_camera: Camera, target: str, odometry: bool
+) -> None:
+    if not odometry:
+        (run / "s.txt").unlink()
+    image = run / "images" / "s.0001.png"
+    image.unlink()
+    image.symlink_to(target)
+    frames = {frame.step.prefix: frame for frame in open_run(run).frames}
+    with pytest.raises(FrameError, match="link that leads out"):
+        read_image(frames["s.0001"], published_camera)
+    assert read_image(frames["s.0000"], published_camera).shape == (288, 768)
+
+
+def test_links_within_the_run_are_followed(run: Path, published_camera: Camera) -> None:
+    for number, target in ((1, "s.0000.png"), (2, "../images/s.0000.png")):
+        image = run / "images" / f"s.000{number}.png"
+        image.unlink()
+        image.symlink_to(target)
+    images = [read_image(frame, published_camera) for frame in open_run(run).frames]
+    np.testing.assert_array_equal(images[1], images[0])
+    np.testing.assert_array_equal(images[2], images[0])
+
+
+def test_a_folder_of_images_may_be_a_link(run: Path, published_camera: Camera) -> None:
+    """Whoever unpacks a data set on another disk sees that link: it is their own."""
+    (run / "images").rename(run.parent / "elsewhere")
+    (run / "images").symlink_to("../elsewhere")
+    for frame in open_run(run).frames:
+        assert read_image(frame, published_camera).shape == (288, 768)
+
+
+def test_nothing_but_files_is_read(run: Path, published_camera: Camera) -> None:
+    for number, make in enumerate((os.mkfifo, os.mkdir)):
+        image = run / "images" / f"s.000{number}.png"
+        image.unlink()
+        make(image)
+    first, second, third = open_run(run).frames
+    for frame in (first, second):
+        with pytest.raises(FrameError, match="cannot be read"):
+            read_image(frame, published_camera)
+    assert read_image(third, published_camera).shape == (288, 768)
+
+
+def test_names_that_a_terminal_would_act_upon_are_escaped(
+    run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    name = "s.0000\x1b[2J\x1b]0;owned\x07\u202e"
+    cv2.imwrite(str(run / "images" / f"{name}.png"), np.zeros((3, 3), np.uint8))
+    (run / "s.txt").write_text(STEP.format(name) + STEP.format("s.0000") + STEP.format("\x1b[31m"))
+    assert main(["circles", str(run), "--force"]) == 3
+    shown = capsys.readouterr()
+    for text in (shown.out, shown.err):
+        assert all(character.isprintable() or character in "\n\r\t" for character in text)
+    assert "\\x1b[31m" in shown.err
+    for path in run.glob("*.json"):
+        json.loads(path.read_text())
