@@ -142,9 +142,8 @@ class BagOdometry:
                         f"{self.name}: at {time_s:.6f} s: expected a finite pose with an "
                         "orientation and a finite covariance"
                     )
-                known = planar if planar.any() else None
                 theta = heading_rad(q.x, q.y, q.z, q.w)
-                yield TimedPose(time_s, float(p.x), float(p.y), theta, known)
+                yield TimedPose(time_s, float(p.x), float(p.y), theta, planar)
 
 
 @contextmanager
@@ -203,7 +202,7 @@ def messages(reader: AnyReader, path: Path, topic: str) -> Iterator[tuple[str, f
                 f"expected a whole bag (--frames takes the first images only)"
             ) from None
         number += 1
-        yield connection.msgtype, recorded_ns * 1e-9, message
+        yield connection.msgtype, recorded_ns / 1e9, message
 
 
 def chosen_topic(
@@ -252,7 +251,7 @@ def compressed_content(message: Any, name: object) -> bytes:
 def stamp_s(message: Any, recorded_s: float) -> float:
     """The time in a message's header (s); that of its recording where the header has none."""
     stamp = message.header.stamp
-    return (stamp.sec + 1e-9 * stamp.nanosec) if stamp.sec or stamp.nanosec else recorded_s
+    return (stamp.sec + stamp.nanosec / 1e9) if stamp.sec or stamp.nanosec else recorded_s
 
 
 def _one_line(error: Exception) -> str:

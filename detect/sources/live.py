@@ -167,6 +167,6 @@ def _open_camera(index: int) -> Capture:
     if not capture.isOpened():
         raise DetectError(
             f"camera:{index}: no camera of that number answers: "
-            "expected one that is plugged in and not in use (try camera:0)"
+            "expected one that is plugged in, in nobody else's use, and open to you (often camera:0)"
         )
     return capture

@@ -151,7 +151,7 @@ def _frames(source: Source, options: SourceOptions) -> tuple[SourceFrames, Path 
         raise DetectError(f"{source.name}: --times {options.times}: its images have their own")
     if wanted == "none":
         return SourceFrames(source), None
-    if wanted.startswith("/") and not Path(wanted).is_file():
+    if wanted.startswith("/") and not (Path(wanted).suffix or Path(wanted).exists()):
         poses = source.poses(wanted)
     elif wanted.endswith(".tum"):
         poses = TumTrajectory(Path(wanted), options.odometry_axes)

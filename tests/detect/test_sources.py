@@ -1,0 +1,258 @@
+"""The same images out of a folder, a pattern, a video: the same rows; and what is refused."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from camera import Camera
+from detect.cli import main
+from detect.errors import DetectError
+from detect.run import Run, read_image
+from detect.sources.opening import open_calibrated, open_source
+from detect.sources.options import SourceOptions
+from groundtruth.streams import read_times
+from landmarks import read_frames
+from tests.detect.recordings import write_video
+
+Captured = pytest.CaptureFixture[str]
+PREFIXES = ["s.0000", "s.0001", "s.0002"]
+
+
+def images_of(run: Path) -> list[np.ndarray]:
+    found = [cv2.imread(str(run / "images" / f"{p}.png"), cv2.IMREAD_GRAYSCALE) for p in PREFIXES]
+    return [np.asarray(image, np.uint8) for image in found if image is not None]
+
+
+def rows(path: Path) -> list[str]:
+    return [line for line in path.read_text().splitlines() if not line.startswith("#")]
+
+
+@pytest.fixture
+def video(small_run: Path, tmp_path: Path) -> Path:
+    path = tmp_path / "film" / "s.avi"
+    path.parent.mkdir()
+    shutil.copy(small_run / "s.cam", path.with_suffix(".cam"))
+    return write_video(path, images_of(small_run))
+
+
+@pytest.fixture
+def expected_rows(small_run: Path, tmp_path: Path) -> list[str]:
+    output = tmp_path / "expected.circles"
+    assert main(["circles", str(small_run), "-o", str(output)]) == 0
+    return rows(output)
+
+
+# -- video ----------------------------------------------------------------------------------
+
+
+def test_a_video_gives_the_rows_of_its_images(
+    small_run: Path, video: Path, expected_rows: list[str], capsys: Captured
+) -> None:
+    assert main(["circles", str(video), "--odometry", str(small_run / "s.txt")]) == 0
+    output = video.parent / "s.detected.circles"
+    assert f"{output}: 3 discs in 3 frames" in capsys.readouterr().out
+    assert rows(output) == expected_rows
+    times = read_times(f"{output}.times")
+    assert times == pytest.approx({p: 0.1 * k for k, p in enumerate(PREFIXES)}, abs=1e-6)
+
+
+def test_all_of_a_video_is_named_after_it(video: Path) -> None:
+    assert main(["all", str(video)]) == 0
+    names = sorted(path.name for path in video.parent.iterdir() if "log" not in path.name)
+    endings = ("detected.circles", "detected.circles.times", "detected.lines", "detected.tilt")
+    assert names == sorted(["s.avi", "s.cam", *(f"s.{ending}" for ending in endings)])
+    assert main(["all", str(video)]) == 1  # nothing is overwritten unasked
+
+
+def test_without_odometry_steps_are_zero(video: Path, expected_rows: list[str]) -> None:
+    assert main(["circles", str(video)]) == 0
+    found = list(read_frames(video.parent / "s.detected.circles"))
+    assert [frame.step.prefix for frame in found] == PREFIXES
+    assert all(frame.step.dx == frame.step.cxx == 0.0 for frame in found)
+    landmarks = [row for row in expected_rows if row.startswith("LANDMARK_C")]
+    written = rows(video.parent / "s.detected.circles")
+    assert [row for row in written if row.startswith("LANDMARK_C")] == landmarks
+
+
+def test_any_number_of_frames(video: Path) -> None:
+    run = open_calibrated(video, None, SourceOptions(frames=2))
+    assert run.frames.expected == 2
+    assert [frame.step.prefix for frame in run.frames] == PREFIXES[:2]
+    assert [frame.step.prefix for frame in run.frames] == PREFIXES[:2]  # begun anew
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("kind", ["video", "bag"])
+def test_workers_write_the_same_bytes(project_root: Path, tmp_path: Path, kind: str) -> None:
+    source = project_root / "images" / "e"
+    images = [
+        np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), np.uint8)
+        for path in sorted((source / "images").glob("*.jpg"))[:40]
+    ]
+    if kind == "video":
+        path = write_video(tmp_path / "e.avi", images)
+    else:
+        pytest.importorskip("rosbags")
+        from tests.detect.recordings import Ros, Said
+
+        ros = Ros()
+        said = [Said("/i", k, ros.image(image, "mono8", k)) for k, image in enumerate(images, 1)]
+        path = ros.write(tmp_path / "e", said)
+    arguments = ["all", str(path), "--camera", str(source / "e.cam")]
+    written = []
+    for jobs in (1, 2):
+        folder = tmp_path / f"jobs{jobs}"
+        folder.mkdir()
+        assert main([*arguments, "--jobs", str(jobs), "-o", str(folder)]) == 0
+        kinds = ("circles", "lines", "tilt", "circles.times")
+        written.append([(folder / f"detected.{kind}").read_bytes() for kind in kinds])
+    assert b"LANDMARK_C" in written[0][0]
+    assert written[0] == written[1]
+
+
+def test_a_video_of_another_size_is_refused_at_once(tmp_path: Path, small_run: Path) -> None:
+    path = write_video(tmp_path / "small.avi", [np.zeros((48, 64), np.uint8)] * 3)
+    told = r"is 64x48 px: expected 768x288, the calibration's size: name the calibration"
+    with pytest.raises(DetectError, match=told):
+        open_calibrated(path, small_run / "s.cam")
+
+
+def test_a_video_that_is_cut_off_says_so(video: Path, caplog: pytest.LogCaptureFixture) -> None:
+    content = video.read_bytes()
+    video.write_bytes(content[: int(0.6 * len(content))])
+    run = open_source(video, None, SourceOptions(odometry="none"))
+    with caplog.at_level("INFO", logger="redetect"):
+        count = len(list(run.frames))
+    assert count < 3
+    assert count == run.frames.expected or f"{count} of the" in caplog.text
+
+
+# -- images ---------------------------------------------------------------------------------
+
+
+def test_a_pattern_takes_what_it_matches(small_run: Path, expected_rows: list[str]) -> None:
+    pattern = small_run / "images" / "s.000[01].png"
+    assert main(["circles", str(pattern), "--odometry", str(small_run / "s.txt")]) == 3
+    assert rows(small_run / "detected.circles") == [
+        *expected_rows[: expected_rows.index(next(r for r in expected_rows if "s.0002" in r))],
+        next(row for row in expected_rows if "s.0002" in row),
+    ]
+
+
+def test_patterns_and_single_images(small_run: Path, published_camera: Camera) -> None:
+    pattern = open_source(small_run / "images" / "*1.png")
+    assert isinstance(pattern, Run)
+    assert pattern.camera == published_camera
+    (frame,) = pattern.frames
+    assert frame.step.prefix == "s.0001"
+    assert pattern.output("circles") == small_run / "detected.circles"
+    (alone,) = open_source(small_run / "images" / "s.0002.png").frames
+    assert alone.image == small_run / "images" / "s.0002.png"
+
+
+@pytest.mark.parametrize(
+    ("deep", "significant"), [(4095, 12), (1023, 10), (65535, 16), (200, 8), (0, 8)]
+)
+def test_deep_images_by_their_significant_bits(tmp_path: Path, deep: int, significant: int) -> None:
+    """The 8 highest of the bits that the images of a run use, the same for all of them."""
+    values = np.linspace(0, deep, 64 * 48).reshape(48, 64).astype(np.uint16)
+    assert cv2.imwrite(str(tmp_path / "a.png"), values)
+    assert cv2.imwrite(str(tmp_path / "b.tiff"), values // 3)
+    for frame, pixels in zip(open_source(tmp_path).frames, (values, values // 3)):
+        expected = pixels >> (significant - 8)
+        np.testing.assert_array_equal(read_image(frame, None), expected)
+
+
+def test_significant_bits_can_be_named(tmp_path: Path) -> None:
+    values = np.full((48, 64), 512, np.uint16)
+    assert cv2.imwrite(str(tmp_path / "a.pgm"), values)
+    (frame,) = open_source(tmp_path, None, SourceOptions(bits=11)).frames
+    assert np.all(read_image(frame, None) == 64)
+    (frame,) = open_source(tmp_path, None, SourceOptions(bits=9)).frames
+    with pytest.raises(ValueError, match="a value of 512 needs more than 9 bits"):
+        read_image(frame, None)
+
+
+def test_bits_that_there_cannot_be() -> None:
+    with pytest.raises(DetectError, match="bits is 17: expected 8 to 16"):
+        SourceOptions(bits=17)
+    with pytest.raises(DetectError, match="frames is -1"):
+        SourceOptions(frames=-1)
+
+
+# -- what a newcomer meets ------------------------------------------------------------------
+
+
+def no_video(tmp_path: Path, _: Path) -> list[str]:
+    (tmp_path / "notes.mp4").write_text("no video")
+    return [str(tmp_path / "notes.mp4")]
+
+
+REFUSED: dict[str, tuple[Callable[[Path, Path], list[str]], str]] = {
+    "nothing there": (
+        lambda tmp_path, run: [str(tmp_path / "gone")],
+        "no such folder or file: expected a run folder, a folder of images",
+    ),
+    "no video": (no_video, "no video that OpenCV can read: expected a run folder, images"),
+    "no calibration": (
+        lambda tmp_path, run: [str((run / "images").rename(tmp_path / "x") / "*.png")],
+        "no calibration: expected a .cam file beside the images, or one named by --camera",
+    ),
+    "no match": (lambda tmp_path, run: [str(run / "images" / "*.jpg")], "no image matches"),
+    "wildcards in folders": (
+        lambda tmp_path, run: [str(run / "*" / "a.png")],
+        "wildcards in the folder's name: expected them in the last part only",
+    ),
+    "no such camera": (
+        lambda tmp_path, run: ["camera:97", "--camera", str(run / "s.cam")],
+        "camera:97: no camera of that number answers",
+    ),
+    "topic without a bag": (
+        lambda tmp_path, run: [str(run), "--image-topic", "/i"],
+        "--image-topic /i: only bags have topics",
+    ),
+    "odometry topic without a bag": (
+        lambda tmp_path, run: [str(run), "--odometry", "/odom"],
+        "holds no topic /odom: only bags do",
+    ),
+    "no odometry": (
+        lambda tmp_path, run: [str(run), "--odometry", str(tmp_path / "gone.txt")],
+        "gone.txt: no such landmark file",
+    ),
+    "trajectory without times": (
+        lambda tmp_path, run: [str(run), "--odometry", str(tmp_path / "a.tum")],
+        "no times of the images: a trajectory needs them",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_refusals_tell_what_to_do(
+    small_run: Path, tmp_path: Path, capsys: Captured, case: str
+) -> None:
+    arguments, told = REFUSED[case]
+    assert main(["circles", *arguments(tmp_path, small_run)]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("error: ")
+    assert told in line
+
+
+def test_a_wrong_size_tells_what_to_do(small_run: Path, capsys: Captured) -> None:
+    cv2.imwrite(str(small_run / "images" / "s.0001.png"), np.zeros((48, 64), np.uint8))
+    assert main(["circles", str(small_run)]) == 3
+    assert "is 64x48 px: expected 768x288, the calibration's size: name" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", ["circles", "lines", "markers", "all"])
+def test_help_shows_an_example(command: str, capsys: Captured) -> None:
+    with pytest.raises(SystemExit):
+        main([command, "--help"])
+    shown = capsys.readouterr().out
+    assert f"Example: detect {command} images/" in " ".join(shown.split())
+    assert "--odometry" in shown

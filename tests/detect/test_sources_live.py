@@ -1,0 +1,156 @@
+"""A live camera, played by a capture that is none: its times, its end, its interrupt."""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from detect.cli import main
+from detect.run import read_image
+from detect.sources import live
+from detect.sources.opening import open_source
+from detect.sources.options import SourceOptions
+from groundtruth.streams import read_times
+from landmarks import read_frames
+
+
+class Played:
+    """Gives images one after the other, then again; or ends after some."""
+
+    def __init__(self, images: list[NDArray[np.uint8]], last: int | None, pause_s: float) -> None:
+        self.images, self.last, self.pause_s = images, last, pause_s
+        self.given = 0
+        self.released = threading.Event()
+
+    def read(self) -> tuple[bool, NDArray[Any] | None]:
+        assert not self.released.is_set()
+        time.sleep(self.pause_s)
+        if self.given == self.last:
+            return False, None
+        image = self.images[self.given % len(self.images)]
+        self.given += 1
+        return True, cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
+
+    def release(self) -> None:
+        self.released.set()
+
+
+Plugged = Callable[..., list[Played]]
+
+
+@pytest.fixture
+def plugged(monkeypatch: pytest.MonkeyPatch) -> Plugged:
+    """Plug a camera in; gives the captures that were opened."""
+
+    def plug(
+        images: list[NDArray[np.uint8]], last: int | None = None, pause_s: float = 0.002
+    ) -> list[Played]:
+        opened: list[Played] = []
+
+        def open_camera(index: int) -> Played:
+            assert index == 0
+            opened.append(Played(images, last, pause_s))
+            return opened[-1]
+
+        monkeypatch.setattr(live, "_open_camera", open_camera)
+        return opened
+
+    return plug
+
+
+def blank(value: int) -> NDArray[np.uint8]:
+    return np.full((288, 768), value, np.uint8)
+
+
+def test_so_many_frames_and_their_times(plugged: Plugged) -> None:
+    opened = plugged([blank(40), blank(80)])
+    before = time.time()
+    frames = list(open_source(Path("camera:0"), None, SourceOptions(frames=5)).frames)
+    assert [frame.step.prefix for frame in frames] == [f"camera0.{k:04d}" for k in range(5)]
+    times = [frame.time_s for frame in frames if frame.time_s is not None]
+    assert before < times[0] < times[-1] < time.time()
+    assert times == sorted(set(times))
+    assert {int(read_image(frame, None)[0, 0]) for frame in frames} <= {40, 80}
+    assert all(capture.released.is_set() for capture in opened)
+
+
+def test_what_there_is_no_time_for_is_passed_over(plugged: Plugged) -> None:
+    plugged([blank(value) for value in range(200)], pause_s=0.001)
+    seen = []
+    for frame in open_source(Path("camera:0"), None, SourceOptions(frames=4)).frames:
+        seen.append(int(read_image(frame, None)[0, 0]))
+        time.sleep(0.02)
+    assert np.all(np.diff(seen) > 1)
+
+
+def test_a_camera_that_ends(plugged: Plugged, caplog: pytest.LogCaptureFixture) -> None:
+    plugged([blank(1)], last=3, pause_s=0.03)
+    with caplog.at_level("INFO", logger="redetect"):
+        frames = list(open_source(Path("camera:0")).frames)
+    assert 1 <= len(frames) <= 3
+    assert "gives no more images" in caplog.text
+
+
+def test_a_silent_camera(
+    plugged: Plugged, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(live, "PATIENCE_S", 0.3)
+    plugged([blank(1)], pause_s=1.0)
+    with caplog.at_level("INFO", logger="redetect"):
+        assert list(open_source(Path("camera:0")).frames) == []
+    assert "no image came within 0.3 s" in caplog.text
+
+
+def test_an_interrupt_finishes_cleanly(
+    plugged: Plugged, small_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first interrupt ends the stream; what was seen is written, and the exit code is 0."""
+    image = cv2.imread(str(small_run / "images" / "s.0000.png"), cv2.IMREAD_GRAYSCALE)
+    assert image is not None
+    opened = plugged([np.asarray(image, np.uint8)])
+    output = tmp_path / "live.circles"
+    framed = live.LiveCamera.images
+
+    def interrupted(self: live.LiveCamera) -> Any:
+        for number, found in enumerate(framed(self)):
+            if number == 3:
+                signal.raise_signal(signal.SIGINT)
+            yield found
+
+    monkeypatch.setattr(live.LiveCamera, "images", interrupted)
+    before = signal.getsignal(signal.SIGINT)
+    arguments = ["circles", "camera:0", "--camera", str(small_run / "s.cam"), "-o", str(output)]
+    assert main(arguments) == 0
+    assert signal.getsignal(signal.SIGINT) is before
+    found = list(read_frames(output))
+    assert [len(frame.circles) for frame in found] == [2] * 4
+    assert list(read_times(f"{output}.times")) == [frame.step.prefix for frame in found]
+    assert all(capture.released.is_set() for capture in opened)
+
+
+def test_a_second_interrupt_is_meant(
+    plugged: Plugged, small_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plugged([blank(40)])
+    output = tmp_path / "live.circles"
+    framed = live.LiveCamera.images
+
+    def interrupted(self: live.LiveCamera) -> Any:
+        for found in framed(self):
+            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(signal.SIGINT)
+            yield found
+
+    monkeypatch.setattr(live.LiveCamera, "images", interrupted)
+    arguments = ["circles", "camera:0", "--camera", str(small_run / "s.cam"), "-o", str(output)]
+    assert main(arguments) == 130
+    assert not output.exists()

@@ -1,0 +1,204 @@
+"""Odometry laid over images: trajectories with times, files of STEP rows."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from detect.cli import main
+from detect.errors import DetectError
+from detect.run import RunFrames
+from detect.sources.interface import TimedPose
+from detect.sources.opening import open_source
+from detect.sources.options import SourceOptions
+from detect.sources.steps import movement_between, pose_between
+from detect.sources.times import TimesByImage, format_time
+from detect.sources.tum import TumTrajectory
+from groundtruth.streams import read_times
+from landmarks import read_frames
+
+PREFIXES = ["s.0000", "s.0001", "s.0002"]
+
+
+@pytest.fixture
+def timed_run(small_run: Path) -> Path:
+    """The small run, with the times of its images."""
+    rows = [format_time(prefix, 100.0 + 0.5 * k) for k, prefix in enumerate(PREFIXES)]
+    (small_run / "s.times").write_text("# times\n" + "\n".join(rows) + "\n")
+    return small_run
+
+
+def tum_row(time_s: float, x: float, y: float, theta: float) -> str:
+    qz, qw = math.sin(theta / 2), math.cos(theta / 2)
+    return f"{time_s:.6f} {x:.6f} {y:.6f} 0.5 0 0 {qz:.9f} {qw:.9f}\n"
+
+
+@pytest.mark.parametrize("axes", ["robotics", "dataset"])
+def test_a_trajectory_gives_the_steps(timed_run: Path, tmp_path: Path, axes: str) -> None:
+    """A drive 0.3 m forward and 0.1 m to the left, then turning by 0.2 rad on the spot."""
+    heading = 0.7
+    forward = np.array([math.cos(heading), math.sin(heading)])
+    left = np.array([-forward[1], forward[0]])
+    places = [np.zeros(2), 0.3 * forward + 0.1 * left, 0.3 * forward + 0.1 * left]
+    turn = 0.5 * math.pi if axes == "dataset" else 0.0  # the data set's X points left
+    headings = [heading, heading, heading + 0.2]
+    trajectory = tmp_path / "drive.tum"
+    trajectory.write_text(
+        "# t x y z qx qy qz qw\n"
+        + "".join(
+            tum_row(100.0 + 0.5 * k, place[0], place[1], theta + turn)
+            for k, (place, theta) in enumerate(zip(places, headings))
+        )
+    )
+    arguments = ["circles", str(timed_run), "--odometry", str(trajectory), "--odometry-axes", axes]
+    assert main(arguments) == 0
+    output = timed_run / "detected.circles"
+    first, second, third = (frame.step for frame in read_frames(output))
+    assert (first.dx, first.dy, first.dphi) == (0.0, 0.0, 0.0)
+    assert (second.dx, second.dy, second.dphi) == pytest.approx((0.1, -0.3, 0.0), abs=1e-5)
+    assert (third.dx, third.dy, third.dphi) == pytest.approx((0.0, 0.0, 0.2), abs=1e-5)
+    assert "odometry: drive.tum" in output.read_text()
+    assert read_times(f"{output}.times") == read_times(timed_run / "s.times")
+
+
+def test_times_can_be_named(timed_run: Path, tmp_path: Path) -> None:
+    (timed_run / "s.times").rename(tmp_path / "x.times")
+    trajectory = tmp_path / "a.tum"
+    trajectory.write_text(tum_row(100.0, 0, 0, 0) + tum_row(100.6, 0.6, 0, 0))
+    options = SourceOptions(odometry=str(trajectory), times=str(tmp_path / "x.times"))
+    run = open_source(timed_run, None, options)
+    frames = list(run.frames)
+    assert [frame.step.prefix for frame in frames] == PREFIXES[:2]  # 101 s: the path has ended
+    assert frames[1].step.dy == pytest.approx(-0.5)
+    assert run.images_without_step == 1
+    assert list(run.frames)[1].step == frames[1].step  # begun anew
+    assert run.images_without_step == 1
+
+
+def test_a_run_folder_as_it_is_has_no_times_file(timed_run: Path) -> None:
+    """What the data set's folders give is what it always was."""
+    assert main(["circles", str(timed_run)]) == 0
+    assert not (timed_run / "detected.circles.times").exists()
+    assert isinstance(open_source(timed_run).frames, RunFrames)
+
+
+def test_rows_in_another_order_are_refused(small_run: Path, tmp_path: Path) -> None:
+    rows = [r for r in (small_run / "s.txt").read_text().splitlines() if r.startswith("STEP")]
+    swapped = tmp_path / "swapped.txt"
+    swapped.write_text("\n".join([rows[1], rows[0], rows[2]]) + "\n")
+    run = open_source(small_run, None, SourceOptions(odometry=str(swapped)))
+    with pytest.raises(DetectError, match=r"the row of s\.0001 stands too early"):
+        list(run.frames)
+
+
+def test_rows_and_images_without_each_other(small_run: Path, tmp_path: Path) -> None:
+    rows = [r for r in (small_run / "s.txt").read_text().splitlines() if r.startswith("STEP")]
+    other = tmp_path / "other.txt"
+    other.write_text("\n".join([rows[0], rows[1].replace("s.0001", "t.0001"), rows[2]]) + "\n")
+    run = open_source(small_run, None, SourceOptions(odometry=str(other)))
+    frames = list(run.frames)
+    assert [frame.step.prefix for frame in frames] == ["s.0000", "t.0001", "s.0002"]
+    assert [frame.image is None for frame in frames] == [False, True, False]
+    assert run.images_without_step == 1
+
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        ("1 2 3\n", r"a\.tum:1: '1 2 3': expected 8 numbers: t x y z qx qy qz qw"),
+        ("# head\n1 0 0 0 0 0 0 nan\n", r"a\.tum:2: .*expected 8 numbers"),
+        ("1 0 0 0 0 0 0 2\n", r"a\.tum:1: qx qy qz qw: expected a unit quaternion"),
+        ("", r"a\.tum: no pose in it: expected odometry"),
+        (tum_row(100.1, 0, 0, 0) + tum_row(100, 0, 0, 0), "stands after that of 100.1"),
+    ],
+)
+def test_malformed_trajectories(timed_run: Path, tmp_path: Path, content: str, told: str) -> None:
+    path = tmp_path / "a.tum"
+    path.write_text(content)
+    run = open_source(timed_run, None, SourceOptions(odometry=str(path)))
+    with pytest.raises(DetectError, match=told):
+        list(run.frames)
+
+
+def test_a_missing_trajectory(timed_run: Path, tmp_path: Path) -> None:
+    run = open_source(timed_run, None, SourceOptions(odometry=str(tmp_path / "gone.tum")))
+    with pytest.raises(DetectError, match="no such TUM trajectory"):
+        list(run.frames)
+
+
+@pytest.mark.parametrize("content", ["s.0000\n", "s.0000 1 2\n", "s.0000 inf\n", "s.0000 x\n"])
+def test_malformed_times(tmp_path: Path, content: str) -> None:
+    (tmp_path / "a.times").write_text("# head\n" + content)
+    with pytest.raises(DetectError, match=r"a\.times:2: .*expected an image's prefix and seconds"):
+        TimesByImage(tmp_path / "a.times")
+
+
+def test_headings_of_quaternions(tmp_path: Path) -> None:
+    """Of a robot that is pitched too, the heading is where its X axis points from above."""
+    pitch, yaw = 0.3, 2.0
+    qw, qx = math.cos(pitch / 2) * math.cos(yaw / 2), -math.sin(pitch / 2) * math.sin(yaw / 2)
+    qy, qz = math.sin(pitch / 2) * math.cos(yaw / 2), math.cos(pitch / 2) * math.sin(yaw / 2)
+    path = tmp_path / "a.tum"
+    path.write_text(f"1 0 0 0 {qx} {qy} {qz} {qw}\n")
+    (pose,) = TumTrajectory(path)
+    assert pose.theta == pytest.approx(yaw)
+
+
+# -- laws -----------------------------------------------------------------------------------
+
+finite = st.floats(-50.0, 50.0)
+angle = st.floats(-3.0, 3.0)
+poses = st.builds(TimedPose, st.just(0.0), finite, finite, angle)
+
+
+@given(poses, poses)
+def test_movements_lead_from_one_pose_to_the_other(before: TimedPose, after: TimedPose) -> None:
+    left, backward, turn = movement_between(before, after).pose
+    forward = -backward
+    x = before.x + math.cos(before.theta) * forward - math.sin(before.theta) * left
+    y = before.y + math.sin(before.theta) * forward + math.cos(before.theta) * left
+    assert (x, y) == pytest.approx((after.x, after.y), abs=1e-9)
+    assert math.cos(before.theta + turn - after.theta) == pytest.approx(1.0)
+
+
+def test_a_movements_covariance_is_what_random_drives_show() -> None:
+    """Monte Carlo: poses scatter as odometry lets them; the step between as is said of it."""
+    rng = np.random.default_rng(11)
+    count = 200_000
+    start_covariance = np.array([[4e-4, 1e-4, 5e-5], [1e-4, 2e-4, -3e-5], [5e-5, -3e-5, 3e-4]])
+    step_covariance = np.array([[3e-4, -5e-5, 2e-5], [-5e-5, 1e-4, 1e-5], [2e-5, 1e-5, 2e-4]])
+    start, step = np.array([1.0, 2.0, 0.8]), np.array([0.5, 0.1, 0.3])  # forward, left, turn
+    starts = rng.multivariate_normal(start, start_covariance, count)
+    steps = rng.multivariate_normal(step, step_covariance, count)
+    cos, sin = np.cos(starts[:, 2]), np.sin(starts[:, 2])
+    ends = starts + np.column_stack(
+        [
+            cos * steps[:, 0] - sin * steps[:, 1],
+            sin * steps[:, 0] + cos * steps[:, 1],
+            steps[:, 2],
+        ]
+    )
+    before = TimedPose(0.0, start[0], start[1], start[2], np.cov(starts.T))
+    end = ends.mean(axis=0)
+    after = TimedPose(1.0, end[0], end[1], end[2], np.cov(ends.T))
+    found = movement_between(before, after).covariance
+    assert found is not None
+    to_dataset = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    expected = to_dataset @ step_covariance @ to_dataset.T
+    np.testing.assert_allclose(found, expected, atol=8e-6)
+
+
+@given(st.floats(0.0, 1.0), poses, poses)
+def test_poses_between_are_between(share: float, before: TimedPose, after: TimedPose) -> None:
+    first = TimedPose(5.0, before.x, before.y, before.theta)
+    second = TimedPose(7.0, after.x, after.y, after.theta)
+    pose = pose_between(first, second, 5.0 + 2.0 * share)
+    assert pose.x == pytest.approx((1 - share) * before.x + share * after.x, abs=1e-9)
+    turned = abs(math.remainder(pose.theta - before.theta, 2 * math.pi))
+    whole = abs(math.remainder(after.theta - before.theta, 2 * math.pi))
+    assert turned <= whole + 1e-9
