@@ -46,7 +46,7 @@ def claimed_size(content: bytes) -> tuple[int, int] | None:
             return _tiff_size(content)
         found = _PNM.match(content[:_PNM_HEADER_BYTES])
         return None if found is None else (int(found[1]), int(found[2]))
-    except (struct.error, IndexError):  # the header ends too early
+    except (struct.error, IndexError, OverflowError):  # ends early, or points far away
         return None
 
 

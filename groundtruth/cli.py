@@ -20,6 +20,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg, subcommand
 
 from groundtruth.options import Fuse, Laser, Lasers, Report, Sync, Validate
 from groundtruth.settings import NetworkSettings, PoseSettings, RigSettings
+from storage.messages import one_line
 
 # For `X | None` tyro imports another library that takes a tenth of a second.
 MaybePath = Optional[Path]  # noqa: UP045
@@ -230,5 +231,5 @@ def main(arguments: list[str] | None = None) -> int:
         print("interrupted", file=sys.stderr)
         return 130
     except (ValueError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {one_line(str(error))}", file=sys.stderr)
         return EXIT_ERROR

@@ -92,10 +92,13 @@ def read_tilts(path: str | os.PathLike[str]) -> dict[str, FrameTilt]:
 def iterate_tilts(path: str | os.PathLike[str]) -> Iterator[FrameTilt]:
     """Read a tilt file row by row; parameters and errors are those of `read_tilts`."""
     try:
-        with Path(path).open(encoding="utf-8", errors="surrogateescape") as stream:
-            for number, line in enumerate(stream, start=1):
-                if len(line) > _LARGEST_ROW:
+        with Path(path).open("rb") as stream:
+            number = 0
+            while source := stream.readline(_LARGEST_ROW + 1):
+                number += 1
+                if len(source) > _LARGEST_ROW:
                     raise LandmarkFileError(str(path), number, "the row is too long")
+                line = source.decode("utf-8", "surrogateescape")
                 words = line.partition("#")[0].split()
                 if not words or words[0] == "NOTILT":
                     continue
@@ -117,7 +120,7 @@ def _tilt(words: list[str], name: str, number: int) -> FrameTilt:
         lines = int(words[7])
     except ValueError:
         values, lines = [math.nan], 0
-    if not all(math.isfinite(value) for value in values):
+    if not all(math.isfinite(value) for value in values) or not 0 <= lines < 1 << 31:
         raise LandmarkFileError(name, number, "expected 5 finite numbers and a whole one")
     pitch, roll, cpp, cpr, crr = values
     if not (cpp > 0.0 and crr > 0.0 and cpp * crr > cpr * cpr):

@@ -17,6 +17,7 @@ import tyro
 from tyro.conf import arg, subcommand
 
 from slam.options import Associate, Command, Ekf, Export, Import, Localize, Map, Noise
+from storage.messages import one_line
 
 EXIT_ERROR = 1
 EXIT_INTERRUPTED = 130
@@ -58,7 +59,7 @@ def main(arguments: list[str] | None = None) -> int:
         print("interrupted", file=sys.stderr)
         return EXIT_INTERRUPTED
     except (ValueError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {one_line(str(error))}", file=sys.stderr)
         return EXIT_ERROR
 
 
