@@ -22,6 +22,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg, subcommand
 from detect.compare_result import CompareOptions
 from detect.conduct import ConductOptions
 from detect.errors import WorkerError
+from detect.exports.options import Export
 from detect.interrupts import interrupts_noted
 from detect.line_settings import PRESETS as LINE_PRESETS
 from detect.line_settings import LineSettings
@@ -292,7 +293,7 @@ class Compare:
     options: OmitArgPrefixes[CompareOptions] = field(default_factory=CompareOptions)
 
 
-Command = Circles | Lines | Markers | All | Compare | Draw | Tune
+Command = Circles | Lines | Markers | All | Compare | Export | Draw | Tune
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -348,6 +349,7 @@ def _parsed(given: list[str]) -> Command:
                 subcommand("all", default=All(run=tyro.MISSING, circles=circles, lines=lines)),
             ]
             | Annotated[Compare, subcommand("compare")]
+            | Annotated[Export, subcommand("export")]
             | Annotated[Draw, subcommand("draw")]
             | Annotated[Tune, subcommand("tune")],
             arg(name=""),

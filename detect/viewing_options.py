@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, Optional
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from detect.compare_result import CompareOptions
+from detect.exports.options import Export
 from detect.line_settings import LineSettings
 from detect.settings import CircleSettings
 from detect.sources.options import SourceOptions
@@ -280,6 +281,7 @@ class Tune:
 #: The module whose `perform` carries a command out.
 PERFORMED_BY: dict[type, str] = {
     Draw: "detect.draw_command",
+    Export: "detect.exports.command",
     View: "detect.view_command",
     Report: "detect.report_command",
     Tune: "detect.tune_command",

@@ -91,6 +91,12 @@ def read_tilts(path: str | os.PathLike[str]) -> dict[str, FrameTilt]:
 
 def iterate_tilts(path: str | os.PathLike[str]) -> Iterator[FrameTilt]:
     """Read a tilt file row by row; parameters and errors are those of `read_tilts`."""
+    return (tilt for _, tilt in numbered_tilts(path))
+
+
+def numbered_tilts(path: str | os.PathLike[str]) -> Iterator[tuple[int, FrameTilt]]:
+    """The tilts of a file with the numbers of their frames, counted from 0; see `read_tilts`."""
+    frame = -1
     try:
         with Path(path).open("rb") as stream:
             number = 0
@@ -100,9 +106,11 @@ def iterate_tilts(path: str | os.PathLike[str]) -> Iterator[FrameTilt]:
                     raise LandmarkFileError(str(path), number, "the row is too long")
                 line = source.decode("utf-8", "surrogateescape")
                 words = line.partition("#")[0].split()
-                if not words or words[0] == "NOTILT":
+                if not words:
                     continue
-                yield _tilt(words, str(path), number)
+                frame += 1
+                if words[0] != "NOTILT":
+                    yield frame, _tilt(words, str(path), number)
     except FileNotFoundError:
         raise LandmarkFileError(str(path), None, "no such tilt file") from None
     except OSError as error:

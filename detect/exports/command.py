@@ -1,0 +1,75 @@
+"""What ``detect export`` does."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from detect.errors import DetectError
+from detect.exports.csv_file import write_csv
+from detect.exports.mcap_file import write_mcap
+from detect.exports.options import Export
+from detect.exports.parquet_file import demand_pyarrow, write_parquet
+from detect.exports.rows import ExportedRows
+from detect.sources.times import TimesByImage
+from landmarks.columns import TableName
+from storage import OutputExistsError, write_whole
+
+
+def perform(command: Export) -> int:
+    """Export a file; returns the exit code.
+
+    Raises
+    ------
+    DetectError
+        If times are needed and there are none, or a package is not installed.
+    landmarks.LandmarkFileError
+        If the file cannot be read.
+    storage.OutputExistsError
+        If an output exists and must not be replaced.
+    """
+    rows = ExportedRows(command.file, _times(command), command.rate_hz)
+    output = command.output
+    if output is None:
+        output = command.file.with_name(f"{command.file.name}.{command.to}")
+    if command.to == "parquet":
+        demand_pyarrow()
+    tables = rows.tables()
+    if not tables:
+        raise DetectError(f"{command.file}: no rows in it: expected STEP, LANDMARK or TILT rows")
+    if command.to == "mcap":
+        with write_whole(output, overwrite=command.force) as stream:
+            count = write_mcap(stream, tables, rows, str(command.file))
+        print(f"{output}: {count} messages")
+        return 0
+    places = table_files(output, tables)
+    for path in places.values():
+        if path.exists() and not command.force:
+            raise OutputExistsError(path)
+    for table, path in places.items():
+        with write_whole(path, overwrite=command.force) as stream:
+            if command.to == "csv":
+                count = write_csv(stream, table, rows)
+            else:
+                count = write_parquet(stream, table, rows, command.file.name)
+        print(f"{path}: {count} rows")
+    return 0
+
+
+def table_files(output: Path, tables: list[TableName]) -> dict[TableName, Path]:
+    """Which file each table goes to: the first one to `output`, others beside it.
+
+    Steps are never first where there is anything else.
+    """
+    order = sorted(tables, key=lambda table: table == "steps")
+    first, *others = order
+    beside = {table: output.with_name(f"{output.stem}.{table}{output.suffix}") for table in others}
+    return {first: output, **beside}
+
+
+def _times(command: Export) -> TimesByImage | None:
+    if command.times is not None:
+        return TimesByImage(command.times)
+    beside = command.file.with_name(f"{command.file.name}.times")
+    if command.rate_hz is None and beside.is_file():
+        return TimesByImage(beside)
+    return None

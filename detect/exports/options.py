@@ -1,0 +1,48 @@
+"""The flags of ``detect export``. Nothing heavy is imported: `--help` needs them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal, Optional
+
+from tyro.conf import Positional, arg
+
+Format = Literal["csv", "parquet", "mcap"]
+
+# For `X | None` tyro imports another library that takes a tenth of a second.
+MaybePath = Optional[Path]  # noqa: UP045
+MaybeFloat = Optional[float]  # noqa: UP045
+
+
+@dataclass(frozen=True)
+class Export:
+    """Write the rows of a file in another format, with named columns and units.
+
+    Example: detect export images/e/map.circles --to csv -o /tmp/discs.csv, or:
+    detect export drive.detected.circles --to mcap
+
+    Parameters
+    ----------
+    file : Path
+        A .circles, .lines, .markers or .tilt file, or one of STEP rows.
+    to : str
+        csv, with a line of names and units; parquet (extra [parquet]); or mcap, messages of ROS 2
+        (extra [bags]).
+    output : Path
+        The file to write; by default the file's name and the format's. The steps go beside it, as
+        .steps.csv or .steps.parquet; MCAP has all in one.
+    times : Path
+        Times of the frames, rows `prefix seconds`; by default the file's name and .times.
+    rate_hz : float
+        Without times: so many frames in a second, the first at 0 s. MCAP needs one or the other.
+    force : bool
+        Replace existing files.
+    """
+
+    file: Positional[Path]
+    to: Format = "csv"
+    output: Annotated[MaybePath, arg(aliases=["-o"])] = None
+    times: MaybePath = None
+    rate_hz: MaybeFloat = None
+    force: bool = False
