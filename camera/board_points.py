@@ -1,0 +1,283 @@
+"""Points of a board in an image (OpenCV)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from camera.board import Board
+from camera.errors import CalibrationError
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+GreyImage = NDArray[np.uint8]
+
+# Half the side of the window round a corner, as a share of the least distance between corners.
+_WINDOW = 0.3
+_SMALLEST_HALF_WINDOW = 2
+_LARGEST_HALF_WINDOW = 9
+_FEWEST_POINTS = 8
+
+
+def find_board(image: GreyImage, board: Board) -> tuple[IntArray, FloatArray]:
+    """Find a board's points in an image.
+
+    Parameters
+    ----------
+    image : (H, W) uint8 array
+    board : Board
+
+    Returns
+    -------
+    indices : (K,) int64 array
+        Which of `Board.points`; ascending.
+    pixels : (K, 2) array
+        Where they are (the top left pixel's centre is 0, 0).
+
+    Raises
+    ------
+    CalibrationError
+        If the board is not there, or too little of a ChArUco board is.
+    """
+    if board.kind == "charuco":
+        return _charuco(image, board)
+    find = _checkerboard if board.kind == "checkerboard" else _circles
+    grid = find(image, board)
+    return np.arange(board.columns * board.rows), grid.reshape(-1, 2)
+
+
+def _not_found(board: Board) -> CalibrationError:
+    return CalibrationError(
+        f"no {board} in the image: is all of it visible, with a white border, sharp and evenly "
+        "lit, and are --columns and --rows right?"
+    )
+
+
+def _checkerboard(image: GreyImage, board: Board) -> FloatArray:
+    import cv2
+
+    size = (board.columns, board.rows)
+    found, corners = cv2.findChessboardCorners(image, size)
+    if not found:
+        found, corners = _checkerboard_stretched(image, size)
+    if not found:
+        raise _not_found(board)
+    grid = np.asarray(corners, dtype=np.float32).reshape(board.rows, board.columns, 2)
+    return _in_order(image, _refined(image, grid))
+
+
+def _checkerboard_stretched(image: GreyImage, size: tuple[int, int]) -> tuple[bool, FloatArray]:
+    """Look again in an image of twice the height: half-height images flatten the squares."""
+    import cv2
+
+    height, width = image.shape
+    taller = cv2.resize(image, (width, 2 * height), interpolation=cv2.INTER_LINEAR)
+    found, corners = cv2.findChessboardCorners(taller, size)
+    if not found:
+        return False, np.empty(0)
+    # Row v of the image is at 2 v + 0.5 of the taller one.
+    upright = np.asarray(corners, dtype=np.float64).reshape(-1, 2)
+    return True, np.column_stack([upright[:, 0], 0.5 * (upright[:, 1] - 0.5)])
+
+
+def _refined(image: GreyImage, grid: NDArray[np.float32], share: float = _WINDOW) -> FloatArray:
+    """Saddle points, from as much round each as holds nothing else.
+
+    The window is small, and a corner's own: a larger one follows the lens's bending of the edges,
+    and one that reaches the next corner is drawn to it. Corners that are NaN stay so.
+    """
+    import cv2
+
+    half = np.clip(
+        np.rint(share * _spacing(grid)), _SMALLEST_HALF_WINDOW, _LARGEST_HALF_WINDOW
+    ).astype(int)
+    stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 100, 1e-4)
+    refined = np.full(grid.shape, np.nan)
+    present = np.isfinite(grid[..., 0])
+    for size in np.unique(half[present], axis=0):
+        chosen = np.all(half == size, axis=-1) & present
+        corners = np.ascontiguousarray(grid[chosen].reshape(-1, 1, 2))
+        window = (int(size[0]), int(size[1]))
+        found = cv2.cornerSubPix(image, corners, window, (-1, -1), stop)
+        refined[chosen] = np.asarray(found, dtype=np.float64).reshape(-1, 2)
+    return refined
+
+
+def _spacing(grid: NDArray[np.float32]) -> FloatArray:
+    """(rows, columns, 2) extent of a square at each corner along u and v, pixels."""
+    extent = np.full((*grid.shape, 2), np.inf)
+    for axis in (0, 1):
+        step = np.abs(np.diff(grid, axis=axis))
+        step = np.where(np.isfinite(step), step, np.inf)
+        ahead: list[slice] = [slice(None), slice(None)]
+        behind: list[slice] = [slice(None), slice(None)]
+        ahead[axis], behind[axis] = slice(None, -1), slice(1, None)
+        for where in (tuple(ahead), tuple(behind)):
+            extent[(*where, slice(None), axis)] = np.minimum(
+                extent[(*where, slice(None), axis)], step
+            )
+    # A corner without neighbours gets the smallest windows.
+    extent = np.where(np.isfinite(extent), extent, 0.0)
+    return np.asarray(extent.max(axis=-1))
+
+
+def _in_order(image: GreyImage, grid: FloatArray) -> FloatArray:
+    """Bring a (rows, columns, 2) grid of corners into the board's own order.
+
+    The board is seen from its printed side, so right x down points into the image; and the square
+    right below the first corner is black, as the one beyond it is. A board that looks the same
+    turned begins in the image's upper left.
+    """
+    grid = _from_the_front(grid)
+    centres = 0.25 * (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:])
+    columns = np.clip(np.rint(centres[..., 0]).astype(int), 0, image.shape[1] - 1)
+    rows = np.clip(np.rint(centres[..., 1]).astype(int), 0, image.shape[0] - 1)
+    grey = image[rows, columns].astype(np.float64)
+    even = np.add.outer(np.arange(grey.shape[0]), np.arange(grey.shape[1])) % 2 == 0
+    if grey[even].mean() > grey[~even].mean():
+        grid = grid[::-1, ::-1]
+    return np.ascontiguousarray(grid)
+
+
+def _from_the_front(grid: FloatArray) -> FloatArray:
+    right = grid[:, -1] - grid[:, 0]
+    down = grid[-1] - grid[0]
+    if np.sum(right[:, 0]) * np.sum(down[:, 1]) < np.sum(right[:, 1]) * np.sum(down[:, 0]):
+        return grid[:, ::-1]
+    return grid
+
+
+def _charuco(image: GreyImage, board: Board) -> tuple[IntArray, FloatArray]:
+    import cv2
+
+    number = getattr(cv2.aruco, board.dictionary, None)
+    if not board.dictionary.startswith("DICT_") or number is None:
+        raise CalibrationError(
+            f"dictionary {board.dictionary!r} is unknown: expected a name of OpenCV's, such as "
+            "DICT_5X5_100"
+        )
+    pattern = cv2.aruco.CharucoBoard(
+        (board.columns, board.rows),
+        board.square_m,
+        board.marker_m,
+        cv2.aruco.getPredefinedDictionary(number),
+    )
+    try:
+        corners, identities, _, _ = cv2.aruco.CharucoDetector(pattern).detectBoard(image)
+    except cv2.error as error:
+        raise CalibrationError(f"no {board} in the image: OpenCV says {error.err}") from None
+    if identities is None or len(identities) < _FEWEST_POINTS:
+        seen = 0 if identities is None else len(identities)
+        raise CalibrationError(
+            f"{seen} corners of a {board} in the image: expected at least {_FEWEST_POINTS}; is "
+            f"--dictionary {board.dictionary} right?"
+        )
+    indices = np.asarray(identities, dtype=np.int64).ravel()
+    found = np.asarray(corners, dtype=np.float32).reshape(-1, 2)
+    order = np.argsort(indices)
+    indices, found = indices[order], found[order]
+    columns = board.columns - 1
+    grid = np.full((board.rows - 1, columns, 2), np.nan, dtype=np.float32)
+    grid[indices // columns, indices % columns] = found
+    # The window must not reach the markers in the white squares.
+    share = min(_WINDOW, 0.5 * (1.0 - board.marker_m / board.square_m))
+    fine = _refined(image, grid, share)[indices // columns, indices % columns]
+    # A corner that wandered off was not one, or its squares are too blurred.
+    room = np.maximum(_WINDOW * _spacing(grid), 1.0)[indices // columns, indices % columns]
+    kept = np.all(np.abs(fine - found) <= room, axis=1)
+    return indices[kept], fine[kept]
+
+
+def _least_spacing(grid: NDArray[np.float32]) -> float:
+    """Least distance of neighbours that were both seen, pixels."""
+    steps = np.concatenate(
+        [np.linalg.norm(np.diff(grid, axis=axis), axis=-1).ravel() for axis in (0, 1)]
+    )
+    steps = steps[np.isfinite(steps)]
+    return float(steps.min()) if len(steps) else 10.0
+
+
+def _circles(image: GreyImage, board: Board) -> FloatArray:
+    import cv2
+
+    flag = (
+        cv2.CALIB_CB_ASYMMETRIC_GRID
+        if board.kind == "asymmetric-circles"
+        else cv2.CALIB_CB_SYMMETRIC_GRID
+    )
+    size = (board.columns, board.rows)
+    # Clustering bears more perspective, the plain search more clutter; and light circles on a
+    # dark ground are dark ones in the negative.
+    for negative in (False, True):
+        picture = 255 - image if negative else image
+        for extra in (0, cv2.CALIB_CB_CLUSTERING):
+            found, centres = cv2.findCirclesGrid(picture, size, flags=flag | extra)
+            if found:
+                grid = np.asarray(centres, dtype=np.float64).reshape(board.rows, board.columns, 2)
+                if board.kind == "circles":
+                    grid = _from_the_front(grid)
+                return circle_centroids(picture, grid)
+    raise _not_found(board)
+
+
+def circle_centroids(image: GreyImage, grid: FloatArray) -> FloatArray:
+    """Centroids of dark circles near given places, weighted by how dark each pixel is.
+
+    Parameters
+    ----------
+    image : (H, W) uint8 array
+    grid : (rows, columns, 2) array
+        Where the circles are, to within their radii.
+
+    Returns
+    -------
+    (rows, columns, 2) array
+        The area centroid of each; a place where there is no circle to measure stays as it is.
+    """
+    import cv2
+
+    spacing = _least_spacing(grid.astype(np.float32))
+    result = grid.copy()
+    for index in np.ndindex(grid.shape[:2]):
+        # Twice, because the first window is round the finder's centre.
+        for _ in range(2):
+            moved = _centroid(image, result[index], 0.5 * spacing, cv2)
+            if moved is None:
+                break
+            result[index] = moved
+    return result
+
+
+def _centroid(image: GreyImage, at: FloatArray, reach: float, cv2: object) -> FloatArray | None:
+    """Centroid of the dark blob in the square window round `at`; None where there is none."""
+    half = max(int(reach), 3)
+    u, v = int(np.rint(at[0])), int(np.rint(at[1]))
+    top, left = max(v - half, 0), max(u - half, 0)
+    window = image[top : v + half + 1, left : u + half + 1].astype(np.float64)
+    if min(window.shape) < 5:
+        return None
+    light = np.percentile(window, 90.0)
+    dark = float(image[min(max(v, 0), image.shape[0] - 1), min(max(u, 0), image.shape[1] - 1)])
+    if light - dark < 20.0:
+        return None
+    # Paper and ink are flat; only the circle's edge, where a pixel holds both, counts in part.
+    weight = np.clip((light - window) / (light - dark), 0.0, 1.0)
+    weight[weight < 0.15] = 0.0
+    connected = _blob(weight, v - top, u - left, cv2)
+    if connected is None:
+        return None
+    weight = np.where(connected, weight, 0.0)
+    total = weight.sum()
+    rows, columns = np.mgrid[top : top + window.shape[0], left : left + window.shape[1]]
+    return np.array([np.sum(weight * columns) / total, np.sum(weight * rows) / total])
+
+
+def _blob(weight: FloatArray, row: int, column: int, cv2: object) -> NDArray[np.bool_] | None:
+    """The blob at a place of the window, if it does not touch the window's edge."""
+    mask = (weight > 0.0).astype(np.uint8)
+    if not (0 <= row < mask.shape[0] and 0 <= column < mask.shape[1]) or not mask[row, column]:
+        return None
+    _, labels = cv2.connectedComponents(mask, connectivity=4)  # type: ignore[attr-defined]
+    blob = np.asarray(labels == labels[row, column])
+    edge = blob[0].any() or blob[-1].any() or blob[:, 0].any() or blob[:, -1].any()
+    return None if edge else blob

@@ -1,0 +1,115 @@
+"""Pictures for a calibration: photographs, folders of them, or a video."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from camera.errors import CalibrationError
+
+GreyImage = NDArray[np.uint8]
+
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".pgm", ".ppm", ".bmp", ".tif", ".tiff")
+VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".mjpeg")
+
+
+def calibration_images(
+    inputs: Sequence[Path], every: int, most: int
+) -> Iterator[tuple[str, GreyImage]]:
+    """Names and pictures, grey, one after the other.
+
+    Parameters
+    ----------
+    inputs : sequence of Path
+        Images, folders of images, videos.
+    every : int
+        Of a video every so many-th frame is taken.
+    most : int
+        At most so many pictures are taken, evenly over all.
+
+    Raises
+    ------
+    CalibrationError
+        If there are none, or one cannot be read.
+    """
+    if every < 1 or most < 1:
+        raise CalibrationError(f"--every {every} and --max-images {most}: expected 1 or more")
+    images: list[Path] = []
+    videos: list[Path] = []
+    for path in inputs:
+        if path.is_dir():
+            images += sorted(p for p in path.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES)
+        elif not path.exists():
+            raise CalibrationError(f"{path}: no such picture, folder or video")
+        elif path.suffix.lower() in VIDEO_SUFFIXES:
+            videos.append(path)
+        else:
+            images.append(path)
+    if not images and not videos:
+        raise CalibrationError(
+            f"no pictures in {', '.join(str(path) for path in inputs)}: expected files ending in "
+            f"{' '.join(IMAGE_SUFFIXES)}, or a video"
+        )
+    for path in _evenly(images, most):
+        yield path.name, read_grey(path)
+    for path in videos:
+        yield from _frames(path, every, most)
+
+
+def read_grey(path: Path) -> GreyImage:
+    """Read an image as grey values of 8 bits.
+
+    Raises
+    ------
+    CalibrationError
+        If it cannot be read.
+    """
+    import cv2
+
+    try:
+        data = np.fromfile(path, dtype=np.uint8)
+    except OSError as error:
+        raise CalibrationError(f"{path}: cannot be read: {error.strerror}") from None
+    image = cv2.imdecode(data, cv2.IMREAD_ANYDEPTH | cv2.IMREAD_GRAYSCALE) if len(data) else None
+    if image is None:
+        raise CalibrationError(f"{path}: not an image that can be read")
+    if image.dtype == np.uint8:
+        return np.asarray(image)
+    # Cameras of 10 to 16 bits leave the upper part of the range unused: by the brightest pixel.
+    brightest = max(float(image.max()), 1.0)
+    return np.asarray(np.rint(image.astype(np.float64) * (255.0 / brightest)), dtype=np.uint8)
+
+
+def _evenly(paths: list[Path], most: int) -> list[Path]:
+    if len(paths) <= most:
+        return paths
+    return [paths[i] for i in np.linspace(0, len(paths) - 1, most).round().astype(int)]
+
+
+def _frames(path: Path, every: int, most: int) -> Iterator[tuple[str, GreyImage]]:
+    import cv2
+
+    video = cv2.VideoCapture(str(path))
+    try:
+        if not video.isOpened():
+            raise CalibrationError(f"{path}: not a video that OpenCV can read")
+        count = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
+        # A long video is thinned, so that the frames taken are from all of it.
+        step = max(every, -(-count // most)) if count > 0 else every
+        number = taken = 0
+        while taken < most and video.grab():
+            if number % step == 0:
+                good, frame = video.retrieve()
+                if not good:
+                    raise CalibrationError(f"{path}: frame {number} cannot be read")
+                grey = frame if frame.ndim == 2 else cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
+                yield f"{path.name}:{number}", np.asarray(grey, dtype=np.uint8)
+                taken += 1
+            number += 1
+        if taken == 0:
+            raise CalibrationError(f"{path}: a video without frames")
+    finally:
+        video.release()

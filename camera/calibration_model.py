@@ -1,0 +1,158 @@
+"""What a calibration adjusts: the projection with its derivatives, rigid poses, and the parameters.
+
+Intrinsics are always the vector ``(scaleX, scaleY, offsetX, offsetY, a2, a3, b1, b2, b3)``, the
+order of the ``.cam`` file. What is free of them is a matrix `span`, so that equal scales are one
+column and a coefficient that is left at 0 has none.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from camera.distortion import Coef, fold_radius
+
+FloatArray = NDArray[np.float64]
+
+#: Names of the intrinsics, in order.
+INTRINSICS = ("scaleX", "scaleY", "offsetX", "offsetY", "a2", "a3", "b1", "b2", "b3")
+
+#: Power of r that each distortion coefficient goes with.
+POWERS = np.array([1.0, 2.0, 1.0, 2.0, 3.0])
+
+#: Which coefficients are free, by their number: even powers first, for a lens is smooth in its
+#: middle; then what the published camera needs.
+FREE_COEFFICIENTS: tuple[tuple[str, ...], ...] = (
+    (),
+    ("a3",),
+    ("a3", "b2"),
+    ("a3", "b1", "b2"),
+    ("a3", "b1", "b2", "b3"),
+    ("a2", "a3", "b1", "b2", "b3"),
+)
+
+# The image's corner must be seen at a radius that stays below the fold by this share.
+_FOLD_MARGIN = 0.01
+
+
+def coefficients(intrinsics: FloatArray) -> Coef:
+    """The distortion's (a2, a3, b1, b2, b3) of an intrinsics vector."""
+    a2, a3, b1, b2, b3 = (float(c) for c in intrinsics[4:9])
+    return a2, a3, b1, b2, b3
+
+
+def free_span(count: int, aspect: float | None) -> FloatArray:
+    """Directions in which intrinsics may change.
+
+    Parameters
+    ----------
+    count : int
+        Number of free distortion coefficients, 0 to 5 (`FREE_COEFFICIENTS`).
+    aspect : float or None
+        scaleY / scaleX if that is known (1 for square pixels, 0.5 for single fields); None if both
+        scales are free.
+
+    Returns
+    -------
+    (9, K) array
+        Its columns span the free parameters; each is a unit vector but that of tied scales.
+    """
+    names = ["offsetX", "offsetY", *FREE_COEFFICIENTS[count]]
+    scales = np.zeros((9, 1 if aspect is not None else 2))
+    scales[0, 0] = 1.0
+    scales[1, -1] = 1.0 if aspect is None else aspect
+    return np.hstack([scales, np.eye(9)[:, [INTRINSICS.index(name) for name in names]]])
+
+
+def project_points(
+    intrinsics: FloatArray, points_camera: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Pixels of points in the camera frame and their derivatives.
+
+    Parameters
+    ----------
+    intrinsics : (9,) array
+    points_camera : (N, 3) array
+        Metres.
+
+    Returns
+    -------
+    pixels : (N, 2) array
+        NaN for points that are not in front of the camera or past the distortion's fold.
+    by_intrinsics : (N, 2, 9) array
+        d(u, v) / d(intrinsics).
+    by_point : (N, 2, 3) array
+        d(u, v) / d(point), pixels per metre.
+    """
+    scale, offset = intrinsics[:2], intrinsics[2:4]
+    a2, a3, b1, b2, b3 = coefficients(intrinsics)
+    z = np.where(points_camera[:, 2] > 0.0, points_camera[:, 2], np.nan)
+    xy = points_camera[:, :2] / z[:, None]
+    r = np.hypot(xy[:, 0], xy[:, 1])
+    r = np.where(r <= fold_radius((a2, a3, b1, b2, b3)), r, np.nan)
+    numerator = r * (a2 + r * a3)
+    denominator = 1.0 + r * (b1 + r * (b2 + r * b3))
+    ratio = numerator / denominator
+    factor = 1.0 + ratio
+    slope = (a2 + 2.0 * a3 * r - ratio * (b1 + r * (2.0 * b2 + 3.0 * b3 * r))) / denominator
+
+    by_intrinsics = np.zeros((len(r), 2, 9))
+    by_factor = scale * xy
+    by_intrinsics[:, 0, 0] = xy[:, 0] * factor
+    by_intrinsics[:, 1, 1] = xy[:, 1] * factor
+    by_intrinsics[:, 0, 2] = by_intrinsics[:, 1, 3] = 1.0
+    by_coefficient = np.stack(
+        [r, r**2, -ratio * r, -ratio * r**2, -ratio * r**3], axis=-1
+    ) / denominator[:, None]  # fmt: skip
+    by_intrinsics[:, :, 4:] = by_factor[:, :, None] * by_coefficient[:, None, :]
+
+    unit = xy / np.where(r > 0.0, r, 1.0)[:, None]
+    by_xy = slope[:, None, None] * xy[:, :, None] * unit[:, None, :]
+    by_xy[:, 0, 0] += factor
+    by_xy[:, 1, 1] += factor
+    by_xy *= scale[:, None]
+    by_point = np.empty((len(r), 2, 3))
+    by_point[:, :, :2] = by_xy / z[:, None, None]
+    by_point[:, :, 2] = -(by_xy @ xy[:, :, None])[:, :, 0] / z[:, None]
+    return by_factor * factor[:, None] + offset, by_intrinsics, by_point
+
+
+def is_possible(intrinsics: FloatArray, width: int, height: int) -> bool:
+    """Whether scales are positive and the distortion grows beyond the image's farthest corner."""
+    if not np.all(np.isfinite(intrinsics)) or min(intrinsics[:2]) <= 0.0:
+        return False
+    coef = coefficients(intrinsics)
+    fold = fold_radius(coef)
+    if not np.isfinite(fold):
+        # r f(r) grows without end, but towards a limit where the coefficients make f fall as 1 / r.
+        fold = 1e6
+    a2, a3, b1, b2, b3 = coef
+    factor = 1.0 + fold * (a2 + fold * a3) / (1.0 + fold * (b1 + fold * (b2 + fold * b3)))
+    corner = corner_radius(intrinsics, width, height)
+    return bool(corner * (1.0 + _FOLD_MARGIN) < fold * factor)
+
+
+def corner_radius(intrinsics: FloatArray, width: int, height: int) -> float:
+    """Distorted normalised radius of the image's corner that is farthest from the centre."""
+    sx, sy, ox, oy = (float(value) for value in intrinsics[:4])
+    x = max(abs(ox), abs(width - 1 - ox)) / sx
+    y = max(abs(oy), abs(height - 1 - oy)) / sy
+    return float(np.hypot(x, y))
+
+
+def rotation_of(vectors: FloatArray) -> FloatArray:
+    """(..., 3, 3) rotations of (..., 3) rotation vectors (Rodrigues)."""
+    angle = np.linalg.norm(vectors, axis=-1)[..., None, None]
+    cross = cross_matrices(vectors)
+    small = angle < 1e-8
+    safe = np.where(small, 1.0, angle)
+    first = np.where(small, 1.0, np.sin(safe) / safe)
+    second = np.where(small, 0.5, (1.0 - np.cos(safe)) / safe**2)
+    return np.asarray(np.eye(3) + first * cross + second * (cross @ cross))
+
+
+def cross_matrices(vectors: FloatArray) -> FloatArray:
+    """(..., 3, 3) matrices [v]x with [v]x w = v x w, of (..., 3) vectors."""
+    x, y, z = vectors[..., 0], vectors[..., 1], vectors[..., 2]
+    zero = np.zeros_like(x)
+    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(*x.shape, 3, 3)

@@ -1,0 +1,351 @@
+"""Converting a camera from one model to another: the target is fitted to the source's pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from camera.calibration_model import free_span, is_possible, project_points
+from camera.conversion_models import COEFFICIENTS, ForeignCamera, Model
+from camera.errors import CameraError, ConversionError
+from camera.model import Camera
+
+FloatArray = NDArray[np.float64]
+AnyCamera = Camera | ForeignCamera
+Rows = Literal["same", "halve", "double"]
+
+_IDENTITY = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
+
+# Grids of pixels: to fit on, and to look for the largest deviation on.
+_FIT_GRID = (41, 31)
+_CHECK_GRID = (129, 97)
+# Lawson's reweighting: so many rounds towards the smallest largest deviation.
+_LAWSON_ROUNDS = 25
+_STEPS = 60
+_LAWSON_STEPS = 5
+# A deviation that only rounding is left of.
+_EXACT_PX = 1e-6
+
+
+@dataclass(frozen=True)
+class Converted:
+    """A converted camera.
+
+    Attributes
+    ----------
+    camera : Camera or ForeignCamera
+    deviation_px : float
+        Largest distance, over the image, between where a pixel's ray is seen by the source and by
+        the target (target's pixels).
+    at : (float, float)
+        The target's pixel where it is largest.
+    """
+
+    camera: AnyCamera
+    deviation_px: float
+    at: tuple[float, float]
+
+
+def target_size(source: AnyCamera, rows: Rows) -> tuple[int, int]:
+    """Width and height of the target's image."""
+    if rows == "halve":
+        return source.width, (source.height + 1) // 2
+    return source.width, source.height * (2 if rows == "double" else 1)
+
+
+def source_pixels(pixels: FloatArray, rows: Rows) -> FloatArray:
+    """The source's pixels of the target's: line v of the even lines is line 2 v of all."""
+    factor = {"same": 1.0, "halve": 2.0, "double": 0.5}[rows]
+    return np.asarray(pixels * np.array([1.0, factor]))
+
+
+def convert_to_foreign(
+    source: AnyCamera, model: Model, rows: Rows = "same", *, free: int = -1
+) -> Converted:
+    """Fit one of the other programs' models.
+
+    Parameters
+    ----------
+    source : Camera or ForeignCamera
+    model : str
+        `radtan`, `rational` or `fisheye`.
+    rows : str
+        `same`, `halve` or `double`.
+    free : int
+        Number of the model's first coefficients that may differ from 0; -1: those that a radially
+        symmetric lens needs, and the tangential ones.
+
+    Returns
+    -------
+    Converted
+
+    Raises
+    ------
+    ConversionError
+        If the source does not see all of its image, or the fit fails.
+    """
+    number = COEFFICIENTS[model] if free < 0 else free
+    if model == "rational":
+        number = min(number, 8)
+    contained = _contained(source, model, number)
+    width, height = target_size(source, rows)
+    factor = {"same": 1.0, "halve": 0.5, "double": 2.0}[rows]
+    if contained is not None:
+        exact = replace(
+            contained,
+            width=width,
+            height=height,
+            fy=contained.fy * factor,
+            cy=contained.cy * factor,
+        )
+        return _measured(exact, _check(source, rows))
+    check = _check(source, rows)
+    pixels = _grid(width, height, _FIT_GRID)
+    rays = _rays(source, source_pixels(pixels, rows))
+    fx, fy, cx, cy = _pinhole(source)
+    start = np.concatenate([[fx, fy * factor, cx, cy * factor], np.zeros(COEFFICIENTS[model])])
+
+    def camera_of(parameters: FloatArray) -> ForeignCamera:
+        fx, fy, cx, cy, *distortion = (float(value) for value in parameters)
+        return ForeignCamera(model, width, height, fx, fy, cx, cy, tuple(distortion))
+
+    def project(parameters: FloatArray) -> tuple[FloatArray, FloatArray]:
+        camera = _unchecked(model, parameters)
+        found = camera(rays)
+        jacobian = np.empty((*found.shape, len(parameters)))
+        for k in range(len(parameters)):
+            step = 1e-6 * max(abs(parameters[k]), 1.0)
+            moved = parameters.copy()
+            moved[k] += step
+            ahead = _unchecked(model, moved)(rays)
+            moved[k] -= 2.0 * step
+            jacobian[..., k] = (ahead - _unchecked(model, moved)(rays)) / (2.0 * step)
+        return found, jacobian
+
+    best: Converted | None = None
+    parameters = start
+    for count in _stages(model, number):
+        span = np.eye(len(start))[:, : 4 + count]
+        parameters = _fit(project, parameters, span, pixels, lambda p: bool(min(p[:2]) > 0.0))
+        refined = _lawson(project, parameters, span, pixels, lambda p: bool(min(p[:2]) > 0.0))
+        for candidate in (parameters, refined):
+            converted = _measured(camera_of(candidate), check)
+            if best is None or converted.deviation_px < best.deviation_px:
+                best = converted
+        if best is not None and best.deviation_px < _EXACT_PX:
+            break
+    assert best is not None
+    return best
+
+
+def convert_to_camera(
+    source: AnyCamera, rows: Rows = "same", pose: Camera | None = None
+) -> Converted:
+    """Fit the project's rational radial model.
+
+    Parameters
+    ----------
+    source : Camera or ForeignCamera
+    rows : str
+        `same`, `halve` or `double`.
+    pose : Camera, optional
+        Whose ``sensor2World``, ``sensor2Tcp`` and ``mountIndex`` the result gets; by default those
+        of the source if it has them, else the identity.
+
+    Returns
+    -------
+    Converted
+
+    Raises
+    ------
+    ConversionError
+        If the source does not see all of its image, or the fit fails.
+    """
+    width, height = target_size(source, rows)
+    if pose is None and isinstance(source, Camera):
+        pose = source
+    placed = pose.robot_from_camera if pose is not None else _IDENTITY
+    tcp = pose.sensor_to_tcp if pose is not None else _IDENTITY
+    mount = pose.mount_index if pose is not None else 0
+    factor = {"same": 1.0, "halve": 0.5, "double": 2.0}[rows]
+
+    def camera_of(p: FloatArray) -> Camera:
+        sx, sy, ox, oy, a2, a3, b1, b2, b3 = (float(value) for value in p)
+        return Camera(width, height, sx, sy, ox, oy, (a2, a3, b1, b2, b3), placed, tcp, mount)
+
+    fx, fy, cx, cy = _pinhole(source)
+    start = np.array([fx, fy * factor, cx, cy * factor, *[0.0] * 5])
+    if isinstance(source, Camera):
+        start[4:] = source.coef
+        return _measured(camera_of(start), _check(source, rows))
+    check = _check(source, rows)
+    pixels = _grid(width, height, _FIT_GRID)
+    rays = _rays(source, source_pixels(pixels, rows))
+    points = np.column_stack([rays, np.ones(len(rays))])
+
+    def project(parameters: FloatArray) -> tuple[FloatArray, FloatArray]:
+        found, by_intrinsics, _ = project_points(parameters, points)
+        return found, by_intrinsics
+
+    def possible(p: FloatArray) -> bool:
+        return is_possible(p, width, height)
+
+    best: Converted | None = None
+    parameters = start
+    if not possible(start):
+        raise ConversionError("the source's focal lengths or principal point are not possible here")
+    for count in range(6):
+        span = free_span(count, None)
+        parameters = _fit(project, parameters, span, pixels, possible)
+        for candidate in (parameters, _lawson(project, parameters, span, pixels, possible)):
+            try:
+                converted = _measured(camera_of(candidate), check)
+            except CameraError:
+                continue
+            if best is None or converted.deviation_px < best.deviation_px:
+                best = converted
+        if best is not None and best.deviation_px < _EXACT_PX:
+            break
+    if best is None:
+        raise ConversionError("no camera of the project's model sees what the source sees")
+    return best
+
+
+def _unchecked(model: Model, p: FloatArray) -> Callable[[FloatArray], FloatArray]:
+    from camera.conversion_models import distorted
+
+    def project(rays: FloatArray) -> FloatArray:
+        with np.errstate(all="ignore"):
+            return np.asarray(distorted(model, p[4:], rays) * p[:2] + p[2:4])
+
+    return project
+
+
+def _stages(model: Model, number: int) -> list[int]:
+    """Numbers of free coefficients, from few to all: so a fit does not start in a wrong valley."""
+    return sorted({min(n, number) for n in (1, 2, 4, 5, 6, 7, 8, number)}) if number else [0]
+
+
+def _contained(source: AnyCamera, model: Model, number: int) -> ForeignCamera | None:
+    """The source itself in the target's model, where that holds it."""
+    if isinstance(source, Camera):
+        if any(source.coef[:2]) or model == "fisheye":
+            return None
+        fx, fy, cx, cy = _pinhole(source)
+        zero = (0.0,) * COEFFICIENTS[model]
+        return ForeignCamera(model, source.width, source.height, fx, fy, cx, cy, zero)
+    if (source.model == "fisheye") != (model == "fisheye"):
+        return None
+    room = COEFFICIENTS[model]
+    padded = (*source.distortion, *(0.0,) * room)[:room]
+    if any(source.distortion[room:]) or any(padded[number:]):
+        return None
+    return replace(source, model=model, distortion=padded)
+
+
+def _pinhole(source: AnyCamera) -> tuple[float, float, float, float]:
+    if isinstance(source, Camera):
+        return source.scale_x, source.scale_y, source.offset_x, source.offset_y
+    return source.fx, source.fy, source.cx, source.cy
+
+
+def _grid(width: int, height: int, size: tuple[int, int]) -> FloatArray:
+    """(N, 2) pixels from corner to corner, denser towards the border, where models part."""
+    bend = [0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, n)) for n in size]
+    axes = [0.5 * b + 0.5 * np.linspace(0.0, 1.0, len(b)) for b in bend]
+    u, v = np.meshgrid(axes[0] * (width - 1), axes[1] * (height - 1))
+    return np.asarray(np.stack([u, v], axis=-1).reshape(-1, 2))
+
+
+def _rays(source: AnyCamera, pixels: FloatArray) -> FloatArray:
+    """(N, 2) undistorted normalised coordinates of the source's pixels."""
+    rays = source.undistort(pixels)
+    if not np.all(np.isfinite(rays)):
+        u, v = pixels[int(np.argmax(~np.isfinite(rays[:, 0])))]
+        raise ConversionError(f"the source sees nothing at pixel ({u:.6g}, {v:.6g})")
+    return rays
+
+
+def _check(source: AnyCamera, rows: Rows) -> tuple[FloatArray, FloatArray]:
+    """The target's pixels that the deviation is looked for at, and their rays."""
+    pixels = _grid(*target_size(source, rows), _CHECK_GRID)
+    return pixels, _rays(source, source_pixels(pixels, rows))
+
+
+def _measured(camera: AnyCamera, check: tuple[FloatArray, FloatArray]) -> Converted:
+    pixels, rays = check
+    away = np.linalg.norm(camera.distort(rays) - pixels, axis=1)
+    away = np.where(np.isfinite(away), away, np.inf)
+    worst = int(np.argmax(away))
+    return Converted(camera, float(away[worst]), (float(pixels[worst, 0]), float(pixels[worst, 1])))
+
+
+def _fit(
+    project: Callable[[FloatArray], tuple[FloatArray, FloatArray]],
+    start: FloatArray,
+    span: FloatArray,
+    pixels: FloatArray,
+    possible: Callable[[FloatArray], bool],
+    weights: FloatArray | None = None,
+    steps: int = _STEPS,
+) -> FloatArray:
+    """Least squares over the grid (Levenberg-Marquardt)."""
+    root = np.ones(len(pixels)) if weights is None else np.sqrt(weights)
+    parameters, damping = start, 1e-4
+    found, jacobian = project(parameters)
+    error = root[:, None] * (pixels - found)
+    cost = float(np.sum(error**2))
+    for _ in range(steps):
+        J = (root[:, None, None] * (jacobian @ span)).reshape(-1, span.shape[1])
+        scale = np.maximum(np.linalg.norm(J, axis=0), 1e-300)
+        J = J / scale
+        while damping < 1e10:
+            stacked = np.vstack([J, np.sqrt(damping) * np.eye(J.shape[1])])
+            right = np.concatenate([error.ravel(), np.zeros(J.shape[1])])
+            step = span @ (np.linalg.lstsq(stacked, right, rcond=None)[0] / scale)
+            trial = parameters + step
+            if possible(trial):
+                found, trial_jacobian = project(trial)
+                trial_error = root[:, None] * (pixels - found)
+                trial_cost = float(np.sum(trial_error**2))
+                if trial_cost < cost:
+                    break
+            damping *= 8.0
+        else:
+            return parameters
+        done = cost - trial_cost <= 1e-9 * cost + 1e-24
+        parameters, error, cost, jacobian = trial, trial_error, trial_cost, trial_jacobian
+        damping = max(damping / 8.0, 1e-14)
+        if done:
+            return np.asarray(parameters)
+    return parameters
+
+
+def _lawson(
+    project: Callable[[FloatArray], tuple[FloatArray, FloatArray]],
+    start: FloatArray,
+    span: FloatArray,
+    pixels: FloatArray,
+    possible: Callable[[FloatArray], bool],
+) -> FloatArray:
+    """Towards the smallest largest deviation (Lawson 1961): weights grow where it is large."""
+    weights = np.full(len(pixels), 1.0)
+    parameters = best = start
+    smallest = float("inf")
+    for _ in range(_LAWSON_ROUNDS):
+        away = np.linalg.norm(project(parameters)[0] - pixels, axis=1)
+        worst = float(away.max())
+        if not np.isfinite(worst):
+            break
+        if worst < smallest:
+            smallest, best = worst, parameters
+        if worst < _EXACT_PX:
+            break
+        weights = weights * (0.05 + away / worst)
+        weights /= weights.mean()
+        parameters = _fit(project, parameters, span, pixels, possible, weights, _LAWSON_STEPS)
+    return best

@@ -1,0 +1,185 @@
+"""The distortion models of other programs: OpenCV, ROS, Kalibr and COLMAP.
+
+All of them are pinhole cameras with pixel centres at integers (COLMAP's half a pixel is taken off
+where its files are read) and a distortion of normalised coordinates x = X/Z, y = Y/Z:
+
+radtan
+    k1 k2 p1 p2 k3: polynomial in r^2, with Brown's tangential terms.
+rational
+    k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4: the same over 1 + k4 r^2 + k5 r^4 + k6 r^6, and OpenCV's
+    thin prism.
+fisheye
+    k1 k2 k3 k4: polynomial in the angle (Kannala and Brandt; OpenCV's fisheye, ROS's and Kalibr's
+    equidistant).
+
+References
+----------
+OpenCV, Camera Calibration and 3D Reconstruction; COLMAP, src/colmap/sensor/models.h.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from camera.errors import ConversionError
+
+FloatArray = NDArray[np.float64]
+Model = Literal["radtan", "rational", "fisheye"]
+
+#: Number of coefficients that `ForeignCamera.distortion` holds for each model.
+COEFFICIENTS: dict[Model, int] = {"radtan": 5, "rational": 12, "fisheye": 4}
+
+_LARGEST_SIDE_PX = 65536
+# An inverse is walked to from the image's centre in so many steps.
+_WALK = 24
+_NEWTON_STEPS = 20
+_CONVERGED_PX = 1e-7
+_SMALLEST_STEP = 1e-6
+
+
+@dataclass(frozen=True)
+class ForeignCamera:
+    """A camera in another program's model.
+
+    Attributes
+    ----------
+    model : str
+        `radtan`, `rational` or `fisheye`.
+    width, height : int
+        Image size in pixels.
+    fx, fy, cx, cy : float
+        Focal lengths and principal point in pixels; the top left pixel's centre is (0, 0).
+    distortion : tuple of float
+        All coefficients of the model, in the order above.
+
+    Raises
+    ------
+    ConversionError
+        If a number is not finite, or a size or focal length not positive.
+    """
+
+    model: Model
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        for name, side in (("width", self.width), ("height", self.height)):
+            if not 1 <= side <= _LARGEST_SIDE_PX:
+                raise ConversionError(f"{name} is {side}: expected 1 to {_LARGEST_SIDE_PX} pixels")
+        numbers = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
+        if not np.all(np.isfinite(numbers)):
+            raise ConversionError(f"a number of the camera is not finite: {numbers}")
+        if min(self.fx, self.fy) <= 0.0:
+            raise ConversionError(
+                f"focal lengths are {self.fx:g} and {self.fy:g}: expected pixels above 0"
+            )
+        if len(self.distortion) != COEFFICIENTS[self.model]:
+            raise ConversionError(
+                f"{self.model} has {len(self.distortion)} coefficients: expected "
+                f"{COEFFICIENTS[self.model]}"
+            )
+
+    @property
+    def parameters(self) -> FloatArray:
+        """fx, fy, cx, cy and the coefficients."""
+        return np.array([self.fx, self.fy, self.cx, self.cy, *self.distortion])
+
+    def distort(self, normalised: FloatArray) -> FloatArray:
+        """(..., 2) pixels of (..., 2) undistorted normalised coordinates."""
+        moved = distorted(self.model, self.distortion, normalised)
+        return np.asarray(
+            moved * np.array([self.fx, self.fy]) + np.array([self.cx, self.cy]), dtype=np.float64
+        )
+
+    def undistort(self, pixels: FloatArray) -> FloatArray:
+        """(N, 2) undistorted normalised coordinates of (N, 2) pixels.
+
+        Newton's method, walking out from the centre so that no branch past a fold is taken.
+
+        Raises
+        ------
+        ConversionError
+            If a pixel sees nothing: the distortion folds inside the image, or the lens sees 90
+            degrees and more off its axis, where there are no such coordinates.
+        """
+        target = (pixels - np.array([self.cx, self.cy])) / np.array([self.fx, self.fy])
+        xy = np.zeros_like(target)
+        with np.errstate(all="ignore"):
+            for share in np.linspace(0.0, 1.0, _WALK + 1)[1:]:
+                for _ in range(_NEWTON_STEPS if share == 1.0 else 2):
+                    error = share * target - distorted(self.model, self.distortion, xy)
+                    xy = xy + _solved(self._jacobian(xy), error)
+                    if np.abs(error).max() < 1e-15:
+                        break
+            off = np.abs(self.distort(xy) - pixels).max(axis=-1)
+            determinant = _determinant(self._jacobian(xy))
+        bad = ~(off < _CONVERGED_PX) | ~(determinant > 0.0)
+        if bad.any():
+            u, v = pixels[int(np.argmax(bad))]
+            raise ConversionError(
+                f"pixel ({u:.6g}, {v:.6g}) sees nothing by the {self.model} model: its distortion "
+                "folds inside the image, or the lens sees 90 degrees and more off its axis; such a "
+                "camera can't be converted as a whole"
+            )
+        return np.asarray(xy)
+
+    def _jacobian(self, xy: FloatArray) -> FloatArray:
+        """(..., 2, 2) d(distorted) / d(x, y), by central differences."""
+        step = _SMALLEST_STEP * (1.0 + np.linalg.norm(xy, axis=-1, keepdims=True))
+        columns = [
+            (
+                distorted(self.model, self.distortion, xy + step * axis)
+                - distorted(self.model, self.distortion, xy - step * axis)
+            )
+            / (2.0 * step)
+            for axis in np.eye(2)
+        ]
+        return np.stack(columns, axis=-1)
+
+
+def _determinant(m: FloatArray) -> FloatArray:
+    return np.asarray(m[..., 0, 0] * m[..., 1, 1] - m[..., 0, 1] * m[..., 1, 0])
+
+
+def _solved(m: FloatArray, right: FloatArray) -> FloatArray:
+    """Solutions of 2 x 2 systems; not finite where there is none."""
+    x, y = right[..., 0], right[..., 1]
+    solution = [m[..., 1, 1] * x - m[..., 0, 1] * y, m[..., 0, 0] * y - m[..., 1, 0] * x]
+    return np.stack(solution, axis=-1) / _determinant(m)[..., None]
+
+
+def distorted(
+    model: Model, coefficients: tuple[float, ...] | FloatArray, normalised: FloatArray
+) -> FloatArray:
+    """(..., 2) distorted normalised coordinates of (..., 2) undistorted ones."""
+    x, y = normalised[..., 0], normalised[..., 1]
+    q = x * x + y * y
+    if model == "fisheye":
+        r = np.sqrt(q)
+        angle = np.arctan(r)
+        a = angle * angle
+        k1, k2, k3, k4 = coefficients
+        bent = angle * (1.0 + a * (k1 + a * (k2 + a * (k3 + a * k4))))
+        factor = np.where(r > 1e-12, bent / np.where(r > 1e-12, r, 1.0), 1.0)
+        return np.asarray(normalised * factor[..., None])
+    k1, k2, p1, p2, k3 = coefficients[:5]
+    factor = 1.0 + q * (k1 + q * (k2 + q * k3))
+    if model == "rational":
+        k4, k5, k6 = coefficients[5:8]
+        factor = factor / (1.0 + q * (k4 + q * (k5 + q * k6)))
+    u = x * factor + 2.0 * p1 * x * y + p2 * (q + 2.0 * x * x)
+    v = y * factor + p1 * (q + 2.0 * y * y) + 2.0 * p2 * x * y
+    if model == "rational":
+        s1, s2, s3, s4 = coefficients[8:12]
+        u = u + q * (s1 + s2 * q)
+        v = v + q * (s3 + s4 * q)
+    return np.stack([u, v], axis=-1)

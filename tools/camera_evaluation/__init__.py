@@ -1,0 +1,1 @@
+"""What calibrating and converting cameras is worth: rendered boards, photographs, conversions."""
