@@ -8,48 +8,64 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Literal
 
 from detect.errors import DetectError
+from storage.bounds import ABOVE_0, LIMIT_OR_0, NOT_NEGATIVE, SHARE_ABOVE_0, demand, whole
 
 if TYPE_CHECKING:
     from detect.tilt import ConsensusSettings
 
 BearingConvention = Literal["level", "published"]
 
-_POSITIVE = (
-    "sigma_across_px",
-    "sigma_along_rows",
-    "regulariser",
-    "start_spacing_rows",
-    "guided_reach_px",
-    "fine_scale_px",
-    "coarse_scale_px",
-    "weight_limit",
-    "sigma_px",
-    "largest_tilt_deg",
-    "tilt_prior_deg",
-    "building_deg",
-)
-_NOT_NEGATIVE = (
-    "border_rows",
-    "start_band_rows",
-    "gap_rows",
-    "least_length_px",
-    "least_evidence",
-    "least_sharpness",
-    "soft_evidence",
-    "largest_horizon_gap_px",
-    "largest_scatter_px",
-    "largest_shift_px",
-    "largest_noise_px",
-    "bend_px",
-    "largest_lean_deg",
-    "largest_lean_sigmas",
-    "largest_lean_px",
-    "same_edge_px",
-    "join_px",
-    "join_share",
-    "shoulder_px",
-    "shoulder_share",
-)
+_BOUNDS = {
+    **dict.fromkeys(
+        (
+            "sigma_across_px",
+            "sigma_along_rows",
+            "regulariser",
+            "guided_reach_px",
+            "fine_scale_px",
+            "coarse_scale_px",
+            "weight_limit",
+            "sigma_px",
+            "largest_tilt_deg",
+            "tilt_prior_deg",
+            "building_deg",
+        ),
+        ABOVE_0,
+    ),
+    **dict.fromkeys(
+        (
+            "least_length_px",
+            "least_evidence",
+            "least_sharpness",
+            "soft_evidence",
+            "bend_px",
+            "same_edge_px",
+            "join_px",
+            "join_share",
+            "shoulder_px",
+            "shoulder_share",
+        ),
+        NOT_NEGATIVE,
+    ),
+    **dict.fromkeys(
+        (
+            "largest_horizon_gap_px",
+            "largest_scatter_px",
+            "largest_shift_px",
+            "largest_noise_px",
+            "largest_lean_deg",
+            "largest_lean_sigmas",
+            "largest_lean_px",
+        ),
+        LIMIT_OR_0,
+    ),
+    **dict.fromkeys(("border_rows", "start_band_rows", "gap_rows"), whole(0)),
+    **dict.fromkeys(("threshold", "guided_pull"), SHARE_ABOVE_0),
+    "start_spacing_rows": whole(1),
+    "least_rows": whole(5),
+    "least_lines": whole(2),
+    "proposers": whole(2, 1000),
+}
 
 
 def _expect(condition: bool, name: str, value: float, expected: str) -> None:
@@ -63,6 +79,7 @@ class LineSettings:
 
     Lengths along a line are given in widths of a pixel, so that they mean the same for full frames
     and for single fields, whose rows are twice as high; what belongs to the filter is in rows.
+    What is called largest may be infinite: there is no such limit.
 
     Parameters
     ----------
@@ -188,17 +205,7 @@ class LineSettings:
     alpha: BearingConvention = "level"
 
     def __post_init__(self) -> None:
-        for name in _POSITIVE:
-            value = getattr(self, name)
-            _expect(0.0 < value < math.inf, name, value, "above 0")
-        for name in _NOT_NEGATIVE:
-            _expect(getattr(self, name) >= 0.0, name, getattr(self, name), "0 or more")
-        for name in ("threshold", "guided_pull"):
-            value = getattr(self, name)
-            _expect(0.0 < value <= 1.0, name, value, "above 0, at most 1")
-        _expect(self.least_rows >= 5, "least_rows", self.least_rows, "5 or more")
-        _expect(self.least_lines >= 2, "least_lines", self.least_lines, "2 or more")
-        _expect(self.proposers >= 2, "proposers", self.proposers, "2 or more")
+        demand(self, DetectError, **_BOUNDS)
         for scale, farthest in self.refine_steps_px:
             _expect(0.3 <= scale < 20.0, "refine_steps_px", scale, "a width of 0.3 to 20")
             _expect(farthest >= 0.0, "refine_steps_px", farthest, "a distance of 0 or more")

@@ -2,11 +2,20 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Literal
 
 from detect.errors import DetectError
+from storage.bounds import (
+    ABOVE_0,
+    FINITE,
+    LIMIT,
+    NOT_NEGATIVE,
+    SHARE_ABOVE_0,
+    demand,
+    from_to,
+    whole,
+)
 
 Polarity = Literal["any", "light", "dark"]
 
@@ -35,7 +44,8 @@ class CircleSettings:
     border_px : int
         Centres keep this distance from the image's border, pixels.
     far_limit_m_per_px : float
-        Centres are so near that the floor moves at most this far per image row, metres.
+        Centres are so near that the floor moves at most this far per image row, metres; infinite:
+        however far.
     polarity : {"any", "light", "dark"}
         Which discs to look for: lighter than the floor, darker, or both.
     noise_floor : float
@@ -77,18 +87,29 @@ class CircleSettings:
     tilt_sigma_deg: float = 0.0
 
     def __post_init__(self) -> None:
-        _expect(0.0 < self.threshold <= 1.0, "threshold", self.threshold, "above 0, at most 1")
-        _expect(0.0 < self.radius_m < math.inf, "radius_m", self.radius_m, "above 0")
+        demand(
+            self,
+            DetectError,
+            threshold=SHARE_ABOVE_0,
+            radius_m=ABOVE_0,
+            inner_radius_m=ABOVE_0,
+            outer_radius_m=ABOVE_0,
+            samples=whole(3, 128),
+            border_px=whole(0),
+            far_limit_m_per_px=LIMIT,
+            noise_floor=NOT_NEGATIVE,
+            separation_m=NOT_NEGATIVE,
+            evidence=FINITE,
+            blur_px=NOT_NEGATIVE,
+            systematic_px=NOT_NEGATIVE,
+            tilt_sigma_deg=from_to(0.0, 90.0),
+        )
         _expect(
             self.inner_radius_m < self.radius_m < self.outer_radius_m,
             "radius_m",
             self.radius_m,
             f"between the outlines ({self.inner_radius_m:g} and {self.outer_radius_m:g})",
         )
-        for name in ("noise_floor", "separation_m", "blur_px", "systematic_px", "tilt_sigma_deg"):
-            value = getattr(self, name)
-            _expect(0.0 <= value < math.inf, name, value, "0 or more")
-        _expect(math.isfinite(self.evidence), "evidence", self.evidence, "a finite number")
 
 
 #: The report's detector to the letter.

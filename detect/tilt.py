@@ -18,6 +18,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from detect.errors import DetectError
+from storage.bounds import ABOVE_0, demand, whole
+
 FloatArray = NDArray[np.float64]
 
 _REFINEMENTS = 6
@@ -69,6 +72,17 @@ class ConsensusSettings:
     building_rad: float = np.radians(0.045)
     proposers: int = 24
     least_lines: int = 3
+
+    def __post_init__(self) -> None:
+        demand(
+            self,
+            DetectError,
+            largest_rad=ABOVE_0,
+            prior_rad=ABOVE_0,
+            building_rad=ABOVE_0,
+            proposers=whole(2, 1000),
+            least_lines=whole(2),
+        )
 
 
 def consensus(

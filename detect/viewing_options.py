@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING, Annotated, Literal, Optional
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from detect.compare_result import CompareOptions
+from detect.compare_result import CompareError, CompareOptions
 from detect.exports.options import Export
 from detect.line_settings import LineSettings
 from detect.settings import CircleSettings
 from detect.sources.options import SourceOptions
+from storage.bounds import ABOVE_0, NOT_NEGATIVE, demand
 
 # For `X | None` tyro imports another library that takes a tenth of a second.
 MaybePath = Optional[Path]  # noqa: UP045
@@ -75,6 +76,9 @@ class Gates:
     gate_m: float = 0.10
     tolerance_deg: float = 0.5
     sigmas: float = 2.0
+
+    def __post_init__(self) -> None:
+        demand(self, CompareError, gate_m=ABOVE_0, tolerance_deg=ABOVE_0, sigmas=NOT_NEGATIVE)
 
     @property
     def discs(self) -> CompareOptions:

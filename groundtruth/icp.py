@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from groundtruth.errors import GeometryError, GroundTruthError
 from groundtruth.icp_kernels import moved, nearest_on_segments, rigid_fit
+from storage.bounds import ABOVE_0, SHARE_ABOVE_0, demand, whole
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -63,14 +64,15 @@ class IcpSettings:
     weak_sigma_m: float = 0.05
 
     def __post_init__(self) -> None:
-        for name in ("gate_m", "threshold_m", "weak_sigma_m"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0.0):
-                raise GroundTruthError(f"{name} is {value:g}: expected more than 0")
-        if not 0.0 < self.kept <= 1.0:
-            raise GroundTruthError(f"kept is {self.kept:g}: expected more than 0, at most 1")
-        if self.most_steps < 1:
-            raise GroundTruthError(f"most_steps is {self.most_steps}: expected 1 or more")
+        demand(
+            self,
+            GroundTruthError,
+            gate_m=ABOVE_0,
+            kept=SHARE_ABOVE_0,
+            threshold_m=ABOVE_0,
+            most_steps=whole(1),
+            weak_sigma_m=ABOVE_0,
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,8 +22,12 @@ from groundtruth.icp import best_share, open_directions, trimmed_variance
 from groundtruth.icp_kernels import moved, nearest_points
 from groundtruth.icp_motion import wrapped
 from groundtruth.icp_scan_kernels import align_scans, explained, scan_normals
+from storage.bounds import ABOVE_0, LIMIT, SHARE_ABOVE_0, Bounds, demand, whole
 
 FloatArray = NDArray[np.float64]
+
+
+_TURN_DEG = Bounds("above 0, at most 360", 0.0, 360.0, above=True)
 
 
 @dataclass(frozen=True)
@@ -68,17 +72,26 @@ class ScanMatchSettings:
     weak_sigma_m: float = 0.05
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.heading_step_deg <= 360.0:
-            raise GroundTruthError(
-                f"heading_step_deg is {self.heading_step_deg:g}: expected more than 0, at most 360"
-            )
-        if not 0.0 < self.kept <= 1.0:
-            raise GroundTruthError(f"kept is {self.kept:g}: expected more than 0, at most 1")
-        gates = (*self.coarse_gates_m, *self.fine_gates_m)
-        if not (self.coarse_gates_m and self.fine_gates_m and min(gates) > 0.0):
-            raise GroundTruthError(f"gates {gates}: expected numbers above 0, coarse and fine")
-        if self.refined < 1 or self.coarse_thinning < 1:
-            raise GroundTruthError("refined, coarse_thinning: expected 1 or more")
+        demand(
+            self,
+            GroundTruthError,
+            heading_step_deg=_TURN_DEG,
+            coarse_gates_m=ABOVE_0,
+            fine_gates_m=ABOVE_0,
+            coarse_thinning=whole(1),
+            refined=whole(1),
+            kept=SHARE_ABOVE_0,
+            largest_shift_m=LIMIT,
+            normal_radius_m=ABOVE_0,
+            normal_reach=whole(1),
+            normal_spread=ABOVE_0,
+            coarse_sigma_m=ABOVE_0,
+            fine_sigma_m=ABOVE_0,
+            weak_sigma_m=ABOVE_0,
+        )
+        for name in ("coarse_gates_m", "fine_gates_m"):
+            if not getattr(self, name):
+                raise GroundTruthError(f"{name} is empty: expected one or more")
 
 
 @dataclass(frozen=True, eq=False)

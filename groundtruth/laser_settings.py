@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, fields
 
 from groundtruth.errors import GroundTruthError
+from storage.bounds import SHARE_ABOVE_0, demand, whole
 
 
 @dataclass(frozen=True)
@@ -87,6 +88,13 @@ class LaserSettings:
             if not (math.isfinite(value) and (value > 0 or (zero and value == 0))):
                 least = "0 or more" if zero else "more than 0"
                 raise GroundTruthError(f"{entry.name} is {value!r}: expected {least}")
-        for name in ("kept", "least_agreement"):
-            if getattr(self, name) > 1.0:
-                raise GroundTruthError(f"{name} is {getattr(self, name):g}: expected at most 1")
+        demand(
+            self,
+            GroundTruthError,
+            kept=SHARE_ABOVE_0,
+            least_agreement=SHARE_ABOVE_0,
+            most_steps=whole(1),
+            least_readings=whole(1),
+            acquire_readings=whole(1),
+            headings=whole(1),
+        )

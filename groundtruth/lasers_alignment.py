@@ -21,6 +21,7 @@ from groundtruth.icp_motion import apply, between, compose, invert, wrapped
 from groundtruth.icp_scan_kernels import align_scans, explained, scan_normals
 from groundtruth.laser_kernels import refine_outline
 from groundtruth.scans import Scanner, Scans
+from storage.bounds import ABOVE_0, LIMIT_OR_0, SHARE_ABOVE_0, demand, from_to
 
 FloatArray = NDArray[np.float64]
 
@@ -64,10 +65,16 @@ class AlignmentSettings:
     inconsistent_m: float = 0.05
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.gate_m) and self.gate_m > 0.0):
-            raise GroundTruthError(f"gate_m is {self.gate_m:g}: expected more than 0")
-        if not 0.0 < self.kept <= 1.0:
-            raise GroundTruthError(f"kept is {self.kept:g}: expected more than 0, at most 1")
+        demand(
+            self,
+            GroundTruthError,
+            gate_m=ABOVE_0,
+            kept=SHARE_ABOVE_0,
+            turns_deg=from_to(-360.0, 360.0),
+            inconsistent_m=LIMIT_OR_0,
+        )
+        if not self.turns_deg:
+            raise GroundTruthError("turns_deg is empty: expected one or more")
 
 
 @dataclass(frozen=True, eq=False)

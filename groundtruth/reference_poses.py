@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from groundtruth.errors import GroundTruthError
 from groundtruth.fiducials import Distance, Survey
 from groundtruth.scoring import wrapped
+from storage.bounds import ABOVE_0, PROBABILITY, demand, whole
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -57,15 +58,15 @@ class DistanceSettings:
     largest_sigma_deg: float = 5.0
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.gross_probability < 1.0:
-            raise GroundTruthError(
-                f"gross_probability is {self.gross_probability}: expected between 0 and 1"
-            )
-        if self.most_gross < 0:
-            raise GroundTruthError(f"most_gross is {self.most_gross}: expected 0 or more")
-        for name in ("ambiguity_chi2", "largest_sigma_m", "largest_sigma_deg"):
-            if not 0.0 < getattr(self, name) < math.inf:
-                raise GroundTruthError(f"{name} is {getattr(self, name)}: expected more than 0")
+        demand(
+            self,
+            GroundTruthError,
+            gross_probability=PROBABILITY,
+            most_gross=whole(0, 10),
+            ambiguity_chi2=ABOVE_0,
+            largest_sigma_m=ABOVE_0,
+            largest_sigma_deg=ABOVE_0,
+        )
 
 
 @dataclass(frozen=True, eq=False)

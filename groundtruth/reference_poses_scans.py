@@ -22,6 +22,7 @@ from groundtruth.reference_poses import DistancePose
 from groundtruth.scanners import Scanner
 from groundtruth.scans import Scans
 from groundtruth.scoring import wrapped
+from storage.bounds import ABOVE_0, PROBABILITY, SHARE_ABOVE_0, demand
 
 FloatArray = NDArray[np.float64]
 ScanStatus = Literal["used", "undetermined", "disagrees", "moved", "no scans", "not asked"]
@@ -71,12 +72,17 @@ class RefineSettings:
     least_share: float = 0.5
 
     def __post_init__(self) -> None:
-        for name in ("still_s", "moved_m", "weak_sigma_m"):
-            if not 0.0 < getattr(self, name) < math.inf:
-                raise GroundTruthError(f"{name} is {getattr(self, name)}: expected more than 0")
-        for name in ("disagreement_probability", "least_share"):
-            if not 0.0 < getattr(self, name) < 1.0:
-                raise GroundTruthError(f"{name} is {getattr(self, name)}: expected between 0 and 1")
+        demand(
+            self,
+            GroundTruthError,
+            still_s=ABOVE_0,
+            moved_m=ABOVE_0,
+            gates_m=ABOVE_0,
+            kept=SHARE_ABOVE_0,
+            weak_sigma_m=ABOVE_0,
+            disagreement_probability=PROBABILITY,
+            least_share=PROBABILITY,
+        )
         if not self.gates_m:
             raise GroundTruthError("gates_m is empty: expected one or more")
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields
 from typing import Literal
 
 from groundtruth.errors import GroundTruthError
+from storage.bounds import NOT_NEGATIVE, demand, whole
 
 Solver = Literal["sqpnp", "epnp", "iterative", "ippe", "pycolmap"]
 Loss = Literal["linear", "huber", "cauchy"]
@@ -125,16 +126,15 @@ class RigSettings:
     time_tolerance_s: float = 0.005
 
     def __post_init__(self) -> None:
-        for name, least in (
-            ("least_support", 1),
-            ("outlier_sigma", 0.0),
-            ("outlier_px", 0.0),
-            ("corner_floor_px", 0.0),
-            ("time_tolerance_s", 0.0),
-        ):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value >= least):
-                raise GroundTruthError(f"{name} is {value:g}: expected {least:g} or more")
+        demand(
+            self,
+            GroundTruthError,
+            least_support=whole(1),
+            outlier_sigma=NOT_NEGATIVE,
+            outlier_px=NOT_NEGATIVE,
+            corner_floor_px=NOT_NEGATIVE,
+            time_tolerance_s=NOT_NEGATIVE,
+        )
 
 
 @dataclass(frozen=True)

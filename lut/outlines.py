@@ -30,6 +30,7 @@ from camera.kernels import camera_numbers
 from lut.errors import TableError
 from lut.floor import floor_positions
 from lut.kernels import ADVANCE_BITS, BLOCK, encode_outlines
+from storage.bounds import ABOVE_0, LIMIT, demand, whole
 
 #: Part of an outline's samples that must lie inside the image.
 MIN_SHARE_INSIDE = 0.5
@@ -48,7 +49,8 @@ class DiscShape:
     border_px : int
         Near limit: centres keep this distance from the image's border, pixels.
     far_limit_m_per_px : float
-        Far limit: the floor moves at most this far from one image row to the next, metres.
+        Far limit: the floor moves at most this far from one image row to the next, metres;
+        infinite: however far.
     """
 
     inner_radius_m: float = 0.06
@@ -58,17 +60,20 @@ class DiscShape:
     far_limit_m_per_px: float = 0.05
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.inner_radius_m < self.outer_radius_m < float("inf"):
+        demand(
+            self,
+            TableError,
+            inner_radius_m=ABOVE_0,
+            outer_radius_m=ABOVE_0,
+            samples=whole(3, 128),
+            border_px=whole(0),
+            far_limit_m_per_px=LIMIT,
+        )
+        if not self.inner_radius_m < self.outer_radius_m:
             raise TableError(
-                f"outlines of radius {self.inner_radius_m:g} and {self.outer_radius_m:g} m: "
-                "expected 0 < inner < outer"
+                f"inner_radius_m is {self.inner_radius_m:g}: expected less than outer_radius_m "
+                f"({self.outer_radius_m:g})"
             )
-        if not 3 <= self.samples <= 128:
-            raise TableError(f"{self.samples} samples on an outline: expected 3 to 128")
-        if self.border_px < 0:
-            raise TableError(f"border of {self.border_px} px: expected 0 or more")
-        if not self.far_limit_m_per_px > 0.0:
-            raise TableError(f"far limit of {self.far_limit_m_per_px:g} m: expected more than 0")
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,10 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.associate_local import LocalSettings, associate_locally, tilt_jacobian
+from slam.errors import SlamError
 from slam.loops import LoopSettings, Match, find_matches, stretches_of
 from slam.loops_closing import closed_path, in_order, merge_labels, pairs_by_votes, pairs_in_place
 from slam.loops_path import Solution, intersect_bearings, solve_path
 from slam.recording import Recording
+from storage.bounds import demand, whole
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -51,6 +53,9 @@ class AssociateSettings:
     map_level: bool = True
     loops: LoopSettings = field(default_factory=LoopSettings)
     most_rounds: int = 6
+
+    def __post_init__(self) -> None:
+        demand(self, SlamError, most_rounds=whole(1))
 
 
 @dataclass(frozen=True, eq=False)

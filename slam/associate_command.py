@@ -22,6 +22,7 @@ from slam.noise import with_relative_noise
 from slam.options import Associate
 from slam.recording import UNKNOWN_ID, Recording, landmark_file
 from storage import OutputExistsError, write_whole
+from storage.bounds import ABOVE_0, NOT_NEGATIVE, PROBABILITY, demand, from_to, whole
 
 #: Of each kind's rows those before and those after the map level.
 Scores = dict[str, dict[str, AssociationScore]]
@@ -35,6 +36,15 @@ def perform(options: Associate) -> int:
     SlamError, landmarks.LandmarkFileError, storage.OutputExistsError, OSError
         If the run cannot be read, a setting makes no sense or an output exists.
     """
+    demand(
+        options,
+        SlamError,
+        gate_probability=PROBABILITY,
+        sigma_scale=ABOVE_0,
+        tilt_sigma_deg=from_to(0.0, 45.0),
+        noise=NOT_NEGATIVE,
+        seed=whole(0),
+    )
     circles = options.circles or not options.lines
     settings = AssociateSettings(
         local=LocalSettings(
@@ -45,10 +55,6 @@ def perform(options: Associate) -> int:
         ),
         map_level=options.map_level,
     )
-    if not options.sigma_scale > 0.0:
-        raise SlamError(f"sigma scale is {options.sigma_scale}: expected above 0")
-    if not options.tilt_sigma_deg >= 0.0:
-        raise SlamError(f"tilt sigma is {options.tilt_sigma_deg}: expected 0 or more")
     sources = _sources(options, circles)
     targets = [_target(options.output, source, len(sources) > 1) for source in sources]
     report = targets[0].with_suffix(".json")

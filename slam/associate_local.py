@@ -15,6 +15,7 @@ Transactions on Robotics 24(5), 2008).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
@@ -24,8 +25,10 @@ from numpy.typing import NDArray
 
 from landmarks import wrap_angle
 from slam.compatibility import Pairing, joint_compatible, nearest_compatible
+from slam.errors import SlamError
 from slam.motion import rotation
 from slam.recording import CircleRows, LineRows, Recording
+from storage.bounds import ABOVE_0, LIMIT, PROBABILITY, Bounds, demand, whole
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -33,6 +36,9 @@ Method = Literal["nearest", "joint"]
 
 # Of the first sight of a line: half a metre to infinity within two standard deviations.
 _INVERSE_DISTANCE_PRIOR = (0.4, 0.4)
+
+
+_SWAY_RAD = Bounds("from 0 to less than a right angle", 0.0, 0.5 * math.pi, below=True)
 
 
 @dataclass(frozen=True)
@@ -72,6 +78,20 @@ class LocalSettings:
     forget_sigma_m: float = 0.35
     most_landmarks: int = 40
     most_nodes: int = 30_000
+
+    def __post_init__(self) -> None:
+        demand(
+            self,
+            SlamError,
+            gate_probability=PROBABILITY,
+            sigma_scale=ABOVE_0,
+            tilt_sigma_rad=_SWAY_RAD,
+            camera_height_m=ABOVE_0,
+            forget_frames=whole(0),
+            forget_sigma_m=LIMIT,
+            most_landmarks=whole(1),
+            most_nodes=whole(1),
+        )
 
 
 @dataclass(eq=False)

@@ -157,7 +157,7 @@ def chi_squared_gates(probability: float, width: int, most_pairs: int) -> FloatA
         If the probability is not in (0, 1).
     """
     if not 0.0 < probability < 1.0:
-        raise SlamError(f"gate probability is {probability}: expected above 0 and below 1")
+        raise SlamError(f"gate_probability is {probability}: expected above 0 and below 1")
     return _gates(float(probability), int(width), max(int(most_pairs), 1)).copy()
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
@@ -19,6 +20,7 @@ from slam.calibration import (
     rows_through_mounting,
     turn_to_the_left,
 )
+from slam.errors import SlamError
 from slam.graph import Estimate, Graph
 from slam.measurement import (
     bearing_jacobians,
@@ -27,6 +29,7 @@ from slam.measurement import (
     disc_jacobians,
 )
 from slam.motion import relative_pose, relative_pose_jacobians
+from storage.bounds import ABOVE_0, Bounds, demand
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -35,6 +38,9 @@ RowErrors = Literal["corrected", "recorded"]
 
 #: Rotation about robot x, y, z, and height.
 MOUNTING_UNKNOWNS = 4
+
+
+_SWAY_RAD = Bounds("from 0 to less than a right angle", 0.0, 0.5 * math.pi, below=True)
 
 
 @dataclass(frozen=True)
@@ -64,6 +70,9 @@ class Weighting:
     calibrate: bool = False
     row_errors: RowErrors = "corrected"
     tilt_sigma_rad: float = 0.0
+
+    def __post_init__(self) -> None:
+        demand(self, SlamError, loss_scale=ABOVE_0, tilt_sigma_rad=_SWAY_RAD)
 
 
 @dataclass(frozen=True)

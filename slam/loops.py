@@ -16,6 +16,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from slam.errors import SlamError
+from storage.bounds import ABOVE_0, LIMIT, NOT_NEGATIVE, demand, whole
+
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
@@ -69,6 +72,24 @@ class LoopSettings:
     later_step: int = 1
     earlier_step: int = 2
     attached_frames: int = 0
+
+    def __post_init__(self) -> None:
+        demand(
+            self,
+            SlamError,
+            stretch_frames=whole(1),
+            stride_frames=whole(1),
+            length_tolerance_m=ABOVE_0,
+            least_length_m=NOT_NEGATIVE,
+            reach_m=ABOVE_0,
+            most_turn_rad=LIMIT,
+            most_shift_m=LIMIT,
+            least_agreeing=whole(2),
+            false_alarms=ABOVE_0,
+            later_step=whole(1),
+            earlier_step=whole(1),
+            attached_frames=whole(0),
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,6 +11,7 @@ import numpy as np
 from landmarks import CircleLandmark, LineLandmark, Row, Step, wrap_angle
 from slam.errors import SlamError
 from slam.recording import Recording
+from storage.bounds import NOT_NEGATIVE, demand, whole
 
 
 @dataclass(frozen=True)
@@ -44,12 +45,15 @@ class AddedNoise:
     seed: int = 1
 
     def __post_init__(self) -> None:
-        for name in ("disc_m", "bearing_rad", "step_m", "turn_rad"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value >= 0.0):
-                raise SlamError(f"noise {name} is {value}: expected 0 or more")
-        if self.seed < 0:
-            raise SlamError(f"seed is {self.seed}: expected 0 or more")
+        demand(
+            self,
+            SlamError,
+            disc_m=NOT_NEGATIVE,
+            bearing_rad=NOT_NEGATIVE,
+            step_m=NOT_NEGATIVE,
+            turn_rad=NOT_NEGATIVE,
+            seed=whole(0),
+        )
 
     @property
     def nothing(self) -> bool:

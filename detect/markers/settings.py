@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Literal
 
 from detect.errors import DetectError
+from storage.bounds import ABOVE_0, NOT_NEGATIVE, PROBABILITY, SHARE, Bounds, demand, whole
 
 Darkness = Literal["ratio", "difference"]
 CornerAlgorithm = Literal["A", "B"]
+
+_LEAST_WIDTH = Bounds("4 or more", 4.0, below=True)
+_AREA_FACTOR = Bounds("above 1", 1.0, above=True, below=True)
 
 
 def _expect(condition: bool, name: str, value: object, expected: str) -> None:
@@ -106,30 +109,36 @@ class MarkerSettings:
 
     def __post_init__(self) -> None:
         _expect(bool(self.thresholds), "thresholds", self.thresholds, "at least one number")
-        for value in self.thresholds:
-            _expect(0.0 < value < 1.0, "thresholds", value, "between 0 and 1")
-        for name in ("width_px", "dark_noise", "least_contrast", "least_margin", "systematic_px"):
-            value = getattr(self, name)
-            _expect(0.0 <= value < math.inf, name, value, "0 or more")
-        _expect(self.disc_widths > 0.0, "disc_widths", self.disc_widths, "above 0")
-        _expect(self.least_width_px >= 4.0, "least_width_px", self.least_width_px, "4 or more")
-        _expect(self.area_factor > 1.0, "area_factor", self.area_factor, "above 1")
+        demand(
+            self,
+            DetectError,
+            ids=whole(0),
+            width_px=NOT_NEGATIVE,
+            thresholds=PROBABILITY,
+            disc_widths=ABOVE_0,
+            dark_noise=NOT_NEGATIVE,
+            least_width_px=_LEAST_WIDTH,
+            area_factor=_AREA_FACTOR,
+            least_holes=whole(0),
+            most_holes=whole(0),
+            least_solidity=SHARE,
+            least_white=NOT_NEGATIVE,
+            most_white=NOT_NEGATIVE,
+            least_square=SHARE,
+            least_contrast=NOT_NEGATIVE,
+            edge_balance=SHARE,
+            largest_distance=SHARE,
+            least_margin=NOT_NEGATIVE,
+            least_explained=SHARE,
+            largest_cell_error=SHARE,
+            systematic_px=NOT_NEGATIVE,
+        )
         _expect(
             0 <= self.least_holes <= self.most_holes,
             "least_holes",
             self.least_holes,
             f"0 to most_holes ({self.most_holes})",
         )
-        for name in (
-            "least_solidity",
-            "least_square",
-            "edge_balance",
-            "largest_distance",
-            "least_explained",
-            "largest_cell_error",
-        ):
-            value = getattr(self, name)
-            _expect(0.0 <= value <= 1.0, name, value, "0 to 1")
         _expect(
             0.0 <= self.least_white < self.most_white,
             "least_white",

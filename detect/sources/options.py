@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from detect.errors import DetectError
+from storage.bounds import demand, whole
 
 #: Axes of a robot's poses: X forward and Y left, or the data set's X left and Y backward.
 Axes = Literal["robotics", "dataset"]
@@ -43,8 +44,7 @@ class SourceOptions:
     bits: int = 0
 
     def __post_init__(self) -> None:
-        if self.frames < 0:
-            raise DetectError(f"frames is {self.frames}: expected 1 or more, or 0 for all")
+        demand(self, DetectError, frames=whole(0))
         if self.bits and not 8 <= self.bits <= 16:
             raise DetectError(f"bits is {self.bits}: expected 8 to 16, or 0")
 

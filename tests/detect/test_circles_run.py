@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -215,7 +216,11 @@ def test_an_interrupted_run_writes_nothing(small_run: Path, tmp_path: Path) -> N
 
 
 def test_settings_without_a_table_are_refused(small_run: Path) -> None:
+    """A camera under the floor."""
     output = small_run / "out.circles"
-    with pytest.raises(TableError, match="2 samples on an outline"):
-        detect_circles_run(open_run(small_run), CircleSettings(samples=2), output, version="1")
+    run = open_run(small_run)
+    rows = run.camera.robot_from_camera
+    under = replace(run.camera, robot_from_camera=(*rows[:2], (*rows[2][:3], -1.5)))
+    with pytest.raises(TableError, match=r"the camera is -1\.5 m above the floor: expected more"):
+        detect_circles_run(replace(run, camera=under), CircleSettings(), output, version="1")
     assert not output.exists()

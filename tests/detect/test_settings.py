@@ -42,7 +42,7 @@ def test_nonsense_is_refused_by_name(name: str, value: float) -> None:
     assert str(refusal.value).startswith(f"{name} is {value:g}: expected ")
 
 
-@pytest.mark.parametrize(("inner", "outer"), [(0.10, 0.14), (0.12, 0.14), (math.nan, 0.14)])
+@pytest.mark.parametrize(("inner", "outer"), [(0.10, 0.14), (0.12, 0.14)])
 def test_a_disc_lies_between_its_outlines(inner: float, outer: float) -> None:
     with pytest.raises(DetectError, match=r"radius_m is 0\.1: expected between the outlines"):
         CircleSettings(inner_radius_m=inner, outer_radius_m=outer)

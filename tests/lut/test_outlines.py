@@ -361,15 +361,15 @@ def test_a_table_is_the_same_every_time(published_camera: Camera) -> None:
 @pytest.mark.parametrize(
     ("changes", "complaint"),
     [
-        ({"inner_radius_m": 0.0}, "expected 0 < inner < outer"),
-        ({"inner_radius_m": 0.14}, "expected 0 < inner < outer"),
-        ({"outer_radius_m": float("inf")}, "expected 0 < inner < outer"),
-        ({"outer_radius_m": float("nan")}, "expected 0 < inner < outer"),
-        ({"samples": 2}, "2 samples on an outline: expected 3 to 128"),
-        ({"samples": 129}, "129 samples on an outline: expected 3 to 128"),
-        ({"border_px": -1}, "border of -1 px: expected 0 or more"),
-        ({"far_limit_m_per_px": 0.0}, "far limit of 0 m: expected more than 0"),
-        ({"far_limit_m_per_px": float("nan")}, "far limit of nan m"),
+        ({"inner_radius_m": 0.0}, "inner_radius_m is 0: expected above 0"),
+        ({"inner_radius_m": 0.14}, "inner_radius_m is 0.14: expected less than outer_radius_m"),
+        ({"outer_radius_m": float("inf")}, "outer_radius_m is inf: expected above 0"),
+        ({"outer_radius_m": float("nan")}, "outer_radius_m is nan"),
+        ({"samples": 2}, "samples is 2: expected a whole number, 3 to 128"),
+        ({"samples": 129}, "samples is 129: expected a whole number, 3 to 128"),
+        ({"border_px": -1}, "border_px is -1: expected a whole number, 0 or more"),
+        ({"far_limit_m_per_px": 0.0}, "far_limit_m_per_px is 0: expected above 0"),
+        ({"far_limit_m_per_px": float("nan")}, "far_limit_m_per_px is nan"),
     ],
 )
 def test_impossible_outlines_are_refused(changes: dict[str, float], complaint: str) -> None:

@@ -83,10 +83,10 @@ def test_existing_files_and_settings_without_sense_are_refused(
     assert not target.exists()
     (tmp_path / "kept.json").unlink()
     for setting, message in (
-        (["--gate-probability", "1.5"], "gate probability is 1.5"),
-        (["--sigma-scale", "0"], "sigma scale is 0"),
-        (["--tilt-sigma-deg", "-1"], "tilt sigma is -1"),
-        (["--noise", "-1"], "expected 0 or more"),
+        (["--gate-probability", "1.5"], "gate_probability is 1.5"),
+        (["--sigma-scale", "0"], "sigma_scale is 0"),
+        (["--tilt-sigma-deg", "-1"], "tilt_sigma_deg is -1"),
+        (["--noise", "-1"], "noise is -1: expected 0 or more"),
     ):
         assert main(["associate", run, "-o", str(target), *setting]) == 1
         assert message in capsys.readouterr().err

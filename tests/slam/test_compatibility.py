@@ -173,7 +173,7 @@ def test_gates_are_quantiles_and_right_sets_pass_with_their_probability() -> Non
 
 @pytest.mark.parametrize("probability", [0.0, 1.0, -1.0, float("nan")])
 def test_gate_probability_outside_its_range_is_refused(probability: float) -> None:
-    with pytest.raises(SlamError, match="gate probability"):
+    with pytest.raises(SlamError, match="gate_probability"):
         joint_compatible(
             np.zeros((1, 1, 2)), np.eye(2), np.eye(2)[None], gate_probability=probability
         )

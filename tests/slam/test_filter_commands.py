@@ -163,7 +163,7 @@ def test_runs_that_can_not_be_mapped(
     [
         (["--start-sigma", "0", "-1", "0"], "standard deviations not below 0"),
         (["--start", "0", "nan", "0"], "expected finite numbers"),
-        (["--gate-probability", "1"], "gate probability"),
+        (["--gate-probability", "1"], "gate_probability"),
         (["--reference", "short.csv"], "short.csv: 2 poses: expected 7"),
         (["--map", "other.csv"], "no row shows a landmark"),
         (["--map", "missing.csv"], "cannot be read"),

@@ -291,7 +291,7 @@ def test_covariances_that_contradict_each_other_are_refused() -> None:
 
 @pytest.mark.parametrize("probability", [0.0, 1.0, -1.0, float("nan")])
 def test_a_gate_that_is_no_probability_is_refused(probability: float) -> None:
-    with pytest.raises(SlamError, match="gate probability"):
+    with pytest.raises(SlamError, match="gate_probability"):
         Associator("nearest", probability)
 
 

@@ -1,0 +1,103 @@
+"""What numbers a setting may have; others are refused by name, with value and what was expected.
+
+    demand(self, DetectError, radius_m=ABOVE_0, samples=whole(3, 128))
+
+NaN is refused everywhere, and infinity wherever it is not said to stand for "no limit".
+"""
+
+from __future__ import annotations
+
+import math
+import operator
+from dataclasses import dataclass
+from typing import Any
+
+from storage.messages import excerpt
+
+
+@dataclass(frozen=True, slots=True)
+class Bounds:
+    """The numbers that one setting may have.
+
+    Attributes
+    ----------
+    expected : str
+        In words.
+    least, most : float
+        Both ends, which may be reached
+    above, below : bool
+        unless these say that they may not.
+    whole : bool
+        Whether only whole numbers will do.
+    """
+
+    expected: str
+    least: float = -math.inf
+    most: float = math.inf
+    above: bool = False
+    below: bool = False
+    whole: bool = False
+
+    def hold(self, value: Any) -> bool:
+        """Whether a value is such a number."""
+        if isinstance(value, bool):
+            return False
+        try:
+            number = operator.index(value) if self.whole else value
+            high_enough = number > self.least if self.above else number >= self.least
+            low_enough = number < self.most if self.below else number <= self.most
+        except TypeError:
+            return False
+        return bool(high_enough and low_enough)
+
+
+def from_to(least: float, most: float) -> Bounds:
+    """Numbers of a closed interval."""
+    return Bounds(f"{least:g} to {most:g}", least, most)
+
+
+def inside(least: float, most: float) -> Bounds:
+    """Numbers of an open interval."""
+    return Bounds(f"above {least:g}, below {most:g}", least, most, above=True, below=True)
+
+
+def whole(least: int, most: int | None = None) -> Bounds:
+    """Whole numbers, both ends included."""
+    words = f"{least} or more" if most is None else f"{least} to {most}"
+    return Bounds(f"a whole number, {words}", least, math.inf if most is None else most, whole=True)
+
+
+FINITE = Bounds("a finite number", above=True, below=True)
+ABOVE_0 = Bounds("above 0", 0.0, above=True, below=True)
+NOT_NEGATIVE = Bounds("0 or more", 0.0, below=True)
+#: Infinity stands for "no limit".
+LIMIT = Bounds("above 0", 0.0, above=True)
+LIMIT_OR_0 = Bounds("0 or more", 0.0)
+SHARE = from_to(0.0, 1.0)
+SHARE_ABOVE_0 = Bounds("above 0, at most 1", 0.0, 1.0, above=True)
+PROBABILITY = inside(0.0, 1.0)
+
+
+def demand(settings: object, error: type[Exception], /, **bounds: Bounds) -> None:
+    """Refuse settings with a number that cannot be.
+
+    Parameters
+    ----------
+    settings : object
+        What has the numbers as attributes; of tuples each number is looked at.
+    error : type of exception
+        What is raised.
+    bounds : Bounds
+        By the attributes' names.
+
+    Raises
+    ------
+    error
+        If a number is out of its bounds: its name, its value, and what was expected.
+    """
+    for name, allowed in bounds.items():
+        value = getattr(settings, name)
+        for number in value if isinstance(value, tuple) else (value,):
+            if not allowed.hold(number):
+                shown = f"{number:g}" if isinstance(number, float) else excerpt(number)
+                raise error(f"{name} is {shown}: expected {allowed.expected}")

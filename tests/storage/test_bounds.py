@@ -1,0 +1,130 @@
+"""Every number of every setting: what cannot be is refused by its name, with its value."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import math
+import pkgutil
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+ROOMS = ("camera", "detect", "groundtruth", "landmarks", "lut", "slam")
+
+#: Dataclasses with a default for every field that are no settings: results, and flags that the
+#: commands hand on to settings.
+NO_SETTINGS = frozenset(
+    {
+        "Conduct", "ConductOptions", "FileHead", "FrameRows", "FrameSelection", "RowCount",
+        "RowFiles", "RunSummary", "SeenRows", "_Rows",
+    }
+)  # fmt: skip
+
+#: Where infinity stands for "no limit".
+ENDLESS = {
+    "CircleSettings": {"far_limit_m_per_px"},
+    "DiscShape": {"far_limit_m_per_px"},
+    "LineSettings": {
+        "largest_horizon_gap_px", "largest_scatter_px", "largest_shift_px", "largest_noise_px",
+        "largest_lean_deg", "largest_lean_sigmas", "largest_lean_px",
+    },
+    "ScanMatchSettings": {"largest_shift_m"},
+    "AlignmentSettings": {"inconsistent_m"},
+    "LocalSettings": {"forget_sigma_m"},
+    "LoopSettings": {"most_turn_rad", "most_shift_m"},
+}  # fmt: skip
+
+#: Which may be negative.
+SIGNED = {
+    "CircleSettings": {"evidence"},  # log-odds
+    "AlignmentSettings": {"turns_deg"},  # to either side
+    "PoseSettings": {"floor_z_m"},  # a height in the world
+}
+
+
+def settings_classes() -> Iterator[type[Any]]:
+    """All dataclasses of the rooms that can be made without arguments, but for `NO_SETTINGS`."""
+    found: dict[str, type[Any]] = {}
+    for room in ROOMS:
+        for module in pkgutil.walk_packages(importlib.import_module(room).__path__, f"{room}."):
+            if module.name.endswith("__main__"):
+                continue
+            for value in vars(importlib.import_module(module.name)).values():
+                if (
+                    isinstance(value, type)
+                    and dataclasses.is_dataclass(value)
+                    and value.__module__ == module.name
+                    and value.__name__ not in NO_SETTINGS
+                    and all(has_default(field) for field in dataclasses.fields(value))
+                ):
+                    found[f"{module.name}.{value.__name__}"] = value
+    yield from (found[name] for name in sorted(found))
+
+
+def has_default(field: dataclasses.Field[Any]) -> bool:
+    return (
+        field.default is not dataclasses.MISSING or field.default_factory is not dataclasses.MISSING
+    )
+
+
+def numbers() -> Iterator[Any]:
+    """Each number of each class: the class, the field's name, and whether it is in a tuple."""
+    for settings in settings_classes():
+        made = settings()
+        for field in dataclasses.fields(settings):
+            value = getattr(made, field.name)
+            in_tuple = isinstance(value, tuple)
+            number = value[0] if in_tuple and value else value
+            if isinstance(number, int | float) and not isinstance(number, bool):
+                yield pytest.param(
+                    settings, field.name, in_tuple, id=f"{settings.__name__}-{field.name}"
+                )
+
+
+NUMBERS = list(numbers())
+
+
+def test_there_are_settings_of_all_kinds() -> None:
+    names = {parameter.values[0].__name__ for parameter in NUMBERS}
+    assert {
+        "CircleSettings", "LineSettings", "MarkerSettings", "DiscShape", "PoseSettings",
+        "LaserSettings", "FuseSettings", "SyncSettings", "LocalSettings", "LoopSettings",
+    } <= names  # fmt: skip
+    assert len(NUMBERS) > 150
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, -1.0, -1])
+@pytest.mark.parametrize(("settings", "name", "in_tuple"), NUMBERS)
+def test_impossible_numbers_are_refused_by_name(
+    settings: type[Any], name: str, in_tuple: bool, value: float
+) -> None:
+    changes: Any = {name: (value,) if in_tuple else value}
+    kind = settings.__name__
+    if value == math.inf and name in ENDLESS.get(kind, ()):
+        assert getattr(settings(**changes), name) == math.inf
+        return
+    if value == -1.0 and name in SIGNED.get(kind, ()):
+        settings(**changes)
+        return
+    with pytest.raises(ValueError, match=rf"(?s)^{name}\b.*expected") as refusal:
+        settings(**changes)
+    assert type(refusal.value) is not ValueError, "the error has a type of the project's"
+    assert f"{value:g}" in str(refusal.value)
+
+
+@pytest.mark.parametrize(("settings", "name", "in_tuple"), NUMBERS)
+def test_whole_numbers_are_whole(settings: type[Any], name: str, in_tuple: bool) -> None:
+    value = getattr(settings(), name)
+    if in_tuple or not isinstance(value, int):
+        return
+    changes: Any = {name: value + 0.5}
+    with pytest.raises(ValueError, match=name):
+        settings(**changes)
+
+
+def test_every_exception_to_the_rule_exists() -> None:
+    known = {(p.values[0].__name__, p.values[1]) for p in NUMBERS}
+    for table in (ENDLESS, SIGNED):
+        assert {(kind, name) for kind, names in table.items() for name in names} <= known
