@@ -1,0 +1,110 @@
+"""The soak tool: what it makes, what it measures, and that it sees what it is to see."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from tools.soak.cli import main
+from tools.soak.long_run import MOST_GROWTH_MIB, SoakError, SoakResult, link_run
+from tools.soak.processes import family, marked
+from tools.soak.short_runs import ShortRuns
+
+pytestmark = pytest.mark.skipif(not Path("/proc").is_dir(), reason="reads Linux's /proc")
+
+GOOD = SoakResult(
+    frames=1000,
+    jobs=2,
+    duration_s=10.0,
+    frames_per_s=(100.0, 100.0),
+    frames_per_processor_s=(60.0, 60.0),
+    resident_mib=(200.0, 200.0, 200.0, 200.0),
+    worker_mib=(300.0, 300.0, 300.0, 300.0),
+    descriptors=(40, 40, 40, 40),
+    processes=4,
+)
+
+
+def test_a_run_of_any_length(project_root: Path, tmp_path: Path) -> None:
+    from detect.run import open_run
+
+    run = open_run(link_run(project_root / "images" / "e", tmp_path / "s", 200))
+    frames = list(run.frames)
+    assert len(frames) == 200
+    images = [frame.image for frame in frames]
+    assert all(image is not None and image.is_file() for image in images)
+    assert frames[0].image is not None
+    assert frames[80].image is not None
+    assert frames[0].image.samefile(frames[80].image)
+    original = project_root / "images" / "e" / "images" / "e.0000.jpg"
+    assert frames[0].image.read_bytes() == original.read_bytes()
+    assert not frames[0].image.samefile(original)
+    assert run.images_without_step == 0
+
+
+def test_a_source_without_images(tmp_path: Path) -> None:
+    with pytest.raises(SoakError, match="expected a run folder"):
+        link_run(tmp_path, tmp_path / "s", 10)
+
+
+def test_processes_are_found_and_measured() -> None:
+    """A child that has 40 MiB, 30 descriptors, and a child of its own."""
+    program = (
+        "import subprocess, sys; block = bytearray(b'1') * (40 << 20);"
+        "files = [open('/dev/null') for _ in range(30)];"
+        "subprocess.Popen([sys.executable, '-c', 'input()']); print('ready', flush=True); input()"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", program],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        env={**os.environ, "REDETECT_MARK": "soak-test"},
+    ) as process:
+        assert process.stdout is not None
+        process.stdout.readline()
+        found = family(process.pid)
+        try:
+            assert found[0].pid == process.pid
+            assert len(found) == 2
+            assert found[0].resident_bytes > 40 << 20
+            assert found[0].descriptors >= 33
+            assert sorted(marked("REDETECT_MARK=soak-test")) == sorted(s.pid for s in found)
+        finally:
+            for state in reversed(found):
+                os.kill(state.pid, 9)
+    assert marked("REDETECT_MARK=soak-test") == []
+
+
+def test_demands() -> None:
+    grown = (200.0, 201.0, 204.0, 200.1 + MOST_GROWTH_MIB)
+    assert GOOD.unmet() == []
+    assert len(replace(GOOD, resident_mib=grown).unmet()) == 1
+    assert len(replace(GOOD, worker_mib=grown).unmet()) == 1
+    assert replace(GOOD, descriptors=(40, 40, 41, 42)).unmet() == ["2 descriptors stayed open"]
+    slower = replace(GOOD, frames_per_processor_s=(60.0, 56.0)).unmet()
+    assert slower == ["the last tenth was 6.7% slower than the first"]
+    assert ShortRuns(9, 0, 0, 0, 0, 0, 0).unmet() == []
+    assert len(ShortRuns(9, 1, 2, 3, 4, 5, 6).unmet()) == 6
+
+
+@pytest.mark.long
+def test_a_soak_of_some_seconds(
+    tmp_path: Path, project_root: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    figures = tmp_path / "soak.json"
+    arguments = ["--frames", "6000", "--jobs", "1", "--source", str(project_root / "images" / "e")]
+    code = main([*arguments, "--json", str(figures), "--scratch", str(tmp_path)])
+    said = capsys.readouterr()
+    assert code in (0, 1), said.err
+    assert "6000 frames, 1 jobs" in said.out, said.err
+    found = json.loads(figures.read_text())
+    assert 50.0 < found["resident_mib"][0] < 600.0
+    assert found["descriptors"][0] == found["descriptors"][-1]
+    assert found["processes"] == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["soak.json"]  # the run is removed

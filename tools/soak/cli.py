@@ -1,0 +1,82 @@
+"""The command ``python -m tools.soak``."""
+
+from __future__ import annotations
+
+import json
+import sys
+import tempfile
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated, Optional
+
+import tyro
+
+from storage import OutputExistsError, write_whole
+from tools.soak.long_run import SoakError, link_run, soak
+from tools.soak.short_runs import repeat_short_runs
+
+# For `X | None` tyro imports another library that takes a tenth of a second.
+MaybePath = Optional[Path]  # noqa: UP045
+
+
+@dataclass(frozen=True)
+class Soak:
+    """A long run of `detect all`, or with --short many short ones; demands that nothing grows.
+
+    The exit code is 1 where a demand is not met.
+
+    Parameters
+    ----------
+    frames : int
+        How long the run is: the images of the source, linked over and over.
+    jobs : int
+        Processes that share the work.
+    short : int
+        So many runs of eight frames instead, one after the other, with and without workers.
+    source : Path
+        A run folder whose images are repeated.
+    scratch : Path
+        Where the run and its results are made, and removed again; on the source's file system.
+    json : Path
+        Write the figures as JSON.
+    force : bool
+        Replace an existing JSON file.
+    """
+
+    frames: int = 200_000
+    jobs: int = 2
+    short: int = 0
+    source: Path = Path("images/e")
+    scratch: Annotated[MaybePath, tyro.conf.arg(help_behavior_hint="(default: a new folder)")] = (
+        None
+    )
+    json: MaybePath = None
+    force: bool = False
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command line; returns the exit code."""
+    command = tyro.cli(Soak, prog="python -m tools.soak", args=arguments)
+    try:
+        if command.json is not None and command.json.exists() and not command.force:
+            raise OutputExistsError(command.json)
+        with tempfile.TemporaryDirectory(dir=command.scratch, prefix="soak-") as name:
+            folder = Path(name)
+            if command.short:
+                short = repeat_short_runs(command.source, folder, command.short, command.jobs)
+                figures, unmet = asdict(short), short.unmet()
+                print(short)
+            else:
+                run = link_run(command.source, folder / "soak", command.frames)
+                result = soak(run, folder / "results", command.frames, command.jobs)
+                figures, unmet = asdict(result), result.unmet()
+                print(result)
+        if command.json is not None:
+            with write_whole(command.json, overwrite=command.force) as stream:
+                stream.write(f"{json.dumps(figures, indent=1)}\n".encode())
+    except (SoakError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    for sentence in unmet:
+        print(sentence, file=sys.stderr)
+    return 1 if unmet else 0

@@ -1,0 +1,221 @@
+"""A run of as many frames as one likes, watched while it is worked on."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import shutil
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from tools.soak.processes import ProcessState, family
+
+#: Throughput is compared between these shares of the run: before and after them, processes start
+#: and files take their places.
+_FIRST, _LAST = (0.01, 0.11), (0.89, 0.99)
+_LOOK_EVERY_S = 0.5
+_MIB = 1 << 20
+
+#: The demands: growth from a tenth of the run to its end, and change of the throughput.
+MOST_GROWTH_MIB = 8.0
+MOST_SLOWER = 0.05
+
+
+class SoakError(RuntimeError):
+    """A run that did not end well, or too short a one."""
+
+
+@dataclass(frozen=True)
+class _Look:
+    time_s: float
+    frames: int
+    processes: tuple[ProcessState, ...]
+
+    @property
+    def processor_s(self) -> float:
+        return sum(process.processor_s for process in self.processes)
+
+    @property
+    def resident_mib(self) -> float:
+        """Of the process that hands out the frames."""
+        return self.processes[0].resident_bytes / _MIB
+
+    @property
+    def worker_mib(self) -> float:
+        """Of the largest other one."""
+        return max((p.resident_bytes for p in self.processes[1:]), default=0) / _MIB
+
+    @property
+    def descriptors(self) -> int:
+        return sum(process.descriptors for process in self.processes)
+
+
+@dataclass(frozen=True)
+class SoakResult:
+    """What came of a long run.
+
+    Attributes
+    ----------
+    frames, jobs : int
+    duration_s : float
+    frames_per_s : (float, float)
+        In the first tenth and in the last one, by the clock.
+    frames_per_processor_s : (float, float)
+        The same, by what all processes computed: other work on the machine hardly counts.
+    resident_mib, worker_mib : tuple of float
+        Memory of the process that hands out the frames, and of the largest worker, at 10, 50, 90
+        and 99 % of the run.
+    descriptors : tuple of int
+        Open in all processes, at the same moments.
+    processes : int
+        The most that there were.
+    """
+
+    frames: int
+    jobs: int
+    duration_s: float
+    frames_per_s: tuple[float, float]
+    frames_per_processor_s: tuple[float, float]
+    resident_mib: tuple[float, ...]
+    worker_mib: tuple[float, ...]
+    descriptors: tuple[int, ...]
+    processes: int
+
+    def unmet(self) -> list[str]:
+        """The demands that are not met, a sentence each."""
+        found = []
+        for what, values in (("memory", self.resident_mib), ("a worker's memory", self.worker_mib)):
+            if values[-1] - values[0] > MOST_GROWTH_MIB:
+                found.append(f"{what} grew by {values[-1] - values[0]:.1f} MiB")
+        if self.descriptors[-1] > self.descriptors[0]:
+            found.append(f"{self.descriptors[-1] - self.descriptors[0]} descriptors stayed open")
+        first, last = self.frames_per_processor_s
+        if last < (1.0 - MOST_SLOWER) * first:
+            found.append(f"the last tenth was {1.0 - last / first:.1%} slower than the first")
+        return found
+
+    def __str__(self) -> str:
+        def row(name: str, values: tuple[float, ...], form: str) -> str:
+            return f"{name:<28}" + "  ".join(format(value, form) for value in values)
+
+        change = [b / a - 1.0 for a, b in (self.frames_per_s, self.frames_per_processor_s)]
+        return "\n".join(
+            [
+                f"{self.frames} frames, {self.jobs} jobs, {self.duration_s:.0f} s",
+                row("frames/s, first and last", self.frames_per_s, ".1f") + f"  {change[0]:+.1%}",
+                row("frames/s of the processor", self.frames_per_processor_s, ".1f")
+                + f"  {change[1]:+.1%}",
+                "at 10, 50, 90, 99 %",
+                row("memory / MiB", self.resident_mib, ".1f"),
+                row("largest worker / MiB", self.worker_mib, ".1f"),
+                row("descriptors", self.descriptors, "d"),
+                f"processes                   {self.processes}",
+            ]
+        )
+
+
+def link_run(source: Path, folder: Path, frames: int) -> Path:
+    """A run folder of any length: hard links to the images of another run, over and over.
+
+    Raises
+    ------
+    SoakError
+        If the source has no images or no calibration, or is on another file system.
+    """
+    images = sorted((source / "images").glob("*.jpg"))
+    cameras = sorted(source.glob("*.cam"))
+    if not images or not cameras:
+        raise SoakError(f"{source}: expected a run folder with images/*.jpg and a .cam")
+    (folder / "images").mkdir(parents=True)
+    shutil.copy(cameras[0], folder / f"{folder.name}.cam")
+    copies = []
+    for image in images:  # links to these, not to the source's own files
+        copies.append(folder / image.name)
+        shutil.copy(image, copies[-1])
+    with (folder / f"{folder.name}.txt").open("w") as steps:
+        for number, image in zip(range(frames), itertools.cycle(copies)):
+            os.link(image, folder / "images" / f"s.{number:07d}.jpg")
+            steps.write(f"STEP s.{number:07d} 0 -0.25 0.01 1e-5 0 1e-5 0 0 1e-4\n")
+    for image in copies:
+        image.unlink()
+    return folder
+
+
+def soak(run: Path, output: Path, frames: int, jobs: int) -> SoakResult:
+    """Work on a run by `detect all`, and watch its processes.
+
+    Raises
+    ------
+    SoakError
+        If it does not end well, or before it could be looked at often enough.
+    """
+    output.mkdir()
+    arguments = ["all", str(run), "-o", str(output), "--jobs", str(jobs)]
+    begin_s = time.monotonic()
+    with subprocess.Popen(
+        [sys.executable, "-m", "detect", *arguments],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as process:
+        try:
+            looks = _looks_at(process, output / ".detected.journal")
+            _, said = process.communicate()
+        except BaseException:
+            process.kill()
+            raise
+    if process.returncode != 0:
+        raise SoakError(f"detect ended with {process.returncode}: {said.strip()[-500:]}")
+    return _result(looks, frames, jobs, time.monotonic() - begin_s)
+
+
+def _looks_at(process: subprocess.Popen[str], journal: Path) -> list[_Look]:
+    """Look at the processes again and again while frames are noted in the journal."""
+    looks: list[_Look] = []
+    lines, place = -1, 0  # the first line is no frame
+    while process.poll() is None:
+        try:
+            with journal.open("rb") as stream:
+                stream.seek(place)
+                content = stream.read()
+        except OSError:
+            content = b""
+        if content:
+            lines += content.count(b"\n")
+            place += len(content)
+            states = family(process.pid)
+            if states and lines > 0:
+                looks.append(_Look(time.monotonic(), lines, tuple(states)))
+        time.sleep(_LOOK_EVERY_S)
+    return looks
+
+
+def _result(looks: list[_Look], frames: int, jobs: int, duration_s: float) -> SoakResult:
+    done = np.array([look.frames for look in looks], float)
+    if len(looks) < 40 or np.count_nonzero(done <= _FIRST[1] * frames) < 4:
+        raise SoakError(f"{frames} frames: too few to be looked at, expected more")
+
+    def rate(values: list[float], share: tuple[float, float]) -> float:
+        begin, end = np.interp([share[0] * frames, share[1] * frames], done, values)
+        return float((share[1] - share[0]) * frames / (end - begin))
+
+    times_s = [look.time_s for look in looks]
+    processor_s = [look.processor_s for look in looks]
+    chosen = [looks[int(np.argmax(done >= share * frames))] for share in (0.1, 0.5, 0.9)]
+    chosen.append(looks[int(np.argmax(done >= min(0.99 * frames, done[-1])))])
+    return SoakResult(
+        frames=frames,
+        jobs=jobs,
+        duration_s=duration_s,
+        frames_per_s=(rate(times_s, _FIRST), rate(times_s, _LAST)),
+        frames_per_processor_s=(rate(processor_s, _FIRST), rate(processor_s, _LAST)),
+        resident_mib=tuple(look.resident_mib for look in chosen),
+        worker_mib=tuple(look.worker_mib for look in chosen),
+        descriptors=tuple(look.descriptors for look in chosen),
+        processes=max(len(look.processes) for look in looks),
+    )
