@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
 from detect.circles_run import LEVELLED
 from detect.errors import DetectError
+from detect.line_settings import LineSettings
 from detect.settings import CircleSettings
 from detect.tune_grid import parameter_value
 
 # The head is what stands before the first row; nobody writes so much.
 _LONGEST_BYTES = 1 << 16
+_NUMBERS = re.compile(r"[0-9.eE+-]+|inf")
 
 
 @dataclass(frozen=True)
@@ -22,8 +27,8 @@ class FileHead:
     ----------
     comments : tuple of str
         Its lines without the signs of comment.
-    settings : dict of str
-        The effective settings, by name, as they are written.
+    settings : tuple of (str, str)
+        The effective settings: names and values, as they are written.
     levelled : bool
         Whether it says that positions of discs are corrected for the frames' tilts.
     """
@@ -41,13 +46,18 @@ class FileHead:
         DetectError
             If one has a value that none can have.
         """
-        known = set(CircleSettings.__dataclass_fields__)
-        values = {
-            name: parameter_value(CircleSettings, name, text)
-            for name, text in self.settings
-            if name in known
-        }
-        return CircleSettings(**values)
+        return CircleSettings(**_values(CircleSettings, self.settings))
+
+    @property
+    def line_settings(self) -> LineSettings:
+        """The settings of verticals; as `circle_settings`."""
+        pairs = dict(self.settings).get("refine_steps_px")
+        singles = [entry for entry in self.settings if entry[0] != "refine_steps_px"]
+        values = _values(LineSettings, singles)
+        if pairs is not None:
+            numbers = [float(word) for word in _NUMBERS.findall(pairs)]
+            values["refine_steps_px"] = tuple(zip(numbers[::2], numbers[1::2]))
+        return LineSettings(**values)
 
 
 def read_head(path: Path) -> FileHead:
@@ -86,3 +96,9 @@ def read_head(path: Path) -> FileHead:
         if equals
     )
     return FileHead(tuple(comments), settings, any(LEVELLED in text for text in comments))
+
+
+def _values(kind: type, settings: Iterable[tuple[str, str]]) -> dict[str, Any]:
+    """The settings that a detector knows, as what they are."""
+    known = {field.name for field in fields(kind)}
+    return {name: parameter_value(kind, name, text) for name, text in settings if name in known}
