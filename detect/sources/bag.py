@@ -15,9 +15,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from detect.errors import DetectError, FrameError
+from detect.sources.bag_camera import BASE_FRAME, recorded_calibration
 from detect.sources.bag_images import pixels_of_message
 from detect.sources.gray import gray_of_pixels, significant_bits
 from detect.sources.interface import (
+    Calibration,
     PoseStream,
     SourceImage,
     TimedPose,
@@ -50,6 +52,8 @@ class Bag:
         Which topic of images, if there are several.
     bits : int or None
         Significant bits of 16-bit images; by default what the first one needs.
+    base_frame : str
+        The frame of the robot's base, on the floor, among the static transforms.
 
     Raises
     ------
@@ -59,12 +63,19 @@ class Bag:
 
     ships_images = True
 
-    def __init__(self, path: Path, image_topic: str | None = None, bits: int | None = None) -> None:
+    def __init__(
+        self,
+        path: Path,
+        image_topic: str | None = None,
+        bits: int | None = None,
+        base_frame: str = BASE_FRAME,
+    ) -> None:
         self.path = path
         self.name = str(path)
         self.stem = path.name if path.is_dir() else path.stem
         self.output_base = path.with_name(f"{self.stem}.detected")
         self._bits = bits
+        self._base_frame = base_frame
         with opened_bag(path) as reader:
             self.topic = chosen_topic(
                 reader, path, (_IMAGE, _COMPRESSED), image_topic, "images", "--image-topic"
@@ -100,9 +111,12 @@ class Bag:
                     image = SourceImage(prefix, time_s, failure=str(error))
                 yield image
 
-    def calibration(self) -> Path | None:
-        """The ``.cam`` file beside it: of its name, or the only one."""
-        return only_calibration(self.path.parent, self.stem)
+    def calibration(self) -> Calibration | None:
+        """The ``.cam`` file beside it: of its name, or the only one; else what it holds itself."""
+        beside = only_calibration(self.path.parent, self.stem)
+        if beside is not None:
+            return beside
+        return recorded_calibration(self.path, self.topic, self._base_frame)
 
     def poses(self, topic: str | None) -> PoseStream | None:
         """The odometry of a topic, or of the only one that has any."""

@@ -11,6 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from camera import Camera, read_camera
 from detect.errors import DetectError
 
 
@@ -40,6 +41,21 @@ class SourceImage:
     content: bytes | NDArray[np.uint8] | None = None
     bits: int = 16
     failure: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Calibration:
+    """A calibrated camera.
+
+    Attributes
+    ----------
+    camera : Camera
+    why_no_pose : str or None
+        Why its pose above the floor is not known, where it is not.
+    """
+
+    camera: Camera
+    why_no_pose: str | None = None
 
 
 class PoseStream(Protocol):
@@ -72,13 +88,15 @@ class Source(Protocol):
         """The images, from the first one (of a live camera: from now)."""
         ...
 
-    def calibration(self) -> Path | None:
-        """The ``.cam`` file that lies beside it.
+    def calibration(self) -> Calibration | None:
+        """The calibration that lies beside it, or that it holds; None if there is none.
 
         Raises
         ------
         DetectError
-            If there are several.
+            If there are several to choose from.
+        camera.CameraError
+            If it cannot be read.
         """
         ...
 
@@ -125,22 +143,24 @@ def numbered_prefix(stem: str, number: int) -> str:
     return f"{frame_prefix(stem)}.{number:04d}"
 
 
-def only_calibration(folder: Path, stem: str) -> Path | None:
+def only_calibration(folder: Path, stem: str) -> Calibration | None:
     """The ``.cam`` of a stem in a folder, or the only one there; None if there is none.
 
     Raises
     ------
     DetectError
         If there are several.
+    camera.CameraError
+        If it cannot be read.
     """
     own = folder / f"{stem}.cam"
     if own.is_file():
-        return own
+        return Calibration(read_camera(own))
     found = sorted(folder.glob("*.cam"))
     if len(found) > 1:
         names = ", ".join(path.name for path in found[:4])
         raise DetectError(f"{folder}: several calibrations ({names}): name one by --camera")
-    return found[0] if found else None
+    return Calibration(read_camera(found[0])) if found else None
 
 
 def unpacked(pixels: NDArray[Any]) -> NDArray[np.uint8]:

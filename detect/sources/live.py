@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from detect.errors import DetectError
 from detect.sources.gray import gray_of_pixels
-from detect.sources.interface import PoseStream, SourceImage, numbered_prefix
+from detect.sources.interface import Calibration, PoseStream, SourceImage, numbered_prefix
 from detect.sources.video import quiet_opencv
 
 _log = logging.getLogger("redetect")
@@ -73,7 +73,7 @@ class LiveCamera:
                 yield SourceImage(prefix, time_s, content=gray)
                 number += 1
 
-    def calibration(self) -> Path | None:
+    def calibration(self) -> Calibration | None:
         """There is none: it is named."""
         return None
 
@@ -167,6 +167,6 @@ def _open_camera(index: int) -> Capture:
     if not capture.isOpened():
         raise DetectError(
             f"camera:{index}: no camera of that number answers: "
-            "expected one that is plugged in, in nobody else's use, and open to you (often camera:0)"
+            "expected one that is plugged in, not in use, and open to you (often camera:0)"
         )
     return capture

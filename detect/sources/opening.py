@@ -18,7 +18,8 @@ from detect.run import (
     open_run,
 )
 from detect.sources.bag import BAG_SUFFIXES, Bag
-from detect.sources.interface import Source
+from detect.sources.bag_camera import BASE_FRAME
+from detect.sources.interface import Calibration, Source
 from detect.sources.live import LiveCamera
 from detect.sources.odometry import FirstFrames, FramesAlongPoses, FramesAlongRows, SourceFrames
 from detect.sources.options import SourceOptions
@@ -61,7 +62,7 @@ def open_calibrated(
         run: ImageRun = open_run(name, camera_path, bits=options.bits or None)
         run = _shortened(run, options.frames)
     else:
-        run = open_source(name, camera_path, options)
+        run = _open(name, camera_path, options, posed=True)
     if isinstance(run, Run):
         return run
     raise DetectError(
@@ -93,12 +94,20 @@ def open_source(
     if _is_plain_folder(name, options):
         run = open_images(name, camera_path, bits=options.bits or None)
         return _shortened(run, options.frames)
+    return _open(name, camera_path, options, posed=False)
+
+
+def _open(name: Path, camera_path: Path | None, options: SourceOptions, *, posed: bool) -> ImageRun:
+    """Open any source, with a calibration where there is one; `posed`: one with a pose."""
     source = _source(name, options)
-    if camera_path is None:
-        camera_path = source.calibration()
-    camera = None if camera_path is None else read_camera(camera_path)
-    if camera is not None:
-        _demand_size(source, camera)
+    calibration = (
+        Calibration(read_camera(camera_path)) if camera_path is not None else source.calibration()
+    )
+    camera = None if calibration is None else calibration.camera
+    if calibration is not None:
+        if posed and calibration.why_no_pose is not None:
+            raise DetectError(calibration.why_no_pose)
+        _demand_size(source, calibration.camera)
     frames, odometry = _frames(source, options)
     run = ImageRun(
         source.output_base.parent,
@@ -121,11 +130,14 @@ def _source(name: Path, options: SourceOptions) -> Source:
     is_bag = _is_ros2_bag(name) or name.suffix.lower() in BAG_SUFFIXES
     if options.image_topic and not is_bag:
         raise DetectError(f"{name}: --image-topic {options.image_topic}: only bags have topics")
+    if options.base_frame and not is_bag:
+        raise DetectError(f"{name}: --base-frame {options.base_frame}: only bags have frames")
     bits = options.bits or None
     if live is not None:
         return LiveCamera(int(live[1]))
     if is_bag and name.exists():
-        return Bag(name, options.image_topic or None, bits)
+        base = options.base_frame or BASE_FRAME
+        return Bag(name, options.image_topic or None, bits, base)
     is_file = name.is_file()
     if is_file and name.suffix.lower() not in IMAGE_SUFFIXES:
         return VideoFile(name)

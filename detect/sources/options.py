@@ -29,6 +29,9 @@ class SourceOptions:
         images.
     image_topic : str
         The images of a bag, if there are several topics of them.
+    base_frame : str
+        The frame of the robot's base, on the floor, in a bag that holds the calibration itself
+        (camera_info and tf_static); by default base_footprint.
     frames : int
         Stop after so many frames; 0 for all of them (of a live camera: until Ctrl-C).
     bits : int
@@ -40,6 +43,7 @@ class SourceOptions:
     odometry_axes: Axes = "robotics"
     times: str = ""
     image_topic: str = ""
+    base_frame: str = ""
     frames: int = 0
     bits: int = 0
 
@@ -51,4 +55,4 @@ class SourceOptions:
     @property
     def plain(self) -> bool:
         """Whether nothing is said of steps and times."""
-        return not (self.odometry or self.times or self.image_topic)
+        return not (self.odometry or self.times or self.image_topic or self.base_frame)

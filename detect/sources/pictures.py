@@ -8,7 +8,13 @@ from pathlib import Path
 from detect.errors import DetectError
 from detect.image_names import IMAGE_SUFFIXES, ImageNames
 from detect.sources.gray import significant_bits_of_file
-from detect.sources.interface import PoseStream, SourceImage, frame_prefix, only_calibration
+from detect.sources.interface import (
+    Calibration,
+    PoseStream,
+    SourceImage,
+    frame_prefix,
+    only_calibration,
+)
 from detect.sources.times import TimesByImage
 
 WILDCARDS = frozenset("*?[")
@@ -64,7 +70,7 @@ class ImageFiles:
             time_s = None if self._times is None else self._times.get(path.stem)
             yield SourceImage(frame_prefix(path.stem), time_s, path, bits=self._bits)
 
-    def calibration(self) -> Path | None:
+    def calibration(self) -> Calibration | None:
         """The ``.cam`` file in the folder, or in the one above ``images/``."""
         return only_calibration(self._home, self._home.resolve().name)
 

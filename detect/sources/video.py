@@ -12,7 +12,13 @@ from typing import TYPE_CHECKING
 
 from detect.errors import DetectError
 from detect.sources.gray import gray_of_pixels
-from detect.sources.interface import PoseStream, SourceImage, numbered_prefix, only_calibration
+from detect.sources.interface import (
+    Calibration,
+    PoseStream,
+    SourceImage,
+    numbered_prefix,
+    only_calibration,
+)
 
 if TYPE_CHECKING:
     import cv2
@@ -75,7 +81,7 @@ class VideoFile:
         if self._count is not None and number < self._count:
             _log.info(f"{self.name}: {number} of the {self._count} frames it speaks of are there")
 
-    def calibration(self) -> Path | None:
+    def calibration(self) -> Calibration | None:
         """The ``.cam`` file beside it: of its name, or the only one."""
         return only_calibration(self.path.parent, self.path.stem)
 

@@ -16,6 +16,7 @@ BAG_KINDS: tuple[BagKind, ...] = ("mcap", "mcap folder", "sqlite", "ros1")
 
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 ODOMETRY = "nav_msgs/msg/Odometry"
+INFO = "sensor_msgs/msg/CameraInfo"
 
 
 @dataclass(frozen=True)
@@ -31,11 +32,14 @@ class Ros:
     """Messages of ROS 1 or 2, without ROS."""
 
     def __init__(self, kind: BagKind = "mcap") -> None:
-        from rosbags.typesys import Stores, get_typestore
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
         self.kind = kind
         self.is1 = kind == "ros1"
         self.store = get_typestore(Stores.ROS1_NOETIC if self.is1 else Stores.ROS2_HUMBLE)
+        if self.is1:  # not among those that come with the package
+            definition = "geometry_msgs/TransformStamped[] transforms\n"
+            self.store.register(get_types_from_msg(definition, "tf2_msgs/msg/TFMessage"))
 
     def make(self, name: str, **fields: Any) -> Any:
         return self.store.types[name](**fields)
@@ -95,6 +99,57 @@ class Ros:
                 covariance=np.zeros(36),
             ),
         )
+
+    def camera_info(
+        self, width: int, height: int, model: str, d: Sequence[float], k: Sequence[float],
+        frame: str, **changed: Any,
+    ) -> Any:  # fmt: skip
+        """A calibration; ROS 1 calls its numbers by capital letters."""
+        numbers = {
+            "d": np.array(d, float),
+            "k": np.array(k, float),
+            "r": np.eye(3).ravel(),
+            "p": np.zeros(12),
+        }
+        if self.is1:
+            numbers = {letter.upper(): values for letter, values in numbers.items()}
+        header = self.header(1.0)
+        header.frame_id = frame
+        region = self.make(
+            "sensor_msgs/msg/RegionOfInterest",
+            x_offset=0, y_offset=0, height=0, width=changed.pop("roi_width", 0), do_rectify=False,
+        )  # fmt: skip
+        fields = {"binning_x": 0, "binning_y": 0, **changed}
+        return self.make(
+            INFO, header=header, height=height, width=width, distortion_model=model,
+            roi=region, **numbers, **fields,
+        )  # fmt: skip
+
+    def static_transforms(self, *placed: tuple[str, str, NDArray[Any]]) -> Any:
+        """Parents, children and (3, 4) parent_from_child."""
+        from scipy.spatial.transform import Rotation
+
+        made = []
+        for parent, child, pose in placed:
+            qx, qy, qz, qw = Rotation.from_matrix(pose[:, :3]).as_quat()
+            x, y, z = pose[:, 3]
+            header = self.header(0.0)
+            header.frame_id = parent
+            name = "geometry_msgs/msg/"
+            transform = self.make(
+                f"{name}Transform",
+                translation=self.make(f"{name}Vector3", x=x, y=y, z=z),
+                rotation=self.make(f"{name}Quaternion", x=qx, y=qy, z=qz, w=qw),
+            )
+            made.append(
+                self.make(
+                    f"{name}TransformStamped",
+                    header=header,
+                    child_frame_id=child,
+                    transform=transform,
+                )
+            )
+        return self.make("tf2_msgs/msg/TFMessage", transforms=made)
 
     def write(self, path: Path, said: Sequence[Said]) -> Path:
         """Record messages; gives the path by which the bag is read."""

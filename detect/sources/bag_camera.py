@@ -1,0 +1,190 @@
+"""The calibration that a bag holds itself: camera_info, and where tf_static puts the camera.
+
+The intrinsics are converted to the project's model, and refused where that cannot follow them. The
+pose is the chain of static transforms from the robot's base *on the floor* to the camera's optical
+frame (x right, y down, z forward), brought to the data set's axes. Without one, only what needs no
+floor can be looked for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from camera import Camera
+from detect.errors import DetectError
+from detect.sources.interface import Calibration
+from detect.sources.steps import DATASET_FROM_ROBOTICS
+
+if TYPE_CHECKING:
+    from rosbags.highlevel import AnyReader
+
+#: What ROS calls the robot's base on the floor (REP 105, REP 120).
+BASE_FRAME = "base_footprint"
+
+#: A conversion may differ by so much from the camera_info, anywhere in the image.
+LIMIT_PX = 0.05
+
+_INFO, _TRANSFORMS = "sensor_msgs/msg/CameraInfo", "tf2_msgs/msg/TFMessage"
+_STATIC = "/tf_static"
+
+Matrix = NDArray[np.float64]
+
+
+def info_topic(reader: AnyReader, image_topic: str) -> str | None:
+    """The camera_info of an image topic: that of its namespace, or the only one."""
+    topics = sorted({c.topic for c in reader.connections if c.msgtype == _INFO})
+    raw = image_topic.removesuffix("/compressed")
+    own = raw.rpartition("/")[0] + "/camera_info"
+    if own in topics:
+        return own
+    return topics[0] if len(topics) == 1 else None
+
+
+def calibration_of_info(message: Any, name: str, pose: Matrix | None, why_not: str) -> Calibration:
+    """The calibration of a camera_info message.
+
+    Parameters
+    ----------
+    message : sensor_msgs/CameraInfo
+    name : str
+        What messages call it.
+    pose : (3, 4) float64 or None
+        `robot_from_camera`.
+    why_not : str
+        Why there is none.
+
+    Returns
+    -------
+    Calibration
+
+    Raises
+    ------
+    DetectError
+        If only part of the image is meant, or the model cannot follow the lens.
+    camera.CameraError
+        If there can be no such camera.
+    """
+    from camera.calibration_floor import with_pose
+    from camera.conversion import convert_to_camera
+    from camera.ros_camera_info import camera_from_message
+
+    part = message.roi.width or message.roi.height
+    if part or max(message.binning_x, message.binning_y) > 1:
+        raise DetectError(f"{name}: binning or roi is set: name a calibration by --camera")
+    d, k = (_field(message, letter).tolist() for letter in "dk")
+    foreign = camera_from_message(
+        message.width, message.height, message.distortion_model, d, k, name
+    )
+    converted = convert_to_camera(foreign)
+    if not converted.deviation_px <= LIMIT_PX:
+        raise DetectError(
+            f"{name}: this project's model differs from it by up to {converted.deviation_px:.3g} "
+            f"px, more than {LIMIT_PX:g}: name a calibration by --camera (`camera convert` makes "
+            "one with a wider --limit-px)"
+        )
+    assert isinstance(converted.camera, Camera)
+    if pose is None:
+        return Calibration(converted.camera, why_not)
+    return Calibration(with_pose(converted.camera, pose))
+
+
+def is_calibrated(message: Any) -> bool:
+    """Whether a camera_info says anything: uncalibrated drivers publish a matrix of zeros."""
+    return bool(np.any(_field(message, "k")))
+
+
+def static_transforms(messages: Iterable[Any]) -> dict[str, tuple[str, Matrix]]:
+    """Parent and 4x4 parent_from_child of each child frame."""
+    found: dict[str, tuple[str, Matrix]] = {}
+    for message in messages:
+        for item in message.transforms:
+            t, q = item.transform.translation, item.transform.rotation
+            placed = np.eye(4)
+            placed[:3, :3] = rotation_of(q.x, q.y, q.z, q.w)
+            placed[:3, 3] = (t.x, t.y, t.z)
+            found[item.child_frame_id.lstrip("/")] = (item.header.frame_id.lstrip("/"), placed)
+    return found
+
+
+def pose_in_dataset(
+    transforms: dict[str, tuple[str, Matrix]], base: str, optical: str
+) -> Matrix | None:
+    """The (3, 4) `robot_from_camera` of an optical frame; None if no chain leads to the base."""
+    placed, frame = np.eye(4), optical.lstrip("/")
+    for _ in range(len(transforms) + 1):
+        if frame == base:
+            return np.asarray(DATASET_FROM_ROBOTICS @ placed[:3], dtype=np.float64)
+        if frame not in transforms:
+            return None
+        frame, parent_from_child = transforms[frame]
+        placed = parent_from_child @ placed
+    return None  # a circle
+
+
+def rotation_of(qx: float, qy: float, qz: float, qw: float) -> Matrix:
+    """The rotation matrix of a quaternion of any length but zero."""
+    q = np.array([qx, qy, qz, qw])
+    x, y, z, w = q / np.linalg.norm(q)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def _field(message: Any, letter: str) -> NDArray[np.float64]:
+    """The numbers of a field of camera_info, which ROS 1 calls by a capital letter."""
+    name = letter.upper() if hasattr(message, letter.upper()) else letter
+    return np.array(getattr(message, name), dtype=np.float64)
+
+
+def recorded_calibration(path: Path, image_topic: str, base: str) -> Calibration | None:
+    """The calibration that a bag holds of the camera of a topic; None if there is none.
+
+    Parameters
+    ----------
+    path : path
+        The bag.
+    image_topic : str
+        The camera's images.
+    base : str
+        The frame of the robot's base, on the floor.
+
+    Returns
+    -------
+    Calibration or None
+
+    Raises
+    ------
+    DetectError, camera.CameraError
+        As `calibration_of_info`, or if the bag cannot be read.
+    """
+    from detect.sources.bag import messages, opened_bag
+
+    with opened_bag(path) as reader:
+        topic = info_topic(reader, image_topic)
+        if topic is None:
+            return None
+        found = next(messages(reader, path, topic), None)
+        if found is None or not is_calibrated(found[2]):
+            return None
+        message = found[2]
+        kinds = {c.topic: c.msgtype for c in reader.connections}
+        transforms: dict[str, tuple[str, Matrix]] = {}
+        if kinds.get(_STATIC) == _TRANSFORMS:
+            transforms = static_transforms(said for _, _, said in messages(reader, path, _STATIC))
+    optical = message.header.frame_id
+    pose = pose_in_dataset(transforms, base, optical)
+    why_not = (
+        f"{path}: {topic} says nothing of the camera's pose above the floor, and no static "
+        f"transforms lead from {base!r} to {optical!r}: name a .cam file by --camera (`camera "
+        "convert` and `camera floor` make one), or the robot's base on the floor by --base-frame"
+    )
+    return calibration_of_info(message, f"{path}: {topic}", pose, why_not)
