@@ -14,6 +14,7 @@ run. Runs of the library without a log have no journal; their files grow and app
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import logging
 import os
@@ -165,8 +166,10 @@ class RunFiles:
         self._begin_journal()
 
     def _demand_new(self) -> None:
-        """Refuse to replace what must not be."""
+        """Refuse to replace what must not be, or cannot be."""
         for file in self._files:
+            if file.path.is_dir() and not file.path.is_symlink():
+                raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(file.path))
             if not file.overwrite and os.path.lexists(file.path):
                 raise OutputExistsError(file.path)
         if self._conduct.log is not None:
@@ -202,7 +205,7 @@ class RunFiles:
                 try:
                     part.place(overwrite=head.overwrite or file.overwrite)
                 finally:
-                    part.discard()
+                    part.close()
         if self._conduct.resume and head.made_by == self._made_by:
             self._done = True
             self._kept = iter(list(lines))

@@ -538,6 +538,17 @@ def test_a_folder_of_the_same_name_comes_back(run_folder: Path, output: Path) ->
     assert hidden(output) == set()
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_folder_in_the_place_of_a_result(
+    run_folder: Path, output: Path, capsys: Captured, kind: str
+) -> None:
+    """Told before anything is done, not when some of the files have taken their places."""
+    (output / f"detected.{kind}").mkdir()
+    assert main(command(run_folder, output)) == 1
+    assert f"Is a directory: '{output / f'detected.{kind}'}'" in capsys.readouterr().err
+    assert [path.name for path in output.iterdir()] == [f"detected.{kind}"]
+
+
 def test_the_log_says_nothing_of_the_interruption(
     kept: Kept, undisturbed: dict[str, bytes], capsys: Captured
 ) -> None:
