@@ -28,7 +28,7 @@ from groundtruth.errors import GeometryError, GroundTruthError
 from groundtruth.network_estimation import BoardView, DoubleBoard
 from storage.bounded import read_bounded
 from storage.inside import path_inside
-from storage.messages import excerpt
+from storage.messages import excerpt, one_line
 
 FloatArray = NDArray[np.float64]
 
@@ -91,13 +91,13 @@ def read_boards(path: Path) -> BoardsFile:
     path = path / BOARDS_NAME if path.is_dir() else path
     content = read_json(path)
     boards = {
-        name: _board(f"{path}: board {name}", entry)
+        name: _board(f"{path}: board {one_line(name, 60)}", entry)
         for name, entry in _objects(f"{path}: boards", content.get("boards")).items()
     }
     unknown = sorted(set(boards) - {FIRST, SECOND, WORLD})
     if unknown or WORLD not in boards or (FIRST in boards) != (SECOND in boards):
         raise GroundTruthError(
-            f"{path}: boards are {sorted(boards)}: expected world, and first and second or neither"
+            f"{path}: boards are {excerpt(sorted(boards))}: expected world, and first and second or neither"
         )
     world = parse_pose(f"{path}: world_from_board", content.get("world_from_board"))
     double = None

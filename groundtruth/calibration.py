@@ -22,7 +22,7 @@ from groundtruth.transforms import quaternion_xyzw, transform_from_quaternion
 from storage import write_whole
 from storage.bounded import read_bounded
 from storage.inside import path_inside
-from storage.messages import excerpt
+from storage.messages import excerpt, one_line
 
 FloatArray = NDArray[np.float64]
 
@@ -163,13 +163,13 @@ def read_network(path: str | os.PathLike[str]) -> Network:
         calibration = cameras[name].get("calibration")
         if not isinstance(calibration, str) or not calibration:
             raise GroundTruthError(
-                f"{path}: camera {name}: calibration is {excerpt(calibration)}: expected a file"
+                f"{path}: camera {one_line(name, 60)}: calibration is {excerpt(calibration)}: expected a file"
             )
         try:
             paths.append(path_inside(Path(path).parent, calibration))
         except ValueError as error:
             raise GroundTruthError(
-                f"{path}: camera {name}: calibration {excerpt(calibration)} {error}: expected a "
+                f"{path}: camera {one_line(name, 60)}: calibration {excerpt(calibration)} {error}: expected a "
                 ".cam file in the network's own"
             ) from None
         calibrations.append(calibration)
@@ -177,7 +177,7 @@ def read_network(path: str | os.PathLike[str]) -> Network:
         names,
         tuple(read_camera(place) for place in paths),
         tuple(calibrations),
-        np.stack([_pose(f"{path}: camera {name}", cameras[name]) for name in names]),
+        np.stack([_pose(f"{path}: camera {one_line(name, 60)}", cameras[name]) for name in names]),
         _joint_covariance(
             str(path), content, "cameras", list(names), [cameras[name] for name in names]
         ),
@@ -289,7 +289,7 @@ def _entries(
         raise GroundTruthError(f"{path}: {key}: expected an object with at least one entry")
     for name, entry in entries.items():
         if not isinstance(entry, dict):
-            raise GroundTruthError(f"{path}: {key}: {name}: expected an object")
+            raise GroundTruthError(f"{path}: {key}: {one_line(name, 60)}: expected an object")
     return entries
 
 
@@ -363,7 +363,9 @@ def _joint_covariance(
         covariance = np.zeros((size, size))
         for i, (name, entry) in enumerate(zip(names, entries)):
             block = slice(6 * i, 6 * i + 6)
-            covariance[block, block] = parse_covariance(f"{path}: {single} {name}", entry)
+            covariance[block, block] = parse_covariance(
+                f"{path}: {single} {one_line(name, 60)}", entry
+            )
         return covariance
     if any("covariance" in entry or "sigmas" in entry for entry in entries):
         raise GroundTruthError(
@@ -373,7 +375,9 @@ def _joint_covariance(
         raise GroundTruthError(f"{path}: covariance: expected an object with {key} and matrix")
     order = [str(name) for name in joint[key]]
     if sorted(order) != sorted(names):
-        raise GroundTruthError(f"{path}: covariance: {key} are {order}: expected {names}")
+        raise GroundTruthError(
+            f"{path}: covariance: {key} are {excerpt(order)}: expected {excerpt(names)}"
+        )
     matrix = _covariance(f"{path}: covariance", joint.get("matrix"), size)
     index = np.concatenate([6 * order.index(name) + np.arange(6) for name in names])
     return np.asarray(matrix[np.ix_(index, index)])

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import os
 import re
+import struct
 import zipfile
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -177,11 +178,17 @@ def _read_npz(path: str | os.PathLike[str]) -> Scans:
         with zipfile.ZipFile(path) as archive:
             times = _member(path, archive, "times_s", np.dtype(np.float64), 1)
             ranges = _member(path, archive, "ranges_mm", np.dtype(np.uint16), 2)
+    except GroundTruthError:
+        raise
     except FileNotFoundError:
         raise GroundTruthError(f"{path}: no such file") from None
     except OSError as error:
         raise GroundTruthError(f"{path}: cannot be read: {error.strerror}") from None
-    except (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError) as error:
+    # What a damaged archive raises: names that are no UTF-8, offsets beyond any file, ...
+    except (
+        zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, ValueError, OverflowError,
+        struct.error,
+    ) as error:  # fmt: skip
         said = one_line(str(error), 200)
         raise GroundTruthError(f"{path}: is no .npz that can be read: {said}") from None
     try:
