@@ -97,7 +97,8 @@ def read_boards(path: Path) -> BoardsFile:
     unknown = sorted(set(boards) - {FIRST, SECOND, WORLD})
     if unknown or WORLD not in boards or (FIRST in boards) != (SECOND in boards):
         raise GroundTruthError(
-            f"{path}: boards are {excerpt(sorted(boards))}: expected world, and first and second or neither"
+            f"{path}: boards are {excerpt(sorted(boards))}: expected world, and first "
+            "and second or neither"
         )
     world = parse_pose(f"{path}: world_from_board", content.get("world_from_board"))
     double = None
