@@ -17,7 +17,7 @@ demo: setup
 	$(BIN)/detect compare images/e
 
 test: setup
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n auto --dist loadfile
 
 check: setup
 	$(BIN)/ruff format --check .
