@@ -21,7 +21,6 @@ from groundtruth.errors import GroundTruthError
 from groundtruth.transforms import quaternion_xyzw, transform_from_quaternion
 from storage import write_whole
 from storage.bounded import read_bounded
-from storage.inside import path_inside
 from storage.messages import excerpt, one_line
 
 FloatArray = NDArray[np.float64]
@@ -163,15 +162,20 @@ def read_network(path: str | os.PathLike[str]) -> Network:
         calibration = cameras[name].get("calibration")
         if not isinstance(calibration, str) or not calibration:
             raise GroundTruthError(
-                f"{path}: camera {one_line(name, 60)}: calibration is {excerpt(calibration)}: expected a file"
+                f"{path}: camera {one_line(name, 60)}: calibration is {excerpt(calibration)}: "
+                "expected a file"
             )
-        try:
-            paths.append(path_inside(Path(path).parent, calibration))
-        except ValueError as error:
+        # It may well lie beside the network's folder; but only a calibration is ever opened.
+        if (
+            Path(calibration).is_absolute()
+            or not calibration.endswith(".cam")
+            or "\0" in calibration
+        ):
             raise GroundTruthError(
-                f"{path}: camera {one_line(name, 60)}: calibration {excerpt(calibration)} {error}: expected a "
-                ".cam file in the network's own"
-            ) from None
+                f"{path}: camera {one_line(name, 60)}: calibration {excerpt(calibration)} "
+                "is no .cam file by a relative path: expected one"
+            )
+        paths.append(Path(path).parent / calibration)
         calibrations.append(calibration)
     return Network(
         names,
