@@ -66,7 +66,7 @@ class Circles:
     run : Path
         Run folder of the data set's layout; a folder of images, or a pattern in quotes
         ('drive/*.png'); a video; a ROS 1 or 2 bag or MCAP file; or a camera of this machine,
-        camera:0. With a .cam beside it, or named by --camera.
+        camera:0. With a .cam beside it, in the bag, or named by --camera.
     preset : str
         Values that the other flags start from: `published` is the report's detector to the letter.
     camera : Path
@@ -116,7 +116,7 @@ class Lines:
     run : Path
         Run folder of the data set's layout; a folder of images, or a pattern in quotes
         ('drive/*.png'); a video; a ROS 1 or 2 bag or MCAP file; or a camera of this machine,
-        camera:0. With a .cam beside it, or named by --camera.
+        camera:0. With a .cam beside it, in the bag, or named by --camera.
     preset : str
         Values that the other flags start from: `published` is the report's parameters.
     camera : Path
@@ -220,7 +220,7 @@ class All:
     run : Path
         Run folder of the data set's layout; a folder of images, or a pattern in quotes
         ('drive/*.png'); a video; a ROS 1 or 2 bag or MCAP file; or a camera of this machine,
-        camera:0. With a .cam beside it, or named by --camera.
+        camera:0. With a .cam beside it, in the bag, or named by --camera.
     preset : str
         Values that the other flags start from.
     camera : Path

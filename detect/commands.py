@@ -224,7 +224,7 @@ def _demand_new(
     if conduct.log is not None and journal_place(conduct.log).exists():
         return  # the results may be half of those of a run that was killed: told when that is over
     if run.has_times:
-        outputs = [*outputs, *(times_file(path).path for path in outputs if path is not None)]
+        outputs = [*outputs, times_file([path for path in outputs if path is not None]).path]
     for path in outputs:
         if path is not None and path.exists() and not force:
             raise OutputExistsError(path)

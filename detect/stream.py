@@ -28,6 +28,9 @@ from detect.workers import local_workers
 from landmarks import FrameTilt, LineLandmark, format_head
 from storage import write_whole
 
+#: Endings of files of landmarks.
+LANDMARK_SUFFIXES = frozenset({".circles", ".lines", ".markers"})
+
 #: So many failures are kept word for word.
 KEPT_FAILURES = 100
 
@@ -131,7 +134,7 @@ def detect_run(
     plan : FramePlan
         What to look for.
     outputs : sequence of Output
-        The files to write. Where the frames' times are known, they go beside the last one.
+        The files to write. Where the frames' times are known, they go beside them.
     overwrite : bool
         Whether existing files may be replaced.
     tilts : mapping, optional
@@ -167,7 +170,7 @@ def detect_run(
     workers = local_workers(1) if workers is None else workers
     summary = RunSummary()
     if run.has_times:
-        outputs = [*outputs, times_file(outputs[-1].path)]
+        outputs = [*outputs, times_file([output.path for output in outputs])]
     with ExitStack() as stack:
         files = stack.enter_context(RunFiles(outputs, plan, conduct, overwrite=overwrite))
         tasks = stack.enter_context(closing(_tasks(run, tilts, reference)))
@@ -191,9 +194,16 @@ def detect_run(
     return summary
 
 
-def times_file(output: Path) -> Output:
-    """The file of the frames' times that stands beside a result: its name and ``.times``."""
-    return Output(output.with_name(f"{output.name}.times"), "times", format_head(TIMES_HEAD))
+def times_file(results: Sequence[Path]) -> Output:
+    """The file of the frames' times that stands beside results.
+
+    It is called like the file of landmarks, with ``.times`` behind; where there are several, like
+    what they have in common: ``detected.circles.times``, but ``detected.times``.
+    """
+    landmarks = [path for path in results if path.suffix in LANDMARK_SUFFIXES]
+    path = landmarks[0] if landmarks else results[-1]
+    name = f"{path.stem if len(landmarks) > 1 else path.name}.times"
+    return Output(path.with_name(name), "times", format_head(TIMES_HEAD))
 
 
 def json_file(path: Path, plan: FramePlan, version: str) -> Output:

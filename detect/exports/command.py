@@ -69,7 +69,10 @@ def table_files(output: Path, tables: list[TableName]) -> dict[TableName, Path]:
 def _times(command: Export) -> TimesByImage | None:
     if command.times is not None:
         return TimesByImage(command.times)
-    beside = command.file.with_name(f"{command.file.name}.times")
-    if command.rate_hz is None and beside.is_file():
-        return TimesByImage(beside)
+    if command.rate_hz is not None:
+        return None
+    for name in (f"{command.file.name}.times", f"{command.file.stem}.times"):
+        beside = command.file.with_name(name)
+        if beside.is_file():
+            return TimesByImage(beside)
     return None

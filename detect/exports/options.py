@@ -33,7 +33,8 @@ class Export:
         The file to write; by default the file's name and the format's. The steps go beside it, as
         .steps.csv or .steps.parquet; MCAP has all in one.
     times : Path
-        Times of the frames, rows `prefix seconds`; by default the file's name and .times.
+        Times of the frames, rows `prefix seconds`; by default <file>.times, or that of what was
+        detected together (detected.times).
     rate_hz : float
         Without times: so many frames in a second, the first at 0 s. MCAP needs one or the other.
     force : bool

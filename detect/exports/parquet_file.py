@@ -49,8 +49,8 @@ def write_parquet(stream: BinaryIO, table: TableName, rows: Iterable[TableRow], 
     DetectError
         If an image's name is no Unicode.
     """
-    import pyarrow as pa  # type: ignore[import-untyped]
-    import pyarrow.parquet as pq  # type: ignore[import-untyped]
+    import pyarrow as pa
+    import pyarrow.parquet as pq
 
     types: dict[str, Any] = {
         "text": pa.string(),

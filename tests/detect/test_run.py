@@ -60,7 +60,7 @@ def test_run_folder_of_the_data_set(run_folder: Path, published_camera: Camera) 
     first, second = (frame.step for frame in run.frames)
     assert first == Step("k.0000", 0.5, 0.1, 0.01, 1e-5, 0.0, 1e-5, 0.0, 0.0, 1e-4)
     assert second.dx == -0.25
-    assert len(run.frames) == 2
+    assert run.frames.expected == 2
     assert run.images_without_step == 0
 
 

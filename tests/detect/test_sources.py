@@ -65,9 +65,17 @@ def test_a_video_gives_the_rows_of_its_images(
 def test_all_of_a_video_is_named_after_it(video: Path) -> None:
     assert main(["all", str(video)]) == 0
     names = sorted(path.name for path in video.parent.iterdir() if "log" not in path.name)
-    endings = ("detected.circles", "detected.circles.times", "detected.lines", "detected.tilt")
+    endings = ("detected.circles", "detected.lines", "detected.tilt", "detected.times")
     assert names == sorted(["s.avi", "s.cam", *(f"s.{ending}" for ending in endings)])
     assert main(["all", str(video)]) == 1  # nothing is overwritten unasked
+    lines = video.parent / "s.detected.lines"
+    assert main(["export", str(lines)]) == 0
+    times = [row.split(",")[2] for row in Path(f"{lines}.csv").read_text().splitlines()[1:]]
+    assert set(times) <= {"0.0", "0.1", "0.2"}
+    (video.parent / "s.detected.circles").unlink()
+    (video.parent / "s.detected.lines").unlink()
+    (video.parent / "s.detected.tilt").unlink()
+    assert main(["all", str(video)]) == 1  # the times stand there
 
 
 def test_without_odometry_steps_are_zero(video: Path, expected_rows: list[str]) -> None:
@@ -110,7 +118,7 @@ def test_workers_write_the_same_bytes(project_root: Path, tmp_path: Path, kind: 
         folder = tmp_path / f"jobs{jobs}"
         folder.mkdir()
         assert main([*arguments, "--jobs", str(jobs), "-o", str(folder)]) == 0
-        kinds = ("circles", "lines", "tilt", "circles.times")
+        kinds = ("circles", "lines", "tilt", "times")
         written.append([(folder / f"detected.{kind}").read_bytes() for kind in kinds])
     assert b"LANDMARK_C" in written[0][0]
     assert written[0] == written[1]
