@@ -387,13 +387,16 @@ def _check_number(count: int, without: str = "") -> None:
 
 
 def _check_views(fit: Adjusted, spread_deg: float) -> None:
-    relative = float(np.sqrt(fit.covariance[0, 0]) / fit.estimate.intrinsics[0])
+    variance = float(fit.covariance[0, 0])
+    # Where nothing is known, rounding can make the variance anything.
+    sigma = np.sqrt(variance) if variance > 0.0 else np.inf
+    relative = float(sigma / fit.estimate.intrinsics[0])
     if spread_deg < _SMALLEST_SPREAD_DEG or not relative < _LARGEST_SCALE_SIGMA:
         raise CalibrationError(
             f"the boards stand too much alike: their normals differ by at most {spread_deg:.1f} "
             f"deg and leave the focal length {100.0 * relative:.2g} % uncertain, for it can't be "
-            "told from the distance; tilt the board by 20 to 45 deg in different directions between "
-            "pictures"
+            "told from the distance; tilt the board by 20 to 45 deg in different directions "
+            "between pictures"
         )
 
 

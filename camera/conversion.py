@@ -126,19 +126,14 @@ def convert_to_foreign(
             jacobian[..., k] = (ahead - _unchecked(model, moved)(rays)) / (2.0 * step)
         return found, jacobian
 
-    best: Converted | None = None
-    parameters = start
-    for count in _stages(model, number):
-        span = np.eye(len(start))[:, : 4 + count]
-        parameters = _fit(project, parameters, span, pixels, lambda p: bool(min(p[:2]) > 0.0))
-        refined = _lawson(project, parameters, span, pixels, lambda p: bool(min(p[:2]) > 0.0))
-        for candidate in (parameters, refined):
-            converted = _measured(camera_of(candidate), check)
-            if best is None or converted.deviation_px < best.deviation_px:
-                best = converted
-        if best is not None and best.deviation_px < _EXACT_PX:
-            break
-    assert best is not None
+    def possible(parameters: FloatArray) -> bool:
+        return bool(min(parameters[:2]) > 0.0)
+
+    every = np.eye(len(start))
+    spans = [every[:, : 4 + count] for count in _stages(model, number)]
+    best = _nearest(project, camera_of, start, spans, pixels, possible, check)
+    if best is None:
+        raise ConversionError(f"no {model} camera sees what the source sees")
     return best
 
 
@@ -194,24 +189,47 @@ def convert_to_camera(
     def possible(p: FloatArray) -> bool:
         return is_possible(p, width, height)
 
-    best: Converted | None = None
-    parameters = start
     if not possible(start):
         raise ConversionError("the source's focal lengths or principal point are not possible here")
-    for count in range(6):
-        span = free_span(count, None)
-        parameters = _fit(project, parameters, span, pixels, possible)
-        for candidate in (parameters, _lawson(project, parameters, span, pixels, possible)):
-            try:
-                converted = _measured(camera_of(candidate), check)
-            except CameraError:
-                continue
-            if best is None or converted.deviation_px < best.deviation_px:
-                best = converted
-        if best is not None and best.deviation_px < _EXACT_PX:
-            break
+    spans = [free_span(count, None) for count in range(6)]
+    best = _nearest(project, camera_of, start, spans, pixels, possible, check)
     if best is None:
         raise ConversionError("no camera of the project's model sees what the source sees")
+    return best
+
+
+def _nearest(
+    project: Callable[[FloatArray], tuple[FloatArray, FloatArray]],
+    camera_of: Callable[[FloatArray], AnyCamera],
+    start: FloatArray,
+    spans: list[FloatArray],
+    pixels: FloatArray,
+    possible: Callable[[FloatArray], bool],
+    check: tuple[FloatArray, FloatArray],
+) -> Converted | None:
+    """The fit with the smallest largest deviation, each span fitted from where the last ended."""
+    best: Converted | None = None
+    nearest = parameters = start
+
+    def keep(candidate: FloatArray) -> bool:
+        nonlocal best
+        try:
+            converted = _measured(camera_of(candidate), check)
+        except CameraError:
+            return False
+        if best is None or converted.deviation_px < best.deviation_px:
+            best = converted
+            return True
+        return False
+
+    span = spans[0]
+    for wider in spans:
+        parameters = _fit(project, parameters, wider, pixels, possible)
+        if keep(parameters):
+            nearest, span = parameters, wider
+        if best is not None and best.deviation_px < _EXACT_PX:
+            return best
+    keep(_lawson(project, nearest, span, pixels, possible))
     return best
 
 

@@ -1,0 +1,252 @@
+"""From rendered pictures to a .cam file and its pose; what a newcomer gets wrong."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from camera import Camera, read_camera, write_camera
+from camera.board import Board
+from camera.board_points import find_board
+from camera.calibration_floor import on_floor, place_on_floor, read_floor_points
+from camera.calibration_model import rotation_of
+from camera.calibration_projection import projection_difference
+from camera.cli import main
+from camera.errors import CalibrationError
+from tools.camera_evaluation.rendered import BOARDS, calibrate_rendered
+from tools.camera_evaluation.rendering import Rays, board_poses, rays_of, render_board
+
+BOARD = Board("checkerboard", 9, 6, 0.04)
+FLAGS = ["--columns", "9", "--rows", "6", "--square-m", "0.04"]
+
+
+@pytest.fixture(scope="module")
+def rays() -> Rays:
+    """A small camera with square pixels and some distortion."""
+    camera = Camera(
+        320, 240, 260.0, 260.0, 160.5, 118.0, (0.0, -0.25, 0.0, 0.3, 0.0),
+        ((-1.0, 0.0, 0.0, 0.0), (0.0, 0.0, -1.0, 0.0), (0.0, -1.0, 0.0, 0.0)),
+    )  # fmt: skip
+    return rays_of(camera)
+
+
+def placed(camera: Camera) -> Camera:
+    """The camera 0.6 m above the floor, looking ahead (-Y) and 40 degrees down."""
+    c, s = math.cos(math.radians(40.0)), math.sin(math.radians(40.0))
+    return replace(
+        camera,
+        robot_from_camera=((-1.0, 0.0, 0.0, 0.05), (0.0, s, -c, -0.1), (0.0, -c, -s, 0.6)),
+    )
+
+
+@pytest.fixture(scope="module")
+def photographs(rays: Rays, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("photographs")
+    poses = board_poses(rays.camera, BOARD, 14, 3, distances_m=(0.35, 0.7), margin_px=5.0)
+    for i, (R, t) in enumerate(poses):
+        cv2.imwrite(str(folder / f"{i:02d}.png"), render_board(rays, BOARD, R, t, seed=i))
+    return folder
+
+
+@pytest.mark.long
+def test_from_pictures_to_a_placed_camera(
+    rays: Rays, photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    truth = placed(rays.camera)
+    # Lying with its top ahead of the robot, its middle at (0.03, -0.75).
+    turn = np.diag([-1.0, -1.0, 1.0])
+    R, centre = truth.rotation.T, truth.centre
+    floor = render_board(
+        rays, BOARD, R @ turn, R @ (np.array([0.03, -0.75, 0.0]) - centre), seed=50
+    )
+    cv2.imwrite(str(tmp_path / "floor.png"), floor)
+    output = tmp_path / "my.cam"
+    command = [
+        "calibrate", str(photographs), *FLAGS, "--floor", str(tmp_path / "floor.png"),
+        "--floor-origin", "0.03", "-0.75", "--floor-yaw", "180", "-o", str(output),
+    ]  # fmt: skip
+    assert main(command) == 0
+    printed = capsys.readouterr().out
+    assert "covariance" in printed
+    found = read_camera(output)
+    assert projection_difference(truth, found).max() < 0.1
+    assert np.linalg.norm(found.centre - truth.centre) < 0.002
+    np.testing.assert_allclose(found.rotation, truth.rotation, atol=0.002)
+    report = json.loads((tmp_path / "my.json").read_text())
+    assert len(report["views"]) == 14
+    for name in ("residuals", "views", "coverage"):
+        assert cv2.imread(str(tmp_path / f"my.{name}.png")) is not None
+    before = output.read_bytes()
+    assert main(command) == 1
+    assert "--force" in capsys.readouterr().err
+    assert main([*command, "--force"]) == 0
+    assert output.read_bytes() == before
+    # The same from known places: a table instead of a picture.
+    places = on_floor(BOARD.points, (0.03, -0.75), math.pi)
+    rows = [
+        f"{u},{v},{x},{y}"
+        for (u, v), (x, y) in zip(truth.project_floor(places[:, :2]), places[:, :2])
+    ]
+    (tmp_path / "places.csv").write_text("\n".join(["u,v,x,y", *rows, ""]))
+    again = tmp_path / "again.cam"
+    assert main(["floor", str(output), str(tmp_path / "places.csv"), "-o", str(again)]) == 0
+    np.testing.assert_allclose(read_camera(again).centre, truth.centre, atol=0.002)
+
+
+@pytest.mark.long
+def test_a_video_gives_what_its_frames_give(
+    photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "board.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, (320, 240))
+    for image in sorted(photographs.iterdir()):
+        frame = cv2.imread(str(image))
+        assert frame is not None
+        writer.write(frame)
+    writer.release()
+    output = tmp_path / "video.cam"
+    command = ["calibrate", str(path), *FLAGS, "--every", "1", "-o", str(output)]
+    assert main([*command, "--coefficients", "2"]) == 0
+    assert "in 14 of 14 pictures" in capsys.readouterr().out
+    report = json.loads((tmp_path / "video.json").read_text())
+    assert [view["name"] for view in report["views"]][:2] == ["board.avi:0", "board.avi:1"]
+
+
+@pytest.mark.long
+def test_rendered_boards_through_the_published_camera(published_camera: Camera) -> None:
+    board, distances = BOARDS["checkerboard"]
+    made = calibrate_rendered(published_camera, board, distances, views=24, seed=7)
+    assert made.found == 24
+    # At the points' own noise, less what the fit takes up.
+    assert made.calibration.adjusted.rms_px < 1.02 * made.floor_px
+    assert projection_difference(published_camera, made.camera).max() < 0.1
+
+
+@pytest.mark.parametrize(
+    "board",
+    [
+        Board("checkerboard", 7, 6, 0.04),
+        Board("charuco", 7, 6, 0.05, marker_m=0.036),
+        Board("asymmetric-circles", 4, 7, 0.03, circle_m=0.028),
+        Board("circles", 6, 5, 0.05, circle_m=0.025),
+    ],
+    ids=lambda board: board.kind,
+)
+def test_points_are_found_in_the_boards_order(rays: Rays, board: Board) -> None:
+    facing = np.diag([1.0, -1.0, -1.0])
+    tilt = rotation_of(np.array([0.2, -0.3, 0.15])) @ facing
+    t = np.array([0.01, 0.0, 0.42])
+    # Circles' images are shifted by perspective, by less than this here.
+    allowed = 0.5 if "circles" in board.kind else 0.15
+    indices, pixels = find_board(render_board(rays, board, tilt, t, noise=1.0), board)
+    expected = rays.camera.project(board.points @ tilt.T + t)[indices]
+    assert len(indices) > 0.8 * len(board.points)
+    assert np.linalg.norm(pixels - expected, axis=1).max() < allowed
+
+
+def test_a_board_upside_down_is_still_in_its_order(rays: Rays) -> None:
+    turned = np.diag([-1.0, 1.0, -1.0])
+    t = np.array([0.0, 0.0, 0.5])
+    _, pixels = find_board(render_board(rays, BOARD, turned, t), BOARD)
+    expected = rays.camera.project(BOARD.points @ turned.T + t)
+    # Upright edges are rendered to a quarter of a pixel.
+    assert np.linalg.norm(pixels - expected, axis=1).max() < 0.3
+
+
+def test_pose_on_the_floor_and_its_covariance(published_camera: Camera) -> None:
+    rng = np.random.default_rng(6)
+    floor_xy = rng.uniform([-0.8, -2.5], [0.8, -0.8], size=(25, 2))
+    exact = published_camera.project_floor(floor_xy)
+    # The file's rotation has six digits; the estimate's is a rotation.
+    still = place_on_floor(published_camera, exact, floor_xy)
+    np.testing.assert_allclose(still.robot_from_camera[:, 3], published_camera.centre, atol=1e-3)
+    nees = []
+    for _ in range(150):
+        noisy = exact + rng.normal(scale=0.2, size=exact.shape)
+        found = place_on_floor(published_camera, noisy, floor_xy)
+        turn = found.robot_from_camera[:, :3] @ still.robot_from_camera[:, :3].T
+        vector = 0.5 * np.array(
+            [turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]
+        )
+        shift = found.robot_from_camera[:, 3] - still.robot_from_camera[:, 3]
+        error = np.concatenate([shift, vector])
+        # The scale is found from 50 residuals, so compare at the true one.
+        covariance = found.covariance * (0.2 / found.sigma_px) ** 2
+        nees.append(error @ np.linalg.solve(covariance, error))
+    assert np.mean(nees) == pytest.approx(6.0, rel=0.2)
+
+
+def test_mirrored_floor_axes_are_told(published_camera: Camera) -> None:
+    floor_xy = np.random.default_rng(6).uniform([-0.8, -2.5], [0.8, -0.8], size=(12, 2))
+    pixels = published_camera.project_floor(floor_xy)
+    with pytest.raises(CalibrationError, match="mirrored"):
+        place_on_floor(published_camera, pixels, floor_xy * [-1.0, 1.0])
+
+
+def test_points_in_a_line_are_told(published_camera: Camera) -> None:
+    floor_xy = np.column_stack([np.zeros(6), np.linspace(-2.0, -1.0, 6)])
+    with pytest.raises(CalibrationError, match="in a line"):
+        place_on_floor(published_camera, published_camera.project_floor(floor_xy), floor_xy)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("x,y,u,v\n", "expected u,v,x,y"),
+        ("u,v,x,y\n1,2,3\n", ":2: expected four numbers"),
+        ("u,v,x,y\n1,2,3,inf\n", ":2: expected four numbers"),
+    ],
+)
+def test_bad_floor_files(tmp_path: Path, text: str, message: str) -> None:
+    path = tmp_path / "places.csv"
+    path.write_text(text)
+    with pytest.raises(CalibrationError, match=message):
+        read_floor_points(path)
+
+
+def test_what_a_newcomer_gets_wrong(
+    rays: Rays, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    output = ["-o", str(tmp_path / "my.cam")]
+
+    def error(*arguments: str) -> str:
+        assert main(list(arguments)) == 1
+        return capsys.readouterr().err
+
+    assert "no such picture" in error("calibrate", str(tmp_path / "none"), *FLAGS, *output)
+    assert "no pictures in" in error("calibrate", str(tmp_path), *FLAGS, *output)
+    empty = np.full((240, 320), 128, dtype=np.uint8)
+    cv2.imwrite(str(tmp_path / "a.png"), empty)
+    told = error("calibrate", str(tmp_path), *FLAGS, *output)
+    assert "in any of 1 pictures" in told
+    assert "10 x 7 squares has 9 x 6" in told
+    R, t = board_poses(rays.camera, BOARD, 1, 3, distances_m=(0.4, 0.6), margin_px=5.0)[0]
+    cv2.imwrite(str(tmp_path / "a.png"), render_board(rays, BOARD, R, t))
+    assert "1 pictures" in error("calibrate", str(tmp_path), *FLAGS, *output)
+    cv2.imwrite(str(tmp_path / "b.png"), empty[:200])
+    assert "pictures before" in error("calibrate", str(tmp_path), *FLAGS, *output)
+    (tmp_path / "b.png").write_bytes(b"no picture")
+    assert "not an image" in error("calibrate", str(tmp_path), *FLAGS, *output)
+    cam = tmp_path / "c.cam"
+    write_camera(rays.camera, cam)
+    told = error("floor", str(cam), str(tmp_path / "a.png"), *output)
+    assert "--columns, --rows and --square-m" in told
+    even = ["--columns", "8", "--rows", "6", "--square-m", "0.04"]
+    assert "looks the same turned" in error(
+        "floor", str(cam), str(tmp_path / "a.png"), *even, *output
+    )
+    assert not (tmp_path / "my.cam").exists()
+
+
+@pytest.mark.parametrize("command", ["calibrate", "floor", "convert"])
+def test_help_shows_an_example(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as end:
+        main([command, "--help"])
+    assert end.value.code == 0
+    assert f"Example: camera {command}" in " ".join(capsys.readouterr().out.split())

@@ -1,0 +1,269 @@
+"""Calibration from points: derivatives, known truth back, covariance, what cannot be calibrated."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from camera import Camera, CameraError
+from camera.board import Board
+from camera.calibration import (
+    BoardView,
+    CalibrationSettings,
+    calibrate,
+    circle_shifts,
+    coverage_warnings,
+    points_of,
+)
+from camera.calibration_adjustment import Estimate, Points, adjust, project_estimate
+from camera.calibration_model import free_span, is_possible, project_points, rotation_of
+from camera.calibration_projection import (
+    intrinsics_of,
+    projection_difference,
+    projection_sigma,
+)
+from camera.errors import CalibrationError
+from tools.camera_evaluation.covariance import monte_carlo
+from tools.camera_evaluation.rendering import board_poses
+
+FloatArray = NDArray[np.float64]
+
+BOARD = Board("checkerboard", 9, 6, 0.04)
+HALF = CalibrationSettings(aspect=0.5)
+DISTANCES_M = (0.2, 0.45)
+IDENTITY = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
+
+
+def seen_views(
+    camera: Camera, views: int, sigma_px: float, seed: int, board: Board = BOARD
+) -> list[BoardView]:
+    """Boards as the camera sees them, with noise."""
+    rng = np.random.default_rng(seed)
+    every = np.arange(len(board.points))
+    return [
+        BoardView(
+            f"{i:02d}.png",
+            every,
+            camera.project(board.points @ R.T + t)
+            + rng.normal(scale=sigma_px, size=(len(every), 2)),
+        )
+        for i, (R, t) in enumerate(board_poses(camera, board, views, seed, distances_m=DISTANCES_M))
+    ]
+
+
+def with_intrinsics(camera: Camera, intrinsics: FloatArray) -> Camera:
+    sx, sy, ox, oy, a2, a3, b1, b2, b3 = (float(value) for value in intrinsics)
+    return replace(
+        camera, scale_x=sx, scale_y=sy, offset_x=ox, offset_y=oy, coef=(a2, a3, b1, b2, b3)
+    )
+
+
+def test_points_are_projected_as_the_camera_projects_them(published_camera: Camera) -> None:
+    points = np.random.default_rng(1).normal(loc=[0.0, 0.0, 1.0], size=(200, 3))
+    pixels, _, _ = project_points(intrinsics_of(published_camera), points)
+    np.testing.assert_allclose(pixels, published_camera.project(points), rtol=0.0, atol=1e-10)
+
+
+def test_derivatives_of_the_projection_are_those_of_differences(published_camera: Camera) -> None:
+    intrinsics = intrinsics_of(published_camera)
+    points = np.array([[0.1, 0.2, 0.7], [-0.3, 0.05, 0.5], [0.0, 0.0, 1.0], [0.4, -0.3, 0.6]])
+    _, by_intrinsics, by_point = project_points(intrinsics, points)
+    for k in range(9):
+        step = np.zeros(9)
+        step[k] = 1e-5
+        ahead = project_points(intrinsics + step, points)[0]
+        behind = project_points(intrinsics - step, points)[0]
+        np.testing.assert_allclose(by_intrinsics[:, :, k], (ahead - behind) / 2e-5, atol=2e-5)
+    for k in range(3):
+        move = np.zeros(3)
+        move[k] = 1e-6
+        ahead = project_points(intrinsics, points + move)[0]
+        behind = project_points(intrinsics, points - move)[0]
+        # On the axis a2 r has a cusp; its differences vanish with the step.
+        np.testing.assert_allclose(by_point[:, :, k], (ahead - behind) / 2e-6, atol=1e-3)
+
+
+def test_derivatives_by_the_pose_are_those_of_differences(published_camera: Camera) -> None:
+    views = seen_views(published_camera, 1, 0.0, seed=3)
+    points = points_of(views, BOARD, (768, 288))
+    R, t = board_poses(published_camera, BOARD, 1, 3, distances_m=DISTANCES_M)[0]
+    intrinsics = intrinsics_of(published_camera)
+    by_pose = project_estimate(Estimate(intrinsics, R[None], t[None]), points)[2]
+    for k in range(6):
+        found = []
+        for sign in (1.0, -1.0):
+            step = np.zeros(6)
+            step[k] = sign * 1e-6
+            moved = Estimate(intrinsics, (rotation_of(step[:3]) @ R)[None], (t + step[3:])[None])
+            found.append(project_estimate(moved, points)[0])
+        difference = (found[0] - found[1]) / 2e-6
+        np.testing.assert_allclose(by_pose[:, :, k], difference, rtol=1e-5, atol=1e-3)
+
+
+@pytest.mark.long
+def test_exact_points_give_the_published_camera_back(published_camera: Camera) -> None:
+    views = seen_views(published_camera, 14, 0.0, seed=5)
+    settings = CalibrationSettings(aspect=0.5, coefficients=5, robust=False)
+    result = calibrate(views, BOARD, (768, 288), settings)
+    found = with_intrinsics(published_camera, result.intrinsics)
+    assert projection_difference(published_camera, found, rotate=False).max() < 1e-3
+    assert result.adjusted.rms_px < 1e-4
+
+
+@pytest.mark.long
+def test_noisy_points_and_wrong_ones_give_the_projection_to_its_predicted_error(
+    published_camera: Camera,
+) -> None:
+    views = seen_views(published_camera, 25, 0.05, seed=11)
+    rng = np.random.default_rng(2)
+    for view in views:
+        wrong = rng.integers(len(view.indices))
+        view.pixels[wrong] += rng.normal(scale=4.0, size=2)
+    # One picture in which the board was found one square off.
+    views[7].pixels[:-1] = views[7].pixels[1:].copy()
+    result = calibrate(views, BOARD, (768, 288), HALF)
+    assert [name for name, _ in result.outliers] == ["07.png"]
+    assert any("points left out" in warning for warning in result.warnings)
+    assert result.adjusted.sigma_px == pytest.approx(0.05, rel=0.1)
+    assert result.adjusted.rms_px == pytest.approx(0.05 * np.sqrt(2.0), rel=0.1)
+    found = with_intrinsics(published_camera, result.intrinsics)
+    away = projection_difference(published_camera, found)
+    sigma = projection_sigma(found, result.adjusted.covariance)
+    assert away.max() < 0.1 + 3.0 * sigma.max()
+    assert np.mean(away < 3.0 * sigma) > 0.95
+    # Fewer coefficients than the lens has are seen through by the pictures held out.
+    assert result.holdout_px[1] > 2.0 * result.holdout_px[result.coefficients]
+
+
+@pytest.mark.long
+def test_predicted_covariance_is_what_repetition_shows(published_camera: Camera) -> None:
+    trials = monte_carlo(published_camera, BOARD, views=15, trials=80, sigma_px=0.02, seed=4)
+    predicted = np.sqrt(np.diag(trials.covariances.mean(axis=0)))
+    ratio = trials.errors.std(axis=0) / predicted
+    # 80 trials know a standard deviation to 8 %.
+    assert np.all((ratio > 0.75) & (ratio < 1.3)), ratio
+    limit = 3.0 * np.sqrt(2.0 * trials.freedom / len(trials.nees))
+    assert trials.nees.mean() == pytest.approx(trials.freedom, abs=limit)
+
+
+def test_pose_covariance_is_what_repetition_shows(published_camera: Camera) -> None:
+    R, t = board_poses(published_camera, BOARD, 1, 8, distances_m=DISTANCES_M)[0]
+    truth = Estimate(intrinsics_of(published_camera), R[None], t[None])
+    exact = published_camera.project(BOARD.points @ R.T + t)
+    rng = np.random.default_rng(5)
+    nees = []
+    for _ in range(150):
+        noisy = exact + rng.normal(scale=0.1, size=exact.shape)
+        points = Points(BOARD.points, noisy, np.zeros(1, dtype=np.int64), 768, 288)
+        fit = adjust(truth, points, np.zeros((9, 0)), robust=False, sigma_px=0.1)
+        turn = fit.estimate.rotations[0] @ R.T
+        vector = 0.5 * np.array(
+            [turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]
+        )
+        error = np.concatenate([vector, fit.estimate.translations[0] - t])
+        nees.append(error @ np.linalg.solve(fit.pose_covariances[0], error))
+    assert np.mean(nees) == pytest.approx(6.0, abs=3.0 * np.sqrt(12.0 / 150))
+
+
+def test_circles_shift_is_that_of_the_rendered_area(published_camera: Camera) -> None:
+    board = Board("circles", 3, 3, 0.05, circle_m=0.03)
+    R, t = board_poses(published_camera, board, 1, 2, distances_m=(0.2, 0.25))[0]
+    truth = Estimate(intrinsics_of(published_camera), R[None], t[None])
+    centres = published_camera.project(board.points @ R.T + t)
+    points = Points(board.points, centres, np.zeros(1, dtype=np.int64), 768, 288)
+    shifts = circle_shifts(truth, points, 0.015)
+    # By brute force: the middle of all fine pixels whose ray meets the first circle.
+    u, v = np.round(centres[0])
+    offsets = np.arange(-60.0, 60.0, 0.125)
+    pixels = np.stack(np.meshgrid(u + offsets, v + offsets), axis=-1).reshape(-1, 2)
+    rays = published_camera.unproject(pixels)
+    place = (rays * (R[:, 2] @ t / (rays @ R[:, 2]))[:, None] - t) @ R
+    inside = np.linalg.norm(place[:, :2] - board.points[0, :2], axis=1) < 0.015
+    brute = pixels[inside].mean(axis=0) - centres[0]
+    assert np.linalg.norm(brute) > 0.05
+    np.testing.assert_allclose(shifts[0], brute, atol=0.01)
+
+
+def test_a_fold_inside_the_image_is_not_possible() -> None:
+    plain = np.array([460.0, 230.0, 384.0, 144.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    assert is_possible(plain, 768, 288)
+    folded = plain.copy()
+    folded[5] = -0.4
+    assert not is_possible(folded, 768, 288)
+    with pytest.raises(CameraError, match="folds inside the image"):
+        Camera(768, 288, 460.0, 230.0, 384.0, 144.0, (0.0, -0.4, 0.0, 0.0, 0.0), IDENTITY)
+
+
+def test_free_span_ties_the_scales() -> None:
+    span = free_span(2, 0.5)
+    assert span.shape == (9, 5)
+    assert span[1, 0] == 0.5 * span[0, 0]
+    assert free_span(5, None).shape == (9, 9)
+
+
+def test_too_few_pictures_say_how_many_are_needed(published_camera: Camera) -> None:
+    views = seen_views(published_camera, 2, 0.05, seed=1)
+    with pytest.raises(CalibrationError, match=r"2 pictures.*at least 3 are needed"):
+        calibrate(views, BOARD, (768, 288), HALF)
+
+
+def test_parallel_boards_are_refused() -> None:
+    camera = Camera(
+        640,
+        480,
+        900.0,
+        900.0,
+        320.0,
+        240.0,
+        (0.0, 0.0, 0.0, 0.0, 0.0),
+        IDENTITY,
+    )
+    facing = np.diag([1.0, -1.0, -1.0])
+    rng = np.random.default_rng(3)
+    views = []
+    for i in range(8):
+        t = np.array([*rng.uniform(-0.1, 0.1, 2), rng.uniform(0.6, 1.0)])
+        pixels = camera.project(BOARD.points @ facing.T + t)
+        views.append(
+            BoardView(f"{i}", np.arange(54), pixels + rng.normal(scale=0.05, size=pixels.shape))
+        )
+    with pytest.raises(CalibrationError, match=r"too much alike.*tilt the board"):
+        calibrate(views, BOARD, (640, 480), CalibrationSettings(coefficients=1))
+
+
+def test_what_of_the_image_was_not_covered_is_told(published_camera: Camera) -> None:
+    pixels = np.random.default_rng(0).uniform([10, 10], [500, 180], size=(500, 2))
+    points = Points(np.zeros((500, 3)), pixels, np.zeros(1, dtype=np.int64), 768, 288)
+    told = "\n".join(coverage_warnings(intrinsics_of(published_camera), points))
+    assert "bottom left" in told
+    assert "top right" in told
+    assert "top left" not in told
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("checkerboard", 2, 6, 0.04), "at least 3 x 3"),
+        (("checkerboard", 9, 6, 0.0), "metres above 0"),
+        (("charuco", 9, 6, 0.04), "marker_m is 0"),
+        (("circles", 9, 6, 0.04, 0.0, "DICT_5X5_100", 0.1), "below the circles' distance"),
+    ],
+)
+def test_impossible_boards(arguments: tuple[object, ...], message: str) -> None:
+    with pytest.raises(CalibrationError, match=message):
+        Board(*arguments)  # type: ignore[arg-type]
+
+
+def test_boards_that_look_the_same_turned() -> None:
+    assert Board("checkerboard", 8, 6, 0.1).looks_turned
+    assert not Board("checkerboard", 9, 6, 0.1).looks_turned
+    assert Board("circles", 9, 6, 0.1).looks_turned
+    assert not Board("asymmetric-circles", 4, 11, 0.1).looks_turned
+    for board in (Board("checkerboard", 9, 6, 0.1), Board("asymmetric-circles", 4, 11, 0.1)):
+        # Turned by 180 degrees, the set of points (and of black squares) is or is not the same.
+        turned = -board.points
+        away = np.linalg.norm(board.points[:, None] - turned, axis=-1).min(axis=0)
+        assert (away.max() < 1e-9) == (board.kind == "checkerboard")

@@ -1,0 +1,216 @@
+"""Conversion: formats read back, half a pixel, models against their own programs, limits."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from camera import Camera, read_camera, write_camera
+from camera.calibration_projection import projection_difference
+from camera.cli import main
+from camera.colmap_cameras import (
+    camera_from_pycolmap,
+    format_colmap,
+    parse_colmap,
+    pycolmap_from_camera,
+)
+from camera.conversion import convert_to_camera, convert_to_foreign
+from camera.conversion_models import ForeignCamera
+from camera.convert_yaml import parse_yaml
+from camera.errors import ConversionError
+from camera.kalibr_camchain import format_kalibr, parse_kalibr
+from camera.opencv_yaml import format_opencv, parse_opencv
+from camera.ros_camera_info import camera_from_message, format_ros, parse_ros
+
+FloatArray = NDArray[np.float64]
+
+RADTAN = ForeignCamera(
+    "radtan", 640, 480, 500.0, 505.0, 318.5, 241.0, (-0.3, 0.1, 1e-3, -5e-4, 0.0)
+)
+RATIONAL = ForeignCamera(
+    "rational", 640, 480, 500.0, 505.0, 318.5, 241.0,
+    (0.5, 0.1, 1e-3, -5e-4, 0.01, 0.8, 0.2, 0.03, 1e-4, -1e-4, 2e-4, 0.0),
+)  # fmt: skip
+FISHEYE = ForeignCamera(
+    "fisheye", 640, 480, 300.0, 301.0, 318.5, 241.0, (-0.01, 0.02, -0.005, 1e-3)
+)
+RAYS = np.random.default_rng(1).uniform(-0.6, 0.6, size=(200, 2))
+
+
+def as_opencv_projects(camera: ForeignCamera, rays: FloatArray) -> FloatArray:
+    points = np.column_stack([rays, np.ones(len(rays))])
+    K = np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
+    zero = np.zeros(3)
+    d = np.array(camera.distortion)
+    if camera.model == "fisheye":
+        found = cv2.fisheye.projectPoints(points[:, None], zero, zero, K, d)[0]
+    else:
+        found = cv2.projectPoints(points, zero, zero, K, d)[0]
+    return np.asarray(found, dtype=np.float64).reshape(-1, 2)
+
+
+@pytest.mark.parametrize("camera", [RADTAN, RATIONAL, FISHEYE], ids=lambda c: c.model)
+def test_models_are_opencvs_and_invert(camera: ForeignCamera) -> None:
+    pixels = camera.distort(RAYS)
+    np.testing.assert_allclose(pixels, as_opencv_projects(camera, RAYS), atol=1e-9)
+    np.testing.assert_allclose(camera.undistort(pixels), RAYS, atol=1e-9)
+
+
+@pytest.mark.parametrize("camera", [RADTAN, FISHEYE], ids=lambda c: c.model)
+def test_colmap_counts_from_the_corner(camera: ForeignCamera) -> None:
+    theirs = pycolmap_from_camera(camera)
+    points = np.column_stack([RAYS, np.ones(len(RAYS))])
+    np.testing.assert_allclose(
+        np.asarray(theirs.img_from_cam(points)) - 0.5, camera.distort(RAYS), atol=1e-9
+    )
+    assert camera_from_pycolmap(theirs) == camera
+
+
+def test_formats_read_back_what_they_wrote() -> None:
+    thin = RATIONAL
+    plain = ForeignCamera("rational", 640, 480, 500.0, 505.0, 318.5, 241.0,
+                          (*RATIONAL.distortion[:8], *(0.0,) * 4))  # fmt: skip
+    for camera in (RADTAN, thin, plain, FISHEYE):
+        assert parse_opencv(format_opencv(camera)) == camera
+        assert parse_ros(format_ros(camera)) == camera
+    for camera in (RADTAN, FISHEYE):
+        assert parse_kalibr(format_kalibr(camera)) == camera
+    for camera in (RADTAN, plain, FISHEYE):
+        assert parse_colmap(format_colmap(camera)) == camera
+
+
+def test_opencv_reads_what_is_written_and_the_other_way(tmp_path: Path) -> None:
+    path = tmp_path / "ours.yaml"
+    path.write_text(format_opencv(RADTAN))
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+    K = storage.getNode("camera_matrix").mat()
+    d = storage.getNode("distortion_coefficients").mat()
+    storage.release()
+    assert K[0, 0] == RADTAN.fx
+    np.testing.assert_array_equal(d.ravel(), RADTAN.distortion)
+    theirs = tmp_path / "theirs.yaml"
+    storage = cv2.FileStorage(str(theirs), cv2.FILE_STORAGE_WRITE)
+    storage.write("image_width", 640)
+    storage.write("image_height", 480)
+    storage.write("camera_matrix", K)
+    storage.write("distortion_coefficients", d)
+    storage.release()
+    assert parse_opencv(theirs.read_text()) == RADTAN
+
+
+def test_an_echoed_ros_message_is_read() -> None:
+    text = (
+        "header:\n  frame_id: camera\nheight: 480\nwidth: 640\ndistortion_model: plumb_bob\n"
+        "d: [-0.3, 0.1, 1e-3, -5e-4, 0]\nk: [500, 0, 318.5, 0, 505, 241, 0, 0, 1]\n"
+        "roi: {width: 0, height: 0}\n---\nnext: 1\n"
+    )
+    assert parse_ros(text) == RADTAN
+
+
+def test_an_uncalibrated_ros_camera_is_refused() -> None:
+    with pytest.raises(ConversionError, match="not calibrated"):
+        camera_from_message(640, 480, "", [], [0.0] * 9)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("model", ["rational"])
+@pytest.mark.parametrize(("out", "home"), [("same", "same"), ("double", "halve")])
+def test_the_published_camera_there_and_back(
+    published_camera: Camera, model: str, out: str, home: str
+) -> None:
+    there = convert_to_foreign(published_camera, model, out)  # type: ignore[arg-type]
+    assert there.deviation_px < 0.05
+    assert there.camera.height == (576 if out == "double" else 288)
+    # Measured apart from the conversion's own measure: OpenCV's projection of the camera's rays.
+    rng = np.random.default_rng(4)
+    pixels = rng.uniform([0.0, 0.0], [767.0, 287.0], size=(3000, 2))
+    assert isinstance(there.camera, ForeignCamera)
+    found = as_opencv_projects(there.camera, published_camera.undistort(pixels))
+    expected = pixels * ([1.0, 2.0] if out == "double" else [1.0, 1.0])
+    assert np.linalg.norm(found - expected, axis=1).max() < 1.05 * there.deviation_px + 1e-3
+    back = convert_to_camera(there.camera, home)  # type: ignore[arg-type]
+    assert isinstance(back.camera, Camera)
+    assert projection_difference(published_camera, back.camera, rotate=False).max() < 0.01
+
+
+def test_half_height_keeps_what_even_lines_see() -> None:
+    full = convert_to_camera(
+        ForeignCamera("radtan", 768, 576, 460.0, 460.0, 383.0, 287.0, (0.0,) * 5)
+    )
+    half = convert_to_camera(full.camera, "halve")
+    assert isinstance(half.camera, Camera)
+    assert isinstance(full.camera, Camera)
+    assert (half.camera.height, half.camera.scale_y, half.camera.offset_y) == (288, 230.0, 143.5)
+    lines = np.array([[100.0, 20.0], [700.0, 280.0]])
+    np.testing.assert_allclose(
+        half.camera.undistort(lines), full.camera.undistort(lines * [1.0, 2.0]), atol=1e-12
+    )
+
+
+def test_tangential_distortion_shows_in_the_deviation() -> None:
+    straight = convert_to_camera(
+        ForeignCamera("radtan", 640, 480, 500.0, 500.0, 320.0, 240.0, (-0.2, 0.05, 0.0, 0.0, 0.0))
+    )
+    bent = convert_to_camera(
+        ForeignCamera("radtan", 640, 480, 500.0, 500.0, 320.0, 240.0, (-0.2, 0.05, 0.01, 0.0, 0.0))
+    )
+    assert straight.deviation_px < 0.01
+    assert bent.deviation_px > 0.5
+
+
+def test_a_fold_inside_the_image_is_told() -> None:
+    folded = ForeignCamera(
+        "radtan", 640, 480, 300.0, 300.0, 320.0, 240.0, (-0.6, 0.0, 0.0, 0.0, 0.0)
+    )
+    with pytest.raises(ConversionError, match="sees nothing by the radtan model"):
+        convert_to_camera(folded)
+
+
+def test_aliases_are_refused() -> None:
+    bomb = "a: &a [x, x]\nb: &b [*a, *a]\nimage_width: 3\n"
+    with pytest.raises(ConversionError, match=r"bomb:2: an alias"):
+        parse_yaml(bomb, "bomb")
+
+
+def test_python_objects_are_not_made() -> None:
+    with pytest.raises(ConversionError, match="expected YAML"):
+        parse_yaml("a: !!python/object/apply:os.system ['true']\n", "evil")
+
+
+@given(st.text(max_size=300))
+def test_no_text_does_worse_than_an_error(text: str) -> None:
+    for parse in (parse_opencv, parse_ros, parse_kalibr, parse_colmap):
+        with pytest.raises(ConversionError):
+            parse(text)
+
+
+@pytest.mark.long
+def test_the_command_converts_and_refuses(
+    tmp_path: Path, published_camera: Camera, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cam = tmp_path / "e.cam"
+    write_camera(published_camera, cam)
+    yaml = tmp_path / "e.opencv.yaml"
+    assert main(["convert", str(cam), str(yaml)]) == 0
+    assert "largest deviation over the image" in capsys.readouterr().out
+    back = tmp_path / "back.cam"
+    assert main(["convert", str(yaml), str(back), "--pose-from", str(cam)]) == 0
+    again = read_camera(back)
+    assert again.robot_from_camera == published_camera.robot_from_camera
+    assert projection_difference(published_camera, again, rotate=False).max() < 0.01
+    kalibr = tmp_path / "e.kalibr.yaml"
+    assert main(["convert", str(cam), str(kalibr)]) == 1
+    assert "--limit-px" in capsys.readouterr().err
+    assert not kalibr.exists()
+    assert main(["convert", str(cam), str(kalibr), "--limit-px", "0.2"]) == 0
+    assert parse_kalibr(kalibr.read_text()).model == "fisheye"
+    assert main(["convert", str(cam), str(tmp_path / "e.yaml")]) == 1
+    assert "--to-format" in capsys.readouterr().err
+    assert main(["convert", str(cam), str(yaml)]) == 1
+    assert "--force" in capsys.readouterr().err

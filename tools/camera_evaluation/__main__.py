@@ -1,0 +1,28 @@
+"""``python -m tools.camera_evaluation STUDY ...``: each study has its own flags (``--help``)."""
+
+from __future__ import annotations
+
+import sys
+from importlib import import_module
+
+#: The module whose `main` carries a study out.
+STUDIES = {
+    "rendered": "tools.camera_evaluation.rendered",
+    "covariance": "tools.camera_evaluation.covariance",
+    "photographs": "tools.camera_evaluation.photographs",
+    "conversions": "tools.camera_evaluation.conversions",
+}
+
+
+def main(arguments: list[str]) -> int:
+    """Run a study; returns the exit code."""
+    if not arguments or arguments[0] not in STUDIES:
+        print(
+            f"usage: python -m tools.camera_evaluation {{{','.join(STUDIES)}}} ...", file=sys.stderr
+        )
+        return 2
+    return int(import_module(STUDIES[arguments[0]]).main(arguments[1:]) or 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

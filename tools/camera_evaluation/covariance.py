@@ -1,0 +1,157 @@
+"""Whether the predicted covariance of a calibration is right, by Monte Carlo.
+
+Example: python -m tools.camera_evaluation covariance images/e/e.cam --trials 100
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import tyro
+from numpy.typing import NDArray
+from tyro.conf import Positional
+
+from camera import Camera, read_camera
+from camera.board import Board
+from camera.calibration_adjustment import Estimate, Points, adjust
+from camera.calibration_model import INTRINSICS, free_span
+from camera.calibration_projection import intrinsics_of
+from tools.camera_evaluation.rendering import board_poses
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Trials:
+    """Results of repeated calibrations.
+
+    Attributes
+    ----------
+    errors : (T, 9) float64
+        Estimated less true intrinsics.
+    covariances : (T, 9, 9) float64
+        As predicted.
+    nees : (T,) float64
+        Normalised squared errors of the projection, over its free directions; `freedom` on average.
+    freedom : int
+    """
+
+    errors: FloatArray
+    covariances: FloatArray
+    nees: FloatArray
+    freedom: int
+
+
+def monte_carlo(
+    camera: Camera,
+    board: Board,
+    *,
+    views: int,
+    trials: int,
+    sigma_px: float,
+    seed: int,
+    distances_m: tuple[float, float] = (0.2, 0.45),
+    outliers: float = 0.0,
+) -> Trials:
+    """Calibrate again and again from the same poses with new noise.
+
+    Parameters
+    ----------
+    camera : Camera
+        The truth; scaleY / scaleX is taken as known.
+    board : Board
+    views, trials : int
+    sigma_px : float
+        Noise of a coordinate.
+    seed : int
+    distances_m : (float, float)
+        Of the boards.
+    outliers : float
+        Share of points that are 20 standard deviations off.
+    """
+    poses = board_poses(camera, board, views, seed, distances_m=distances_m)
+    truth = Estimate(
+        intrinsics_of(camera), np.stack([R for R, _ in poses]), np.stack([t for _, t in poses])
+    )
+    pixels = np.concatenate([camera.project(board.points @ R.T + t) for R, t in poses])
+    count = len(board.points)
+    span = free_span(5, camera.scale_y / camera.scale_x)
+    rng = np.random.default_rng(seed + 1)
+    errors, covariances, nees = [], [], []
+    for _ in range(trials):
+        noise = rng.normal(scale=sigma_px, size=pixels.shape)
+        wrong = rng.random(len(pixels)) < outliers
+        noise[wrong] += 20.0 * sigma_px * rng.normal(size=(int(wrong.sum()), 2))
+        points = Points(
+            np.tile(board.points, (views, 1)),
+            pixels + noise,
+            np.arange(views) * count,
+            camera.width,
+            camera.height,
+        )
+        fit = adjust(truth, points, span)
+        error = fit.estimate.intrinsics - truth.intrinsics
+        free = np.linalg.pinv(span)
+        reduced = free @ fit.covariance @ free.T
+        errors.append(error)
+        covariances.append(fit.covariance)
+        scale = np.sqrt(np.diag(reduced))
+        whitened = (free @ error) / scale
+        nees.append(whitened @ np.linalg.solve(reduced / np.outer(scale, scale), whitened))
+    return Trials(np.array(errors), np.array(covariances), np.array(nees), span.shape[1])
+
+
+@dataclass(frozen=True)
+class Options:
+    """Predicted against observed spread of a calibration.
+
+    Example: python -m tools.camera_evaluation covariance images/e/e.cam --trials 100
+
+    Parameters
+    ----------
+    camera : Path
+        The true camera.
+    views : int
+        Boards in each calibration.
+    trials : int
+        Calibrations.
+    sigma_px : float
+        Noise of a coordinate.
+    outliers : float
+        Share of points that are 20 standard deviations off.
+    seed : int
+        Everything random follows from it.
+    """
+
+    camera: Positional[Path]
+    views: int = 25
+    trials: int = 100
+    sigma_px: float = 0.03
+    outliers: float = 0.0
+    seed: int = 1
+
+
+def main(arguments: list[str]) -> int:
+    """Run the study."""
+    options = tyro.cli(Options, prog="covariance", args=arguments)
+    trials = monte_carlo(
+        read_camera(options.camera),
+        Board("checkerboard", 9, 6, 0.04),
+        views=options.views,
+        trials=options.trials,
+        sigma_px=options.sigma_px,
+        seed=options.seed,
+        outliers=options.outliers,
+    )
+    predicted = np.sqrt(np.diag(trials.covariances.mean(axis=0)))
+    print(f"{options.trials} calibrations, {options.views} views, noise {options.sigma_px} px")
+    print("            observed   predicted   ratio")
+    for name, seen, said in zip(INTRINSICS, trials.errors.std(axis=0), predicted):
+        print(f"{name:8s} {seen:11.5g} {said:11.5g} {seen / said:7.3f}")
+    print(
+        f"normalised squared error {trials.nees.mean():.2f} "
+        f"(expected {trials.freedom}, +- {np.sqrt(2 * trials.freedom / len(trials.nees)):.2f})"
+    )
+    return 0

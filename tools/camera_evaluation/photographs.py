@@ -1,0 +1,152 @@
+"""Hold-out error on real photographs of disc boards, against OpenCV's rational model.
+
+The points are the centroids of the discs in the photographs, found from where the truth has them;
+both calibrations get the same points and the same board, and leave one photograph out at a time.
+
+Example: python -m tools.camera_evaluation photographs ../shared/data/discs/dev
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import tyro
+from numpy.typing import NDArray
+from tyro.conf import Positional
+
+from camera.board import Board
+from camera.board_points import circle_centroids
+from camera.calibrate_images import read_grey
+from camera.calibration import (
+    BoardView,
+    CalibrationSettings,
+    calibrate,
+)
+from camera.calibration_adjustment import Points
+
+FloatArray = NDArray[np.float64]
+DISC_RADIUS_M = 0.1
+
+
+class FixedBoard(Board):
+    """A board whose points are what was measured: places by their number, not a regular print."""
+
+    @property
+    def points(self) -> FloatArray:
+        """(N, 3) all discs of all photographs, one after the other."""
+        return np.asarray(self.__dict__["_places"])
+
+
+def fixed_board(places: FloatArray) -> Board:
+    """A board of discs at given places, (N, 3) in metres."""
+    board = FixedBoard("circles", 3, 3, 1.0, circle_m=2.0 * DISC_RADIUS_M)
+    board.__dict__["_places"] = places
+    return board
+
+
+def read_group(folder: Path, group: str) -> tuple[list[BoardView], Board, tuple[int, int]]:
+    """All photographs of a camera: views, the board, and the image size."""
+    views: list[BoardView] = []
+    places: list[FloatArray] = []
+    offset, size = 0, (0, 0)
+    for path in sorted(folder.glob(f"{group}_*/truth.json")):
+        truth = json.loads(path.read_text())
+        discs = [d for d in truth["discs"] if d["how"] == "measured" and d["visible"]]
+        uv = np.array([[d["u"], d["v"]] for d in discs])
+        xy = np.array([[d["px"], d["py"], 0.0] for d in discs])
+        image = read_grey(next((path.parent / "images").iterdir()))
+        size = (image.shape[1], image.shape[0])
+        dark = image if truth["polarity"] == "dark" else 255 - image
+        # The truth says where to look; what is measured is the image's.
+        seen = circle_centroids(dark, uv[None])[0]
+        near = np.any(seen != uv, axis=1) & (np.linalg.norm(seen - uv, axis=1) < 3.0)
+        uv, xy = seen[near], xy[near]
+        views.append(BoardView(path.parent.name, np.arange(offset, offset + len(uv)), uv))
+        places.append(xy)
+        offset += len(uv)
+    return views, fixed_board(np.concatenate(places)), size
+
+
+def opencv_holdout(points: Points, *, rational: bool) -> float:
+    """RMS error (px) in the photograph left out, by OpenCV: its pose alone is fitted."""
+    import cv2
+
+    every = np.arange(len(points.starts))
+    flags = cv2.CALIB_RATIONAL_MODEL if rational else 0
+    squares = 0.0
+    size = (points.width, points.height)
+    for out in every:
+        used = points.of(every[every != out])
+        board = [used.board[s : s + n].astype(np.float32) for s, n in zip(used.starts, used.counts)]
+        seen = [used.pixels[s : s + n].astype(np.float32) for s, n in zip(used.starts, used.counts)]
+        _, K, d, _, _ = cv2.calibrateCamera(
+            board, seen, size, np.eye(3), np.zeros(8 if rational else 5), flags=flags
+        )
+        held = points.of(np.array([out]))
+        _, rvec, tvec = cv2.solvePnP(held.board, held.pixels, K, d)
+        rvec, tvec = cv2.solvePnPRefineLM(held.board, held.pixels, K, d, rvec, tvec)
+        found = cv2.projectPoints(held.board, rvec, tvec, K, d)[0].reshape(-1, 2)
+        squares += float(np.sum((found - held.pixels) ** 2))
+    return float(np.sqrt(squares / len(points.board)))
+
+
+@dataclass(frozen=True)
+class Options:
+    """Hold-out error on photographs of discs, against OpenCV's models.
+
+    Example: python -m tools.camera_evaluation photographs ../shared/data/discs/dev
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of photographs with truth.
+    groups : several str
+        Cameras: beginnings of the photographs' names.
+    free_aspect : bool
+        Both scales free, as OpenCV has them; else equal.
+    """
+
+    folder: Positional[Path]
+    groups: tuple[str, ...] = ("asym", "sym", "rct", "robvis")
+    free_aspect: bool = True
+
+
+def compare(folder: Path, group: str, *, free_aspect: bool) -> dict[str, float]:
+    """Hold-out errors in px: `ours`, `opencv_rational`, `opencv`, all on the same points."""
+    views, board, size = read_group(folder, group)
+    settings = CalibrationSettings(
+        aspect=None if free_aspect else 1.0, robust=False, keep_outliers=True
+    )
+    result = calibrate(views, board, size, settings)
+    # The same corrected points for both: OpenCV knows nothing of circles.
+    points = result.points
+    return {
+        "views": float(len(points.starts)),
+        "points": float(len(points.board)),
+        "ours": result.holdout_px[result.coefficients],
+        "coefficients": float(result.coefficients),
+        "opencv_rational": opencv_holdout(points, rational=True),
+        "opencv": opencv_holdout(points, rational=False),
+    }
+
+
+def main(arguments: list[str]) -> int:
+    """Run the study."""
+    options = tyro.cli(Options, prog="photographs", args=arguments)
+    print(
+        "group     views points  ours (px)  free  OpenCV rational (px)  OpenCV k1 k2 p1 p2 k3 (px)"
+    )
+    for group in options.groups:
+        r = compare(
+            options.folder,
+            group,
+            free_aspect=options.free_aspect,
+        )
+        print(
+            f"{group:10s} {r['views']:4.0f} {r['points']:6.0f} {r['ours']:10.4f} "
+            f"{r['coefficients']:5.0f} {r['opencv_rational']:21.4f} {r['opencv']:27.4f}"
+        )
+    return 0
