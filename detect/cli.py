@@ -30,7 +30,7 @@ from detect.markers.settings import PRESETS as MARKER_PRESETS
 from detect.markers.settings import MarkerSettings
 from detect.settings import PUBLISHED, CircleSettings
 from detect.sources.options import SourceOptions
-from detect.viewing_options import Draw, Report, Tune
+from detect.viewing_options import Draw, Report, Tune, View
 
 Preset = Literal["default", "published"]
 
@@ -293,7 +293,7 @@ class Compare:
     options: OmitArgPrefixes[CompareOptions] = field(default_factory=CompareOptions)
 
 
-Command = Circles | Lines | Markers | All | Compare | Export | Draw | Report | Tune
+Command = Circles | Lines | Markers | All | Compare | Export | Draw | View | Report | Tune
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -351,6 +351,7 @@ def _parsed(given: list[str]) -> Command:
             | Annotated[Compare, subcommand("compare")]
             | Annotated[Export, subcommand("export")]
             | Annotated[Draw, subcommand("draw")]
+            | Annotated[View, subcommand("view")]
             | Annotated[Report, subcommand("report")]
             | Annotated[Tune, subcommand("tune")],
             arg(name=""),

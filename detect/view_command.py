@@ -1,0 +1,199 @@
+"""The command ``detect view``: frames and rows over time, for Rerun."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from detect.draw_frame import ends_of, floor_projection, line_curves, sigma_bars
+from detect.draw_inputs import SeenRows, find_files, open_rows
+from detect.draw_selection import select_frames
+from detect.drawing import circle_on_floor
+from detect.errors import DetectError, FrameError
+from detect.progress import print_failures, progress_bar
+from detect.run import Run, read_image
+from detect.settings import CircleSettings
+from detect.sources.opening import open_source
+from detect.viewing_options import View
+from landmarks import Step, circle_arrays
+from storage import OutputExistsError, write_whole
+
+FloatArray = NDArray[np.float64]
+
+_FRAMES_FAILED = 3
+_EDGE, _LINE, _SIGMA, _MAP = (255, 170, 0), (60, 220, 60), (255, 170, 0), (80, 140, 220)
+# Rerun counts from the corner of the top left pixel, not from its centre.
+_CORNER = 0.5
+
+
+def perform(options: View) -> int:
+    """Carry the command out; returns the exit code."""
+    rr = _rerun()
+    run = open_source(options.run, options.camera, options.source)
+    if not isinstance(run, Run):
+        raise DetectError(
+            f"{options.run}: no calibration: expected a .cam file in it, or one named by --camera"
+        )
+    files = find_files(run, options.files)
+    if options.output is not None and options.output.exists() and not options.force:
+        raise OutputExistsError(options.output)
+    selection = select_frames(run.frames, options.frames, options.every)
+    source = open_rows(files)
+    head = files.heads.get("circles")
+    settings = CircleSettings() if head is None else head.circle_settings
+    poses, known = _poses(options, [frame.step for frame in run.frames])
+    recording = rr.RecordingStream("detect view", recording_id=f"detect-{run.name}")
+    failures: list[str] = []
+    with tempfile.TemporaryDirectory() as folder:
+        raw = Path(folder) / "view.rrd"
+        if options.output is None:
+            recording.spawn()
+        else:
+            recording.save(str(raw))
+        recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        path = np.column_stack([poses[:, :2], np.zeros(len(poses))])
+        recording.log("world/path", rr.LineStrips3D([path]), static=True)
+        for name, places in known.items():
+            at = np.column_stack([places, np.zeros(len(places))])
+            recording.log(f"world/map/{name}", rr.Points3D(at, colors=_MAP), static=True)
+        with progress_bar("frames", selection.expected(run.frames)) as advance:
+            for position, frame in selection.of(run.frames):
+                recording.set_time("frame", sequence=position)
+                rows = source.of(frame.step.prefix)
+                _log_world(rr, recording, rows, poses[position + 1], settings)
+                try:
+                    image = read_image(frame, run.camera)
+                except FrameError as error:
+                    failures.append(str(error))
+                    continue
+                recording.log("camera/image", rr.Image(image).compress(jpeg_quality=85))
+                _log_image(rr, recording, run, rows, settings)
+                advance()
+        recording.flush()
+        recording.disconnect()
+        if options.output is not None:
+            with (
+                write_whole(options.output, overwrite=options.force) as stream,
+                raw.open("rb") as content,
+            ):
+                shutil.copyfileobj(content, stream)
+            print(f"{options.output}: open it by: rerun {options.output}")
+    print_failures(len(failures), failures)
+    return _FRAMES_FAILED if failures else 0
+
+
+def summed_steps(steps: Iterable[Step]) -> FloatArray:
+    """Poses along the odometry: the start, and one after each step.
+
+    Parameters
+    ----------
+    steps : iterable of Step
+        Movements, each in the robot frame before it.
+
+    Returns
+    -------
+    (N + 1, 3) float64
+        x, y (m), heading (rad) in the robot frame of the start.
+    """
+    poses = [(0.0, 0.0, 0.0)]
+    for step in steps:
+        x, y, theta = poses[-1]
+        cosine, sine = np.cos(theta), np.sin(theta)
+        poses.append(
+            (
+                float(x + cosine * step.dx - sine * step.dy),
+                float(y + sine * step.dx + cosine * step.dy),
+                theta + step.dphi,
+            )
+        )
+    return np.array(poses)
+
+
+def _poses(options: View, steps: list[Step]) -> tuple[FloatArray, dict[str, FloatArray]]:
+    """The robot's poses, and the places of the map's landmarks."""
+    # Only files of `slam map` are read by its own reader.
+    from slam.map_file import read_map, read_path
+
+    poses = summed_steps(steps)
+    if options.path is not None:
+        poses = read_path(options.path).poses
+        if len(poses) != len(steps) + 1:
+            raise DetectError(
+                f"{options.path}: {len(poses)} poses: expected {len(steps) + 1}, the start and one "
+                "for each frame of the run"
+            )
+    if options.map is None:
+        return poses, {}
+    known = read_map(options.map)
+    return poses, {"discs": known.discs.xy, "verticals": known.lines.xy}
+
+
+def _log_world(
+    rr: Any, recording: Any, rows: SeenRows, pose: FloatArray, settings: CircleSettings
+) -> None:
+    x, y, theta = pose.tolist()
+    turn = rr.RotationAxisAngle(axis=[0, 0, 1], radians=theta)
+    recording.log("world/robot", rr.Transform3D(translation=[x, y, 0.0], rotation=turn))
+    # Forward is -Y.
+    arrow = rr.Arrows3D(origins=[[0, 0, 0]], vectors=[[0, -0.5, 0]], colors=_LINE)
+    recording.log("world/robot/forward", arrow)
+    if rows.circles is not None:
+        places = circle_arrays(rows.circles).xy
+        rings = [circle_on_floor(centre, settings.radius_m) for centre in places]
+        rings = [np.column_stack([ring, np.zeros(len(ring))]) for ring in rings]
+        recording.log("world/robot/discs", rr.LineStrips3D(rings, colors=_EDGE))
+        recording.log("count/discs", rr.Scalars([float(len(places))]))
+    if rows.lines is not None:
+        recording.log("count/verticals", rr.Scalars([float(len(rows.lines))]))
+    if rows.tilt is not None:
+        recording.log("tilt/pitch_deg", rr.Scalars([float(np.degrees(rows.tilt.pitch))]))
+        recording.log("tilt/roll_deg", rr.Scalars([float(np.degrees(rows.tilt.roll))]))
+
+
+def _log_image(rr: Any, recording: Any, run: Run, rows: SeenRows, settings: CircleSettings) -> None:
+    camera = run.camera
+    if rows.circles is not None:
+        project = floor_projection(camera, rows.tilt if rows.levelled else None)
+        seen = [
+            (project(circle_on_floor(np.array([row.px, row.py]), settings.radius_m)), row.quality)
+            for row in rows.circles
+        ]
+        shown = [(ring + _CORNER, f"{q:.2f}") for ring, q in seen if np.isfinite(ring).all()]
+        strips = [np.vstack([ring, ring[:1]]) for ring, _ in shown]
+        labels = [text for _, text in shown]
+        recording.log("camera/image/discs", rr.LineStrips2D(strips, colors=_EDGE, labels=labels))
+    if rows.lines is not None:
+        ends = ends_of(rows.lines)
+        sigma = np.array([row.sigma for row in rows.lines], dtype=np.float64)
+        for name, curves, colour in (
+            ("verticals", line_curves(camera, ends), _LINE),
+            ("sigma", sigma_bars(camera, ends, sigma), _SIGMA),
+        ):
+            shown_curves = [curve + _CORNER for curve in curves if np.isfinite(curve).all()]
+            recording.log(f"camera/image/{name}", rr.LineStrips2D(shown_curves, colors=colour))
+    if rows.markers is not None:
+        squares = [
+            np.array([(c.u, c.v) for c in (*row.corners, row.corners[0])]) + _CORNER
+            for row in rows.markers
+        ]
+        labels = [f"{row.id}" for row in rows.markers]
+        recording.log("camera/image/markers", rr.LineStrips2D(squares, colors=_LINE, labels=labels))
+
+
+def _rerun() -> Any:
+    """The package of Rerun, which sends nothing home from here."""
+    os.environ.setdefault("RERUN_ANALYTICS_DISABLED", "1")
+    try:
+        import rerun
+    except ImportError:
+        raise DetectError(
+            "detect view needs the package rerun-sdk: install it by pip install 'redetect[view]'"
+        ) from None
+    return rerun
