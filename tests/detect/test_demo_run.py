@@ -50,7 +50,7 @@ def test_published_detector_finds_the_demo_run(project_root: Path, tmp_path: Pat
 
 def test_demo_run_is_complete(project_root: Path) -> None:
     run = open_run(project_root / "images" / "e")
-    assert 60 <= run.frames.expected <= 100
+    assert 60 <= sum(1 for _ in run.frames) <= 100
     assert all(frame.image is not None for frame in run.frames)
     assert run.images_without_step == 0
     size = sum(path.stat().st_size for path in run.folder.rglob("*") if path.is_file())
