@@ -261,8 +261,11 @@ def test_refusals(small_run: Path, tmp_path: Path, capsys: Captured) -> None:
     assert_refused(["draw", run], small_run, "--video", capsys)
     assert_refused(["draw", run, "-o", out, "--lines", "no.lines"], small_run, "no.lines", capsys)
     assert_refused(["draw", run, "-o", out, "--fps", "0"], small_run, "fps", capsys)
-    assert_refused(["draw", run, "-o", out, "--gate-m", "-1"], small_run, "gate_m", capsys)
     assert_refused(["draw", run, "-o", out, "--frames", "x"], small_run, "'x'", capsys)
+    with pytest.raises(SystemExit) as ended:
+        main(["draw", run, "-o", out, "--gate-m", "-1"])
+    assert ended.value.code == 2
+    assert "gate_m" in capsys.readouterr().err
     video = tmp_path / "v.mp4"
     video.write_bytes(b"mine")
     assert_refused(["draw", run, "--video", str(video)], small_run, "--force", capsys)
