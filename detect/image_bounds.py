@@ -50,7 +50,8 @@ def bounded_content(path: Path, name: object, size: tuple[int, int] | None) -> b
                 raise FrameError(
                     f"{name}: has {status.st_size} bytes: expected an image, at most {limit}"
                 )
-            return stream.read(limit)
+            # Memory is taken for as much as is asked for, whatever there is.
+            return stream.read(status.st_size)
     except OSError as error:
         raise FrameError(f"{name}: cannot be read: {error.strerror}") from None
 

@@ -169,7 +169,7 @@ def _own_content(path: Path) -> bytes | None:
             _log.warning("%s: %s: it is computed again", path, why)
             return None
         with os.fdopen(handle, "rb", closefd=False) as stream:
-            return stream.read(_LARGEST_FILE_BYTES)
+            return stream.read(state.st_size)
     except OSError:
         return None
     finally:

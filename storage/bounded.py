@@ -40,10 +40,10 @@ def read_bounded(path: str | os.PathLike[str], largest_bytes: int) -> bytes:
         if state.st_size > largest_bytes:
             raise OSError(errno.EFBIG, f"larger than {largest_bytes} bytes")
         with os.fdopen(handle, "rb", closefd=False) as stream:
-            # The file may grow while it is read.
-            content = stream.read(largest_bytes + 1)
+            # Memory is taken for as much as is asked for, whatever there is.
+            content = stream.read(state.st_size + 1)
     finally:
         os.close(handle)
-    if len(content) > largest_bytes:
-        raise OSError(errno.EFBIG, f"larger than {largest_bytes} bytes")
+    if len(content) > state.st_size:
+        raise OSError(errno.EBUSY, "grows while it is read")
     return content

@@ -1,0 +1,122 @@
+"""Every reader on files that are damaged, or put together from the words of its language.
+
+A short, seeded run of what `python -m tools.fuzz` does for as long as one likes: a result, or a
+typed error whose message names the file and fits on one printable line of bounded length.
+"""
+
+from __future__ import annotations
+
+import random
+import tracemalloc
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, given, seed, settings
+from hypothesis import strategies as st
+
+from tools.fuzz.damage import damaged
+from tools.fuzz.readers import READERS, Reader, attempt
+
+#: Memory that a reader may take for a file of some kilobytes.
+_MOST_BYTES = 64 << 20
+
+each_reader = pytest.mark.parametrize("reader", READERS, ids=lambda reader: reader.name)
+
+
+@pytest.fixture
+def folder(reader: Reader, tmp_path: Path) -> Path:
+    """The folder of a reader's file, with what else it needs."""
+    for name, content in reader.beside.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(content)
+    return tmp_path
+
+
+@each_reader
+def test_what_fuzzing_begins_with_is_accepted(reader: Reader, folder: Path) -> None:
+    for content in reader.seeds:
+        path = folder / reader.file
+        path.write_bytes(content)
+        assert attempt(reader, path) is None
+
+
+@each_reader
+def test_damaged_files(reader: Reader, folder: Path) -> None:
+    path = folder / reader.file
+    chance = random.Random(f"damage of {reader.name}")
+    tracemalloc.start()
+    try:
+        for _ in range(150):
+            path.write_bytes(damaged(chance.choice(reader.seeds), reader.words, chance))
+            attempt(reader, path)
+        assert tracemalloc.get_traced_memory()[1] < _MOST_BYTES
+    finally:
+        tracemalloc.stop()
+
+
+@each_reader
+def test_files_of_a_reader_s_own_words(reader: Reader, folder: Path) -> None:
+    words = st.sampled_from(
+        [*reader.words, *(word for content in reader.seeds for word in content.split(b" "))]
+    )
+    glue = st.sampled_from(
+        [b"", b" ", b"\n", b"\r\n", b",", b"\t", b"\0", b"\xff", b"\xe2\x80\xa8"]
+    )
+
+    @seed(2)
+    @settings(
+        max_examples=60, deadline=None, database=None, suppress_health_check=list(HealthCheck)
+    )
+    @given(st.lists(st.tuples(words, glue), max_size=40))
+    def read(pieces: list[tuple[bytes, bytes]]) -> None:
+        path = folder / reader.file
+        path.write_bytes(b"".join(word + between for word, between in pieces))
+        attempt(reader, path)
+
+    read()
+
+
+@each_reader
+def test_what_is_no_file(reader: Reader, folder: Path) -> None:
+    """A folder in its place; nothing at all."""
+    if not reader.errors:
+        pytest.skip("reads bytes, not files")
+    path = folder / reader.file
+    if reader.name != "map covariance":  # which may be absent
+        assert attempt(reader, path) is not None
+        path.mkdir()
+        assert attempt(reader, path) is not None
+
+
+NASTY = [
+    ("map", b"kind,id,x_m,y_m,cxx_m2,cxy_m2,cyy_m2,rows\ndisc,3,1,2,1,1e200,1,5\n", "negative"),
+    ("g2o", b"\x1f\x1f\n", "VERTEX_SE2"),
+    ("scans", b"1 1e308 1e308 1e308\n", None),
+    ("ptpd", b"a, my offset from master, c\n1, 2, 3\n", "no line"),
+    ("ptpd", b"offset from master, a, timestamp\n1,2\n", None),
+    ("rig", b'{"dictionary": "x", "markers": {"3": {"width_m": 1' + b"0" * 400 + b"}}}", "width_m"),
+    ("rig", b'{"dictionary": 1' + b"0" * 5000 + b"}", "too long"),
+    ("rig", b"[" * 100_000, "nested too deep"),
+    ("boards", b'{"boards": {"world": {"columns": 3, "rows": 4, "square_m": 1}}, "images":'
+     b' [{"camera": "a", "board": []}], "world_from_board": {"translation_m": [0, 0, 0],'
+     b' "quaternion_xyzw": [0, 0, 0, 1]}}', "board is"),
+    ("network", b'{"cameras": {"\x7f\\u001b[2J": 1}}', "expected an object"),
+    ("network", b'{"cameras": {"a": {"calibration": "../../../etc/passwd"}}}', "is no .cam"),
+    ("network", b'{"cameras": {"a": {"calibration": "/etc/passwd"}}}', "is no .cam file"),
+    ("network", b'{"cameras": {"a": {"calibration": "a\\u0000.cam"}}}', "is no .cam file"),
+    ("tilts", b"TILT " + b"x" * 70_000, "too long"),
+    ("image header", b"II+\0\x08\0\0\0" + b"\xff" * 8, None),
+    ("scan arrays", b"PK\x05\x06" + bytes(18), "no such array"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "content", "message"), NASTY)
+def test_what_fuzzing_found_or_might(
+    name: str, content: bytes, message: str | None, tmp_path: Path
+) -> None:
+    (reader,) = [reader for reader in READERS if reader.name == name]
+    path = tmp_path / reader.file
+    path.write_bytes(content)
+    error = attempt(reader, path)
+    assert (error is None) == (message is None)
+    assert message is None or message in str(error)
