@@ -28,6 +28,9 @@ from detect.sources.times import TimesByImage
 from detect.sources.tum import TumTrajectory
 from detect.sources.video import VideoFile
 
+# How the description of a ROS 2 bag begins.
+_BAG_KEY, _LOOKED_AT = b"rosbag2_bagfile_information", 4096
+
 _LIVE = re.compile(r"camera:([0-9]{1,4})")
 
 
@@ -199,4 +202,8 @@ def _demand_size(source: Source, camera: Camera) -> None:
 
 
 def _is_ros2_bag(name: Path) -> bool:
-    return (name / "metadata.yaml").is_file()
+    try:
+        with (name / "metadata.yaml").open("rb") as stream:
+            return _BAG_KEY in stream.read(_LOOKED_AT)
+    except OSError:
+        return False

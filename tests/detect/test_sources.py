@@ -194,6 +194,11 @@ def test_bits_that_there_cannot_be() -> None:
         SourceOptions(frames=-1)
 
 
+def test_a_description_of_images_makes_no_bag(small_run: Path) -> None:
+    (small_run / "metadata.yaml").write_text("camera: front\n")
+    assert open_source(small_run).frames.expected == 3
+
+
 # -- what a newcomer meets ------------------------------------------------------------------
 
 
