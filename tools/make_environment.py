@@ -1,6 +1,8 @@
 """Make the project's virtual environment, unless it already stands and fits.
 
-Uses nothing but the standard library, so that any Python 3.11 or newer can run it:
+Where `requirements/lock.txt` was made for this kind of machine, exactly the packages that it names
+are installed, each checked against its hash; elsewhere, what `pyproject.toml` allows. Uses nothing
+but the standard library, so that any Python 3.11 or newer can run it:
 
     python3 tools/make_environment.py .venv
 """
@@ -8,12 +10,17 @@ Uses nothing but the standard library, so that any Python 3.11 or newer can run 
 from __future__ import annotations
 
 import hashlib
+import platform
 import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
+LOCK = ROOT / "requirements" / "lock.txt"
+#: What the lock file was made and tested on.
+LOCKED_FOR = ("Linux", "x86_64", (3, 11))
+_WRONG_HASH = "DO NOT MATCH THE HASHES"
 
 
 def main() -> int:
@@ -31,22 +38,62 @@ def main() -> int:
     if stamp.is_file() and stamp.read_text() == wanted:
         return 0
     print(f"setting up {environment.name} (once; a few minutes on a slow connection)", flush=True)
-    shutil.rmtree(environment, ignore_errors=True)
-    subprocess.run([sys.executable, "-m", "venv", str(environment)], check=True)
-    pip = [str(environment / "bin" / "python"), "-m", "pip", "--disable-pip-version-check"]
-    finished = subprocess.run(
-        [*pip, "install", "--quiet", "--editable", f"{ROOT}[dev]"], check=False
-    )
-    if finished.returncode != 0:
+    if not _installed(environment):
         print("error: the packages could not be installed (see above)", file=sys.stderr)
         return 1
     stamp.write_text(wanted)
     return 0
 
 
+def _installed(environment: Path) -> bool:
+    """Install the locked packages or, where that cannot be, what the project allows."""
+    here = (platform.system(), platform.machine(), sys.version_info[:2])
+    if not LOCK.is_file() or here != LOCKED_FOR:
+        system, machine, version = LOCKED_FOR
+        print(
+            f"the lock file is for Python {version[0]}.{version[1]} on {system} {machine}: "
+            "installing what pyproject.toml allows, without hashes",
+            flush=True,
+        )
+        return _installed_unlocked(environment)
+    pip = _new_environment(environment)
+    locked = subprocess.run(
+        [*pip, "install", "--quiet", "--require-hashes", "--no-deps", "--requirement", str(LOCK)],
+        check=False, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    if locked.returncode == 0:
+        # All that it needs is there, setuptools too: nothing is fetched to build with.
+        own = [*pip, "install", "--quiet", "--no-build-isolation", "--editable", f"{ROOT}[dev]"]
+        return subprocess.run(own, check=False).returncode == 0
+    sys.stderr.write(locked.stderr)
+    if _WRONG_HASH in locked.stderr:
+        # Somebody gives out other files under the same names: nothing is to be had from there.
+        return False
+    print(
+        "the locked packages cannot all be had here: installing what pyproject.toml allows, "
+        "without hashes",
+        flush=True,
+    )
+    return _installed_unlocked(environment)
+
+
+def _installed_unlocked(environment: Path) -> bool:
+    pip = _new_environment(environment)
+    command = [*pip, "install", "--quiet", "--editable", f"{ROOT}[dev]"]
+    return subprocess.run(command, check=False).returncode == 0
+
+
+def _new_environment(environment: Path) -> list[str]:
+    """Make it anew, with nothing in it; returns how its pip is called."""
+    shutil.rmtree(environment, ignore_errors=True)
+    subprocess.run([sys.executable, "-m", "venv", str(environment)], check=True)
+    return [str(environment / "bin" / "python"), "-m", "pip", "--disable-pip-version-check"]
+
+
 def _fingerprint(environment: Path) -> str:
     """What the environment depends on: its place, the interpreter and the declared packages."""
-    parts = [str(environment), sys.executable, sys.version, (ROOT / "pyproject.toml").read_text()]
+    files = [path.read_text() for path in (ROOT / "pyproject.toml", LOCK) if path.is_file()]
+    parts = [str(environment), sys.executable, sys.version, *files]
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()
 
 

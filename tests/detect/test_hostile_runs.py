@@ -14,6 +14,7 @@ from camera import Camera
 from detect.cli import main
 from detect.errors import FrameError
 from detect.run import open_run, read_image
+from landmarks import read_frames
 
 STEP = "STEP {} 0 0 0 1e-6 0 1e-6 0 0 1e-6\n"
 
@@ -129,3 +130,59 @@ def test_names_that_a_terminal_would_act_upon_are_escaped(
     assert "\\x1b[31m" in shown.err
     for path in run.glob("*.json"):
         json.loads(path.read_text())
+
+
+def mounted(text: str, pose: list[list[float]]) -> str:
+    """The calibration with another sensor2World."""
+    begin, end = text.index("sensor2World:"), text.index("mountIndex")
+    rows = " ".join(f"[ {', '.join(map(repr, row))} ]" for row in pose)
+    return f"{text[:begin]}sensor2World: {rows}\n{text[end:]}"
+
+
+LEVEL = [[-1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, -1.0, 0.0, 1.5]]
+DOWN = [[-1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 1.5]]
+UP = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 1.5]]
+
+
+@pytest.mark.parametrize(
+    ("pose", "message"),
+    [
+        ([*LEVEL[:2], [0.0, -1.0, 0.0, -1.5]], "the camera is -1.5 m above the floor"),
+        ([*LEVEL[:2], [0.0, -1.0, 0.0, 0.0]], "the camera is 0 m above the floor"),
+        ([*LEVEL[:2], [0.0, -1.1, 0.0, 1.5]], "sensor2World is not a rotation"),
+        ([[1.0, *LEVEL[0][1:]], *LEVEL[1:]], "sensor2World is not a rotation but a reflection"),
+        ([*LEVEL[:2], [0.0, -1.0, float("nan"), 1.5]], "sensor2World has 'nan'"),
+    ],
+)
+def test_impossible_mountings_are_refused(
+    run: Path, capsys: pytest.CaptureFixture[str], pose: list[list[float]], message: str
+) -> None:
+    (run / "s.cam").write_text(mounted((run / "s.cam").read_text(), pose))
+    assert main(["all", str(run)]) == 1
+    assert message in capsys.readouterr().err
+    assert not list(run.glob("detected.*"))
+
+
+@pytest.mark.parametrize("pose", [DOWN, UP])
+def test_a_horizon_outside_the_image_means_no_verticals(
+    run: Path, pose: list[list[float]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """And a camera that sees no floor finds no discs; neither is an error, nor a warning."""
+    (run / "s.cam").write_text(mounted((run / "s.cam").read_text(), pose))
+    assert main(["all", str(run)]) == 0
+    for name in ("detected.lines", *(["detected.circles"] if pose is UP else [])):
+        frames = list(read_frames(run / name))
+        assert [frame.step.prefix for frame in frames] == ["s.0000", "s.0001", "s.0002"]
+        assert not any(frame.landmarks for frame in frames)
+    assert "NOTILT s.0000 0" in (run / "detected.tilt").read_text()
+    capsys.readouterr()
+
+
+def test_a_distortion_that_folds_inside_the_image_is_refused(
+    run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = (run / "s.cam").read_text()
+    begin = text.index("coef:")
+    (run / "s.cam").write_text(text[:begin] + "coef: { 0 -0.9 0 0 0 } }\n")
+    assert main(["all", str(run)]) == 1
+    assert "the distortion folds inside the image" in capsys.readouterr().err
