@@ -1,0 +1,19 @@
+"""Real photographs of disc boards: what is held out is explained as well as by OpenCV's model."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tools.camera_evaluation.photographs import compare
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("group", ["asym", "sym", "rct"])
+def test_held_out_photographs_are_explained_as_well_as_by_opencv(
+    shared_data: Path, group: str
+) -> None:
+    found = compare(shared_data / "discs" / "dev", group, free_aspect=True)
+    assert found["views"] >= 5
+    assert found["ours"] <= found["opencv_rational"]
