@@ -11,6 +11,7 @@ If that process is killed, they end by themselves.
 
 from __future__ import annotations
 
+import gc
 import multiprocessing
 import os
 import re
@@ -47,6 +48,7 @@ _LOCAL_CHUNK = 8
 _CLUSTER_CHUNK = 16
 _WINDOW_PER_WORKER = 3
 _GRACE_S = 1.0
+_TIDY_EVERY = 256
 _CLUSTER_ANSWER_S = 10.0
 _CLUSTER_PATIENCE_S = 60.0
 _CLUSTER_LOOK_S = 5.0
@@ -129,6 +131,7 @@ class _InProcess(Executor):
     """Does what it is given at once, before it gives the future back."""
 
     def submit(self, fn: Callable[P, R], /, *args: P.args, **kwargs: P.kwargs) -> Future[R]:
+        _tidy_now_and_then(_TIDY_EVERY * _LOCAL_CHUNK)
         future: Future[R] = Future()
         future.set_result(fn(*args, **kwargs))
         return future
@@ -191,7 +194,20 @@ def _unless_stopped(fn: Callable[P, R], /, *args: P.args, **kwargs: P.kwargs) ->
     """Do a task, unless its result is no longer waited for."""
     if _stopped is not None and _stopped.is_set():
         raise CancelledError
+    _tidy_now_and_then(_TIDY_EVERY)
     return fn(*args, **kwargs)
+
+
+def _tidy_now_and_then(every: int) -> None:
+    """Give back what Python keeps for later: its own collections leave it, and it grows slowly."""
+    global _tasks_begun
+    _tasks_begun += 1
+    if _tasks_begun % every == 0:
+        gc.collect()
+
+
+#: How many tasks this process has begun.
+_tasks_begun = 0
 
 
 #: Set in a worker process when the run ends early.
@@ -215,6 +231,8 @@ def _begin(plan: FramePlan, stop: Event, first: Lock, ready: Event, show: bool) 
         ready.set()
     else:
         ready.wait()
+    gc.collect()
+    gc.freeze()  # what is there stays: collections need not look at it
 
 
 def _end_with_parent() -> None:
