@@ -86,7 +86,8 @@ def demand_bounded(content: bytes, name: object, size: tuple[int, int] | None) -
         )
     if size is not None and sorted(claimed) != sorted(size):
         raise FrameError(
-            f"{name}: is {width}x{height} px: expected {size[0]}x{size[1]}, the calibration's size: "
+            f"{name}: is {width}x{height} px: "
+            f"expected {size[0]}x{size[1]}, the calibration's size: "
             "name the calibration of these images by --camera"
         )
 
