@@ -83,7 +83,7 @@ def repeat_short_runs(source: Path, folder: Path, runs: int, jobs: int) -> Short
     }
     first: dict[str, bytes] = {}
     cached = different = 0
-    shared = _names(_SHARED_MEMORY)
+    shared = _shared()
     for number in range(runs):
         arguments = ["all", str(run), "-o", str(output), "--force"]
         arguments += ["--jobs", str(jobs if number % 2 else 1)]
@@ -103,12 +103,17 @@ def repeat_short_runs(source: Path, folder: Path, runs: int, jobs: int) -> Short
     return ShortRuns(
         runs=runs,
         processes=len(marked(mark)),
-        shared=len(_names(_SHARED_MEMORY) - shared),
+        shared=len(_shared() - shared),
         temporary=len(_names(temporary)),
         hidden=sum(name.startswith(".") for name in _names(output)),
         caches=len(_names(caches)) - cached,
         different=different,
     )
+
+
+def _shared() -> set[str]:
+    """Shared memory and semaphores as Python names them."""
+    return {name for name in _names(_SHARED_MEMORY) if name.startswith(("sem.", "psm_"))}
 
 
 def _names(folder: Path) -> set[str]:
