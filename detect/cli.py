@@ -31,6 +31,7 @@ from detect.markers.settings import MarkerSettings
 from detect.settings import PUBLISHED, CircleSettings
 from detect.sources.options import SourceOptions
 from detect.viewing_options import Draw, Report, Tune, View
+from storage.messages import one_line
 
 Preset = Literal["default", "published"]
 
@@ -308,7 +309,7 @@ def main(arguments: list[str] | None = None) -> int:
             pass
         except (ValueError, OSError, WorkerError) as error:
             if not interrupted.is_set():
-                print(f"error: {error}", file=sys.stderr)
+                print(f"error: {one_line(str(error))}", file=sys.stderr)
                 return EXIT_ERROR
         except BaseException as error:
             if not interrupted.is_set():
