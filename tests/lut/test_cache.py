@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import io
+import logging
 import pickle
 import subprocess
 import sys
@@ -212,7 +213,8 @@ def test_damage_of_any_kind_is_noticed_and_repaired(
         damaged = damaged.under(path.name)
     assert damaged != sound
     path.write_bytes(damaged)
-    assert caplog.messages == []
+    # That a table is computed may be told, whatever level other tests have left; no warning yet.
+    assert [record for record in caplog.records if record.levelno >= logging.WARNING] == []
     assert_same(cached_disc_table(camera, SHAPE, tmp_path), built)
     assert computed == [SHAPE, SHAPE]
     assert path.read_bytes() == sound

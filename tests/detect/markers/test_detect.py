@@ -368,7 +368,7 @@ def test_the_published_detector_finds_a_plain_marker() -> None:
     [
         ({"thresholds": ()}, "thresholds"),
         ({"thresholds": (0.5, 1.5)}, "thresholds is 1.5"),
-        ({"width_px": -1.0}, "width_px is -1.0"),
+        ({"width_px": -1.0}, "width_px is -1:"),
         ({"least_holes": 5, "most_holes": 2}, "least_holes"),
         ({"least_explained": 2.0}, "least_explained"),
         ({"area_factor": 0.5}, "area_factor"),
