@@ -3,6 +3,9 @@
 Python turns an interrupt into an exception wherever it happens to be. While a kernel is compiled,
 that may be where nobody lets the exception through: it is printed and forgotten, or comes out as
 another one. So it is noted that there was one, and looked at after every frame.
+
+While processes are started or ended, an exception out of nowhere leaves half of one behind: there
+an interrupt waits until that is done.
 """
 
 from __future__ import annotations
@@ -34,6 +37,51 @@ def interrupts_noted() -> Iterator[threading.Event]:
         yield _received
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+@contextmanager
+def interrupts_deferred() -> Iterator[None]:
+    """Let interrupts wait until the end of a block, which is short, and raise them there.
+
+    Processes started meanwhile inherit a blocked interrupt. That alone would not do: an interrupt
+    that this thread blocks is taken by another one, and raised in this one all the same.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        At the end of the block, if there was one during it.
+    """
+    before = signal.getsignal(signal.SIGINT)
+    if threading.current_thread() is not threading.main_thread() or not callable(before):
+        with _interrupts_blocked():
+            yield
+        return
+    waiting = threading.Event()
+
+    def note(_: int, __: FrameType | None) -> None:
+        waiting.set()
+
+    signal.signal(signal.SIGINT, note)
+    try:
+        with _interrupts_blocked():
+            yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if waiting.is_set():
+        _received.set()
+        raise KeyboardInterrupt
+
+
+@contextmanager
+def _interrupts_blocked() -> Iterator[None]:
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def raise_if_interrupted() -> None:

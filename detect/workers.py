@@ -20,11 +20,11 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import CancelledError, Executor, Future, ProcessPoolExecutor
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from multiprocessing.connection import wait
 from multiprocessing.process import BaseProcess
 from multiprocessing.synchronize import Event, Lock
-from typing import TYPE_CHECKING, ParamSpec, TypeVar
+from typing import TYPE_CHECKING, ParamSpec, TypeVar, cast
 
 from detect.announcing import (
     announce_compiling,
@@ -34,6 +34,7 @@ from detect.announcing import (
 from detect.dispatch import Workers
 from detect.errors import WorkerError
 from detect.frame import FramePlan, rehearse
+from detect.interrupts import interrupts_deferred
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -147,30 +148,46 @@ def _in_process(plan: FramePlan) -> Iterator[Executor]:
 
 
 class _SpawnedProcesses(ProcessPoolExecutor):
-    """Processes that inherit a blocked interrupt: it would reach them even while they start."""
+    """Processes that inherit a blocked interrupt: it would reach them even while they start.
+
+    None is left half started: an interrupt of this process waits meanwhile.
+    """
 
     def submit(self, fn: Callable[P, R], /, *args: P.args, **kwargs: P.kwargs) -> Future[R]:
-        with _interrupts_blocked():
+        with interrupts_deferred():
             return super().submit(_unless_stopped, fn, *args, **kwargs)
 
 
 @contextmanager
 def _processes(jobs: int, plan: FramePlan) -> Iterator[Executor]:
     context = multiprocessing.get_context("spawn")
-    stop, first, ready = context.Event(), context.Lock(), context.Event()
-    pool = _SpawnedProcesses(
-        jobs,
-        mp_context=context,
-        initializer=_begin,
-        initargs=(plan, stop, first, ready, announcements_are_shown()),
-    )
-    try:
+    with ExitStack() as ending:
+        with interrupts_deferred():
+            stop, first, ready = context.Event(), context.Lock(), context.Event()
+            pool = _SpawnedProcesses(
+                jobs,
+                mp_context=context,
+                initializer=_begin,
+                initargs=(plan, stop, first, ready, announcements_are_shown()),
+            )
+            ending.callback(_shut_down, pool, stop)
         yield pool
-    finally:
+
+
+def _shut_down(pool: ProcessPoolExecutor, stop: Event) -> None:
+    """End a pool's processes, whatever they are doing; a further interrupt waits for that.
+
+    The thread that looks after them is waited for: an interrupted program leaves threads behind,
+    and this one would be stopped between the removal of a semaphore and the note of that.
+    """
+    with interrupts_deferred():
         stop.set()
         processes = list((pool._processes or {}).values())
+        caretaker = cast("threading.Thread | None", pool._executor_manager_thread)
         pool.shutdown(wait=False, cancel_futures=True)
         _end(processes)
+        if caretaker is not None:
+            caretaker.join(_GRACE_S)
 
 
 def _end(processes: Sequence[BaseProcess]) -> None:
@@ -240,18 +257,6 @@ def _end_with_parent() -> None:
     if parent is not None:
         wait([parent.sentinel])
         os._exit(1)
-
-
-@contextmanager
-def _interrupts_blocked() -> Iterator[None]:
-    if not hasattr(signal, "pthread_sigmask"):  # Windows
-        yield
-        return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 # -- a cluster ------------------------------------------------------------------------------

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import signal
+import threading
+import time
 from pathlib import Path
 
 import pytest
 
 from detect import commands
 from detect.cli import main
+from detect.interrupts import interrupts_deferred, interrupts_noted, raise_if_interrupted
 from detect.progress import progress_bar
 
 
@@ -54,6 +58,65 @@ def test_a_swallowed_interrupt_comes_back_after_the_frame(
     assert frames == [0, 1, 2]
     assert main(["compare", str(tmp_path)]) == 130  # the note of one run is none of the next
     assert frames == [0, 1, 2, 0, 1, 2]
+
+
+def interrupted_block(done: list[str]) -> None:
+    with interrupts_deferred():
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(0.05)
+        done.append("the block")
+
+
+def test_an_interrupt_waits_for_the_end_of_what_must_not_be_torn() -> None:
+    before = signal.getsignal(signal.SIGINT)
+    done: list[str] = []
+    with interrupts_noted() as interrupted:
+        with pytest.raises(KeyboardInterrupt):
+            interrupted_block(done)
+        assert interrupted.is_set()
+        with pytest.raises(KeyboardInterrupt):
+            raise_if_interrupted()
+    assert done == ["the block"]
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_an_interrupt_that_another_thread_takes_waits_too() -> None:
+    begun, end = threading.Event(), threading.Event()
+
+    def wait() -> None:
+        begun.set()
+        end.wait()
+
+    other = threading.Thread(target=wait)  # does not block the interrupt, as the first one does
+    other.start()
+    begun.wait()
+    done: list[str] = []
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            interrupted_block(done)
+    finally:
+        end.set()
+        other.join()
+    assert done == ["the block"]
+
+
+def test_without_an_interrupt_nothing_is_raised() -> None:
+    before = signal.getsignal(signal.SIGINT)
+    with interrupts_deferred():
+        pass
+    with pytest.raises(ValueError, match="own"), interrupts_deferred():
+        raise ValueError("own")
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_an_ignored_interrupt_stays_ignored() -> None:
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with interrupts_deferred():
+            os.kill(os.getpid(), signal.SIGINT)
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def test_nowhere_to_keep_kernels(
