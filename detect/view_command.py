@@ -23,6 +23,7 @@ from detect.settings import CircleSettings
 from detect.sources.opening import open_source
 from detect.viewing_options import View
 from landmarks import Step, circle_arrays
+from landmarks.map_file import read_map, read_path
 from storage import OutputExistsError, write_whole
 
 FloatArray = NDArray[np.float64]
@@ -118,9 +119,6 @@ def summed_steps(steps: Iterable[Step]) -> FloatArray:
 
 def _poses(options: View, steps: list[Step]) -> tuple[FloatArray, dict[str, FloatArray]]:
     """The robot's poses, and the places of the map's landmarks."""
-    # Only files of `slam map` are read by its own reader.
-    from slam.map_file import read_map, read_path
-
     poses = summed_steps(steps)
     if options.path is not None:
         poses = read_path(options.path).poses

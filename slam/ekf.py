@@ -19,6 +19,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from landmarks.map_file import LandmarkMap, Landmarks, Path2D
 from slam.ekf_covariance import POSE_SIZE, JointCovariance
 from slam.ekf_lines import relative_range_sigma, start_line
 from slam.ekf_views import View, WaitingLines
@@ -26,7 +27,6 @@ from slam.errors import SlamError
 from slam.filter_association import Associator
 from slam.filter_frames import NO_CAMERA, FilterRun, FrameRows, RowCount, frames_of, unknown
 from slam.filter_kernels import frame_innovation
-from slam.map_file import LandmarkMap, Landmarks, Path2D
 from slam.recording import Recording
 
 FloatArray = NDArray[np.float64]

@@ -5,13 +5,13 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
+from landmarks.map_file import read_map, write_map, write_path
 from slam.ekf import EkfSlam, run_ekf
 from slam.errors import SlamError
 from slam.filter_association import Associator
 from slam.filter_input import default_output, read_reference, read_run
 from slam.filter_report import demand_free, map_distance, path_distance, summary, table, write_json
 from slam.map_covariance import covariance_file, write_joint_covariance
-from slam.map_file import read_map, write_map, write_path
 from slam.options import Ekf
 from slam.pictures import draw_errors, draw_map
 

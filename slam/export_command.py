@@ -8,13 +8,21 @@ import numpy as np
 
 import slam
 from landmarks import CircleLandmark, read_frames, write_frames
+from landmarks.map_file import (
+    LandmarkMap,
+    Landmarks,
+    Path2D,
+    read_map,
+    read_path,
+    write_map,
+    write_path,
+)
 from slam.axes import MEANING, Axes, covariance_from_dataset, from_dataset
 from slam.errors import SlamError
 from slam.export_text import text_rows
 from slam.g2o import write_g2o
 from slam.g2o_frames import demand_readable, frames_of_graph, graph_of_frames, poses_of_run
 from slam.g2o_reading import read_g2o
-from slam.map_file import LandmarkMap, Landmarks, Path2D, read_map, read_path, write_map, write_path
 from slam.options import Export, Import
 from slam.recording import Recording, landmark_file, read_recording
 from slam.run_camera import camera_of_run

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.map_file import Path2D
+from landmarks.map_file import Path2D
 from slam.recording import UNKNOWN_ID, Recording
 
 FloatArray = NDArray[np.float64]

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from landmarks.map_file import Path2D, read_path
 from slam.errors import SlamError
 from slam.filter_frames import NO_CAMERA
-from slam.map_file import Path2D, read_path
 from slam.recording import Recording, read_recording
 from slam.run_camera import camera_of_run
 

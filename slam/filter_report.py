@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from landmarks import squared_mahalanobis, wrap_angle
+from landmarks.map_file import LandmarkMap, Path2D
 from slam.errors import SlamError
 from slam.filter_frames import FilterRun
-from slam.map_file import LandmarkMap, Path2D
 from storage import OutputExistsError, write_whole
 
 FloatArray = NDArray[np.float64]

@@ -16,9 +16,9 @@ from landmarks import (
     format_record,
     parse_record,
 )
+from landmarks.map_file import Path2D, read_map, read_path
 from slam.errors import SlamError
 from slam.g2o import RunGraph
-from slam.map_file import Path2D, read_map, read_path
 from slam.measurement import disc_in_map
 from slam.motion import chain_steps
 from slam.recording import CircleRows, Recording, recording_of_frames

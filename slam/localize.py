@@ -17,11 +17,11 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from landmarks.map_file import LandmarkMap, Path2D
 from slam.errors import SlamError
 from slam.filter_association import Associator
 from slam.filter_frames import NO_CAMERA, FilterRun, FrameRows, RowCount, frames_of, unknown
 from slam.filter_kernels import frame_innovation
-from slam.map_file import LandmarkMap, Path2D
 from slam.motion import move, move_jacobians
 from slam.recording import Recording
 

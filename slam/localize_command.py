@@ -6,13 +6,13 @@ import time
 
 import numpy as np
 
+from landmarks.map_file import read_map, write_path
 from slam.errors import SlamError
 from slam.filter_association import Associator
 from slam.filter_input import default_output, read_reference, read_run
 from slam.filter_report import demand_free, path_distance, summary, table, write_json
 from slam.localize import Localizer, MapErrors, run_localizer
 from slam.map_covariance import covariance_file, read_joint_covariance
-from slam.map_file import read_map, write_path
 from slam.options import Localize
 from slam.pictures import draw_errors, draw_map
 

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 
 import slam
+from landmarks.map_file import LandmarkMap, Path2D, no_landmarks, write_map, write_path
 from slam.chi_squared import as_json, table_lines
 from slam.errors import SlamError
 from slam.graph_terms import Weighting
 from slam.map_covariance import covariance_file, joint_covariance, write_joint_covariance
-from slam.map_file import LandmarkMap, Path2D, no_landmarks, write_map, write_path
 from slam.mapping import LeftOut, MappedRun, Mounting, landmark_map, map_run, path_of
 from slam.options import Map
 from slam.recording import Recording, read_recording

@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from landmarks.map_file import LandmarkMap
 from slam.errors import SlamError
 from slam.graph import Estimate, Graph
 from slam.graph_terms import Weighting, layout_of, linearise
-from slam.map_file import LandmarkMap
 from slam.solve import factor, normal_equations
 from storage import write_whole
 from storage.plain_arrays import read_plain_array

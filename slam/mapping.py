@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera
+from landmarks.map_file import LandmarkMap, Landmarks, Path2D
 from slam.calibration import check_rows_fit_camera, mounting_change
 from slam.chi_squared import ChiSquared, chi_squared
 from slam.connection import check_connected
@@ -17,7 +18,6 @@ from slam.errors import SlamError
 from slam.graph import Estimate, Graph, first_sight, graph_of_recording, with_lines
 from slam.graph_terms import Weighting
 from slam.initial_lines import InitialLines, place_lines
-from slam.map_file import LandmarkMap, Landmarks, Path2D
 from slam.marginals import Marginals, marginals
 from slam.recording import Recording
 from slam.solve import Solution, solve

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from landmarks import wrap_angle
+from landmarks.map_file import Path2D
 from slam.axes import MEANING, Axes, from_dataset, to_dataset
 from slam.errors import SlamError
 from slam.export_text import AXES_COMMENT, demand_axes, finite, text_rows, write_text
-from slam.map_file import Path2D
 
 FloatArray = NDArray[np.float64]
 

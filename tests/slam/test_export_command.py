@@ -8,10 +8,7 @@ import numpy as np
 import pytest
 
 from landmarks import CircleLandmark, Frame, format_frame, read_frames
-from slam.axes import covariance_from_dataset, from_dataset
-from slam.cli import main
-from slam.g2o_reading import read_g2o
-from slam.map_file import (
+from landmarks.map_file import (
     LandmarkMap,
     Landmarks,
     Path2D,
@@ -21,6 +18,9 @@ from slam.map_file import (
     write_map,
     write_path,
 )
+from slam.axes import covariance_from_dataset, from_dataset
+from slam.cli import main
+from slam.g2o_reading import read_g2o
 from slam.motion import chain_steps
 from slam.recording import read_recording
 

@@ -11,9 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from landmarks import wrap_angle
+from landmarks.map_file import Path2D
 from slam.axes import Axes
 from slam.errors import SlamError
-from slam.map_file import Path2D
 from slam.tum import read_tum, write_tum
 from storage import OutputExistsError
 

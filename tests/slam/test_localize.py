@@ -9,11 +9,11 @@ import pytest
 from numpy.typing import NDArray
 
 from landmarks import wrap_angle
+from landmarks.map_file import LandmarkMap, Landmarks, no_landmarks
 from slam.errors import SlamError
 from slam.filter_association import Associator
 from slam.filter_frames import frames_of
 from slam.localize import Localizer, MapErrors, run_localizer
-from slam.map_file import LandmarkMap, Landmarks, no_landmarks
 from slam.measurement import (
     bearing_jacobians,
     bearing_of_vertical,

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from landmarks.map_file import read_map, read_path
 from slam.cli import main
-from slam.map_file import read_map, read_path
 from slam.measurement import disc_in_robot
 from slam.motion import relative_pose
 

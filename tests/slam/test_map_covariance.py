@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from landmarks.map_file import LandmarkMap, Landmarks, no_landmarks
 from slam.errors import SlamError
 from slam.graph_terms import Weighting, linearise
 from slam.map_covariance import (
@@ -15,7 +16,6 @@ from slam.map_covariance import (
     read_joint_covariance,
     write_joint_covariance,
 )
-from slam.map_file import LandmarkMap, Landmarks, no_landmarks
 from slam.mapping import map_run
 from slam.recording import read_recording
 from slam.run_camera import camera_of_run

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from landmarks.map_file import LandmarkMap, Landmarks, Path2D, no_landmarks
 from slam.errors import SlamError
-from slam.map_file import LandmarkMap, Landmarks, Path2D, no_landmarks
 from slam.pictures import NEES_BAND, draw_errors, draw_map, ellipse_outlines, pose_errors
 from storage import OutputExistsError
 

@@ -30,11 +30,11 @@ from groundtruth.scanners import read_robot, read_scanners
 from groundtruth.scans import read_scans
 from groundtruth.streams import read_planar_poses, read_rows_of_numbers, read_times
 from landmarks import LandmarkError, frames_of_rows, read_rows
+from landmarks.map_file import read_map, read_path
 from landmarks.tilts import read_tilts
 from slam.errors import SlamError
 from slam.g2o_reading import read_g2o
 from slam.map_covariance import covariance_file, read_joint_covariance
-from slam.map_file import read_map, read_path
 from slam.tum import read_tum
 
 #: Characters of a message beside the file's name.
@@ -306,12 +306,17 @@ READERS: tuple[Reader, ...] = (
         "map",
         "map.csv",
         read_map,
-        (SlamError,),
+        (LandmarkError,),
         (_MAP.encode(),),
         (b"disc,", b"line,", b'"', *_NUMBERS),
     ),
     Reader(
-        "path", "path.csv", read_path, (SlamError,), (_PATH.encode(),), (b"start,", b'"', *_NUMBERS)
+        "path",
+        "path.csv",
+        read_path,
+        (LandmarkError,),
+        (_PATH.encode(),),
+        (b"start,", b'"', *_NUMBERS),
     ),
     Reader(
         "map covariance",

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.map_file import LandmarkMap, Landmarks, no_landmarks
+from landmarks.map_file import LandmarkMap, Landmarks, no_landmarks
 from slam.measurement import bearing_of_vertical, disc_in_robot
 from slam.motion import chain_steps
 from slam.recording import CircleRows, LineRows, Recording

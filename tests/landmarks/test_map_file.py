@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from slam.errors import SlamError
-from slam.map_file import (
+from landmarks import LandmarkFileError
+from landmarks.map_file import (
     LandmarkMap,
     Landmarks,
     Path2D,
@@ -77,5 +77,5 @@ def test_a_path_comes_back(tmp_path: Path, with_covariance: bool) -> None:
 )
 def test_a_malformed_map_names_the_line(tmp_path: Path, text: str, message: str) -> None:
     (tmp_path / "m.csv").write_text(text)
-    with pytest.raises(SlamError, match=message):
+    with pytest.raises(LandmarkFileError, match=message):
         read_map(tmp_path / "m.csv")

@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.errors import SlamError
+from landmarks.errors import LandmarkFileError
 from storage import write_whole
 from storage.bounded import read_bounded
 
@@ -143,27 +143,27 @@ def read_map(path: str | os.PathLike[str]) -> LandmarkMap:
 
     Raises
     ------
-    SlamError
+    LandmarkFileError
         If the file cannot be read or a row is malformed, a landmark stands twice or a covariance is
         negative; the message names file and line.
     """
     found: dict[str, dict[int, tuple[list[float], int]]] = {"disc": {}, "line": {}}
     for line, words in _read(path, MAP_COLUMNS):
         if words[0] not in found:
-            raise SlamError(f"{path}:{line}: kind is {words[0][:20]!r}: expected disc or line")
+            raise LandmarkFileError(path, line, f"kind is {words[0][:20]!r}: expected disc or line")
         number = _whole(path, line, "id", words[1])
         values = [
             _finite(path, line, name, word) for name, word in zip(MAP_COLUMNS[2:7], words[2:7])
         ]
         rows = _whole(path, line, "rows", words[7])
         if number in found[words[0]]:
-            raise SlamError(f"{path}:{line}: {words[0]} {number} stands in the map already")
+            raise LandmarkFileError(path, line, f"{words[0]} {number} stands in the map already")
         if (
             values[2] < 0.0
             or values[4] < 0.0
             or values[3] * values[3] > (values[2] * values[4] * 1.000001)
         ):
-            raise SlamError(f"{path}:{line}: {words[0]} {number}: covariance is negative")
+            raise LandmarkFileError(path, line, f"{words[0]} {number}: covariance is negative")
         found[words[0]][number] = (values, rows)
     return LandmarkMap(discs=_landmarks(found["disc"]), lines=_landmarks(found["line"]))
 
@@ -189,7 +189,7 @@ def read_path(path: str | os.PathLike[str]) -> Path2D:
 
     Raises
     ------
-    SlamError
+    LandmarkFileError
         If the file cannot be read or a row is malformed; the message names file and line.
     """
     prefixes, numbers = [], []
@@ -247,7 +247,7 @@ def _read(
     try:
         text = read_bounded(place, _LARGEST_FILE_BYTES).decode("utf-8", "surrogateescape")
     except OSError as error:
-        raise SlamError(f"{place}: cannot be read: {error.strerror or error}") from None
+        raise LandmarkFileError(place, None, f"cannot be read: {error.strerror or error}") from None
     head: list[str] | None = None
     count = 0
     for number, line in enumerate(text.splitlines(), 1):
@@ -257,15 +257,17 @@ def _read(
         if head is None:
             widths = {len(columns), fewest or len(columns)}
             if len(words) not in widths or tuple(words) != tuple(columns[: len(words)]):
-                raise SlamError(f"{place}:{number}: expected the columns {','.join(columns)}")
+                raise LandmarkFileError(place, number, f"expected the columns {','.join(columns)}")
             head = words
             continue
         if len(words) != len(head):
-            raise SlamError(f"{place}:{number}: {len(words)} values: expected {len(head)}")
+            raise LandmarkFileError(place, number, f"{len(words)} values: expected {len(head)}")
         count += 1
         yield number, words
     if count == 0:
-        raise SlamError(f"{place}: no rows: expected at least one under {','.join(columns)}")
+        raise LandmarkFileError(
+            place, None, f"no rows: expected at least one under {','.join(columns)}"
+        )
 
 
 def _finite(path: str | os.PathLike[str], line: int, name: str, word: str) -> float:
@@ -274,7 +276,7 @@ def _finite(path: str | os.PathLike[str], line: int, name: str, word: str) -> fl
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise SlamError(f"{path}:{line}: {name} is {word[:30]!r}: expected a finite number")
+        raise LandmarkFileError(path, line, f"{name} is {word[:30]!r}: expected a finite number")
     return value
 
 
@@ -284,5 +286,5 @@ def _whole(path: str | os.PathLike[str], line: int, name: str, word: str) -> int
     except ValueError:
         value = 2**63
     if abs(value) >= 2**63:
-        raise SlamError(f"{path}:{line}: {name} is {word[:30]!r}: expected a whole number")
+        raise LandmarkFileError(path, line, f"{name} is {word[:30]!r}: expected a whole number")
     return value
