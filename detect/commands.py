@@ -13,17 +13,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from detect.announcing import show_announcements
-from detect.cli import (
-    EXIT_ERROR,
-    EXIT_FRAMES_FAILED,
-    All,
-    Circles,
-    Command,
-    Compare,
-    Lines,
-    Markers,
-)
+from detect.cli import EXIT_ERROR, EXIT_FRAMES_FAILED, Command
 from detect.errors import WorkerError
+from detect.options import All, Circles, Compare, DetectorFlags, Lines, Markers
 from detect.progress import print_failures, progress_bar
 from detect.viewing_options import PERFORMED_BY
 
@@ -190,12 +182,12 @@ def _all(command: All) -> int:
     return _exit_code(summary, run)
 
 
-def _workers(command: Circles | Lines | Markers | All, run: ImageRun) -> Workers:
+def _workers(command: DetectorFlags, run: ImageRun) -> Workers:
     """Who does the work of a command."""
     from detect.workers import cluster_workers, default_jobs, local_workers
 
     # Tasks that carry images, or bring pictures back, are kept small.
-    draws = not isinstance(command, All) and command.draw is not None
+    draws = isinstance(command, Circles | Lines | Markers) and command.draw is not None
     large = draws or run.frames.ships_images
     if command.cluster is not None:
         if command.jobs is not None:
@@ -205,7 +197,7 @@ def _workers(command: Circles | Lines | Markers | All, run: ImageRun) -> Workers
     return local_workers(jobs, pictures=large)
 
 
-def _conduct(command: Circles | Lines | Markers | All, log: Path) -> Conduct:
+def _conduct(command: DetectorFlags, log: Path) -> Conduct:
     """How a command is carried out."""
     from detect import __version__
     from detect.conduct import conduct_of

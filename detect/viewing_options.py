@@ -6,22 +6,17 @@ Nothing heavy is imported: `--help` needs it all.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, make_dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, Optional
+from typing import TYPE_CHECKING, Annotated
 
-from tyro.conf import OmitArgPrefixes, Positional, arg
+from tyro.conf import OmitArgPrefixes, arg
 
 from detect.compare_result import CompareError, CompareOptions
 from detect.exports.options import Export
+from detect.flags import MaybeInt, MaybePath, MaybeStr, PickedFrames, Preset, RunFlags
 from detect.line_settings import LineSettings
 from detect.settings import CircleSettings
 from detect.sources.options import SourceOptions
 from storage.bounds import ABOVE_0, NOT_NEGATIVE, demand
-
-# For `X | None` tyro imports another library that takes a tenth of a second.
-MaybePath = Optional[Path]  # noqa: UP045
-MaybeInt = Optional[int]  # noqa: UP045
-MaybeStr = Optional[str]  # noqa: UP045
 
 
 @dataclass(frozen=True)
@@ -86,98 +81,68 @@ class Gates:
         return CompareOptions(gate_m=self.gate_m)
 
 
-@dataclass(frozen=True)
-class Draw:
+@dataclass(frozen=True, kw_only=True)
+class RowsFlags(RunFlags):
+    """What every command needs that looks at the frames of a run."""
+
+    source: SourceOptions = field(default_factory=SourceOptions)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Draw(PickedFrames, RowsFlags):
     """Draw rows from files into the images: PNG files, or a video. Nothing is detected again.
 
     Example: detect all images/e, then: detect draw images/e -o /tmp/drawn --every 10
 
     Parameters
     ----------
-    run : Path
-        Run folder, folder or pattern of images, video or bag, as for `detect circles`.
     output : Path
         Folder for a PNG file per frame.
     video : Path
         Write an MP4 file as well, or instead.
     fps : float
         Frames of the video per second.
-    camera : Path
-        Calibration, if it is not the one in the run folder.
-    every : int
-        Only every so manieth frame.
-    frames : tuple of str
-        Only these frames: names of images, positions in the run, and ranges FROM:TO or
-        FROM:TO:STEP of positions without the last.
-    force : bool
-        Replace existing files.
     """
 
-    run: Positional[Path]
-    output: Annotated[MaybePath, arg(aliases=["-o"])] = None
     video: MaybePath = None
     fps: float = 10.0
-    camera: MaybePath = None
-    every: int = 1
-    frames: tuple[str, ...] = ()
-    force: bool = False
-    source: SourceOptions = field(default_factory=SourceOptions)
     files: OmitArgPrefixes[RowFiles] = field(default_factory=RowFiles)
     gates: OmitArgPrefixes[Gates] = field(default_factory=Gates)
 
 
-@dataclass(frozen=True)
-class View:
+@dataclass(frozen=True, kw_only=True)
+class View(PickedFrames, RowsFlags):
     """Frames, landmarks, tilt, path and map over time in Rerun (extra [view]).
 
     Example: detect all images/e, then: detect view images/e -o /tmp/e.rrd
 
     Parameters
     ----------
-    run : Path
-        Run folder, folder or pattern of images, video or bag, as for `detect circles`.
     output : Path
         The recording (.rrd) to write; without it, the viewer is started.
-    camera : Path
-        Calibration, if it is not the one in the run folder.
     path : Path
         The robot's path (path.csv of `slam map`); by default the sum of the STEP rows.
     map : Path
         Map to show (map.csv of `slam map`), in the frame of --path.
-    every : int
-        Only every so manieth frame.
-    frames : tuple of str
-        Only these frames, as for `detect draw`.
     force : bool
         Replace an existing recording.
     """
 
-    run: Positional[Path]
-    output: Annotated[MaybePath, arg(aliases=["-o"])] = None
-    camera: MaybePath = None
     path: MaybePath = None
     map: MaybePath = None
-    every: int = 1
-    frames: tuple[str, ...] = ()
-    force: bool = False
-    source: SourceOptions = field(default_factory=SourceOptions)
     files: OmitArgPrefixes[RowFiles] = field(default_factory=RowFiles)
 
 
-@dataclass(frozen=True)
-class Report:
+@dataclass(frozen=True, kw_only=True)
+class Report(RowsFlags):
     """One HTML page about a run: what was found, and how good it is against reference rows.
 
     Example: detect all images/e, then: detect report images/e -o /tmp/e.html
 
     Parameters
     ----------
-    run : Path
-        Run folder, folder or pattern of images, video or bag, as for `detect circles`.
     output : Path
         The page; by default detected.html in the run folder.
-    camera : Path
-        Calibration, if it is not the one in the run folder.
     worst : int
         How many of the worst frames are shown.
     time_frames : int
@@ -187,13 +152,8 @@ class Report:
         Replace an existing page.
     """
 
-    run: Positional[Path]
-    output: Annotated[MaybePath, arg(aliases=["-o"])] = None
-    camera: MaybePath = None
     worst: int = 5
     time_frames: int = 0
-    force: bool = False
-    source: SourceOptions = field(default_factory=SourceOptions)
     files: OmitArgPrefixes[RowFiles] = field(default_factory=RowFiles)
     gates: OmitArgPrefixes[Gates] = field(default_factory=Gates)
 
@@ -222,8 +182,8 @@ else:
     Grid = _grid()
 
 
-@dataclass(frozen=True)
-class Tune:
+@dataclass(frozen=True, kw_only=True)
+class Tune(PickedFrames, RowsFlags):
     """Try parameters over a grid against a reference file: precision and recall, knee marked.
 
     Example: detect tune images/e --threshold 0.3:0.7:0.1 --every 8 -o /tmp/tuned
@@ -234,8 +194,6 @@ class Tune:
 
     Parameters
     ----------
-    run : Path
-        Run folder, folder or pattern of images, video or bag, as for `detect circles`.
     output : Path
         Folder for table.csv, table.json and curve.png; by default `detected.tune`
         in the run folder.
@@ -243,41 +201,26 @@ class Tune:
         Tune the detector of verticals instead of that of discs.
     preset : str
         `default` or `published`: the values of all parameters that are not varied.
-    camera : Path
-        Calibration, if it is not the one in the run folder.
     reference : Path
         Reference rows; by default map.circles (map.lines) in the run folder.
     tilt : Path
         Tilts of the frames: positions of discs are corrected for them.
     only_identified : bool
         Count only reference rows that have an ID.
-    every : int
-        Only every so manieth frame.
-    frames : tuple of str
-        Only these frames, as for `detect draw`.
     most : int
         Refuse grids of more combinations than this.
     jobs : int
         Processes that share the work, 1 for none beside this one; by default one for every 500
         frames to be looked at, at most as many as there are cores. What is written is the same.
-    force : bool
-        Replace existing files.
     """
 
-    run: Positional[Path]
-    output: Annotated[MaybePath, arg(aliases=["-o"])] = None
     verticals: bool = False
-    preset: Literal["default", "published"] = "default"
-    camera: MaybePath = None
+    preset: Preset = "default"
     reference: MaybePath = None
     tilt: MaybePath = None
     only_identified: bool = False
-    every: int = 1
-    frames: tuple[str, ...] = ()
     most: int = 1000
     jobs: MaybeInt = None
-    force: bool = False
-    source: SourceOptions = field(default_factory=SourceOptions)
     gates: OmitArgPrefixes[Gates] = field(default_factory=Gates)
     grid: OmitArgPrefixes[Grid] = field(default_factory=Grid)
 

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal, Optional
+from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-Format = Literal["csv", "parquet", "mcap"]
+from detect.flags import MaybeFloat, MaybePath
 
-# For `X | None` tyro imports another library that takes a tenth of a second.
-MaybePath = Optional[Path]  # noqa: UP045
-MaybeFloat = Optional[float]  # noqa: UP045
+Format = Literal["csv", "parquet", "mcap"]
 
 
 @dataclass(frozen=True)

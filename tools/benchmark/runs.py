@@ -12,8 +12,8 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.cli import All, Circles, Lines
 from detect.commands import carry_out
+from detect.options import All, Circles, Lines
 from detect.run import open_run
 from detect.settings import PUBLISHED
 from tools.benchmark.errors import BenchmarkError

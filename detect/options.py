@@ -1,0 +1,198 @@
+"""The flags of the detectors and of ``detect compare``: one frozen dataclass per command.
+
+Nothing heavy is imported: `--help` needs it all.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from tyro.conf import OmitArgPrefixes, Positional
+
+from detect.compare_result import CompareOptions
+from detect.conduct import ConductOptions
+from detect.flags import MaybeFloat, MaybeInt, MaybePath, MaybeStr, Preset, RunFlags
+from detect.line_settings import LineSettings
+from detect.markers.settings import MarkerSettings
+from detect.settings import CircleSettings
+from detect.sources.options import SourceOptions
+
+
+@dataclass(frozen=True, kw_only=True)
+class DetectorFlags(RunFlags):
+    """What every detector needs besides its settings.
+
+    Parameters
+    ----------
+    run : Path
+        Run folder of the data set's layout; a folder of images, or a pattern in quotes
+        ('drive/*.png'); a video; a ROS 1 or 2 bag or MCAP file; or a camera of this machine,
+        camera:0. With a .cam beside it, in the bag, or named by --camera.
+    preset : str
+        Values that the other flags start from.
+    jobs : int
+        Processes that share the work, 1 for none beside this one; by default one for every 500
+        frames, at most as many as there are cores. What is written is the same.
+    cluster : str
+        Address of a dask scheduler (tcp://host:8786) whose workers do the work instead.
+    """
+
+    preset: Preset = "default"
+    jobs: MaybeInt = None
+    cluster: MaybeStr = None
+    source: OmitArgPrefixes[SourceOptions] = field(default_factory=SourceOptions)
+    conduct: OmitArgPrefixes[ConductOptions] = field(default_factory=ConductOptions)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Circles(DetectorFlags):
+    """Detect the discs of a run and write them to a .circles file.
+
+    Example: detect circles images/e --draw /tmp/discs, or:
+    detect circles drive.mcap --camera front.cam --odometry /odom
+
+    Parameters
+    ----------
+    preset : str
+        Values that the other flags start from: `published` is the report's detector to the letter.
+    output : Path
+        The file to write; by default detected.circles in the run folder, or named after the video
+        or bag and beside it.
+    tilt : Path
+        Tilts of the frames (written by `detect lines`): positions are corrected for them.
+    draw : Path
+        Folder for images with the outlines and qualities drawn in.
+    json : Path
+        Write the rows with their pixels and evidence as JSON as well.
+    """
+
+    tilt: MaybePath = None
+    draw: MaybePath = None
+    json: MaybePath = None
+    settings: OmitArgPrefixes[CircleSettings] = field(default_factory=CircleSettings)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lines(DetectorFlags):
+    """Detect the verticals of a run and write them to a .lines file, and the tilt to a .tilt file.
+
+    Example: detect lines images/e --join-threshold 0.006, or:
+    detect lines drive.avi --camera front.cam --frames 100
+
+    Parameters
+    ----------
+    preset : str
+        Values that the other flags start from: `published` is the report's parameters.
+    output : Path
+        The file to write; by default detected.lines in the run folder, or named after the video
+        or bag and beside it.
+    tilt : Path
+        The tilt file to write; by default the output's name with the ending .tilt.
+    ids_from : Path
+        A .lines file whose IDs are carried over where the match is unambiguous.
+    join_threshold : float
+        Lines whose bearings are closer than this (radians) are joined; overrides `--join-px`.
+    draw : Path
+        Folder for images with the lines and their standard deviations drawn in.
+    rejected : bool
+        Draw all tracks instead, the rejected ones with the reason.
+    response : bool
+        Draw the filter's response as well, into files of their own.
+    """
+
+    tilt: MaybePath = None
+    ids_from: MaybePath = None
+    join_threshold: MaybeFloat = None
+    draw: MaybePath = None
+    rejected: bool = False
+    response: bool = False
+    settings: OmitArgPrefixes[LineSettings] = field(default_factory=LineSettings)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Markers(DetectorFlags):
+    """Detect the square markers of a run and write them to a .markers file.
+
+    Example: detect markers images/m/a --dictionary rawseeds, or:
+    detect markers camera:0 --frames 100
+
+    Parameters
+    ----------
+    run : Path
+        Run folder of the data set's layout; a folder of images, or a pattern in quotes
+        ('drive/*.png'); a video; a ROS 1 or 2 bag or MCAP file; or a camera of this machine,
+        camera:0. With a .cam beside it, or named by --camera, the lens's distortion is taken off;
+        without one, edges are taken to be straight in the images.
+    preset : str
+        Values that the other flags start from: `published` is the report's detector.
+    output : Path
+        The file to write; by default detected.markers in the run folder, or named after the video
+        or bag and beside it.
+    draw : Path
+        Folder for images with the markers drawn in, and with what was rejected.
+    """
+
+    draw: MaybePath = None
+    settings: OmitArgPrefixes[MarkerSettings] = field(default_factory=MarkerSettings)
+
+
+@dataclass(frozen=True, kw_only=True)
+class All(DetectorFlags):
+    """Detect verticals, tilt and discs of a run; the discs' positions are corrected for the tilt.
+
+    Example: detect all images/e --circles.polarity light, or:
+    detect all 'drive/*.png' --camera front.cam --times drive.times --odometry drive.tum
+
+    Parameters
+    ----------
+    output : Path
+        Folder for detected.circles, detected.lines and detected.tilt; by default the run's, or
+        named after the video or bag and beside it.
+    """
+
+    circles: CircleSettings = field(default_factory=CircleSettings)
+    lines: LineSettings = field(default_factory=LineSettings)
+
+
+@dataclass(frozen=True)
+class Compare:
+    """Compare detected rows with reference rows: matched, missed, extra, errors.
+
+    Example: detect compare images/e --min-recall 0.9, or: detect compare images/e --lines
+
+    Parameters
+    ----------
+    run : Path
+        Run folder.
+    lines : bool
+        Compare verticals instead of discs.
+    reference : Path
+        Reference rows; by default map.circles (map.lines) in the run folder.
+    detected : Path
+        Detected rows; by default detected.circles (detected.lines) in the run folder.
+    tolerance_deg : float
+        Bearings of the same line differ by at most this,
+    sigmas : float
+        or by this many standard deviations of the detected one.
+    min_recall : float
+        Exit with 1 if the recall is lower.
+    min_precision : float
+        Exit with 1 if the precision is lower.
+    json : Path
+        Write the result as JSON.
+    force : bool
+        Replace an existing JSON file.
+    """
+
+    run: Positional[Path]
+    lines: bool = False
+    reference: MaybePath = None
+    detected: MaybePath = None
+    tolerance_deg: float = 0.5
+    sigmas: float = 2.0
+    min_recall: MaybeFloat = None
+    min_precision: MaybeFloat = None
+    json: MaybePath = None
+    force: bool = False
+    options: OmitArgPrefixes[CompareOptions] = field(default_factory=CompareOptions)
