@@ -26,7 +26,6 @@ from slam.ekf_views import View, WaitingLines
 from slam.errors import SlamError
 from slam.filter_association import Associator
 from slam.filter_frames import NO_CAMERA, FilterRun, FrameRows, RowCount, frames_of, unknown
-from slam.filter_kernels import frame_innovation
 from slam.recording import Recording
 
 FloatArray = NDArray[np.float64]
@@ -175,24 +174,20 @@ class EkfSlam:
         return self.covariance.block((slots[:, None] + np.arange(2)).ravel())
 
     def _update(self, rows: FrameRows, discs: list[int], lines: list[int]) -> None:
-        line_ids = [rows.line_ids[k] for k in lines]
-        innovation, jacobian, noise, index = frame_innovation(
+        innovation, jacobian, noise, index = rows.innovation(
+            discs,
+            lines,
+            self.disc_slots,
+            self.line_slots,
             self._state,
             self._linearised,
-            np.array([self.disc_slots[rows.disc_ids[k]] for k in discs], dtype=np.int64),
-            rows.disc_xy[discs],
-            rows.disc_covariance[discs],
-            np.array([self.line_slots[i] for ids in line_ids for i in ids], dtype=np.int64),
-            np.cumsum([0, *map(len, line_ids)]),
-            rows.bearing_rad[lines],
-            rows.sigma_rad[lines],
             self.camera_xy,
         )
         self._apply(innovation, jacobian, noise, index)
         self.count.discs += len(discs)
         self.count.lines += len(lines)
         self.disc_rows.update([rows.disc_ids[k] for k in discs])
-        self.line_rows.update([i for ids in line_ids for i in ids])
+        self.line_rows.update([i for k in lines for i in rows.line_ids[k]])
 
     def _apply(
         self, innovation: FloatArray, jacobian: FloatArray, noise: FloatArray, index: IntArray

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from landmarks.map_file import Path2D
+from slam.filter_kernels import frame_innovation
 from slam.recording import UNKNOWN_ID, Recording
 
 FloatArray = NDArray[np.float64]
@@ -48,6 +49,48 @@ class FrameRows:
         """The same rows under other identifiers."""
         return FrameRows(
             disc_ids, self.disc_xy, self.disc_covariance, line_ids, self.bearing_rad, self.sigma_rad
+        )
+
+    def innovation(
+        self,
+        discs: Sequence[int],
+        lines: Sequence[int],
+        disc_slots: Mapping[int, int],
+        line_slots: Mapping[int, int],
+        state: FloatArray,
+        linearised_at: FloatArray,
+        camera_xy: FloatArray,
+    ) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
+        """What some of the rows say beyond what the state predicts.
+
+        Parameters
+        ----------
+        discs, lines : sequences of int
+            The rows, by their places here; all of known landmarks.
+        disc_slots, line_slots : mappings of int to int
+            Where in the state each landmark begins.
+        state, linearised_at : (n,) float64
+            See `slam.filter_kernels.frame_innovation`.
+        camera_xy : (2,) float64
+            The camera's centre in the robot frame (m).
+
+        Returns
+        -------
+        innovation, jacobian, noise, index
+            See `slam.filter_kernels.frame_innovation`.
+        """
+        line_ids = [self.line_ids[k] for k in lines]
+        return frame_innovation(
+            state,
+            linearised_at,
+            np.array([disc_slots[self.disc_ids[k]] for k in discs], dtype=np.int64),
+            self.disc_xy[discs],
+            self.disc_covariance[discs],
+            np.array([line_slots[i] for ids in line_ids for i in ids], dtype=np.int64),
+            np.cumsum([0, *map(len, line_ids)]),
+            self.bearing_rad[lines],
+            self.sigma_rad[lines],
+            camera_xy,
         )
 
 

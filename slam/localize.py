@@ -21,7 +21,6 @@ from landmarks.map_file import LandmarkMap, Path2D
 from slam.errors import SlamError
 from slam.filter_association import Associator
 from slam.filter_frames import NO_CAMERA, FilterRun, FrameRows, RowCount, frames_of, unknown
-from slam.filter_kernels import frame_innovation
 from slam.motion import move, move_jacobians
 from slam.recording import Recording
 
@@ -161,17 +160,13 @@ class Localizer:
         self._count(rows, discs, lines)
         if not discs and not lines:
             return
-        line_ids = [rows.line_ids[k] for k in lines]
-        innovation, jacobian, noise, index = frame_innovation(
+        innovation, jacobian, noise, index = rows.innovation(
+            discs,
+            lines,
+            self.disc_slots,
+            self.line_slots,
             self._state,
             self._state,
-            np.array([self.disc_slots[rows.disc_ids[k]] for k in discs], dtype=np.int64),
-            rows.disc_xy[discs],
-            rows.disc_covariance[discs],
-            np.array([self.line_slots[i] for ids in line_ids for i in ids], dtype=np.int64),
-            np.cumsum([0, *map(len, line_ids)]),
-            rows.bearing_rad[lines],
-            rows.sigma_rad[lines],
             self.camera_xy,
         )
         block = self.block(index)
