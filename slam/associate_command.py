@@ -17,7 +17,7 @@ from slam.associate import AssociateSettings, RunAssociation, associate_run
 from slam.associate_local import LocalSettings
 from slam.association_score import AssociationScore, score_association
 from slam.errors import SlamError
-from slam.filter_input import read_run
+from slam.filter_input import read_run_of
 from slam.noise import with_relative_noise
 from slam.options import Associate
 from slam.recording import UNKNOWN_ID, Recording, landmark_file
@@ -61,13 +61,7 @@ def perform(options: Associate) -> int:
     for path in (*targets, report):
         if path.exists() and not options.force:
             raise OutputExistsError(path)
-    recording, centre = read_run(
-        options.run,
-        circles=circles,
-        lines=options.lines,
-        stem=options.stem,
-        camera=options.camera,
-    )
+    recording, centre = read_run_of(options)
     camera_xy = (float(centre[0]), float(centre[1]))
 
     runs: list[dict[str, Any]] = []

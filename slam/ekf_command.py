@@ -2,26 +2,27 @@
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 
 from landmarks.map_file import read_map, write_map, write_path
 from slam.ekf import EkfSlam, run_ekf
 from slam.errors import SlamError
 from slam.filter_association import Associator
-from slam.filter_input import default_output, read_reference, read_run
-from slam.filter_report import demand_free, map_distance, path_distance, summary, table, write_json
+from slam.filter_input import default_output, read_reference, read_run_of
+from slam.filter_output import (
+    ERROR_PICTURE,
+    MAP_PICTURE,
+    PATH_NAME,
+    demand_free,
+    draw_results,
+    timed,
+    write_json,
+)
+from slam.filter_report import map_distance, path_distance, summary, table
 from slam.map_covariance import covariance_file, write_joint_covariance
 from slam.options import Ekf
-from slam.pictures import draw_errors, draw_map
 
-PATH_NAME, MAP_NAME, JSON_NAME, MAP_PICTURE, ERROR_PICTURE = (
-    "path.csv",
-    "map.csv",
-    "ekf.json",
-    "map.png",
-    "errors.png",
-)
+MAP_NAME, JSON_NAME = "map.csv", "ekf.json"
 
 
 def perform(command: Ekf) -> int:
@@ -34,18 +35,10 @@ def perform(command: Ekf) -> int:
         *([ERROR_PICTURE] if command.reference else []),
     )
     associator = Associator(command.association, command.gate_probability)
-    recording, camera_xy = read_run(
-        command.run,
-        circles=command.circles,
-        lines=command.lines,
-        stem=command.stem,
-        camera=command.camera,
-    )
+    recording, camera_xy = read_run_of(command)
     demand_free(output, names, overwrite=command.force)
     ekf = EkfSlam(camera_xy=camera_xy, jacobians=command.jacobians)
-    began, began_working = time.perf_counter(), time.thread_time()
-    run = run_ekf(recording, ekf, associator)
-    seconds, working = time.perf_counter() - began, time.thread_time() - began_working
+    run, time_line = timed(lambda: run_ekf(recording, ekf, associator))
     landmark_map = ekf.landmark_map()
     if not len(landmark_map.discs) and not len(landmark_map.lines):
         raise SlamError(
@@ -75,27 +68,7 @@ def perform(command: Ekf) -> int:
             "from reference    landmarks rms {rms_m:.3f} m, median {median_m:.3f}, max "
             "{max_m:.3f}; squared, over their covariance and 2: {normalised:.2f}".format(**from_map)
         )
-    print(
-        f"time              {seconds:.2f} s, {len(recording) / seconds:.0f} steps/s; of processor "
-        f"{working:.2f} s, {len(recording) / working:.0f} steps/s"
-    )
+    print(time_line)
     title = f"{command.run.name}: EKF-SLAM, poses as they were at the time, map at the end"
-    draw_map(
-        output / MAP_PICTURE,
-        landmark_map,
-        run.path,
-        reference=reference,
-        title=title,
-        overwrite=command.force,
-        interactive=command.interactive,
-    )
-    if reference is not None:
-        draw_errors(
-            output / ERROR_PICTURE,
-            run.path,
-            reference.poses,
-            title=title,
-            overwrite=command.force,
-            interactive=command.interactive,
-        )
+    draw_results(output, landmark_map, run.path, reference, title, command)
     return 0

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from landmarks.map_file import Path2D, read_path
 from slam.errors import SlamError
 from slam.filter_frames import NO_CAMERA
+from slam.options import RunFlags
 from slam.recording import Recording, read_recording
 from slam.run_camera import camera_of_run
 
@@ -51,6 +52,17 @@ def read_run(
         return recording, NO_CAMERA
     mounting = camera_of_run(run, camera).robot_from_camera
     return recording, np.array([mounting[0][3], mounting[1][3]])
+
+
+def read_run_of(flags: RunFlags) -> tuple[Recording, FloatArray]:
+    """`read_run` of the run that a command names."""
+    return read_run(
+        flags.run,
+        circles=flags.circles,
+        lines=flags.lines,
+        stem=flags.stem,
+        camera=flags.camera,
+    )
 
 
 def read_reference(path: Path, poses: Path2D) -> Path2D:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,6 @@ from landmarks import squared_mahalanobis, wrap_angle
 from landmarks.map_file import LandmarkMap, Path2D
 from slam.errors import SlamError
 from slam.filter_frames import FilterRun
-from storage import OutputExistsError, write_whole
 
 FloatArray = NDArray[np.float64]
 
@@ -126,18 +124,6 @@ def summary(run: FilterRun, settings: Any, distance: dict[str, float] | None) ->
     return {"version": slam.__version__, "settings": flags, "figures": figures}
 
 
-def write_json(path: Path, content: dict[str, object], *, overwrite: bool) -> None:
-    """Write a summary.
-
-    Raises
-    ------
-    storage.OutputExistsError
-        If the file exists and may not be replaced.
-    """
-    with write_whole(path, overwrite=overwrite) as stream:
-        stream.write((json.dumps(content, indent=1) + "\n").encode())
-
-
 def table(run: FilterRun, distance: dict[str, float] | None) -> list[str]:
     """Lines for the terminal."""
     count = run.count
@@ -168,17 +154,3 @@ def table(run: FilterRun, distance: dict[str, float] | None) -> list[str]:
             "".format(**degrees)
         )
     return lines
-
-
-def demand_free(folder: Path, names: tuple[str, ...], *, overwrite: bool) -> None:
-    """Refuse before the work what could not be written after it, and make the folder.
-
-    Raises
-    ------
-    storage.OutputExistsError
-        If one of the files exists and may not be replaced.
-    """
-    for name in names:
-        if (folder / name).exists() and not overwrite:
-            raise OutputExistsError(folder / name)
-    folder.mkdir(parents=True, exist_ok=True)

@@ -2,26 +2,27 @@
 
 from __future__ import annotations
 
-import time
-
 import numpy as np
 
 from landmarks.map_file import read_map, write_path
 from slam.errors import SlamError
 from slam.filter_association import Associator
-from slam.filter_input import default_output, read_reference, read_run
-from slam.filter_report import demand_free, path_distance, summary, table, write_json
+from slam.filter_input import default_output, read_reference, read_run_of
+from slam.filter_output import (
+    ERROR_PICTURE,
+    MAP_PICTURE,
+    PATH_NAME,
+    demand_free,
+    draw_results,
+    timed,
+    write_json,
+)
+from slam.filter_report import path_distance, summary, table
 from slam.localize import Localizer, MapErrors, run_localizer
 from slam.map_covariance import covariance_file, read_joint_covariance
 from slam.options import Localize
-from slam.pictures import draw_errors, draw_map
 
-PATH_NAME, JSON_NAME, MAP_PICTURE, ERROR_PICTURE = (
-    "path.csv",
-    "localize.json",
-    "map.png",
-    "errors.png",
-)
+JSON_NAME = "localize.json"
 
 
 def perform(command: Localize) -> int:
@@ -43,13 +44,7 @@ def perform(command: Localize) -> int:
     map_errors = _map_errors(command)
     considered = map_errors == "considered"
     joint = read_joint_covariance(command.map, landmark_map) if considered else None
-    recording, camera_xy = read_run(
-        command.run,
-        circles=command.circles,
-        lines=command.lines,
-        stem=command.stem,
-        camera=command.camera,
-    )
+    recording, camera_xy = read_run_of(command)
     demand_free(output, names, overwrite=command.force)
     localizer = Localizer(
         landmark_map,
@@ -59,9 +54,7 @@ def perform(command: Localize) -> int:
         map_errors=map_errors,
         joint_covariance=joint,
     )
-    began, began_working = time.perf_counter(), time.thread_time()
-    run = run_localizer(recording, localizer, associator)
-    seconds, working = time.perf_counter() - began, time.thread_time() - began_working
+    run, time_line = timed(lambda: run_localizer(recording, localizer, associator))
     if not run.count.discs and not run.count.lines:
         raise SlamError(
             f"{command.run}: no row shows a landmark of {command.map}: expected identifiers of the "
@@ -81,28 +74,10 @@ def perform(command: Localize) -> int:
     print("\n".join(table(run, distance)))
     if considered and joint is None:
         print(f"errors of the map taken as independent: no {covariance_file(command.map).name}")
-    print(
-        f"time              {seconds:.2f} s, {len(recording) / seconds:.0f} steps/s; of processor "
-        f"{working:.2f} s, {len(recording) / working:.0f} steps/s"
+    print(time_line)
+    draw_results(
+        output, landmark_map, run.path, reference, f"{command.run.name}: localised", command
     )
-    draw_map(
-        output / MAP_PICTURE,
-        landmark_map,
-        run.path,
-        reference=reference,
-        title=f"{command.run.name}: localised",
-        overwrite=command.force,
-        interactive=command.interactive,
-    )
-    if reference is not None:
-        draw_errors(
-            output / ERROR_PICTURE,
-            run.path,
-            reference.poses,
-            title=f"{command.run.name}: localised",
-            overwrite=command.force,
-            interactive=command.interactive,
-        )
     return 0
 
 

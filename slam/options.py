@@ -10,16 +10,12 @@ from tyro.conf import Positional, arg
 
 # For `X | None` tyro imports another library that takes a tenth of a second.
 MaybePath = Optional[Path]  # noqa: UP045
-MaybeInt = Optional[int]  # noqa: UP045
-MaybeFloat = Optional[float]  # noqa: UP045
 MaybeStr = Optional[str]  # noqa: UP045
 
 
-@dataclass(frozen=True)
-class Map:
-    """Least-squares map: all poses and landmarks of a run at once.
-
-    Example: slam map images/e --circles --lines -o /tmp/e-map
+@dataclass(frozen=True, kw_only=True)
+class RunFlags:
+    """What every command needs that reads the landmarks of a run.
 
     Parameters
     ----------
@@ -31,6 +27,28 @@ class Map:
         Use the vertical lines.
     stem : str
         Name of the landmark files in the folder; by default map, else detected.
+    camera : Path
+        Calibration, if it is not the one in the run folder (lines need one).
+    force : bool
+        Replace existing files.
+    """
+
+    run: Positional[Path]
+    circles: bool = False
+    lines: bool = False
+    stem: MaybeStr = None
+    camera: MaybePath = None
+    force: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class Map(RunFlags):
+    """Least-squares map: all poses and landmarks of a run at once.
+
+    Example: slam map images/e --circles --lines -o /tmp/e-map
+
+    Parameters
+    ----------
     camera : Path
         Calibration, if it is not the one in the run folder (lines and --calibrate need one).
     calibrate : bool
@@ -53,15 +71,8 @@ class Map:
         Folder for map.csv, path.csv, table.json and pictures; by default `slam` in the run folder.
     interactive : bool
         Show the pictures in windows as well.
-    force : bool
-        Replace existing files.
     """
 
-    run: Positional[Path]
-    circles: bool = False
-    lines: bool = False
-    stem: MaybeStr = None
-    camera: MaybePath = None
     calibrate: bool = False
     row_errors: Literal["corrected", "recorded"] = "corrected"
     tilt_deg: float = 0.0
@@ -70,34 +81,42 @@ class Map:
     loss_scale: float = 3.0
     output: Annotated[MaybePath, arg(aliases=["-o"])] = None
     interactive: bool = False
-    force: bool = False
 
 
-@dataclass(frozen=True)
-class Localize:
+@dataclass(frozen=True, kw_only=True)
+class FilterFlags(RunFlags):
+    """What both filters need.
+
+    Parameters
+    ----------
+    gate_probability : float
+        Share of right rows that pass the gate; with known association nothing is gated.
+    reference : Path
+        A path.csv to measure the distance from.
+    interactive : bool
+        Show the pictures in windows as well.
+    """
+
+    association: Literal["known", "nearest", "joint"] = "known"
+    gate_probability: float = 0.999
+    reference: MaybePath = None
+    output: Annotated[MaybePath, arg(aliases=["-o"])] = None
+    interactive: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class Localize(FilterFlags):
     """Localise in a known map with an extended Kalman filter.
 
     Example: slam localize images/e --map /tmp/e-map/map.csv
 
     Parameters
     ----------
-    run : Path
-        Run folder, or a .circles or .lines file.
     map : Path
         The map (written by `slam map`).
-    circles : bool
-        Use the discs; so it is, too, where neither kind is asked for.
-    lines : bool
-        Use the vertical lines.
-    stem : str
-        Name of the landmark files in the folder; by default map, else detected.
-    camera : Path
-        Calibration, if it is not the one in the run folder (lines need one).
     association : str
         `known`: rows say by their IDs which landmark they show; `nearest` or `joint`: it is found
         out, by Mahalanobis distance of one row at a time or of a frame's rows together.
-    gate_probability : float
-        Share of right rows that pass the gate.
     map_errors : str
         `considered`: the map's covariances are errors that stay the same each time a landmark is
         seen; `white`: errors that are new each time; `ignored`: the map is exact. By default
@@ -106,91 +125,45 @@ class Localize:
         Pose at the start in the map (m, m, rad).
     start_sigma : three floats
         Its standard deviations.
-    reference : Path
-        A path.csv to measure the distance from.
     output : Path
         Folder for path.csv, localize.json and pictures; by default `slam/localize` in the run
         folder.
-    interactive : bool
-        Show the pictures in windows as well.
-    force : bool
-        Replace existing files.
     """
 
-    run: Positional[Path]
     map: Path
-    circles: bool = False
-    lines: bool = False
-    stem: MaybeStr = None
-    camera: MaybePath = None
-    association: Literal["known", "nearest", "joint"] = "known"
-    gate_probability: float = 0.999
     map_errors: Literal["auto", "considered", "white", "ignored"] = "auto"
     start: tuple[float, float, float] = (0.0, 0.0, 0.0)
     start_sigma: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    reference: MaybePath = None
-    output: Annotated[MaybePath, arg(aliases=["-o"])] = None
-    interactive: bool = False
-    force: bool = False
 
 
-@dataclass(frozen=True)
-class Ekf:
+@dataclass(frozen=True, kw_only=True)
+class Ekf(FilterFlags):
     """Map and localise at once with an extended Kalman filter (EKF-SLAM, landmarks by their IDs).
 
     Example: slam ekf images/e --reference /tmp/e-map/path.csv
 
     Parameters
     ----------
-    run : Path
-        Run folder, or a .circles or .lines file.
-    circles : bool
-        Use the discs; so it is, too, where neither kind is asked for.
-    lines : bool
-        Use the vertical lines.
-    stem : str
-        Name of the landmark files in the folder; by default map, else detected.
-    camera : Path
-        Calibration, if it is not the one in the run folder (lines need one).
     association : str
         `known`: rows say by their IDs which landmark they show; `nearest` or `joint`: it is found
         out.
-    gate_probability : float
-        Share of right rows that pass the gate; with known association nothing is gated.
     jacobians : str
         Where the models are linearised: at the `first` estimate of each landmark, so that the
         filter does not believe to learn its heading from landmarks it has placed itself; or at the
         `latest`, as the textbook filter does, which is inconsistent at large heading error.
-    reference : Path
-        A path.csv to measure the distance from.
     reference_map : Path
         A map.csv to measure the distance of the landmarks from.
     output : Path
         Folder for map.csv, path.csv, ekf.json and pictures; by default `slam/ekf` in the run
         folder.
-    interactive : bool
-        Show the pictures in windows as well.
-    force : bool
-        Replace existing files.
     """
 
-    run: Positional[Path]
-    circles: bool = False
-    lines: bool = False
-    stem: MaybeStr = None
-    camera: MaybePath = None
-    association: Literal["known", "nearest", "joint"] = "known"
-    gate_probability: float = 0.999
     jacobians: Literal["first", "latest"] = "first"
-    reference: MaybePath = None
     reference_map: MaybePath = None
-    output: Annotated[MaybePath, arg(aliases=["-o"])] = None
-    interactive: bool = False
-    force: bool = False
 
 
-@dataclass(frozen=True)
-class Associate:
+@dataclass(frozen=True, kw_only=True)
+class Associate(RunFlags):
     """Find out which rows of a run show the same landmark, and write the run with those IDs.
 
     Where the file has IDs of its own they are not used, but the result is scored against them.
@@ -199,16 +172,6 @@ class Associate:
 
     Parameters
     ----------
-    run : Path
-        Run folder, or a .circles or .lines file.
-    circles : bool
-        Use the discs; so it is, too, where neither kind is asked for.
-    lines : bool
-        Use the vertical lines.
-    stem : str
-        Name of the landmark files in the folder; by default map, else detected.
-    camera : Path
-        Calibration, if it is not the one in the run folder (lines need one).
     method : str
         `nearest`: Mahalanobis distance of one row at a time; `joint`: joint compatibility of a
         frame's rows (JCBB).
@@ -230,15 +193,8 @@ class Associate:
     output : Path
         The landmark file to write; by default associated.circles (or .lines) in the run folder.
         With both kinds two files, which differ in the suffix. The scores go into a .json beside.
-    force : bool
-        Replace existing files.
     """
 
-    run: Positional[Path]
-    circles: bool = False
-    lines: bool = False
-    stem: MaybeStr = None
-    camera: MaybePath = None
     method: Literal["nearest", "joint"] = "joint"
     map_level: bool = True
     gate_probability: float = 0.999
@@ -247,7 +203,6 @@ class Associate:
     noise: tuple[float, ...] = ()
     seed: int = 1
     output: Annotated[MaybePath, arg(aliases=["-o"])] = None
-    force: bool = False
 
 
 @dataclass(frozen=True)
@@ -292,8 +247,8 @@ class Noise:
     force: bool = False
 
 
-@dataclass(frozen=True)
-class Export:
+@dataclass(frozen=True, kw_only=True)
+class Export(RunFlags):
     """Write a run (and a map of it) in the formats of other tools.
 
     Example: slam export images/e --to g2o -o /tmp/e.g2o
@@ -310,30 +265,14 @@ class Export:
         default odometry's and first sight's.
     axes : str
         `robotics`: X forward, Y left, as the other tools expect; `dataset`: X left, Y backward.
-    circles : bool
-        Use the discs; so it is, too, where neither kind is asked for.
-    lines : bool
-        Use the vertical lines.
-    stem : str
-        Name of the landmark files in the folder; by default map, else detected.
-    camera : Path
-        Calibration, if it is not the one in the run folder (lines need one).
     output : Path
         The file to write; for csv a folder.
-    force : bool
-        Replace existing files.
     """
 
-    run: Positional[Path]
     output: Annotated[Path, arg(aliases=["-o"])]
     to: Literal["g2o", "tum", "csv"] = "g2o"
     solution: MaybePath = None
     axes: Literal["robotics", "dataset"] = "robotics"
-    circles: bool = False
-    lines: bool = False
-    stem: MaybeStr = None
-    camera: MaybePath = None
-    force: bool = False
 
 
 @dataclass(frozen=True)
