@@ -13,6 +13,7 @@ from camera.calibration_projection import projection_sigma
 from camera.model import Camera
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 FloatArray = NDArray[np.float64]
@@ -46,7 +47,7 @@ def _png(figure: Figure) -> bytes:
     return stream.getvalue()
 
 
-def _image_axes(figure: Figure, place: int, calibration: Calibration, columns: int):  # type: ignore[no-untyped-def]
+def _image_axes(figure: Figure, place: int, calibration: Calibration, columns: int) -> Axes:
     axes = figure.add_subplot(1, columns, place)
     axes.set_xlim(-0.5, calibration.points.width - 0.5)
     axes.set_ylim(calibration.points.height - 0.5, -0.5)
