@@ -13,10 +13,12 @@ from detect.errors import DetectError
 from detect.line_settings import LineSettings
 from detect.settings import CircleSettings
 from detect.tune_grid import parameter_value
+from storage.messages import excerpt
 
 # The head is what stands before the first row; nobody writes so much.
 _LONGEST_BYTES = 1 << 16
-_NUMBERS = re.compile(r"[0-9.eE+-]+|inf")
+_STEPS = "refine_steps_px"
+_NUMBERS = re.compile(r"[^(),]+")
 
 
 @dataclass(frozen=True)
@@ -31,11 +33,14 @@ class FileHead:
         The effective settings: names and values, as they are written.
     levelled : bool
         Whether it says that positions of discs are corrected for the frames' tilts.
+    name : str
+        What messages call the file.
     """
 
     comments: tuple[str, ...] = ()
     settings: tuple[tuple[str, str], ...] = ()
     levelled: bool = False
+    name: str = ""
 
     @property
     def circle_settings(self) -> CircleSettings:
@@ -46,18 +51,18 @@ class FileHead:
         DetectError
             If one has a value that none can have.
         """
-        return CircleSettings(**_values(CircleSettings, self.settings))
+        try:
+            return CircleSettings(**_values(CircleSettings, self.settings))
+        except DetectError as error:
+            raise DetectError(f"{self.name}: {error}") from None
 
     @property
     def line_settings(self) -> LineSettings:
         """The settings of verticals; as `circle_settings`."""
-        pairs = dict(self.settings).get("refine_steps_px")
-        singles = [entry for entry in self.settings if entry[0] != "refine_steps_px"]
-        values = _values(LineSettings, singles)
-        if pairs is not None:
-            numbers = [float(word) for word in _NUMBERS.findall(pairs)]
-            values["refine_steps_px"] = tuple(zip(numbers[::2], numbers[1::2]))
-        return LineSettings(**values)
+        try:
+            return LineSettings(**_line_values(self.settings))
+        except DetectError as error:
+            raise DetectError(f"{self.name}: {error}") from None
 
 
 def read_head(path: Path) -> FileHead:
@@ -95,7 +100,21 @@ def read_head(path: Path) -> FileHead:
         for name, equals, value in (word.partition("=") for word in text.split()[1:])
         if equals
     )
-    return FileHead(tuple(comments), settings, any(LEVELLED in text for text in comments))
+    levelled = any(LEVELLED in text for text in comments)
+    return FileHead(tuple(comments), settings, levelled, str(path))
+
+
+def _line_values(settings: Iterable[tuple[str, str]]) -> dict[str, Any]:
+    """As `_values`, of `LineSettings`; of its pairs of numbers, too."""
+    singles = [entry for entry in settings if entry[0] != _STEPS]
+    values = _values(LineSettings, singles)
+    for text in [text for name, text in settings if name == _STEPS]:
+        try:
+            numbers = [float(word) for word in _NUMBERS.findall(text)]
+            values[_STEPS] = tuple(zip(numbers[::2], numbers[1::2], strict=True))
+        except ValueError:
+            raise DetectError(f"{_STEPS} is {excerpt(text)}: expected pairs of numbers") from None
+    return values
 
 
 def _values(kind: type, settings: Iterable[tuple[str, str]]) -> dict[str, Any]:

@@ -10,6 +10,7 @@ from decimal import Decimal, InvalidOperation
 from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 from detect.errors import DetectError
+from storage.messages import excerpt
 
 SettingsType = TypeVar("SettingsType")
 
@@ -47,18 +48,19 @@ def parameter_value(kind: type, name: str, text: str) -> Any:
     if get_origin(wanted) is Literal:
         if text in get_args(wanted):
             return text
-        raise DetectError(f"{name} is {text!r}: expected one of {', '.join(get_args(wanted))}")
+        allowed = ", ".join(get_args(wanted))
+        raise DetectError(f"{name} is {excerpt(text)}: expected one of {allowed}")
     if wanted is bool:
         if text.lower() in ("true", "false"):
             return text.lower() == "true"
-        raise DetectError(f"{name} is {text!r}: expected True or False")
+        raise DetectError(f"{name} is {excerpt(text)}: expected True or False")
     if wanted not in (int, float):
         raise DetectError(f"{name} is no single number or word: it cannot be varied")
     try:
         return wanted(text)
     except ValueError:
         whole = "a whole number" if wanted is int else "a number"
-        raise DetectError(f"{name} is {text!r}: expected {whole}") from None
+        raise DetectError(f"{name} is {excerpt(text)}: expected {whole}") from None
 
 
 def parameter_values(kind: type, name: str, text: str) -> tuple[Any, ...]:

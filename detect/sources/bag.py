@@ -19,6 +19,7 @@ from detect.sources.bag_camera import BASE_FRAME, recorded_calibration
 from detect.sources.bag_images import pixels_of_message
 from detect.sources.gray import gray_of_pixels, significant_bits
 from detect.sources.interface import (
+    FARTHEST,
     Calibration,
     PoseStream,
     SourceImage,
@@ -27,6 +28,7 @@ from detect.sources.interface import (
     only_calibration,
 )
 from detect.sources.tum import heading_rad
+from storage.messages import OneLineError
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
@@ -96,17 +98,18 @@ class Bag:
             ):
                 prefix = numbered_prefix(self.stem, number)
                 name = f"{self.name}: {prefix}"
-                time_s = stamp_s(message, recorded_s)
                 try:
-                    if kind == _COMPRESSED:
-                        content = compressed_content(message, name)
-                        # The bits of compressed images are those of PNG files: all 16, or named.
-                        image = SourceImage(prefix, time_s, content=content, bits=bits or 16)
-                    else:
-                        pixels = pixels_of_message(message, name)
-                        bits = significant_bits(pixels) if bits is None else bits
-                        gray = gray_of_pixels(pixels, name, bits)
-                        image = SourceImage(prefix, time_s, content=gray)
+                    with understood(name):
+                        time_s = stamp_s(message, recorded_s)
+                        if kind == _COMPRESSED:
+                            content = compressed_content(message, name)
+                            # Of compressed images the bits are those of PNG files: 16, or named.
+                            image = SourceImage(prefix, time_s, content=content, bits=bits or 16)
+                        else:
+                            pixels = pixels_of_message(message, name)
+                            bits = significant_bits(pixels) if bits is None else bits
+                            gray = gray_of_pixels(pixels, name, bits)
+                            image = SourceImage(prefix, time_s, content=gray)
                 except FrameError as error:
                     image = SourceImage(prefix, time_s, failure=str(error))
                 yield image
@@ -145,16 +148,18 @@ class BagOdometry:
     def __iter__(self) -> Generator[TimedPose, None, None]:
         with opened_bag(self.path) as reader:
             for _, recorded_s, message in messages(reader, self.path, self._topic):
-                pose = message.pose.pose
-                q, p = pose.orientation, pose.position
-                covariance = np.array(message.pose.covariance, dtype=np.float64).reshape(6, 6)
-                planar = covariance[_PLANAR]
-                values = np.array([p.x, p.y, q.x, q.y, q.z, q.w, *planar.ravel()])
-                time_s = stamp_s(message, recorded_s)
-                if not np.isfinite(values).all() or not q.x**2 + q.y**2 + q.z**2 + q.w**2 > 0.0:
+                with understood(self.name):
+                    pose = message.pose.pose
+                    q, p = pose.orientation, pose.position
+                    covariance = np.array(message.pose.covariance, dtype=np.float64).reshape(6, 6)
+                    planar = covariance[_PLANAR]
+                    numbers = [p.x, p.y, q.x, q.y, q.z, q.w, *planar.ravel()]
+                    values = np.array(numbers, dtype=np.float64)
+                    time_s = stamp_s(message, recorded_s)
+                if not np.abs(values).max() <= FARTHEST or not np.any(values[2:6] ** 2 > 0.0):
                     raise DetectError(
                         f"{self.name}: at {time_s:.6f} s: expected a finite pose with an "
-                        "orientation and a finite covariance"
+                        f"orientation and a finite covariance, no number above {FARTHEST:g}"
                     )
                 theta = heading_rad(q.x, q.y, q.z, q.w)
                 yield TimedPose(time_s, float(p.x), float(p.y), theta, planar)
@@ -217,6 +222,25 @@ def messages(reader: AnyReader, path: Path, topic: str) -> Iterator[tuple[str, f
             ) from None
         number += 1
         yield connection.msgtype, recorded_ns / 1e9, message
+
+
+@contextmanager
+def understood(name: str) -> Iterator[None]:
+    """Work on a message: a bag brings its own definitions, which may be other than ROS's.
+
+    Raises
+    ------
+    DetectError
+        If the message lacks what ROS's has, or has something else there.
+    """
+    try:
+        yield
+    except OneLineError:  # that has been said already
+        raise
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+        raise DetectError(
+            f"{name}: a message is not as ROS defines it: {_one_line(error)}"
+        ) from None
 
 
 def chosen_topic(

@@ -98,8 +98,24 @@ def is_calibrated(message: Any) -> bool:
     return bool(np.any(_field(message, "k")))
 
 
-def static_transforms(messages: Iterable[Any]) -> dict[str, tuple[str, Matrix]]:
-    """Parent and 4x4 parent_from_child of each child frame."""
+def static_transforms(reader: AnyReader, path: Path) -> dict[str, tuple[str, Matrix]]:
+    """Parent and 4x4 parent_from_child of each child frame, of a bag's ``/tf_static``.
+
+    Raises
+    ------
+    DetectError
+        If one is none.
+    """
+    from detect.sources.bag import messages, understood
+
+    kinds = {c.topic: c.msgtype for c in reader.connections}
+    if kinds.get(_STATIC) != _TRANSFORMS:
+        return {}
+    with understood(f"{path}: {_STATIC}"):
+        return _transforms(said for _, _, said in messages(reader, path, _STATIC))
+
+
+def _transforms(messages: Iterable[Any]) -> dict[str, tuple[str, Matrix]]:
     found: dict[str, tuple[str, Matrix]] = {}
     for message in messages:
         for item in message.transforms:
@@ -122,13 +138,24 @@ def pose_in_dataset(
         if frame not in transforms:
             return None
         frame, parent_from_child = transforms[frame]
-        placed = parent_from_child @ placed
+        with np.errstate(over="ignore", invalid="ignore"):  # no camera is so far away
+            placed = parent_from_child @ placed
     return None  # a circle
 
 
 def rotation_of(qx: float, qy: float, qz: float, qw: float) -> Matrix:
-    """The rotation matrix of a quaternion of any length but zero."""
-    q = np.array([qx, qy, qz, qw])
+    """The rotation matrix of a quaternion of any length but zero.
+
+    Raises
+    ------
+    ValueError
+        If it is none.
+    """
+    q = np.array([qx, qy, qz, qw], dtype=np.float64)
+    largest = np.abs(q).max()
+    if not 0.0 < largest < np.inf:
+        raise ValueError(f"a rotation of {qx:g}, {qy:g}, {qz:g}, {qw:g}")
+    q = q / largest  # squares of what is very large or small are no numbers
     x, y, z, w = q / np.linalg.norm(q)
     return np.array(
         [
@@ -166,25 +193,25 @@ def recorded_calibration(path: Path, image_topic: str, base: str) -> Calibration
     DetectError, camera.CameraError
         As `calibration_of_info`, or if the bag cannot be read.
     """
-    from detect.sources.bag import messages, opened_bag
+    from detect.sources.bag import messages, opened_bag, understood
 
     with opened_bag(path) as reader:
         topic = info_topic(reader, image_topic)
         if topic is None:
             return None
+        name = f"{path}: {topic}"
         found = next(messages(reader, path, topic), None)
-        if found is None or not is_calibrated(found[2]):
-            return None
-        message = found[2]
-        kinds = {c.topic: c.msgtype for c in reader.connections}
-        transforms: dict[str, tuple[str, Matrix]] = {}
-        if kinds.get(_STATIC) == _TRANSFORMS:
-            transforms = static_transforms(said for _, _, said in messages(reader, path, _STATIC))
-    optical = message.header.frame_id
+        with understood(name):
+            if found is None or not is_calibrated(found[2]):
+                return None
+            message = found[2]
+            optical = str(message.header.frame_id)
+        transforms = static_transforms(reader, path)
     pose = pose_in_dataset(transforms, base, optical)
     why_not = (
-        f"{path}: {topic} says nothing of the camera's pose above the floor, and no static "
+        f"{name} says nothing of the camera's pose above the floor, and no static "
         f"transforms lead from {base!r} to {optical!r}: name a .cam file by --camera (`camera "
         "convert` and `camera floor` make one), or the robot's base on the floor by --base-frame"
     )
-    return calibration_of_info(message, f"{path}: {topic}", pose, why_not)
+    with understood(name):
+        return calibration_of_info(message, name, pose, why_not)

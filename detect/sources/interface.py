@@ -14,6 +14,9 @@ from numpy.typing import NDArray
 from camera import Camera, read_camera
 from detect.errors import DetectError
 
+#: No robot is as far from where it began (m): products of such numbers are still numbers.
+FARTHEST = 1e12
+
 
 @dataclass(frozen=True, slots=True)
 class SourceImage:

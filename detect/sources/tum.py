@@ -10,7 +10,7 @@ from collections.abc import Generator
 from pathlib import Path
 
 from detect.errors import DetectError
-from detect.sources.interface import TimedPose
+from detect.sources.interface import FARTHEST, TimedPose
 from detect.sources.options import Axes
 
 _COLUMNS = 8
@@ -58,6 +58,8 @@ class TumTrajectory:
                 "expected 8 numbers: t x y z qx qy qz qw"
             )
         time_s, x, y, _, *quaternion = values
+        if max(abs(x), abs(y)) > FARTHEST:
+            raise DetectError(f"{self.path}:{number}: expected x and y of at most {FARTHEST:g} m")
         if abs(math.hypot(*quaternion) - 1.0) > _UNIT:
             raise DetectError(f"{self.path}:{number}: qx qy qz qw: expected a unit quaternion")
         theta = heading_rad(*quaternion)

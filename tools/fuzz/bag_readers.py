@@ -1,0 +1,177 @@
+"""Readers of recordings: ROS 1 and 2 bags and MCAP files, as `detect` reads them."""
+
+from __future__ import annotations
+
+import tempfile
+from functools import cache, partial
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from camera import CameraError
+from detect.errors import DetectError
+from detect.sources.bag import Bag, opened_bag
+from detect.sources.bag_camera import pose_in_dataset, static_transforms
+from detect.sources.steps import movement_between, step_of
+from tools.fuzz.reader import Reader
+
+_Kind = Literal["mcap", "sqlite", "ros1"]
+_WORDS = (
+    b"sensor_msgs/msg/Image", b"sensor_msgs/msg/CompressedImage", b"nav_msgs/msg/Odometry",
+    b"sensor_msgs/msg/CameraInfo", b"tf2_msgs/msg/TFMessage", b"std_msgs/msg/Header", b"mono8",
+    b"/tf_static", b"/cam/camera_info", b"MCAP0\r\n", b"lz4", b"zstd", b"uint8[] data", b"cdr",
+    b"Header header", b"float64[9] k", b"string encoding", b"#ROSBAG V2.0\n", b"op=\x02", b"conn=",
+    b"ros2msg",
+)  # fmt: skip
+
+
+def _bag(path: Path) -> object:
+    """All that `detect` asks of a bag.
+
+    The calibration that it begins with is none, so that no camera is fitted to it, which takes
+    seconds; the transforms are read all the same.
+    """
+    bag = Bag(path)
+    images = list(bag.images())
+    for image in images:
+        assert (image.content is None) != (image.failure is None)
+    bag.calibration()
+    odometry = bag.poses(None)
+    poses = [] if odometry is None else list(odometry)
+    steps = [step_of("e", movement_between(*pair)) for pair in pairwise(poses)]
+    with opened_bag(path) as reader:
+        transforms = static_transforms(reader, path)
+    return images, steps, pose_in_dataset(transforms, "b", "o")
+
+
+class _Ros:
+    """Some messages of ROS 1 or 2, without ROS."""
+
+    def __init__(self, kind: _Kind) -> None:
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+        self.is_1 = kind == "ros1"
+        self.store = get_typestore(Stores.ROS1_NOETIC if self.is_1 else Stores.ROS2_HUMBLE)
+        if self.is_1:
+            definition = "geometry_msgs/TransformStamped[] transforms\n"
+            self.store.register(get_types_from_msg(definition, "tf2_msgs/msg/TFMessage"))
+
+    def make(self, name: str, **fields: Any) -> Any:
+        return self.store.types[name](**fields)
+
+    def header(self) -> Any:
+        stamp = self.make("builtin_interfaces/msg/Time", sec=1, nanosec=5)
+        extra = {"seq": 0} if self.is_1 else {}
+        return self.make("std_msgs/msg/Header", stamp=stamp, frame_id="optical", **extra)
+
+    def image(self) -> Any:
+        return self.make(
+            "sensor_msgs/msg/Image", header=self.header(), height=8, width=8, encoding="mono8",
+            is_bigendian=0, step=8, data=np.arange(64, dtype=np.uint8),
+        )  # fmt: skip
+
+    def info(self) -> Any:
+        numbers = {
+            "d": np.zeros(5),
+            "k": np.zeros(9),
+            "r": np.eye(3).ravel(),
+            "p": np.zeros(12),
+        }
+        if self.is_1:
+            numbers = {letter.upper(): values for letter, values in numbers.items()}
+        region = self.make(
+            "sensor_msgs/msg/RegionOfInterest",
+            x_offset=0, y_offset=0, height=0, width=0, do_rectify=False,
+        )  # fmt: skip
+        return self.make(
+            "sensor_msgs/msg/CameraInfo", header=self.header(), height=8, width=8, roi=region,
+            distortion_model="plumb_bob", binning_x=0, binning_y=0, **numbers,
+        )  # fmt: skip
+
+    def odometry(self) -> Any:
+        package = "geometry_msgs/msg/"
+        zero = self.make(f"{package}Vector3", x=0.0, y=0.0, z=0.0)
+        pose = self.make(
+            f"{package}Pose",
+            position=self.make(f"{package}Point", x=1.0, y=2.0, z=0.0),
+            orientation=self.make(f"{package}Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
+        )
+        twist = self.make(f"{package}Twist", linear=zero, angular=zero)
+        return self.make(
+            "nav_msgs/msg/Odometry",
+            header=self.header(),
+            child_frame_id="base",
+            pose=self.make(f"{package}PoseWithCovariance", pose=pose, covariance=np.zeros(36)),
+            twist=self.make(f"{package}TwistWithCovariance", twist=twist, covariance=np.zeros(36)),
+        )
+
+    def transforms(self) -> Any:
+        package = "geometry_msgs/msg/"
+        transform = self.make(
+            f"{package}Transform",
+            translation=self.make(f"{package}Vector3", x=0.0, y=0.0, z=1.5),
+            rotation=self.make(f"{package}Quaternion", x=1.0, y=0.0, z=0.0, w=0.5),
+        )
+        header = self.header()
+        header.frame_id = "b"
+        stamped = self.make(
+            f"{package}TransformStamped",
+            header=header, child_frame_id="o", transform=transform,
+        )  # fmt: skip
+        return self.make("tf2_msgs/msg/TFMessage", transforms=[stamped])
+
+
+@cache
+def _recorded(kind: _Kind) -> bytes:
+    """A bag of an image, its calibration and pose, and odometry."""
+    ros = _Ros(kind)
+    said = {
+        "/cam/image_raw": ros.image(),
+        "/cam/camera_info": ros.info(),
+        "/odom": ros.odometry(),
+        "/tf_static": ros.transforms(),
+    }
+    with tempfile.TemporaryDirectory() as folder:
+        place = Path(folder) / "b"
+        if ros.is_1:
+            from rosbags.rosbag1 import Writer as Writer1
+
+            with Writer1(place) as bag1:
+                for topic, message in said.items():
+                    name = message.__msgtype__
+                    connection1 = bag1.add_connection(topic, name, typestore=ros.store)
+                    bag1.write(connection1, 5, ros.store.serialize_ros1(message, name))
+            return place.read_bytes()
+        from rosbags.rosbag2 import StoragePlugin, Writer
+
+        plugin = StoragePlugin.SQLITE3 if kind == "sqlite" else StoragePlugin.MCAP
+        with Writer(place, version=9, storage_plugin=plugin) as bag:
+            for topic, message in said.items():
+                name = message.__msgtype__
+                connection = bag.add_connection(topic, name, typestore=ros.store)
+                bag.write(connection, 5, ros.store.serialize_cdr(message, name))
+        ending = ".db3" if kind == "sqlite" else ".mcap"
+        return (place / f"b{ending}").read_bytes()
+
+
+def _seeds(kind: _Kind) -> tuple[bytes, ...]:
+    return (_recorded(kind),)
+
+
+_ERRORS = (DetectError, CameraError)
+
+BAG_READERS: tuple[Reader, ...] = (
+    Reader(
+        "mcap", "b.mcap", _bag, _ERRORS, (), _WORDS, made_seeds=partial(_seeds, "mcap"), files=5
+    ),
+    Reader(
+        "ros1 bag", "b.bag", _bag, _ERRORS, (), _WORDS, made_seeds=partial(_seeds, "ros1"),
+        files=5,
+    ),
+    Reader(
+        "sqlite bag", "b.db3", _bag, _ERRORS, (), _WORDS, made_seeds=partial(_seeds, "sqlite"),
+        files=5,
+    ),
+)  # fmt: skip

@@ -1,0 +1,135 @@
+"""Readers of calibrations: the data set's, other programs', and what a calibration is made of."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+from camera import CameraError, format_camera, parse_camera, read_camera
+from camera.calibration_floor import read_floor_points
+from camera.colmap_cameras import format_colmap, parse_colmap
+from camera.conversion_models import ForeignCamera
+from camera.convert_command import format_of_text
+from camera.convert_yaml import read_text
+from camera.kalibr_camchain import format_kalibr, parse_kalibr
+from camera.opencv_yaml import format_opencv, parse_opencv
+from camera.ros_camera_info import format_ros, parse_ros
+from tools.fuzz.reader import Reader
+from tools.fuzz.words import CAMERA_TEXT, NUMBERS
+
+
+def _camera(path: Path) -> object:
+    camera = read_camera(path)
+    again = parse_camera(format_camera(camera))
+    assert again == camera, "a camera changes when it is written and read"
+    return camera
+
+
+def _foreign(
+    parse: Callable[[str, str], ForeignCamera], write: Callable[[ForeignCamera], str], path: Path
+) -> object:
+    """A camera of another program, as `camera convert` reads it; written and read it is the same.
+
+    But for COLMAP's half pixel, which rounds, and models that a format writes as a larger one.
+    """
+    camera = parse(read_text(path), str(path))
+    try:
+        text = write(camera)
+    except CameraError:  # one that this format reads, and has no words for
+        return camera
+    once = parse(text, str(path))
+    twice = parse(write(once), str(path))
+    assert (once.width, once.height) == (camera.width, camera.height), "another size"
+    assert twice == once or parse is parse_colmap, "a camera changes when it is written and read"
+    return camera
+
+
+def _guessed(path: Path) -> object:
+    return format_of_text(path, read_text(path))
+
+
+_OPENCV = ForeignCamera("radtan", 64, 48, 50.0, 51.0, 31.5, 23.5, (-0.1, 0.01, 0.001, 0.002, 0.0))
+_RATIONAL = ForeignCamera("rational", 64, 48, 50.0, 51.0, 31.5, 23.5, (0.1,) * 8 + (0.0,) * 4)
+_FISHEYE = ForeignCamera("fisheye", 64, 48, 50.0, 51.0, 31.5, 23.5, (0.1, 0.01, 0.0, 0.0))
+_YAML_WORDS = (
+    b"&a", b"*a", b"!!python/object/apply:os.system", b"!!opencv-matrix", b"<<: ", b"---\n",
+    b"data: ", b"[", b"]", b"{", b"}", b"- ", b"? ", b": ", b"|", b"1" * 400, b"0x1f", b"1:30",
+    b"2001-13-45", b"!!binary ", b"!!set ", b"~", b".nan", b".inf", b"%YAML:1.0\n", *NUMBERS,
+)  # fmt: skip
+
+
+def _texts(*cameras: ForeignCamera, write: Callable[[ForeignCamera], str]) -> tuple[bytes, ...]:
+    return tuple(write(camera).encode() for camera in cameras)
+
+
+CAMERA_READERS: tuple[Reader, ...] = (
+    Reader(
+        "camera",
+        "e.cam",
+        _camera,
+        (CameraError,),
+        (CAMERA_TEXT,),
+        (b"sensor2World:", b"coef:", b"width:", b"{", b"}", b"[", b"]", b"key: value", *NUMBERS),
+    ),
+    Reader(
+        "opencv",
+        "a.opencv.yaml",
+        partial(_foreign, parse_opencv, format_opencv),
+        (CameraError,),
+        _texts(_OPENCV, _RATIONAL, _FISHEYE, write=format_opencv),
+        (b"camera_matrix: ", b"fisheye_model: ", b"image_width: ", *_YAML_WORDS),
+        files=40,
+    ),
+    Reader(
+        "camera info",
+        "a.ros.yaml",
+        partial(_foreign, parse_ros, format_ros),
+        (CameraError,),
+        _texts(_OPENCV, _RATIONAL, _FISHEYE, write=format_ros),
+        (b"distortion_model: ", b"roi: ", b"binning_x: ", b"plumb_bob", *_YAML_WORDS),
+        files=40,
+    ),
+    Reader(
+        "kalibr",
+        "camchain.yaml",
+        partial(_foreign, parse_kalibr, format_kalibr),
+        (CameraError,),
+        _texts(_OPENCV, _FISHEYE, write=format_kalibr),
+        (b"cam1:\n  ", b"intrinsics: ", b"resolution: ", b"equi", b"none", *_YAML_WORDS),
+        files=40,
+    ),
+    Reader(
+        "colmap",
+        "cameras.txt",
+        partial(_foreign, parse_colmap, format_colmap),
+        (CameraError,),
+        (
+            *_texts(_OPENCV, _RATIONAL, _FISHEYE, write=format_colmap),
+            b"2 SIMPLE_RADIAL 640 480 500 320 240 0.1\n",
+        ),
+        (b"PINHOLE", b"SIMPLE_PINHOLE", b"RADIAL_FISHEYE", b"FULL_OPENCV", *NUMBERS),
+    ),
+    Reader(
+        "any calibration",
+        "calibration.yaml",
+        _guessed,
+        (CameraError,),
+        (
+            CAMERA_TEXT,
+            *_texts(_OPENCV, write=format_opencv),
+            *_texts(_OPENCV, write=format_ros),
+            *_texts(_OPENCV, write=format_kalibr),
+        ),
+        _YAML_WORDS,
+        files=40,
+    ),
+    Reader(
+        "floor points",
+        "floor.csv",
+        read_floor_points,
+        (CameraError,),
+        (b"u,v,x,y\n10,20.5,1,-2\n\n11,20.5,1.5,-2\n",),
+        (b'"', b"u,v,x,y", *NUMBERS),
+    ),
+)

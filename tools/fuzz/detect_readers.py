@@ -1,0 +1,285 @@
+"""Readers of what a run is made of: images, times, heads of files, journals, cached tables."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import os
+import struct
+from functools import cache
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from camera import CameraError, parse_camera
+from camera.calibrate_images import read_grey
+from detect.draw_head import read_head
+from detect.errors import DetectError, FrameError
+from detect.image_bounds import bounded_content
+from detect.image_header import claimed_size
+from detect.resume_journal import left_journal
+from detect.run_log import demand_log_place
+from detect.sources.bag_images import pixels_of_message
+from detect.sources.gray import (
+    DEEP_SUFFIXES,
+    decode_gray,
+    gray_of_pixels,
+    significant_bits_of_file,
+)
+from detect.sources.steps import movement_between, step_of
+from detect.sources.times import TimesByImage
+from detect.sources.tum import TumTrajectory
+from lut.cache import cached_vertical_table
+from storage import OutputExistsError
+from tools.fuzz.reader import Reader
+from tools.fuzz.words import CAMERA_TEXT, NUMBERS
+
+#: Images are read for a calibration of this size.
+_SIZE = (8, 8)
+#: Without a calibration, images that claim more are left alone here: they only take time.
+_MOST_PIXELS = 1 << 16
+
+_JPEG = b"\xff\xd8\xff\xe0\0\x04AB\xff\xc0\0\x0b\x08\0\x08\0\x08\x01\x01\x11\0\xff\xd9"
+_TIFF = b"II*\0\x08\0\0\0\x02\0" + b"".join(
+    struct.pack("<HHII", tag, 3, 1, 8) for tag in (256, 257)
+) + bytes(4)  # fmt: skip
+_IMAGE_WORDS = (
+    b"\xff\xd8", b"\xff\xc0", b"\xff\xc2", b"\xff\xc4", b"\xff\xda", b"\xff\xd9", b"\xff\xff",
+    b"II*\0", b"MM\0*", b"II+\0", b"MM\0+", b"P5", b"P2", b"P6", b"#", b"IHDR", b"IDAT", b"PLTE",
+    b"tRNS", b"acTL", b"eXIf", b"iCCP", b"\0\x08",
+)  # fmt: skip
+
+
+def _header(path: Path) -> object:
+    size = claimed_size(path.read_bytes())
+    assert size is None or (len(size) == 2 and all(type(side) is int for side in size))
+    return size
+
+
+def _image(path: Path) -> object:
+    """As frames are decoded, whatever their significant bits."""
+    content = bounded_content(path, path, _SIZE)
+    image = decode_gray(content, path, 16, _SIZE)
+    assert image.dtype == np.uint8
+    assert image.ndim == 2
+    return decode_gray(content, path, 12, _SIZE)
+
+
+def _small(path: Path) -> bool:
+    size = claimed_size(path.read_bytes()) if path.is_file() else None
+    return size is None or size[0] * size[1] <= _MOST_PIXELS
+
+
+def _deep_image(path: Path) -> object:
+    assert path.suffix in DEEP_SUFFIXES
+    return significant_bits_of_file(path) if _small(path) else None
+
+
+def _calibration_image(path: Path) -> object:
+    return read_grey(path) if _small(path) else None
+
+
+def _trajectory(path: Path) -> object:
+    poses = list(TumTrajectory(path, "robotics"))
+    return [step_of("e", movement_between(*pair)) for pair in pairwise(poses)]
+
+
+@cache
+def _encoded() -> tuple[bytes, ...]:
+    """Images as OpenCV writes them, of 8 and 16 bits, grey and coloured."""
+    import cv2
+
+    grey = (np.arange(64, dtype=np.uint8) * 3).reshape(8, 8)
+    deep = grey.astype(np.uint16) * 16
+    colour = np.dstack([grey, grey.T, 255 - grey])
+    found = [cv2.imencode(f".{form}", grey)[1] for form in ("jpg", "png", "pgm", "bmp", "tiff")]
+    found += [cv2.imencode(f".{form}", colour)[1] for form in ("jpg", "png", "ppm", "bmp")]
+    found += [cv2.imencode(f".{form}", deep)[1] for form in ("png", "pgm", "tiff")]
+    progressive = [cv2.IMWRITE_JPEG_PROGRESSIVE, 1]
+    found.append(cv2.imencode(".jpg", grey, progressive)[1])
+    return tuple(image.tobytes() for image in found)
+
+
+class _Message:
+    """An image message whose fields stand at the beginning of a file."""
+
+    def __init__(self, content: bytes) -> None:
+        fields = struct.unpack("<IIIB", content[:13].ljust(13, b"\0"))
+        self.height, self.width, self.step, self.is_bigendian = fields
+        encoding, _, data = content[13:].partition(b"\n")
+        self.encoding = encoding.decode("utf-8", "replace")
+        self.data: NDArray[np.uint8] = np.frombuffer(data, np.uint8)
+
+
+def _image_message(path: Path) -> object:
+    image = gray_of_pixels(pixels_of_message(_Message(path.read_bytes()), path), path, 12)
+    assert image.dtype == np.uint8
+    assert image.ndim == 2
+    return image
+
+
+def _message(encoding: str, step: int, bytes_there: int, big: int = 0) -> bytes:
+    return struct.pack("<IIIB", 8, 8, step, big) + f"{encoding}\n".encode() + bytes(bytes_there)
+
+
+def _head(path: Path) -> object:
+    head = read_head(path)
+    return head.circle_settings, head.line_settings
+
+
+def _journal(path: Path) -> object:
+    journal = left_journal(path)
+    assert journal is not None
+    try:
+        journal.is_complete()
+        head, lines = journal.read()
+        return head, list(lines)
+    finally:
+        journal.close()
+
+
+def _log(path: Path) -> object:
+    demand_log_place(path, overwrite=False)
+    return None
+
+
+_TABLE_CAMERA = parse_camera(
+    CAMERA_TEXT.decode()
+    .replace("768 height: 288", "16 height: 12")
+    .replace("384 offsetY: 144", "8 offsetY: 6")
+)
+
+
+def _table(path: Path) -> object:
+    """A cached table with the hash that it should have; whatever it holds, the true one comes."""
+    folder = path.parent / "cache"
+    if not folder.is_dir():
+        folder.mkdir(mode=0o700)
+        cached_vertical_table(_TABLE_CAMERA, folder)
+    (place,) = folder.iterdir()
+    payload = path.read_bytes()
+    digest = hashlib.sha256(place.name.encode() + b"\0" + payload).digest()
+    handle = os.open(place, os.O_WRONLY | os.O_TRUNC)
+    os.write(handle, digest + payload)
+    os.close(handle)
+    return cached_vertical_table(_TABLE_CAMERA, folder)
+
+
+@cache
+def _table_content() -> tuple[bytes, ...]:
+    import dataclasses
+
+    from lut import build_vertical_table
+
+    stream = io.BytesIO()
+    table = build_vertical_table(_TABLE_CAMERA)
+    fields = {f.name: getattr(table, f.name) for f in dataclasses.fields(table)}
+    np.savez(stream, allow_pickle=False, **fields)
+    return (stream.getvalue(),)
+
+
+DETECT_READERS: tuple[Reader, ...] = (
+    Reader(
+        "image header",
+        "image",
+        _header,
+        (),
+        (
+            _JPEG,
+            b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR\0\0\0\x08\0\0\0\x08\x08\0\0\0\0",
+            b"P5 8 8 255\n",
+            b"BM" + bytes(12) + struct.pack("<Iii", 40, 8, 8),
+            _TIFF,
+        ),
+        _IMAGE_WORDS,
+    ),
+    Reader(
+        "image", "e.0000.jpg", _image, (FrameError,), (), _IMAGE_WORDS, made_seeds=_encoded,
+    ),
+    Reader(
+        "deep image", "e.png", _deep_image, (), (), _IMAGE_WORDS, made_seeds=_encoded,
+    ),
+    Reader(
+        "calibration image", "e.png", _calibration_image, (CameraError,), (), _IMAGE_WORDS,
+        made_seeds=_encoded,
+    ),
+    Reader(
+        "image message",
+        "message",
+        _image_message,
+        (FrameError,),
+        (
+            _message("mono8", 10, 80),
+            _message("16UC1", 16, 128, 1),
+            _message("rgb8", 24, 192),
+            _message("bayer_rggb8", 8, 64),
+            _message("yuv422", 16, 128),
+            _message("bgra16", 64, 512),
+        ),
+        (b"mono16", b"8UC1", b"8UC4", b"bayer_bggr16", b"bayer_gbrg8", b"uyvy", b"rgba8", b"bgr16"),
+        needed=False,
+    ),
+    Reader(
+        "trajectory",
+        "e.tum",
+        _trajectory,
+        (DetectError,),
+        (b"# t x y z qx qy qz qw\n0 0 0 0 0 0 0 1\n1 0.5 0 0 0 0 0.1 0.995\n",),
+        NUMBERS,
+    ),
+    Reader(
+        "image times",
+        "e.times",
+        TimesByImage,
+        (DetectError,),
+        (b"e.0000 0.1\ne.0001 0.2\n",),
+        NUMBERS,
+    ),
+    Reader(
+        "settings",
+        "detected.circles",
+        _head,
+        (DetectError,),
+        (
+            b"# redetect 0.1.0\n# settings radius_m=0.1 samples=16 polarity=any refine=True\n",
+            b"# settings refine_steps_px=((1.0,0.5),(0.5,0.25)) threshold=0.2 alpha=published\n",
+        ),
+        (
+            b"settings ", b"radius_m=", b"samples=", b"verify=", b"polarity=", b"threshold=",
+            b"refine_steps_px=", b"sigma_x_px=", b"evidence=", b"border_px=", b"True", b"1-2",
+            b"1e5e5", *NUMBERS,
+        ),
+    ),
+    Reader(
+        "journal",
+        ".detected.journal",
+        _journal,
+        (),
+        (
+            b'["ab",[0,1],false]\n[[10,0],"cd",1,0,0,1,[["verified",2]],null,"ef"]\n"complete"\n',
+            b'["ab",[],true]\n[[],"cd",1,0,0,1,[],"no image","ef"]\n',
+        ),
+        (b"[", b"]", b",", b'"', b"null", b"true", b"-1", b"1" * 30, b"1e999", b"NaN", b"{}"),
+    ),
+    Reader(
+        "log",
+        "detected.log.json",
+        _log,
+        (OutputExistsError,),
+        (b'{\n "program": "redetect",\n "version": "0.1.0"\n}\n',),
+        (b"{", b"}", b"\xef\xbb\xbf"),
+        needed=False,
+    ),
+    Reader(
+        "cached table",
+        "table",
+        _table,
+        (),
+        (),
+        (b"PK\x03\x04", b"PK\x01\x02", b"'descr': '|O'", b".npy", struct.pack("<I", 0xFFFFFFFF)),
+        made_seeds=_table_content,
+        files=10,
+    ),
+)  # fmt: skip

@@ -1,0 +1,152 @@
+"""Readers of landmarks and of what is made of them: rows, tilts, maps, graphs, paths."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import numpy as np
+
+from landmarks import LandmarkError, frames_of_rows, read_rows
+from landmarks.map_file import read_map, read_path
+from landmarks.tilts import read_tilts
+from slam.errors import SlamError
+from slam.g2o_reading import read_g2o
+from slam.map_covariance import covariance_file, read_joint_covariance
+from slam.tum import read_tum
+from tools.fuzz.reader import Reader
+from tools.fuzz.words import NUMBERS
+
+
+def _landmarks(path: Path) -> object:
+    """Frames of a file; what was accepted is given back byte by byte, and its records too."""
+    from landmarks import parse_rows
+    from landmarks.writing import format_record
+
+    rows = list(read_rows(path))
+    assert b"".join(row.source or b"" for row in rows) == path.read_bytes(), "round trip"
+    frames = list(frames_of_rows(rows))
+    # Only a file's first row may begin with a byte order mark that is none of its words.
+    again = "#\n" + "".join(f"{format_record(r.record)}\n" for r in rows if r.record is not None)
+    encoded = again.encode("utf-8", "surrogateescape")
+    once = [row.record for row in parse_rows(io.BytesIO(encoded)) if row.record is not None]
+    twice = "#\n" + "".join(f"{format_record(record)}\n" for record in once)
+    assert len(once) == sum(row.record is not None for row in rows), "records lost in writing"
+    assert twice == again, "written records change when they are read"
+    return frames
+
+
+def _npy(array: object) -> bytes:
+    stream = io.BytesIO()
+    np.save(stream, np.asarray(array))
+    return stream.getvalue()
+
+
+def _joint(path: Path) -> object:
+    map_file = path.parent / "map.csv"
+    assert covariance_file(map_file).name == path.name
+    return read_joint_covariance(map_file, read_map(map_file))
+
+
+_STEP = b"STEP e.0000  0.00088 -0.15647  0.01153 1e-5 0 1e-5 0 0 1e-4\n"
+_CIRCLE = b"LANDMARK_C 0.31 -2.5 0.81 0.0016 1e-5 0.0021 17\n"
+_LINE = b"LANDMARK_L 0.1 -0.2 0.1 0.3 0.02 0.001 0 0.002 -1\n"
+_MARKER = b"LANDMARK_M rawseeds 3 0.99" + b" 10 20 0.1 0 0.1" * 4 + b"\n"
+_SETTINGS = b"CIRCLEMARKDETECTOR e.cam nohalf 0.1 0.6\n"
+_IDENTITY_4 = "1 0 0 1 0 1"
+_G2O = f"""# AXES robotics
+VERTEX_SE2 0 0 0 0
+VERTEX_SE2 1 0.5 0 0.1
+VERTEX_XY 12 1 1
+EDGE_SE2 0 1 0.5 0 0.1 {_IDENTITY_4}
+EDGE_SE2_XY 1 12 0.5 1 4 0 4
+# FRAME 1 e.0000 0.5
+FIX 0
+""".encode()
+_MAP_HEAD = "kind,id,x_m,y_m,cxx_m2,cxy_m2,cyy_m2,rows\n"
+_MAP = _MAP_HEAD + "disc,3,1.0,2.0,0.01,0.0,0.01,5\nline,-1,1.5,2.0,0.01,0.001,0.01,2\n"
+_PATH = "# by hand\nprefix,x_m,y_m,theta_rad\nstart,0,0,0\ne.0001,0.1,-0.2,3\n"
+_MAP_OF_ONE = (_MAP_HEAD + "disc,3,1.0,2.0,0.01,0.0,0.01,5\n").encode()
+
+LANDMARK_READERS: tuple[Reader, ...] = (
+    Reader(
+        "landmarks",
+        "e.circles",
+        _landmarks,
+        (LandmarkError,),
+        (
+            _SETTINGS + _STEP + _CIRCLE + _LINE + _MARKER,
+            _STEP + b"# c \\\n" + _CIRCLE[:20] + b"\\\n" + _CIRCLE[20:].replace(b"\n", b"\r\n"),
+            b"\xef\xbb\xbf" + _STEP,
+        ),
+        (
+            b"STEP",
+            b"LANDMARK",
+            b"LANDMARK_C",
+            b"LANDMARK_L",
+            b"LANDMARK_M",
+            b"XDETECTOR",
+            b"\\\n",
+            b"\r\n",
+            *NUMBERS,
+        ),
+    ),
+    Reader(
+        "tilts",
+        "e.tilt",
+        read_tilts,
+        (LandmarkError,),
+        (b"# x\nTILT e.0000 0.01 -0.02 1e-6 0 1e-6 9\nNOTILT e.0001 2\n",),
+        (b"TILT", b"NOTILT", *NUMBERS),
+    ),
+    Reader(
+        "map",
+        "map.csv",
+        read_map,
+        (LandmarkError,),
+        (_MAP.encode(),),
+        (b"disc,", b"line,", b'"', *NUMBERS),
+    ),
+    Reader(
+        "path",
+        "path.csv",
+        read_path,
+        (LandmarkError,),
+        (_PATH.encode(),),
+        (b"start,", b'"', *NUMBERS),
+    ),
+    Reader(
+        "map covariance",
+        covariance_file(Path("map.csv")).name,
+        _joint,
+        (SlamError,),
+        (_npy(0.01 * np.eye(2)),),
+        (b"NUMPY", b"'descr': '|O'", b"(2, 2)"),
+        {"map.csv": _MAP_OF_ONE},
+        needed=False,
+    ),
+    Reader(
+        "g2o",
+        "e.g2o",
+        read_g2o,
+        (SlamError,),
+        (_G2O,),
+        (
+            b"VERTEX_SE2 ",
+            b"VERTEX_XY ",
+            b"EDGE_SE2 ",
+            b"EDGE_SE2_XY ",
+            b"FIX ",
+            b"# FRAME ",
+            *NUMBERS,
+        ),
+    ),
+    Reader(
+        "tum",
+        "e.tum",
+        read_tum,
+        (SlamError,),
+        (b"# AXES robotics\n0 0 0 0 0 0 0 1\n1 0.5 0 0 0 0 0.1 0.995\n",),
+        NUMBERS,
+    ),
+)

@@ -1,0 +1,86 @@
+"""What fuzzing knows of a reader, and what it demands of it.
+
+What a reader may do with a file is give a result, or raise a typed error whose message names the
+file, fits on one line, is of bounded length and shows nothing that a terminal would act upon.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+#: Characters of a message beside the file's name.
+LONGEST_MESSAGE = 500
+
+
+@dataclass(frozen=True)
+class Reader:
+    """A reader and what fuzzing it begins with.
+
+    Attributes
+    ----------
+    name : str
+    file : str
+        What the file is called; it may lie in a folder.
+    read : callable
+        Reads a file; what else it demands of the result it asserts.
+    errors : tuple of exception types
+        What it may raise.
+    seeds : tuple of bytes
+        Files that it accepts.
+    words : tuple of bytes
+        Words of its language, for those who put files together.
+    beside : mapping of str to bytes
+        Other files that it needs in the same folder.
+    made_seeds : callable or None
+        Makes further files that it accepts, where that takes a while.
+    files : int
+        So many damaged files are read by the tests: fewer where each takes milliseconds.
+    needed : bool
+        Whether it is an error that there is no file.
+    """
+
+    name: str
+    file: str
+    read: Callable[[Path], object]
+    errors: tuple[type[Exception], ...]
+    seeds: tuple[bytes, ...] = ()
+    words: tuple[bytes, ...] = ()
+    beside: Mapping[str, bytes] = field(default_factory=dict)
+    made_seeds: Callable[[], tuple[bytes, ...]] | None = None
+    files: int = 150
+    needed: bool = True
+
+    def all_seeds(self) -> tuple[bytes, ...]:
+        """All files that it accepts."""
+        return self.seeds if self.made_seeds is None else (*self.seeds, *self.made_seeds())
+
+    def prepare(self, folder: Path) -> Path:
+        """Put what stands beside its file into a folder; gives back the file's place."""
+        for name, content in self.beside.items():
+            (folder / name).parent.mkdir(exist_ok=True)
+            (folder / name).write_bytes(content)
+        path = folder / self.file
+        path.parent.mkdir(exist_ok=True)
+        return path
+
+
+def attempt(reader: Reader, path: Path) -> Exception | None:
+    """Let a reader read a file: its typed error, if any; whatever else it raises escapes.
+
+    Raises
+    ------
+    AssertionError
+        If the error's message is none that a user can read in safety.
+    """
+    try:
+        reader.read(path)
+    except reader.errors as error:
+        message = str(error)
+        assert path.name in message or str(path.parent) in message, "names no file"
+        beside_name = message.replace(str(path), "")
+        assert message.isprintable(), f"control characters in a message: {message!a}"
+        assert len(beside_name) <= LONGEST_MESSAGE, f"message of {len(beside_name)} characters"
+        return error
+    return None
