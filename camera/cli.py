@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Sequence
 from importlib import import_module
 from typing import Annotated
 
@@ -17,9 +18,7 @@ import tyro
 from tyro.conf import arg, subcommand
 
 from camera.options import Calibrate, Command, Convert, Floor
-
-EXIT_ERROR = 1
-EXIT_INTERRUPTED = 130
+from storage.exit_codes import exit_code_of
 
 #: The module whose `perform` carries a command out.
 PERFORMED_BY: dict[type, str] = {
@@ -33,6 +32,12 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
     # Matrices are small here: threads of BLAS would cost more than they save.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    command = parsed(sys.argv[1:] if arguments is None else arguments)
+    return exit_code_of(lambda: import_module(PERFORMED_BY[type(command)]).perform(command))
+
+
+def parsed(arguments: Sequence[str]) -> Command:
+    """What a command line says; exits, as `--help` does, where it says nothing that can be done."""
     command: Command = tyro.cli(
         Annotated[
             Annotated[Calibrate, subcommand("calibrate")]
@@ -41,17 +46,11 @@ def main(arguments: list[str] | None = None) -> int:
             arg(name=""),
         ],
         prog="camera",
-        description="Calibrate a camera, place it on the floor, convert its calibration.",
-        args=sys.argv[1:] if arguments is None else arguments,
+        description="Calibrate a camera, place it on the floor, convert its calibration.\n\n"
+        "Example: camera calibrate photographs --columns 9 --rows 6 --square-m 0.025 -o my.cam",
+        args=arguments,
     )
-    try:
-        return int(import_module(PERFORMED_BY[type(command)]).perform(command))
-    except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
-        return EXIT_INTERRUPTED
-    except (ValueError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return EXIT_ERROR
+    return command
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ from __future__ import annotations
 import atexit
 import os
 import sys
+from collections.abc import Sequence
 from typing import Annotated
 
 import tyro
@@ -27,11 +28,9 @@ from detect.markers.settings import MarkerSettings
 from detect.options import All, Circles, Compare, Lines, Markers
 from detect.settings import PUBLISHED, CircleSettings
 from detect.viewing_options import Draw, Report, Tune, View
-from storage.messages import one_line
+from storage.exit_codes import say_error, say_interrupted
 
-EXIT_ERROR = 1
 EXIT_FRAMES_FAILED = 3
-EXIT_INTERRUPTED = 130
 
 # Numba's words where neither the program's folder nor the user's cache can be written to.
 _NO_KERNEL_CACHE = "no locator available"
@@ -49,7 +48,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
     with interrupts_noted() as interrupted:
         try:
-            command = _parsed(sys.argv[1:] if arguments is None else arguments)
+            command = parsed(sys.argv[1:] if arguments is None else arguments)
             from detect.commands import carry_out
 
             return carry_out(command)
@@ -57,25 +56,24 @@ def main(arguments: list[str] | None = None) -> int:
             pass
         except (ValueError, OSError, WorkerError) as error:
             if not interrupted.is_set():
-                print(f"error: {one_line(str(error))}", file=sys.stderr)
-                return EXIT_ERROR
+                return say_error(error)
         except BaseException as error:
             if not interrupted.is_set():
                 if _NO_KERNEL_CACHE in str(error):
-                    print(f"error: {_WHERE_KERNELS_GO}", file=sys.stderr)
-                    return EXIT_ERROR
+                    return say_error(_WHERE_KERNELS_GO)
                 raise
-    print("interrupted", file=sys.stderr, flush=True)
+    code = say_interrupted()
     if arguments is None:
         # Left to itself, Python dies of an interrupt that passed through an `exec` of some
         # library's, although it was caught here.
         atexit._run_exitfuncs()
-        os._exit(EXIT_INTERRUPTED)
-    return EXIT_INTERRUPTED
+        os._exit(code)
+    return code
 
 
-def _parsed(given: list[str]) -> Command:
-    preset = _preset(given)
+def parsed(arguments: Sequence[str]) -> Command:
+    """What a command line says; exits, as `--help` does, where it says nothing that can be done."""
+    preset = _preset(arguments)
     circles = _CIRCLE_PRESETS.get(preset, CircleSettings())
     lines = LINE_PRESETS.get(preset, LineSettings())
     markers = MARKER_PRESETS.get(preset, MarkerSettings())
@@ -106,12 +104,13 @@ def _parsed(given: list[str]) -> Command:
             arg(name=""),
         ],
         prog="detect",
-        description="Landmarks with covariances out of a calibrated camera's images.",
-        args=given,
+        description="Landmarks with covariances out of a calibrated camera's images.\n\n"
+        "Example: detect all images/e",
+        args=arguments,
     )
 
 
-def _preset(arguments: list[str]) -> str:
+def _preset(arguments: Sequence[str]) -> str:
     """The preset that a command line names: it decides the other flags' defaults."""
     for position, argument in enumerate(arguments):
         if argument == "--preset" and position + 1 < len(arguments):

@@ -13,11 +13,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from detect.announcing import show_announcements
-from detect.cli import EXIT_ERROR, EXIT_FRAMES_FAILED, Command
+from detect.cli import EXIT_FRAMES_FAILED, Command
 from detect.errors import WorkerError
 from detect.options import All, Circles, Compare, DetectorFlags, Lines, Markers
 from detect.progress import print_failures, progress_bar
 from detect.viewing_options import PERFORMED_BY
+from storage.exit_codes import EXIT_ERROR
 
 if TYPE_CHECKING:
     from rich.console import Group

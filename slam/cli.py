@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Sequence
 from importlib import import_module
 from typing import Annotated
 
@@ -17,10 +18,7 @@ import tyro
 from tyro.conf import arg, subcommand
 
 from slam.options import Associate, Command, Ekf, Export, Import, Localize, Map, Noise
-from storage.messages import one_line
-
-EXIT_ERROR = 1
-EXIT_INTERRUPTED = 130
+from storage.exit_codes import exit_code_of
 
 #: The module whose `perform` carries a command out.
 PERFORMED_BY: dict[type, str] = {
@@ -38,6 +36,12 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
     # Matrices are small or sparse here: threads of BLAS would cost more than they save.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    command = parsed(sys.argv[1:] if arguments is None else arguments)
+    return exit_code_of(lambda: import_module(PERFORMED_BY[type(command)]).perform(command))
+
+
+def parsed(arguments: Sequence[str]) -> Command:
+    """What a command line says; exits, as `--help` does, where it says nothing that can be done."""
     command: Command = tyro.cli(
         Annotated[
             Annotated[Map, subcommand("map")]
@@ -50,17 +54,11 @@ def main(arguments: list[str] | None = None) -> int:
             arg(name=""),
         ],
         prog="slam",
-        description="What landmarks are for: map, localisation, SLAM, association, noise.",
-        args=sys.argv[1:] if arguments is None else arguments,
+        description="What landmarks are for: map, localisation, SLAM, association, noise.\n\n"
+        "Example: slam map images/e --circles --lines -o /tmp/e-map",
+        args=arguments,
     )
-    try:
-        return int(import_module(PERFORMED_BY[type(command)]).perform(command))
-    except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
-        return EXIT_INTERRUPTED
-    except (ValueError, OSError) as error:
-        print(f"error: {one_line(str(error))}", file=sys.stderr)
-        return EXIT_ERROR
+    return command
 
 
 if __name__ == "__main__":

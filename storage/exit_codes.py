@@ -1,0 +1,49 @@
+"""How a command ends: its exit code, and one line on the terminal where something was wrong."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+
+from storage.messages import one_line
+
+#: The command could not be carried out.
+EXIT_ERROR = 1
+#: It was interrupted from the keyboard.
+EXIT_INTERRUPTED = 130
+
+
+def exit_code_of(work: Callable[[], int]) -> int:
+    """Do what a command is for; say what is wrong on one line.
+
+    Typed errors of all rooms are ValueErrors, and those of the system OSErrors: anything else is a
+    fault of the program and shows its traceback.
+
+    Parameters
+    ----------
+    work : callable
+        Carries the command out; returns the exit code.
+
+    Returns
+    -------
+    int
+        The exit code of `work`, `EXIT_ERROR` or `EXIT_INTERRUPTED`.
+    """
+    try:
+        return work()
+    except KeyboardInterrupt:
+        return say_interrupted()
+    except (ValueError, OSError) as error:
+        return say_error(error)
+
+
+def say_error(error: BaseException | str) -> int:
+    """Say what was wrong; returns the exit code."""
+    print(f"error: {one_line(str(error))}", file=sys.stderr)
+    return EXIT_ERROR
+
+
+def say_interrupted() -> int:
+    """Say that there was an interrupt; returns the exit code."""
+    print("interrupted", file=sys.stderr, flush=True)
+    return EXIT_INTERRUPTED
