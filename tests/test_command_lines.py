@@ -1,0 +1,68 @@
+"""Every command's help shows an example, and every example is a command line that parses."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from importlib import import_module
+
+import pytest
+
+PROGRAMS = ("camera", "detect", "slam")
+
+
+def help_of(program: str, words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+    with pytest.raises(SystemExit) as end:
+        import_module(f"{program}.cli").main([*words, "--help"])
+    assert end.value.code == 0
+    return capsys.readouterr().out
+
+
+def commands_of(program: str, capsys: pytest.CaptureFixture[str]) -> list[str]:
+    return re.findall(r"• (\w+)", help_of(program, [], capsys))
+
+
+def examples_in(text: str) -> list[list[str]]:
+    """The command lines of a help text: what stands behind a colon and begins with a program."""
+    found = []
+    before_the_flags = re.split(r"^\W+(?:options|positional arguments)\b", text, flags=re.M)[0]
+    for paragraph in before_the_flags.split("\n\n"):
+        if paragraph.startswith("usage:"):
+            continue
+        for piece in " ".join(paragraph.split()).split(": "):
+            words = re.sub(r",? (or|then)$", "", piece)
+            if words.split(" ")[0] in PROGRAMS:
+                found.append(shlex.split(words))
+    return found
+
+
+@pytest.mark.parametrize("program", PROGRAMS)
+def test_every_help_shows_an_example_that_parses(
+    program: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    parsed = import_module(f"{program}.cli").parsed
+    commands = commands_of(program, capsys)
+    assert len(commands) >= 3
+    for command in commands:
+        examples = examples_in(help_of(program, [command], capsys))
+        assert [program, command] in [words[:2] for words in examples], command
+        for words in examples:
+            assert type(parsed(words[1:])).__name__.lower() == words[1]
+
+
+@pytest.mark.parametrize("program", PROGRAMS)
+def test_the_programs_own_help_shows_an_example_that_parses(
+    program: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (words,) = examples_in(help_of(program, [], capsys))
+    assert type(import_module(f"{program}.cli").parsed(words[1:])).__name__.lower() == words[1]
+
+
+def test_an_example_with_a_flag_that_is_none_is_noticed(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    (words,) = examples_in("Example: slam map images/e --no-such-flag")
+    with pytest.raises(SystemExit) as end:
+        import_module("slam.cli").parsed(words[1:])
+    assert end.value.code == 2
+    assert "no-such-flag" in capsys.readouterr().err
