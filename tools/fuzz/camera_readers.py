@@ -31,17 +31,16 @@ def _foreign(
 ) -> object:
     """A camera of another program, as `camera convert` reads it; written and read it is the same.
 
-    But for COLMAP's half pixel, which rounds, and models that a format writes as a larger one.
+    But for COLMAP's half pixel, which rounds, and its models that are written as a larger one.
     """
     camera = parse(read_text(path), str(path))
     try:
         text = write(camera)
     except CameraError:  # one that this format reads, and has no words for
         return camera
-    once = parse(text, str(path))
-    twice = parse(write(once), str(path))
-    assert (once.width, once.height) == (camera.width, camera.height), "another size"
-    assert twice == once or parse is parse_colmap, "a camera changes when it is written and read"
+    again = parse(text, str(path))
+    assert (again.width, again.height) == (camera.width, camera.height), "another size"
+    assert again == camera or parse is parse_colmap, "a camera changes when it is written and read"
     return camera
 
 

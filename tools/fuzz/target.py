@@ -25,7 +25,6 @@ with atheris.instrument_imports(
         "storage",
         "tools.fuzz",
         "csv",
-        "yaml",
     ],
     enable_loader_override=False,
 ):

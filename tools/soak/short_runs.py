@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import io
+import multiprocessing
 import os
 import subprocess
 import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -60,10 +65,22 @@ class ShortRuns:
         )
 
 
-def repeat_short_runs(source: Path, folder: Path, runs: int, jobs: int) -> ShortRuns:
-    """Carry out `detect all` on a few frames again and again, every second time by processes.
+def repeat_short_runs(
+    source: Path, folder: Path, runs: int, jobs: int, *, warm: bool = False
+) -> ShortRuns:
+    """Carry out `detect all` on a few frames again and again.
 
-    Shared memory of other programs that comes meanwhile is counted as well.
+    Parameters
+    ----------
+    source : path
+        A run folder whose images are repeated.
+    folder : path
+        Where the run and its results are made.
+    runs, jobs : int
+        So many runs, every second one by so many processes.
+    warm : bool
+        Fork each run from a process that has all kernels loaded, which is twenty times as fast;
+        none has workers.
 
     Raises
     ------
@@ -75,31 +92,27 @@ def repeat_short_runs(source: Path, folder: Path, runs: int, jobs: int) -> Short
     for path in (output, temporary, caches):
         path.mkdir()
     mark = f"REDETECT_SOAK={folder}"
-    environment = {
-        **os.environ,
+    added = {
         "REDETECT_SOAK": str(folder),
         "TMPDIR": str(temporary),
         "REDETECT_CACHE": str(caches),
     }
+    arguments = ["all", str(run), "-o", str(output), "--force", "--jobs"]
     first: dict[str, bytes] = {}
     cached = different = 0
     shared = _shared()
-    for number in range(runs):
-        arguments = ["all", str(run), "-o", str(output), "--force"]
-        arguments += ["--jobs", str(jobs if number % 2 else 1)]
-        done = subprocess.run(
-            [sys.executable, "-m", "detect", *arguments],
-            env=environment,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-        if done.returncode != 0:
-            raise SoakError(f"detect ended with {done.returncode}: {done.stderr.strip()[-500:]}")
-        found = {path.name: path.read_bytes() for path in output.iterdir()}
-        if number == 0:
-            first, cached = found, len(_names(caches))
-        different += found != first
+    with _environment(added):
+        if warm:
+            _warm_up([*arguments, "1"])
+        for number in range(runs):
+            if warm:
+                _forked([*arguments, "1"])
+            else:
+                _started([*arguments, str(jobs if number % 2 else 1)])
+            found = {path.name: path.read_bytes() for path in output.iterdir()}
+            if number == 0:
+                first, cached = found, len(_names(caches))
+            different += found != first
     return ShortRuns(
         runs=runs,
         processes=len(marked(mark)),
@@ -111,8 +124,62 @@ def repeat_short_runs(source: Path, folder: Path, runs: int, jobs: int) -> Short
     )
 
 
+@contextmanager
+def _environment(added: dict[str, str]) -> Iterator[None]:
+    """Variables of the environment for the time of a block."""
+    before = dict(os.environ)
+    os.environ.update(added)
+    tempfile.tempdir = None  # look at the variable again
+    try:
+        yield
+    finally:
+        for name in added:
+            os.environ.pop(name)
+        os.environ.update(before)
+        tempfile.tempdir = None
+
+
+def _started(arguments: list[str]) -> None:
+    """Carry out a command in a new process."""
+    done = subprocess.run(
+        [sys.executable, "-m", "detect", *arguments],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    if done.returncode != 0:
+        raise SoakError(f"detect ended with {done.returncode}: {done.stderr.strip()[-500:]}")
+
+
+def _warm_up(arguments: list[str]) -> None:
+    """Load whatever a command needs into this process."""
+    from detect.cli import main
+
+    with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()) as said:
+        code = main(arguments)
+    if code != 0:
+        raise SoakError(f"detect ended with {code}: {said.getvalue().strip()[-500:]}")
+
+
+def _forked(arguments: list[str]) -> None:
+    """Carry out a command in a copy of this process, which ends as any of Python's does."""
+    process = multiprocessing.get_context("fork").Process(target=_command, args=(arguments,))
+    process.start()
+    process.join()
+    if process.exitcode != 0:
+        raise SoakError(f"detect ended with {process.exitcode}")
+
+
+def _command(arguments: list[str]) -> None:
+    from detect.cli import main
+
+    with Path(os.devnull).open("w") as nowhere, redirect_stdout(nowhere):
+        code = main(arguments)
+    sys.exit(code)
+
+
 def _shared() -> set[str]:
-    """Shared memory and semaphores as Python names them."""
+    """Shared memory and semaphores as Python names them, of all programs."""
     return {name for name in _names(_SHARED_MEMORY) if name.startswith(("sem.", "psm_"))}
 
 
