@@ -8,8 +8,8 @@ The curved one is very nearly a straight edge moved and bent a little,
     W(z, t) = Phi(-g),    g = z + t (1/2 + t Q(z, t)),
 
 because a Gaussian blur moves an edge of curvature 1/R by sigma^2 / (2 R) towards its centre. Q is a
-polynomial, fitted once over |z| <= `Z_LIMIT` and t <= `T_LIMIT` by least squares, reweighted until
-the largest error of W was least: it is 0.0011 (the tests integrate the disc and check that).
+polynomial, fitted once over ``|z|`` <= `Z_LIMIT` and t <= `T_LIMIT` by least squares, reweighted
+until the largest error of W was least: it is 0.0011 (the tests integrate the disc and check that).
 """
 
 from __future__ import annotations

@@ -1,5 +1,7 @@
 """``boards.json``: which checkerboard is in which image of which camera, and what is known of them.
 
+::
+
     {"boards": {"first": {"columns": 7, "rows": 6, "square_m": 0.11}, "second": {...},
                 "world": {...}},
      "world_from_board": {"translation_m": [...], "quaternion_xyzw": [...]},

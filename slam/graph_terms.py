@@ -193,7 +193,7 @@ def cost(graph: Graph, estimate: Estimate, weighting: Weighting) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Linearised:
-    """A linear least-squares problem: the change x, m of the unknowns least in |J x + B m + r|.
+    """A linear least-squares problem: the change x, m of the unknowns least in ``|J x + B m + r|``.
 
     Attributes
     ----------

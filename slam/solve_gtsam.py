@@ -6,7 +6,7 @@ sees a disc at height 0 at the pixel (x, y). (`BetweenFactorPose2` on a disc wit
 is not: its error is the logarithm, which mixes heading into place.) For odometry
 `BetweenFactorPose2` serves; its logarithm differs from the report's error in the second order only.
 Bearings of several lines in a row, from a camera beside the robot's centre, have no compiled
-factor: those rows are `CustomFactor`s, in Python.
+factor: those rows are of class `CustomFactor`, in Python.
 """
 
 from __future__ import annotations

@@ -1,5 +1,7 @@
 """Where frames come from: one small module per source, behind one interface (`interface`).
 
+::
+
     source             module       what it is named by
     run folder         detect.run   the folder
     images             pictures     a folder, one image, or a pattern such as 'drive/*.png'
