@@ -96,17 +96,11 @@ class FilteredColumns:
     def none_yet(cls, table: VerticalTable) -> FilteredColumns:
         """Nothing has been filtered."""
         from detect.line_group_kernels import STEP
-        from detect.line_vector_kernels import LANES
+        from detect.line_vector_code import LANES
 
         height, width = table.column.shape
         groups = -(-width // STEP)
         return cls(np.empty(groups * height * LANES, np.float32), np.zeros((groups, 2), np.int32))
-
-
-@lru_cache(maxsize=4)
-def strip_columns(table: VerticalTable) -> NDArray[np.float32]:
-    """(H, W) float32, the table's columns row by row: neighbouring verticals beside each other."""
-    return np.ascontiguousarray(table.column)
 
 
 def gaussian_window(sigma: float) -> FloatArray:
@@ -128,7 +122,7 @@ def _weights_across(sigma_px: float, spacing_px: float) -> FloatArray:
 @lru_cache(maxsize=16)
 def line_filter(settings: LineSettings) -> LineFilter:
     """The filter that settings ask for."""
-    from detect.line_vector_kernels import WORD
+    from detect.line_vector_code import WORD
 
     weights = _weights_across(settings.sigma_across_px, 1.0)
     # Moments between two pixels are those of both, interpolated; so are the weights.

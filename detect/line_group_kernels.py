@@ -13,7 +13,13 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from detect.line_vector_kernels import LANES, ROW_NUMBERS, WORD, moments_across, response_along
+from detect.line_filter_vector_kernels import (
+    moments_across,
+    moments_across_two,
+    response_along,
+    response_along_two,
+)
+from detect.line_vector_code import LANES, WORD
 
 #: Groups of verticals begin so many columns apart, and so many before the first that is theirs:
 #: whoever asks for a column may ask for two more on either side.
@@ -50,17 +56,18 @@ def _cut_responses(
     leftmost: np.float32,
     rightmost: np.float32,
     moments: NDArray[np.float32],
+    plane: int,
     base: int,
     v: int,
     response: NDArray[np.float32],
     to: int,
 ) -> None:
-    """As `response_along`, where windows are cut off at verticals' ends, and made up for."""
+    """As `response_along`, where windows are cut off at each vertical's own ends."""
     s = len(along) // 2
     for lane in range(LANES):
         c = base + lane
         response[to + lane] = np.float32(0.0)
-        x = strip[v, c]
+        x = strip[to + lane]
         if not (x >= leftmost and x < rightmost):
             continue
         share = np.float32(0.0)
@@ -69,11 +76,11 @@ def _cut_responses(
         square = np.float32(0.0)
         for y in range(max(first_row[c], v - s), min(last_row[c], v + s) + 1):
             w = along[y - v + s]
-            at = ROW_NUMBERS * y + lane
+            at = LANES * y + lane
             share += w
             mean += w * moments[at]
-            cov += w * moments[at + LANES]
-            square += w * moments[at + 2 * LANES]
+            cov += w * moments[at + plane]
+            square += w * moments[at + 2 * plane]
         mean /= share
         cov /= share
         variance = abs(square / share - mean * mean)
@@ -81,11 +88,42 @@ def _cut_responses(
 
 
 @uncounted
+def _moments_of_rows(
+    pixels: NDArray[np.uint8],
+    strip: NDArray[np.float32],
+    width: int,
+    half_width: int,
+    leftmost: np.float32,
+    rightmost: np.float32,
+    weights: NDArray[np.float32],
+    moments: NDArray[np.float32],
+    plane: int,
+    at_group: int,
+    first: int,
+    after: int,
+) -> None:
+    words = weights.shape[1] // WORD
+    y = first
+    while y + 1 < after:
+        moments_across_two(
+            pixels, y * width - half_width, width, strip, at_group + y * LANES, leftmost, rightmost,
+            weights, words, moments, plane, y * LANES,
+        )  # fmt: skip
+        y += 2
+    if y < after:
+        moments_across(
+            pixels, y * width - half_width, width, strip, at_group + y * LANES, leftmost, rightmost,
+            weights, words, moments, plane, y * LANES,
+        )  # fmt: skip
+
+
+@uncounted
 def respond(
     pixels: NDArray[np.uint8],
     strip: NDArray[np.float32],
-    flat_strip: NDArray[np.float32],
+    ends: NDArray[np.int32],
     half_width: int,
+    height: int,
     first_row: NDArray[np.int32],
     last_row: NDArray[np.int32],
     weights: NDArray[np.float32],
@@ -102,48 +140,63 @@ def respond(
 
     `moments` holds those of the group and the rows that `filtered` tells: number, first, last + 1.
     """
-    height, width = strip.shape
-    taps = weights.shape[1]
+    width = len(first_row)
+    plane = height * LANES
     s = len(along) // 2
     base = min(max(group * STEP - MARGIN, 0), width - LANES)
     leftmost = np.float32(half_width)
     rightmost = np.float32(width - 1 - half_width)
-    # Rows in which any of the verticals is seen, and in which all are.
-    top = height
-    bottom = -1
-    full_top = 0
-    full_bottom = height - 1
-    for c in range(base, base + LANES):
-        full_top = max(full_top, first_row[c])
-        full_bottom = min(full_bottom, last_row[c])
-        if first_row[c] <= last_row[c]:
-            top = min(top, first_row[c])
-            bottom = max(bottom, last_row[c])
-    if full_top > full_bottom:
-        full_top = height
+    top = ends[group, 0]
+    bottom = ends[group, 1]
+    full_top = ends[group, 2]
+    full_bottom = ends[group, 3]
     first = max(begin - s, top)
     after = min(end - 1 + s, bottom) + 1
     if filtered[0] != group or first > filtered[2] or after < filtered[1]:
         filtered[0] = group
         filtered[1] = first
         filtered[2] = first
-    for y in range(first, after):
-        if not filtered[1] <= y < filtered[2]:
-            moments_across(
-                pixels, y * width - half_width, flat_strip, y * width + base, leftmost, rightmost,
-                weights, taps // WORD, moments, y * ROW_NUMBERS,
-            )  # fmt: skip
+    at_group = group * plane
+    _moments_of_rows(
+        pixels, strip, width, half_width, leftmost, rightmost, weights, moments, plane, at_group,
+        first, min(after, filtered[1]),
+    )  # fmt: skip
+    _moments_of_rows(
+        pixels, strip, width, half_width, leftmost, rightmost, weights, moments, plane, at_group,
+        max(first, filtered[2]), after,
+    )  # fmt: skip
     filtered[1] = min(filtered[1], first)
     filtered[2] = max(filtered[2], after)
-    for v in range(begin, end):
-        to = (group * height + v) * LANES
+    alike = top == full_top and bottom == full_bottom
+    one = np.float32(1.0)
+    v = begin
+    while v < end:
+        at = at_group + v * LANES
         if v - s >= full_top and v + s <= full_bottom:
+            if v + 1 < end and v + 1 + s <= full_bottom:
+                response_along_two(
+                    moments, plane, (v - s) * LANES, along, 0, len(along), one, regulariser, strip,
+                    at, leftmost, rightmost, response, at,
+                )  # fmt: skip
+                v += 1
+            else:
+                response_along(
+                    moments, plane, (v - s) * LANES, along, 0, len(along), one, regulariser, strip,
+                    at, leftmost, rightmost, response, at,
+                )  # fmt: skip
+        elif alike:
+            highest = max(v - s, top)
+            share = np.float32(0.0)
+            for k in range(highest - v + s, min(v + s, bottom) - v + s + 1):
+                share += along[k]
             response_along(
-                moments, (v - s) * ROW_NUMBERS, along, len(along), regulariser, flat_strip,
-                v * width + base, leftmost, rightmost, response, to,
+                moments, plane, highest * LANES, along, highest - v + s,
+                min(v + s, bottom) - highest + 1, one / share, regulariser, strip, at, leftmost,
+                rightmost, response, at,
             )  # fmt: skip
         else:
             _cut_responses(
-                strip, first_row, last_row, along, regulariser, leftmost, rightmost, moments,
-                base, v, response, to,
+                strip, first_row, last_row, along, regulariser, leftmost, rightmost, moments, plane,
+                base, v, response, at,
             )  # fmt: skip
+        v += 1

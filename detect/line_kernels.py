@@ -13,7 +13,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from detect.line_group_kernels import MARGIN, STEP, respond, uncounted
-from detect.line_vector_kernels import LANES, ROW_NUMBERS
+from detect.line_vector_code import LANES
 
 #: Rows that are filtered ahead of a track.
 _AHEAD = 12
@@ -76,11 +76,11 @@ def _top_of_parabola(left: np.float32, centre: np.float32, right: np.float32) ->
 def _follow(
     pixels: NDArray[np.uint8],
     strip: NDArray[np.float32],
-    flat_strip: NDArray[np.float32],
+    ends: NDArray[np.int32],
+    columns_per_rise: NDArray[np.float64],
     half_width: int,
     first_row: NDArray[np.int32],
     last_row: NDArray[np.int32],
-    bearing: NDArray[np.float64],
     elevation_tan: NDArray[np.float32],
     weights: NDArray[np.float32],
     along: NDArray[np.float32],
@@ -93,8 +93,6 @@ def _follow(
     row: int,
     column: float,
     direction: int,
-    pitch: float,
-    roll: float,
     threshold: float,
     max_gap: int,
     border: int,
@@ -109,7 +107,7 @@ def _follow(
     0 if there is none in the first row. Points are written from the middle of the results on, in
     this direction.
     """
-    height, width = strip.shape
+    height, width = elevation_tan.shape
     v = row
     # The expected position is j + part. Whole columns change seldom: a processor that foresees it
     # works on the next rows before it knows where in this one the edge is.
@@ -117,24 +115,16 @@ def _follow(
     part = column - j
     n = 0
     gap = 0
-    lean_column = -1
-    columns_per_rise = 0.0
     while gap <= max_gap:
         if n > 0:
             v += direction
             if v < border or v > height - 1 - border or j < 1 or j > width - 2:
                 break
-            rise = elevation_tan[v, j] - elevation_tan[v - direction, j]
-            if not math.isfinite(rise):
+            # A vertical leans in the strip of a tilted camera.
+            moved = columns_per_rise[j] * (elevation_tan[v, j] - elevation_tan[v - direction, j])
+            if not math.isfinite(moved):
                 break
-            if j != lean_column:
-                # A vertical leans by this much in the strip of a tilted camera.
-                lean = pitch * math.sin(bearing[j]) - roll * math.cos(bearing[j])
-                columns_per_rise = 2.0 * lean / (bearing[j + 1] - bearing[j - 1])
-                if not math.isfinite(columns_per_rise):
-                    break
-                lean_column = j
-            part += columns_per_rise * rise
+            part += moved
             if part < -0.5 or part >= 0.5:
                 whole = math.floor(part + 0.5)
                 j += whole
@@ -156,7 +146,7 @@ def _follow(
                 known[group, 0] = begin
                 known[group, 1] = end
             respond(
-                pixels, strip, flat_strip, half_width, first_row, last_row, weights, along,
+                pixels, strip, ends, half_width, height, first_row, last_row, weights, along,
                 regulariser, moments, filtered, group, begin, end, response,
             )  # fmt: skip
         base = min(max(group * STEP - MARGIN, 0), width - LANES)
@@ -187,7 +177,8 @@ def _follow(
                 out_column[place] = j + (part + off)
                 out_score[place] = centre
                 # The start counts as the expected position, not as a point that confirms it.
-                part += (max(pull, 1.0 / (n + 1.0)) if n > 0 else 1.0) * off
+                yielding = pull if pull * (n + 1.0) >= 1.0 else 1.0 / (n + 1.0)
+                part += (yielding if n > 0 else 1.0) * off
                 if part < -0.5 or part >= 0.5:
                     whole = math.floor(part + 0.5)
                     j += whole
@@ -203,9 +194,11 @@ def _follow(
 def follow_edges(
     pixels: NDArray[np.uint8],
     strip: NDArray[np.float32],
+    ends: NDArray[np.int32],
+    lean_by_pitch: NDArray[np.float64],
+    lean_by_roll: NDArray[np.float64],
     first_row: NDArray[np.int32],
     last_row: NDArray[np.int32],
-    bearing: NDArray[np.float64],
     elevation_tan: NDArray[np.float32],
     weights: NDArray[np.float32],
     half_width: int,
@@ -236,10 +229,10 @@ def follow_edges(
     ----------
     pixels : (N,) uint8
         Grey values in scan order; where T > 2r + 2, behind the last of them as many as that more.
-    strip : (H, W) float32
-        The table's columns (see `lut.verticals.VerticalTable`), row by row; at least `LANES` wide.
-    first_row, last_row, bearing, elevation_tan
-        The table.
+    strip, ends, lean_by_pitch, lean_by_roll
+        See `detect.line_strip.Strip`; the image is at least `LANES` wide.
+    first_row, last_row, elevation_tan
+        The table (see `lut.verticals.VerticalTable`).
     weights : (4, T) float32
         See `detect.line_filter.LineFilter.weights_between`.
     half_width : int
@@ -275,9 +268,10 @@ def follow_edges(
     row, column, score : (P,) int32, float64, float32
         The points: row and sub-pixel column in the strip, absolute response.
     """
-    height, width = strip.shape
-    flat_strip = strip.reshape(-1)
-    moments = np.empty(height * ROW_NUMBERS, np.float32)
+    height, width = elevation_tan.shape
+    columns_per_rise = pitch * lean_by_pitch + roll * lean_by_roll
+    # Means, covariances and mean squares.
+    moments = np.empty(3 * height * LANES, np.float32)
     filtered = np.full(3, -1, np.int64)
     lowest = height
     highest = 0
@@ -309,9 +303,9 @@ def follow_edges(
         near = float(start_column[start])
         for direction in range(-1, 2, 2):
             count = _follow(
-                pixels, strip, flat_strip, half_width, first_row, last_row, bearing,
+                pixels, strip, ends, columns_per_rise, half_width, first_row, last_row,
                 elevation_tan, weights, along, regulariser, moments, filtered, response, known,
-                polarity, v, near, direction, pitch, roll, threshold, max_gap, border, pull, reach,
+                polarity, v, near, direction, threshold, max_gap, border, pull, reach,
                 own_row, own_column, own_score,
             )  # fmt: skip
             if count == 0:

@@ -13,9 +13,9 @@ from detect.line_filter import (
     StartBand,
     line_filter,
     start_band,
-    strip_columns,
 )
 from detect.line_settings import LineSettings
+from detect.line_strip import strip_of
 from detect.tilt import TiltEstimate
 from lut.verticals import VerticalTable
 
@@ -224,16 +224,18 @@ def line_tracks(
     """
     from detect.line_kernels import follow_edges
 
-    window = line_filter(settings)
+    window, strip = line_filter(settings), strip_of(table)
     if filtered is None:
         filtered = FilteredColumns.none_yet(table)
     return LineTracks(
         *follow_edges(
             _padded(image, window),
-            strip_columns(table),
+            strip.column,
+            strip.ends,
+            strip.lean_by_pitch,
+            strip.lean_by_roll,
             table.first_row,
             table.last_row,
-            table.bearing_rad,
             table.elevation_tan,
             window.weights_between,
             window.weights.shape[1] // 2,
