@@ -15,8 +15,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.associate_local import LocalSettings, associate_locally, tilt_jacobian
+from slam.associate_local import LocalSettings, associate_locally
 from slam.errors import SlamError
+from slam.local_map import tilt_jacobian
 from slam.loops import LoopSettings, Match, find_matches, stretches_of
 from slam.loops_closing import closed_path, in_order, merge_labels, pairs_by_votes, pairs_in_place
 from slam.loops_path import Solution, intersect_bearings, solve_path

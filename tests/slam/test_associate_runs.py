@@ -12,15 +12,9 @@ from numpy.typing import NDArray
 
 from landmarks import wrap_angle
 from slam.associate import AssociateSettings, associate_run
-from slam.associate_local import (
-    LocalMap,
-    LocalSettings,
-    Method,
-    associate_locally,
-    moved,
-    tilt_jacobian,
-)
+from slam.associate_local import LocalSettings, Method, associate_locally
 from slam.association_score import score_association
+from slam.local_map import LocalMap, moved, tilt_jacobian
 from slam.measurement import bearing_of_vertical, disc_in_robot
 from slam.motion import chain_steps, relative_pose
 from slam.recording import CircleRows, LineRows, Recording
