@@ -22,8 +22,8 @@ from camera.calibration import (
     CalibrationSettings,
     calibrate,
     coefficient_names,
-    coverage,
 )
+from camera.calibration_checks import coverage
 from camera.calibration_floor import (
     FloorPose,
     on_floor,

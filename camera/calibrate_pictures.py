@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from camera.calibration import Calibration, coverage
+from camera.calibration import Calibration
+from camera.calibration_checks import coverage
 from camera.calibration_projection import projection_sigma
 from camera.model import Camera
 

@@ -17,13 +17,8 @@ from camera.calibration_adjustment import (
     adjust,
     project_estimate,
 )
-from camera.calibration_model import (
-    FREE_COEFFICIENTS,
-    corner_radius,
-    free_span,
-    is_possible,
-    project_points,
-)
+from camera.calibration_checks import demand_different_views, demand_enough, warnings_of
+from camera.calibration_model import FREE_COEFFICIENTS, free_span, is_possible, project_points
 from camera.calibration_start import best_poses, first_estimate, normals_spread_deg
 from camera.errors import CalibrationError
 from storage.bounds import ABOVE_0, demand, whole
@@ -31,10 +26,6 @@ from storage.bounds import ABOVE_0, demand, whole
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-FEWEST_VIEWS = 3
-# Below this the focal length hangs on the perspective of single views alone.
-_SMALLEST_SPREAD_DEG = 3.0
-_LARGEST_SCALE_SIGMA = 0.03
 _OUTLIER_FACTOR = 3.0
 # A point is wrong when it is so many standard deviations off.
 _WRONG_POINT = 8.0
@@ -166,7 +157,7 @@ def calibrate(
         If the views are too few or too much alike, or nothing explains them.
     """
     settings = settings if settings is not None else CalibrationSettings()
-    _check_number(len(views))
+    demand_enough(len(views))
     measured = points_of(views, board, size)
     names = tuple(view.name for view in views)
     try:
@@ -190,7 +181,7 @@ def calibrate(
     if far.any() and not settings.keep_outliers:
         kept = np.flatnonzero(~far)
         outliers = tuple((names[v], float(rms[v])) for v in np.flatnonzero(far))
-        _check_number(len(kept), f" without {', '.join(name for name, _ in outliers)}")
+        demand_enough(len(kept), f" without {', '.join(name for name, _ in outliers)}")
         names = tuple(names[v] for v in kept)
         measured = measured.of(kept)
         start = of_views(start, kept)
@@ -207,8 +198,8 @@ def calibrate(
     chosen = _fewest_needed(holdout, measured, fits)
     adjusted, points = fits[chosen]
     spread = normals_spread_deg(adjusted.estimate.rotations)
-    _check_views(adjusted, spread)
-    warnings = _warnings(adjusted, points, spread)
+    demand_different_views(adjusted, spread)
+    warnings = warnings_of(adjusted, points, spread)
     if wrong:
         warnings.insert(0, f"{wrong} points left out: they lie far from where the others say")
     return Calibration(adjusted, points, names, outliers, chosen, holdout, spread, tuple(warnings))
@@ -376,73 +367,6 @@ def _fewest_needed(
     best = min(holdout, key=lambda count: holdout[count])
     slack = _WORTH * fits[best][0].sigma_px ** 2 / len(points.board)
     return min(n for n, error in holdout.items() if error**2 <= holdout[best] ** 2 + slack)
-
-
-def _check_number(count: int, without: str = "") -> None:
-    if count < FEWEST_VIEWS:
-        raise CalibrationError(
-            f"{count} pictures of the board{without}: at least {FEWEST_VIEWS} are needed, and 15 "
-            "to 40 are good; take more, from different sides and out to the image's corners"
-        )
-
-
-def _check_views(fit: Adjusted, spread_deg: float) -> None:
-    variance = float(fit.covariance[0, 0])
-    # Where nothing is known, rounding can make the variance anything.
-    sigma = np.sqrt(variance) if variance > 0.0 else np.inf
-    relative = float(sigma / fit.estimate.intrinsics[0])
-    if spread_deg < _SMALLEST_SPREAD_DEG or not relative < _LARGEST_SCALE_SIGMA:
-        raise CalibrationError(
-            f"the boards stand too much alike: their normals differ by at most {spread_deg:.1f} "
-            f"deg and leave the focal length {100.0 * relative:.2g} % uncertain, for it can't be "
-            "told from the distance; tilt the board by 20 to 45 deg in different directions "
-            "between pictures"
-        )
-
-
-def _warnings(fit: Adjusted, points: Points, spread_deg: float) -> list[str]:
-    warnings = []
-    views = len(points.starts)
-    if views < 10:
-        warnings.append(f"only {views} pictures: 15 to 40 make the result firmer")
-    if spread_deg < 20.0:
-        warnings.append(
-            f"the boards' normals differ by at most {spread_deg:.0f} deg: tilt the board by 20 to "
-            "45 deg in different directions"
-        )
-    warnings += coverage_warnings(fit.estimate.intrinsics, points)
-    return warnings
-
-
-def coverage(points: Points, columns: int = 8, rows: int = 6) -> IntArray:
-    """Number of points in each cell of the image, (rows, columns)."""
-    u = np.clip(((points.pixels[:, 0] + 0.5) * columns / points.width).astype(int), 0, columns - 1)
-    v = np.clip(((points.pixels[:, 1] + 0.5) * rows / points.height).astype(int), 0, rows - 1)
-    counts = np.zeros((rows, columns), dtype=np.int64)
-    np.add.at(counts, (v, u), 1)
-    return counts
-
-
-def coverage_warnings(intrinsics: FloatArray, points: Points) -> list[str]:
-    """What of the image no point was seen in."""
-    warnings = []
-    thirds = coverage(points, 3, 3)
-    across, down = ("left", "middle", "right"), ("top", "middle", "bottom")
-    empty = [
-        f"{down[row]} {across[column]}" if row != 1 or column != 1 else "centre"
-        for row, column in np.argwhere(thirds == 0)
-    ]
-    if empty:
-        warnings.append(f"no points in the image's {', '.join(empty)}: hold the board there, too")
-    normalised = (points.pixels - intrinsics[2:4]) / intrinsics[:2]
-    seen = float(np.hypot(normalised[:, 0], normalised[:, 1]).max())
-    share = seen / corner_radius(intrinsics, points.width, points.height)
-    if share < 0.9:
-        warnings.append(
-            f"points reach only {100.0 * share:.0f} % of the way from the centre to the farthest "
-            "corner: beyond, the distortion is extrapolated"
-        )
-    return warnings
 
 
 def coefficient_names(count: int) -> str:

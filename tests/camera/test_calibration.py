@@ -15,10 +15,10 @@ from camera.calibration import (
     CalibrationSettings,
     calibrate,
     circle_shifts,
-    coverage_warnings,
     points_of,
 )
 from camera.calibration_adjustment import Estimate, Points, adjust, project_estimate
+from camera.calibration_checks import coverage_warnings
 from camera.calibration_model import free_span, is_possible, project_points, rotation_of
 from camera.calibration_projection import (
     intrinsics_of,
