@@ -21,7 +21,7 @@ from detect.sources.bag_images import pixels_of_message
 from detect.sources.gray import gray_of_pixels
 from detect.sources.opening import open_source
 from detect.sources.options import SourceOptions
-from groundtruth.streams import read_times
+from groundtruth.trajectories.streams import read_times
 from landmarks import Frame, Step, format_frame, read_frames, read_steps
 from tests.detect.recordings import BAG_KINDS, BagKind, Ros, Said
 

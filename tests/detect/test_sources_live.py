@@ -19,7 +19,7 @@ from detect.run import read_image
 from detect.sources import live
 from detect.sources.opening import open_source
 from detect.sources.options import SourceOptions
-from groundtruth.streams import read_times
+from groundtruth.trajectories.streams import read_times
 from landmarks import read_frames
 
 

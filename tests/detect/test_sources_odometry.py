@@ -19,7 +19,7 @@ from detect.sources.options import SourceOptions
 from detect.sources.steps import movement_between, pose_between
 from detect.sources.times import TimesByImage, format_time
 from detect.sources.tum import TumTrajectory
-from groundtruth.streams import read_times
+from groundtruth.trajectories.streams import read_times
 from landmarks import read_frames
 
 PREFIXES = ["s.0000", "s.0001", "s.0002"]

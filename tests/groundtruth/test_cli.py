@@ -13,13 +13,20 @@ import pytest
 from numpy.typing import NDArray
 
 from camera import write_camera
-from groundtruth.calibration import Network, Rig, read_network, read_rig, write_network, write_rig
 from groundtruth.cli import main
-from groundtruth.streams import PlanarPoses, read_planar_poses, write_planar_poses
-from groundtruth.transforms import exp_se3, inverse, log_se3, planar_transform
+from groundtruth.geometry.transforms import exp_se3, inverse, log_se3, planar_transform
+from groundtruth.markers.calibration import (
+    Network,
+    Rig,
+    read_network,
+    read_rig,
+    write_network,
+    write_rig,
+)
+from groundtruth.trajectories.streams import PlanarPoses, read_planar_poses, write_planar_poses
 from landmarks import Frame, Step, write_frames
-from tests.groundtruth.scene import box_rig, frames_of, hall_cameras, lens
-from tests.groundtruth.test_network import BOARDS, OFFSET, WORLD, shots
+from tests.groundtruth.markers.scene import box_rig, frames_of, hall_cameras, lens
+from tests.groundtruth.markers.test_network import BOARDS, OFFSET, WORLD, shots
 
 FloatArray = NDArray[np.float64]
 Captured = pytest.CaptureFixture[str]
@@ -251,7 +258,7 @@ def test_a_network_from_corners(tmp_path: Path, capsys: Captured) -> None:
         write_camera(lens(), folder / name / f"{name}.cam")
 
     def pose(matrix: FloatArray) -> dict[str, list[float]]:
-        from groundtruth.transforms import quaternion_xyzw
+        from groundtruth.geometry.transforms import quaternion_xyzw
 
         return {
             "translation_m": matrix[:3, 3].tolist(),

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from groundtruth.cli import main
-from groundtruth.scoring import compare_streams
-from groundtruth.streams import read_planar_poses
+from groundtruth.trajectories.streams import read_planar_poses
+from groundtruth.validation.scoring import compare_streams
 from landmarks import Frame, MarkerCorner, MarkerLandmark, write_frames
 
 

@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from groundtruth.cli import main as groundtruth
-from groundtruth.clock import ClockSegment, read_clock
-from groundtruth.scoring import compare_streams
-from groundtruth.streams import PlanarPoses, read_planar_poses
+from groundtruth.clocks.clock import ClockSegment, read_clock
+from groundtruth.trajectories.streams import PlanarPoses, read_planar_poses
+from groundtruth.validation.scoring import compare_streams
 from tools.simulator.laser.session_files import write_session
 from tools.simulator.laser.settings import Faults, LaserSettings
 

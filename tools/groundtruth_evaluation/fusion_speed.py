@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 import tyro
 
-from groundtruth.fuse import fuse
-from groundtruth.streams import PlanarPoses
+from groundtruth.fusion.fuse import fuse
+from groundtruth.trajectories.streams import PlanarPoses
 
 
 @dataclass(frozen=True)

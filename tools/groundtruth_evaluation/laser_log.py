@@ -21,8 +21,9 @@ from numpy.typing import NDArray
 from tyro.conf import Positional, arg
 
 from groundtruth.errors import GeometryError, GroundTruthError
-from groundtruth.icp_motion import between, wrapped
-from groundtruth.icp_scans import ScanMatchSettings, match_scans
+from groundtruth.geometry.plane import between
+from groundtruth.lasers.icp_scans import ScanMatchSettings, match_scans
+from landmarks import wrap_angle
 
 FloatArray = NDArray[np.float64]
 
@@ -104,7 +105,7 @@ def perform(options: LaserLog) -> int:
     elapsed = time.perf_counter() - began
     truth = between(poses[:-1], poses[1:])[pairs]
     shift_m = np.hypot(*(found[:, :2] - truth[:, :2]).T)
-    turn_deg = np.degrees(np.abs(wrapped(found[:, 2] - truth[:, 2])))
+    turn_deg = np.degrees(np.abs(wrap_angle(found[:, 2] - truth[:, 2])))
     shift_m, turn_deg = (np.where(np.isnan(e), np.inf, e) for e in (shift_m, turn_deg))
     gross = (shift_m > 0.15) | (turn_deg > 3.0)
     print(f"pairs {len(pairs)}, {1e3 * elapsed / len(pairs):.1f} ms each")

@@ -23,12 +23,13 @@ import tyro
 from numpy.typing import NDArray
 
 from groundtruth.errors import GroundTruthError
-from groundtruth.icp_motion import wrapped
-from groundtruth.laser_blocks import combined_poses
-from groundtruth.laser_command import load_session, track_robot, track_without_suspects
-from groundtruth.laser_tracking import OK, REACQUIRED, UNDETERMINED, LaserTrack
-from groundtruth.scans import Scanner, read_scanners
-from groundtruth.streams import read_planar_poses
+from groundtruth.lasers.blocks import combined_poses
+from groundtruth.lasers.scanners import Scanner, read_scanners
+from groundtruth.lasers.session import load_session
+from groundtruth.lasers.suspects import track_robot, track_without_suspects
+from groundtruth.lasers.tracking import OK, REACQUIRED, UNDETERMINED, LaserTrack
+from groundtruth.trajectories.streams import read_planar_poses
+from landmarks import wrap_angle
 
 FloatArray = NDArray[np.float64]
 
@@ -149,7 +150,7 @@ def errors_in_room(session: Path, track: LaserTrack, sets_per_pose: int) -> dict
     heading = np.unwrap(truth.poses[:, 2])
     columns = (truth.poses[:, 0], truth.poses[:, 1], heading)
     error = poses.poses[chosen] - np.column_stack([np.interp(t, truth.times_s, v) for v in columns])
-    error[:, 2] = wrapped(error[:, 2])
+    error[:, 2] = wrap_angle(error[:, 2])
     shift, turn = 1e3 * np.hypot(error[:, 0], error[:, 1]), np.degrees(error[:, 2])
     squared = np.einsum("ni,nij,nj->n", error, np.linalg.inv(poses.covariances[chosen]), error)
     return {
@@ -192,8 +193,8 @@ def _calibration(session: Path, options: LaserSessions) -> tuple[Path, dict[str,
     exact = session / "scanners.truth.json"
     if options.scanners == "true":
         return exact, {"scanner_mm": 0.0, "scanner_deg": 0.0, "scanner_nees": 0.0}
-    from groundtruth.lasers_command import perform as align
-    from groundtruth.options import Lasers
+    from groundtruth.commands.lasers import perform as align
+    from groundtruth.commands.options import Lasers
 
     output = session / "aligned.json"
     with redirect_stdout(io.StringIO()):
@@ -204,7 +205,7 @@ def _calibration(session: Path, options: LaserSessions) -> tuple[Path, dict[str,
 def scanner_errors(found: tuple[Scanner, ...], exact: tuple[Scanner, ...]) -> dict[str, float]:
     """Mean errors of the scanners' poses, and the mean normalised error squared."""
     error = np.array([f.pose - e.pose for f, e in zip(found, exact)])
-    error[:, 2] = wrapped(error[:, 2])
+    error[:, 2] = wrap_angle(error[:, 2])
     nees = [float(e @ np.linalg.solve(f.covariance, e)) / 3.0 for e, f in zip(error, found)]
     return {
         "scanner_mm": float(1e3 * np.hypot(error[:, 0], error[:, 1]).mean()),

@@ -11,16 +11,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from groundtruth.building import read_building
-from groundtruth.fiducials import read_distances, read_survey
-from groundtruth.scans import (
-    Scanner,
-    find_scans,
-    read_robot,
-    read_scanners,
-    read_scans,
-)
-from groundtruth.streams import PlanarPoses, read_planar_poses
+from groundtruth.lasers.building import read_building
+from groundtruth.lasers.scanners import Scanner, read_robot, read_scanners
+from groundtruth.lasers.scans import find_scans, read_scans
+from groundtruth.trajectories.streams import PlanarPoses, read_planar_poses
+from groundtruth.validation.fiducials import read_distances, read_survey
+from landmarks import wrap_angle
 from tools.simulator.cli import main
 from tools.simulator.laser.measuring import compose
 from tools.simulator.laser.people import Passer, legs_of
@@ -35,7 +31,6 @@ from tools.simulator.laser.streams import (
     measured_distances,
     odometry_stream,
     survey_of,
-    wrapped,
 )
 
 FloatArray = NDArray[np.float64]
@@ -186,7 +181,7 @@ def test_errors_of_marker_poses_are_those_of_their_covariances() -> None:
         camera = camera_stream(plan)
         assert camera.covariances is not None
         error = camera.poses - plan.route.poses(camera.times_s)
-        error[:, 2] = wrapped(error[:, 2])
+        error[:, 2] = wrap_angle(error[:, 2])
         squares.append(np.einsum("ni,nij,nj->n", error, np.linalg.inv(camera.covariances), error))
         assert is_covered(plan.route.poses(camera.times_s)[:, :2]).all()
     square = np.concatenate(squares)

@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from groundtruth.building import read_building
-from groundtruth.calibration import read_json
-from groundtruth.fiducials import read_survey
-from groundtruth.scans import Scanner, find_scans, read_robot, read_scanners, read_scans
-from groundtruth.streams import read_planar_poses
+from groundtruth.json_file import read_json
+from groundtruth.lasers.building import read_building
+from groundtruth.lasers.scanners import Scanner, read_robot, read_scanners
+from groundtruth.lasers.scans import find_scans, read_scans
+from groundtruth.trajectories.streams import read_planar_poses
+from groundtruth.validation.fiducials import read_survey
 from storage import write_whole
 from tools.simulator.laser.measuring import compose
 

@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from groundtruth.building import Building, write_building, write_drawing
-from groundtruth.calibration import write_json
-from groundtruth.fiducials import write_distances, write_survey
-from groundtruth.scans import Scanner, Scans, write_robot, write_scanners, write_scans
-from groundtruth.streams import write_planar_poses
+from groundtruth.json_file import write_json
+from groundtruth.lasers.building import Building, write_building, write_drawing
+from groundtruth.lasers.scanners import Scanner, write_robot, write_scanners
+from groundtruth.lasers.scans import Scans, write_scans
+from groundtruth.trajectories.streams import write_planar_poses
+from groundtruth.validation.fiducials import write_distances, write_survey
 from storage import write_whole
 from tools.simulator.laser.clock import ptpd_lines
 from tools.simulator.laser.measuring import Scene, measured, true_ranges

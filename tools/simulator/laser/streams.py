@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from groundtruth.fiducials import Distance, Survey
-from groundtruth.streams import PlanarPoses
+from groundtruth.trajectories.streams import PlanarPoses
+from groundtruth.validation.fiducials import Distance, Survey
+from landmarks import wrap_angle
 from tools.simulator.laser.measuring import compose
 from tools.simulator.laser.session import SessionPlan
 from tools.simulator.laser.site import FIDUCIALS, ROOM_M
@@ -22,15 +23,10 @@ _CAMERAS = np.array([[0.3, 0.4], [9.6, 7.1]])
 _NEAREST_FIDUCIALS = 4
 
 
-def wrapped(theta: FloatArray) -> FloatArray:
-    """Angles in (-pi, pi]."""
-    return np.asarray(np.pi - np.mod(np.pi - theta, 2.0 * np.pi))
-
-
 def exact_poses(plan: SessionPlan, times_s: FloatArray) -> PlanarPoses:
     """True poses at times of the ground truth's clock, headings in (-pi, pi]."""
     poses = plan.route.poses(times_s)
-    poses[:, 2] = wrapped(poses[:, 2])
+    poses[:, 2] = wrap_angle(poses[:, 2])
     return PlanarPoses(times_s, poses)
 
 
@@ -50,7 +46,7 @@ def odometry_stream(plan: SessionPlan) -> PlanarPoses:
         route.start_s, route.end_s, 1.0 / settings.odometry_hz, float(rng.random())
     )
     path = measured_path(route.poses(times), settings.wheels, rng)
-    path[:, 2] = wrapped(path[:, 2])
+    path[:, 2] = wrap_angle(path[:, 2])
     logged = np.ones(len(times), dtype=bool)
     if settings.pause_log:
         logged = in_visits(plan, times, LOG_MARGIN_S)
@@ -71,7 +67,7 @@ def camera_stream(plan: SessionPlan) -> PlanarPoses:
     lost_s = times - plan.visits[0][0] - faults.lost_camera_at_s
     seen &= ~((lost_s >= 0.0) & (lost_s < faults.lost_camera_s))
     poses = exact + noise
-    poses[:, 2] = wrapped(poses[:, 2])
+    poses[:, 2] = wrap_angle(poses[:, 2])
     return PlanarPoses(times[seen], poses[seen], covariances[seen])
 
 

@@ -17,8 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from groundtruth.calibration import write_json
-from groundtruth.transforms import apply, inverse, planar_transform, quaternion_xyzw
+from groundtruth.geometry.transforms import apply, inverse, planar_transform, quaternion_xyzw
+from groundtruth.json_file import write_json
 from tools.simulator.markers.clutter import checkerboard
 from tools.simulator.markers.errors import CalibrationErrors
 from tools.simulator.markers.imaging import Imaging, grey_image

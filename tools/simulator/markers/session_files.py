@@ -11,8 +11,8 @@ from typing import Any, Literal
 import numpy as np
 
 from camera import Camera, format_camera, write_camera
-from groundtruth.calibration import write_network, write_rig
-from groundtruth.streams import PlanarPoses, write_planar_poses
+from groundtruth.markers.calibration import write_network, write_rig
+from groundtruth.trajectories.streams import PlanarPoses, write_planar_poses
 from storage import write_whole
 from tools.simulator.markers.errors import CalibrationErrors, disturbed_network, disturbed_rig
 from tools.simulator.markers.session import (

@@ -1,0 +1,1 @@
+"""The robot's clock against the ground truth's."""

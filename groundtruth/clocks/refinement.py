@@ -1,0 +1,157 @@
+"""The robot's clock from its whole movement, once headings have told it roughly.
+
+Headings alone tell the time by turns, and no better than odometry's heading wanders. Where the
+ground truth has positions and covariances, the clock is moved, near what the headings said, to
+where odometry's movements make all measured poses likeliest; bends of the way and changes of speed
+tell the time then, too.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from groundtruth.clocks.clock import ClockModel, ClockSegment
+from groundtruth.errors import GroundTruthError
+from groundtruth.fusion.movement import likeliest_noise, movement_problem, noise_of
+from groundtruth.fusion.settings import FuseSettings
+from groundtruth.trajectories.streams import PlanarPoses
+
+FloatArray = NDArray[np.float64]
+
+_MARGIN_S = 2.0
+_LEAST_WAY_M = 1.0
+_FEWEST_POSES = 20
+_ROUNDS = 2
+# Deviations of simulated sessions from the truth were so many times what the curvature of the
+# likelihood says: wheels do not err quite as the model has it.
+_SIGMA_FACTOR = 2.0
+
+
+def refine_by_movement(
+    segments: Sequence[ClockSegment],
+    odometry: PlanarPoses,
+    groundtruth: PlanarPoses,
+) -> list[ClockSegment]:
+    """Move each segment's offset and rate to where the movements fit best.
+
+    Parameters
+    ----------
+    segments : sequence of ClockSegment
+        What the headings told.
+    odometry : PlanarPoses
+        The robot's own poses on its own clock.
+    groundtruth : PlanarPoses
+        Poses with covariances.
+
+    Returns
+    -------
+    list of ClockSegment
+        Refined where their status is `ok` or `jump`, the robot drove a metre or more, and the
+        headings' result was near; the others unchanged.
+    """
+    if groundtruth.covariances is None:
+        return list(segments)
+    return [
+        _refined(segment, odometry, groundtruth) if segment.status in ("ok", "jump") else segment
+        for segment in segments
+    ]
+
+
+def _refined(
+    segment: ClockSegment, odometry: PlanarPoses, groundtruth: PlanarPoses
+) -> ClockSegment:
+    assert groundtruth.covariances is not None
+    here = (groundtruth.times_s >= segment.from_s) & (groundtruth.times_s <= segment.to_s)
+    near = (odometry.times_s >= segment.from_s + segment.offset_s - _MARGIN_S) & (
+        odometry.times_s <= segment.to_s + segment.offset_s + _MARGIN_S
+    )
+    steps = np.diff(odometry.poses[near][:, :2], axis=0)
+    if (
+        np.count_nonzero(here) < _FEWEST_POSES
+        or np.count_nonzero(near) < _FEWEST_POSES
+        or float(np.sum(np.hypot(steps[:, 0], steps[:, 1]))) < _LEAST_WAY_M
+    ):
+        return segment
+    measured = PlanarPoses(
+        groundtruth.times_s[here], groundtruth.poses[here], groundtruth.covariances[here]
+    )
+    robot_times, own = odometry.times_s[near], odometry.poses[near]
+    settings = FuseSettings()
+    noise = noise_of(settings)
+    # One unit of the search: what the headings leave open, but no less than a millisecond at the
+    # segment's middle and at its ends.
+    half = 0.5 * (segment.to_s - segment.from_s)
+    unit = np.array([max(segment.sigma_offset_s, 1e-3), max(segment.sigma_rate, 1e-3 / half)])
+
+    def surprise(x: FloatArray) -> float:
+        moved = replace(
+            segment,
+            offset_s=segment.offset_s + unit[0] * float(x[0]),
+            rate=segment.rate + unit[1] * float(x[1]),
+        )
+        times = ClockModel((moved,)).groundtruth_times(robot_times)
+        problem = movement_problem(PlanarPoses(times, own), {"pose": measured}, settings)
+        return problem.surprise(noise)
+
+    best = np.zeros(2)
+    try:
+        for _ in range(_ROUNDS):
+            moved = replace(
+                segment,
+                offset_s=segment.offset_s + unit[0] * float(best[0]),
+                rate=segment.rate + unit[1] * float(best[1]),
+            )
+            times = ClockModel((moved,)).groundtruth_times(robot_times)
+            noise = likeliest_noise(
+                movement_problem(PlanarPoses(times, own), {"pose": measured}, settings)
+            )
+            found = minimize(
+                surprise,
+                best,
+                method="Nelder-Mead",
+                options={"xatol": 0.01, "fatol": 0.01, "initial_simplex": best + _SIMPLEX},
+            )
+            best = found.x
+    except GroundTruthError:
+        return segment
+    if np.max(np.abs(best)) > _FARTHEST:
+        return segment
+    covariance = _covariance(surprise, best)
+    if covariance is None:
+        return segment
+    sigma = _SIGMA_FACTOR * unit * np.sqrt(np.diag(covariance))
+    return replace(
+        segment,
+        offset_s=segment.offset_s + float(unit[0] * best[0]),
+        rate=segment.rate + float(unit[1] * best[1]),
+        sigma_offset_s=float(sigma[0]),
+        sigma_rate=float(sigma[1]),
+    )
+
+
+_SIMPLEX = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+# Farther from what the headings told than so many of their deviations, something else is wrong.
+_FARTHEST = 8.0
+
+
+def _covariance(surprise: Callable[[FloatArray], float], at: FloatArray) -> FloatArray | None:
+    """Of the two unknowns, from the curvature of minus twice the logarithm of the likelihood."""
+    middle = surprise(at)
+    step = np.array([0.7, 0.7])
+    hessian = np.empty((2, 2))
+    for i in range(2):
+        e = np.eye(2)[i] * step[i]
+        hessian[i, i] = (surprise(at + e) + surprise(at - e) - 2.0 * middle) / step[i] ** 2
+    e, f = np.array([step[0], 0.0]), np.array([0.0, step[1]])
+    hessian[0, 1] = hessian[1, 0] = (
+        surprise(at + e + f) - surprise(at + e - f) - surprise(at - e + f) + surprise(at - e - f)
+    ) / (4.0 * step[0] * step[1])
+    if not (np.linalg.eigvalsh(hessian)[0] > 0.0 and math.isfinite(hessian.sum())):
+        return None
+    return np.asarray(2.0 * np.linalg.inv(hessian))

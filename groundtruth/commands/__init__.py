@@ -1,0 +1,1 @@
+"""The commands of ``groundtruth``: a module each, its `perform` carries it out."""

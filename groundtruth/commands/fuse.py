@@ -1,0 +1,67 @@
+"""``groundtruth fuse``: files and messages round the fusion."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+
+from groundtruth.clocks.clock import read_clock
+from groundtruth.commands.options import Fuse
+from groundtruth.commands.outputs import check_outputs, provenance
+from groundtruth.errors import GroundTruthError
+from groundtruth.fusion.fuse import FuseSettings, fuse
+from groundtruth.trajectories.streams import PlanarPoses, read_planar_poses, write_planar_poses
+from storage import write_whole
+
+
+def perform(options: Fuse) -> int:
+    """Carry out ``groundtruth fuse``; returns the exit code."""
+    account = options.output.with_suffix(".json")
+    check_outputs([options.output, account], options.force)
+    named = {"laser": options.laser, "camera": options.camera}
+    files: dict[str, Path] = {name: path for name, path in named.items() if path is not None}
+    if not files:
+        raise GroundTruthError("neither --laser nor --camera: expected at least one ground truth")
+    settings = FuseSettings(
+        distance_sigma=options.distance_sigma,
+        turn_sigma=options.turn_sigma,
+        turn_per_metre_sigma=options.turn_per_metre_sigma,
+        learn_noise=options.learn_noise,
+        gate_probability=options.gate_probability,
+        covariance_scale=dict(zip(named, options.covariance_scale)),
+    )
+    odometry = read_planar_poses(options.odometry)
+    if options.clock is not None:
+        times = read_clock(options.clock).groundtruth_times(odometry.times_s)
+        odometry = PlanarPoses(times, odometry.poses)
+    fusion = fuse(
+        odometry, {name: read_planar_poses(path) for name, path in files.items()}, settings
+    )
+    document = {
+        **provenance(
+            settings,
+            [options.odometry, *files.values(), *([options.clock] if options.clock else [])],
+        ),
+        "used": fusion.used,
+        "odometry": asdict(fusion.odometry),
+        "covariances_repaired": fusion.repaired,
+        "restarts_s": fusion.restarts_s,
+        "rejected": [asdict(rejected) for rejected in fusion.rejected],
+    }
+    write_planar_poses(options.output, fusion.poses, overwrite=options.force)
+    with write_whole(account, overwrite=options.force) as stream:
+        stream.write((json.dumps(document, indent=1) + "\n").encode())
+    assert fusion.poses.covariances is not None
+    sigma = 1e3 * np.sqrt(
+        np.median(np.trace(fusion.poses.covariances[:, :2, :2], axis1=1, axis2=2))
+    )
+    used = ", ".join(f"{count} from {name}" for name, count in fusion.used.items())
+    print(
+        f"{options.output}: {len(fusion.poses)} poses out of {used}; "
+        f"{len(fusion.rejected)} rejected, {len(fusion.restarts_s)} restarts; "
+        f"median sigma {sigma:.1f} mm"
+    )
+    return 0

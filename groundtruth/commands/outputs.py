@@ -1,0 +1,60 @@
+"""What every command does: looks after its outputs, says what they rest on, shows progress."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from groundtruth import __version__
+from storage import OutputExistsError
+
+#: Exit code of a command that could not be carried out, or gave no pose.
+EXIT_ERROR = 1
+
+
+def check_outputs(paths: Sequence[Path | None], force: bool) -> None:
+    """Refuse to begin where an output exists, unless it may be replaced."""
+    for path in paths:
+        if path is not None and path.exists() and not force:
+            raise OutputExistsError(path)
+
+
+def provenance(settings: Any, files: Sequence[Path] = ()) -> dict[str, Any]:
+    """What stands beside a result: version, settings, and the files that it depends on."""
+    return {
+        "version": __version__,
+        "settings": asdict(settings),
+        "files": {
+            path.name: {"sha256": hashlib.sha256(path.read_bytes()).hexdigest()} for path in files
+        },
+    }
+
+
+@contextmanager
+def progress(label: str) -> Iterator[tuple[Callable[[int], None], Callable[[], None]]]:
+    """A progress bar on a terminal; yields what to tell the total to, and what to call on."""
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeRemainingColumn,
+    )
+
+    console = Console(stderr=True)
+    bar = Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+        console=console,
+        disable=not console.is_terminal,
+    )
+    with bar:
+        task = bar.add_task(label, total=None)
+        yield lambda total: bar.update(task, total=total), lambda: bar.advance(task)

@@ -1,0 +1,1 @@
+"""Odometry and measured poses together: filter forward, smoothing backward."""

@@ -1,0 +1,157 @@
+"""Fusion of odometry with ground truths: Kalman filter forward, smoothing backward (RAWSEEDS D2.1).
+
+Odometry is the control, poses from laser and markers are the measurements. What odometry is off by
+systematically (a share of turns and ways, a bend) is estimated along, since it is what decides how
+far a gap can be bridged; how much it errs at random is what makes the measurements likeliest. The
+nodes are the odometry's times and the measurements' own, between which odometry is interpolated
+linearly; so no measurement is interpolated, which would count the same noise twice.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from groundtruth.fusion.movement import likeliest_noise, movement_problem, noise_of
+from groundtruth.fusion.settings import FuseSettings
+from groundtruth.trajectories.streams import PlanarPoses
+from landmarks import wrap_angle
+
+__all__ = ["FuseSettings", "Fusion", "OdometryErrors", "Rejected", "fuse"]
+
+
+@dataclass(frozen=True)
+class Rejected:
+    """A measurement that the gate kept out.
+
+    Attributes
+    ----------
+    stream : str
+        Whose it was.
+    time_s : float
+    squared_innovation : float
+        Squared normalised distance from what was expected.
+    """
+
+    stream: str
+    time_s: float
+    squared_innovation: float
+
+
+@dataclass(frozen=True)
+class OdometryErrors:
+    """What the measurements say of odometry.
+
+    Attributes
+    ----------
+    turn_scale, turn_bias_per_metre, distance_scale : float
+        By what share turns are longer than odometry says, the turn it misses per metre (rad), by
+        what share ways are longer.
+    turn_scale_sigma, turn_bias_per_metre_sigma, distance_scale_sigma : float
+        Their standard deviations.
+    distance_sigma, turn_sigma, turn_per_metre_sigma : float
+        Its random errors, as in `FuseSettings`.
+    """
+
+    turn_scale: float
+    turn_bias_per_metre: float
+    distance_scale: float
+    turn_scale_sigma: float
+    turn_bias_per_metre_sigma: float
+    distance_scale_sigma: float
+    distance_sigma: float
+    turn_sigma: float
+    turn_per_metre_sigma: float
+
+
+@dataclass(frozen=True, eq=False)
+class Fusion:
+    """The robot's path out of all streams.
+
+    Attributes
+    ----------
+    poses : PlanarPoses
+        At the odometry's times from the first measurement to the last, with covariances; headings
+        within +-pi.
+    rejected : tuple of Rejected
+        In order of time.
+    restarts_s : tuple of float
+        When the filter began anew, since nothing of what was measured fitted any more.
+    used : dict of str to int
+        Measurements that went in, by stream.
+    odometry : OdometryErrors
+        What was learnt of it.
+    repaired : dict of str to int
+        Covariances that were not positive definite as written, by stream; they were raised by their
+        file's rounding.
+    """
+
+    poses: PlanarPoses
+    rejected: tuple[Rejected, ...]
+    restarts_s: tuple[float, ...]
+    used: dict[str, int]
+    odometry: OdometryErrors
+    repaired: dict[str, int]
+
+
+def fuse(
+    odometry: PlanarPoses,
+    streams: Mapping[str, PlanarPoses],
+    settings: FuseSettings | None = None,
+) -> Fusion:
+    """Fuse odometry with poses measured by other means.
+
+    Parameters
+    ----------
+    odometry : PlanarPoses
+        The robot's own poses, on the measurements' clock; only movements between them count.
+    streams : mapping of str to PlanarPoses
+        Measured poses with covariances, by name.
+    settings : FuseSettings, optional
+
+    Returns
+    -------
+    Fusion
+
+    Raises
+    ------
+    GroundTruthError
+        If there is no measurement within the odometry's time, a stream has no covariances, or one
+        of them cannot be repaired.
+    """
+    chosen = settings or FuseSettings()
+    problem = movement_problem(odometry, streams, chosen)
+    noise = likeliest_noise(problem) if chosen.learn_noise else noise_of(chosen)
+    smoothed, spread, account = problem.smooth(noise)
+
+    first, last = problem.times_s[0], problem.times_s[-1]
+    inside = odometry.times_s[(odometry.times_s >= first) & (odometry.times_s <= last)]
+    at = np.searchsorted(problem.times_s, inside)
+    poses = smoothed[at, :3]
+    poses[:, 2] = wrap_angle(poses[:, 2])
+    # Odometry's errors are constants: all that is known of them is known at the end.
+    last_spread = np.sqrt(np.maximum(np.diagonal(spread[-1]), 0.0))
+    return Fusion(
+        poses=PlanarPoses(inside, poses, spread[at][:, :3, :3].copy()),
+        rejected=tuple(
+            Rejected(
+                problem.streams[i],
+                float(problem.times_s[problem.nodes[i]]),
+                float(account.squared[i]),
+            )
+            for i in np.flatnonzero(~account.accepted)
+        ),
+        restarts_s=tuple(float(time) for time in problem.times_s[account.restarted]),
+        used={
+            name: int(np.count_nonzero(account.accepted & (np.array(problem.streams) == name)))
+            for name in streams
+        },
+        odometry=OdometryErrors(
+            *(float(value) for value in smoothed[-1, 3:]),
+            *(float(value) for value in last_spread[3:]),
+            *(float(value) for value in noise),
+        ),
+        repaired=problem.repaired,
+    )

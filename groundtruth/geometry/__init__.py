@@ -1,0 +1,1 @@
+"""Rigid motions: in space, in the plane, and the covariances of poses."""

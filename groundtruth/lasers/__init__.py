@@ -1,0 +1,1 @@
+"""Scanners, scans and building: matching, alignment, tracking of a robot."""

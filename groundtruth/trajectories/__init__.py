@@ -1,0 +1,1 @@
+"""Poses over time: files, other times, rigid alignment of whole paths."""

@@ -1,0 +1,1 @@
+"""How good poses are: against a truth, against surveyed reference poses."""

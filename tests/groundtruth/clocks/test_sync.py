@@ -1,0 +1,300 @@
+"""Clocks that are known come back, with deviations that are right; what cannot be told is said."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from groundtruth.cli import main
+from groundtruth.clocks.clock import ClockModel, ClockSegment, clock_document, read_clock
+from groundtruth.clocks.headings import HeadingIntegral, heading_noise, segments_between_gaps
+from groundtruth.clocks.ptpd import read_ptpd
+from groundtruth.clocks.sync import SyncSettings, synchronise
+from groundtruth.clocks.wandering import Wandering, estimate_wandering
+from groundtruth.errors import GroundTruthError, StreamError
+from groundtruth.trajectories.streams import PlanarPoses, read_planar_poses, write_planar_poses
+from landmarks import wrap_angle
+from tests.groundtruth.clocks.simulated import Clocks, headings_only, joined, simulate
+
+SEGMENT = ClockSegment(
+    10.0, 20.0, 15.0, 0.5, 1.001, 0.0, 1e-3, 1e-4, 1e-3, turned_rad=5.0, status="ok"
+)
+
+
+@pytest.mark.parametrize(
+    ("offset", "drift"), [(-0.97, -0.0095), (-0.2, 1e-4), (0.0, 0.0), (0.61, 0.004), (0.98, 0.0097)]
+)
+def test_the_clock_comes_back_from_anywhere_within_the_bounds(offset: float, drift: float) -> None:
+    clocks = Clocks(offset_s=offset, drift=drift)
+    odometry, truth = simulate(clocks, seed=3)
+    (found,) = synchronise(odometry, truth)
+    expected = offset + drift * (found.reference_s - 30.0)
+    assert abs(found.offset_s - expected) < 0.003
+    assert abs(found.rate - 1.0 - drift) < 2e-4
+    assert abs(wrap_angle(np.array(found.angle_rad - clocks.angle_rad))) < 0.02
+    assert abs(found.offset_s - expected) < 4.0 * found.sigma_offset_s
+
+
+def test_slow_ground_truth_is_met_by_samples_not_by_windows() -> None:
+    clocks = Clocks(truth_rate_hz=5.0, truth_sigma_rad=0.005)
+    (found,) = synchronise(*simulate(clocks, seed=4))
+    assert abs(found.offset_s - clocks.offset_s) < 4.0 * found.sigma_offset_s < 0.02
+
+
+@pytest.mark.long
+def test_deviations_are_right() -> None:
+    normalised = []
+    for seed in range(30):
+        clocks = Clocks(offset_s=-0.4 + 0.02 * seed, drift=-2e-4 + 1e-5 * seed, walk=0.01)
+        (found,) = synchronise(*simulate(clocks, seed))
+        normalised.append(
+            (
+                (found.offset_s - clocks.offset_s - clocks.drift * (found.reference_s - 30.0))
+                / found.sigma_offset_s,
+                (found.rate - 1.0 - clocks.drift) / found.sigma_rate,
+            )
+        )
+    squared = np.mean(np.square(normalised), axis=0)
+    # 99 % band of chi-squared with 30 degrees of freedom over 30, widened for sigmas estimated
+    # from the residuals themselves.
+    assert np.all(squared > 0.4)
+    assert np.all(squared < 2.0)
+
+
+def test_a_segment_without_turns_cannot_be_synchronised() -> None:
+    straight = simulate(Clocks(turns=False), seed=1)
+    (found,) = synchronise(*straight)
+    assert found.status == "no turns"
+    assert math.isinf(found.sigma_offset_s)
+
+
+@pytest.mark.long
+def test_segments_on_one_line_share_it() -> None:
+    pieces = []
+    for start in (0.0, 300.0, 700.0):
+        # One line: at each visit's middle the offset is what the drift made of it.
+        clocks = Clocks(offset_s=0.1 + 5e-5 * (start + 30.0), drift=5e-5, start_s=start, walk=0.01)
+        pieces.append(simulate(clocks, seed=int(start)))
+    found = synchronise(joined([p[0] for p in pieces]), joined([p[1] for p in pieces]))
+    assert len(found) == 3
+    for segment in found:
+        assert "one line through 3 segments" in segment.note
+        assert abs(segment.rate - 1.0 - 5e-5) < 1.5e-5
+        assert abs(segment.offset_s - 0.1 - 5e-5 * segment.reference_s) < 0.004
+
+
+@pytest.mark.long
+def test_segments_whose_clock_was_set_between_them_keep_their_own() -> None:
+    pieces = [
+        simulate(Clocks(offset_s=offset, start_s=start, drift=0.0), seed=8)
+        for start, offset in ((0.0, -0.2), (300.0, 0.3))
+    ]
+    found = synchronise(joined([p[0] for p in pieces]), joined([p[1] for p in pieces]))
+    assert [round(segment.offset_s, 2) for segment in found] == [-0.2, 0.3]
+    assert all(segment.note == "" for segment in found)
+
+
+@pytest.mark.long
+def test_a_segment_without_turns_is_told_by_the_others() -> None:
+    pieces = [
+        simulate(Clocks(offset_s=0.2, drift=0.0, start_s=start, turns=turns), seed=8)
+        for start, turns in ((0.0, True), (300.0, False), (600.0, True))
+    ]
+    found = synchronise(joined([p[0] for p in pieces]), joined([p[1] for p in pieces]))
+    assert [segment.status for segment in found] == ["ok", "no turns", "ok"]
+    assert abs(found[1].offset_s - 0.2) < 0.003
+
+
+@pytest.mark.parametrize("jump_s", [0.08, 0.3])
+def test_a_clock_set_within_a_segment_is_marked_and_bounded(jump_s: float) -> None:
+    clocks = Clocks(offset_s=-0.1, drift=0.0, jump_at_s=25.0, jump_s=jump_s)
+    found = synchronise(*simulate(clocks, seed=5))
+    assert [segment.status for segment in found] == ["jump", "jump"]
+    assert abs(found[0].to_s - 25.0) < 1.5
+    assert abs(found[0].offset_s + 0.1) < 0.02
+    assert abs(found[1].offset_s + 0.1 - jump_s) < 0.02
+
+
+@pytest.mark.long
+def test_nothing_is_found_where_nothing_jumped() -> None:
+    for seed in range(10):
+        (found,) = synchronise(*simulate(Clocks(), seed=20 + seed))
+        assert found.status == "ok"
+
+
+def test_streams_that_never_meet_are_refused() -> None:
+    odometry, truth = simulate(Clocks(), seed=1)
+    late = PlanarPoses(odometry.times_s + 5000.0, odometry.poses)
+    with pytest.raises(GroundTruthError, match="do not overlap within 1 s"):
+        synchronise(late, truth)
+    with pytest.raises(GroundTruthError, match="odometry has 3 poses: expected 20 or more"):
+        synchronise(headings_only(np.arange(3.0), np.zeros(3)), truth)
+
+
+@pytest.mark.parametrize("name", ["largest_offset_s", "largest_drift", "segment_gap_s"])
+@pytest.mark.parametrize("value", [0.0, -1.0, math.nan, math.inf])
+def test_settings_that_mean_nothing_are_refused(name: str, value: float) -> None:
+    with pytest.raises(GroundTruthError, match=name):
+        SyncSettings(**dict[str, Any]({name: value}))
+
+
+@given(
+    st.lists(st.floats(-5, 5), min_size=1, max_size=6),
+    st.lists(st.floats(0.995, 1.005), min_size=6, max_size=6),
+    st.lists(st.floats(-1e3, 1e4), min_size=1, max_size=20),
+)
+def test_times_go_there_and_back(
+    offsets: list[float], rates: list[float], times: list[float]
+) -> None:
+    segments = tuple(
+        replace(
+            SEGMENT,
+            from_s=100.0 * k,
+            to_s=100.0 * k + 30.0,
+            reference_s=100.0 * k + 15.0,
+            offset_s=offset,
+            rate=rate,
+        )
+        for k, (offset, rate) in enumerate(zip(offsets, rates))
+    )
+    model = ClockModel(segments)
+    again = model.groundtruth_times(model.robot_times(times))
+    np.testing.assert_allclose(again, times, atol=1e-6)
+
+
+def test_a_clock_that_was_set_back_has_no_inverse() -> None:
+    model = ClockModel(
+        (SEGMENT, replace(SEGMENT, from_s=20.1, to_s=30.0, reference_s=25.0, offset_s=-3.0))
+    )
+    with pytest.raises(GroundTruthError, match="goes back between"):
+        model.groundtruth_times([5.0])
+
+
+def test_means_of_straight_pieces_are_exact() -> None:
+    integral = HeadingIntegral(np.array([0.0, 1.0, 3.0]), np.array([0.0, 2.0, -2.0]))
+    means = integral.means(np.array([0.0, 0.5, 1.0, 2.0]), np.array([1.0, 1.5, 3.0, 2.5]))
+    np.testing.assert_allclose(means, [1.0, 1.5, 0.0, -0.5], atol=1e-12)
+    covered = integral.covers(np.array([0.0, 0.2, -0.1]), np.array([1.0, 2.0, 0.5]), 1.5)
+    np.testing.assert_array_equal(covered, [True, False, False])
+
+
+def test_noise_of_headings_is_told_from_turning() -> None:
+    rng = np.random.default_rng(2)
+    times = np.arange(0, 100, 0.02)
+    noise = heading_noise(times, 3.0 * np.sin(0.4 * times) + rng.normal(0, 0.01, len(times)))
+    assert noise == pytest.approx(0.01, rel=0.05)
+
+
+def test_cuts_are_where_the_pauses_are() -> None:
+    parts = segments_between_gaps(np.array([0.0, 1.0, 7.0, 8.0, 30.0]), 5.0)
+    assert [(part.start, part.stop) for part in parts] == [(0, 2), (2, 4), (4, 5)]
+
+
+def test_wandering_is_told_from_noise() -> None:
+    rng = np.random.default_rng(7)
+    times = np.arange(0, 400, 0.2)
+    walk = np.cumsum(rng.normal(0, np.sqrt(4e-5 * 0.2), len(times)))
+    found = estimate_wandering(times, walk + rng.normal(0, 0.004, len(times)))
+    assert found.sigma == pytest.approx(0.004, rel=0.1)
+    assert found.rate == pytest.approx(4e-5, rel=0.35)
+
+
+def test_whitening_is_the_inverse_of_the_covariance_with_free_level() -> None:
+    times = np.array([0.0, 0.3, 0.7, 1.5, 1.6])
+    shape = np.array([[0.0], [0.1], [0.1], [-0.2], [0.3]])
+    noise = Wandering(times, 0.02, 0.003, shape)
+    covariance = 0.02**2 * np.eye(5) + 0.003 * np.minimum.outer(times, times) + shape @ shape.T
+    inverse = np.linalg.inv(covariance)
+    ones = np.ones(5)
+    free = inverse - np.outer(inverse @ ones, ones @ inverse) / (ones @ inverse @ ones)
+    np.testing.assert_allclose(noise.whiten(np.eye(5)), free, rtol=1e-6, atol=1e-6)
+
+
+def test_clock_files_come_back(tmp_path: Path) -> None:
+    import json
+
+    untold = replace(SEGMENT, from_s=30.0, to_s=40.0, status="no turns", sigma_rate=math.inf)
+    path = tmp_path / "clock.json"
+    path.write_text(json.dumps({"segments": clock_document([SEGMENT, untold])}))
+    assert read_clock(path).segments == (SEGMENT, untold)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{", "is no JSON"),
+        ("[" * 100000, "is no JSON"),
+        ("[]", "no list of segments"),
+        ('{"segments": []}', "no list of segments"),
+        ('{"segments": [3]}', "segment 1 is no object"),
+        ('{"segments": [{"from_s": "a"}]}', "segment 1: from_s is not a number"),
+        ('{"segments": [{"from_s": 1e999}]}', "segment 1: from_s is not finite"),
+    ],
+)
+def test_malformed_clock_files_are_refused(tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "clock.json").write_text(text)
+    with pytest.raises(GroundTruthError, match=message):
+        read_clock(tmp_path / "clock.json")
+
+
+def test_both_layouts_of_ptpd_are_read(tmp_path: Path) -> None:
+    debug = tmp_path / "debug.log"
+    debug.write_text(
+        "1235561680.5 (ptpd debug) offset from master:           0s      25000ns\n"
+        "1235561680.5 (ptpd debug) observed drift:       1500\n"
+        "1235561681.5 (ptpd debug) offset from master:           0s     -25000ns\n"
+        "noise\n"
+    )
+    log = read_ptpd(debug)
+    np.testing.assert_allclose(log.times_s, [1235561680.5, 1235561681.5])
+    np.testing.assert_allclose(log.offset_s, [25e-6, -25e-6])
+    np.testing.assert_allclose(log.drift, [1.5e-6, np.nan])
+
+    table = tmp_path / "stats.log"
+    table.write_text(
+        "# Timestamp, State, Clock ID, One Way Delay, Offset From Master, Slave to Master, "
+        "Master to Slave, Observed Drift, Last packet Received\n"
+        "2018-04-12 15:22:30.028085, slv, x/1, 0.000033858, -0.000008460, 0.0, 0.0, -16399.8, S\n"
+        "2018-04-12 15:22:31.028085, init\n"
+    )
+    log = read_ptpd(table)
+    np.testing.assert_allclose(log.times_s, [1523546550.028085])
+    np.testing.assert_allclose(log.offset_s, [-8.46e-6])
+    np.testing.assert_allclose(log.drift, [-1.63998e-5])
+
+    (tmp_path / "other.log").write_text("nothing of the kind\n")
+    with pytest.raises(StreamError, match="no line reports an offset"):
+        read_ptpd(tmp_path / "other.log")
+
+
+def test_the_command_writes_a_clock_and_moves_odometry(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    clocks = Clocks(drift=0.0)
+    odometry, truth = simulate(clocks, seed=6)
+    write_planar_poses(tmp_path / "odometry.csv", odometry)
+    write_planar_poses(tmp_path / "truth.csv", truth)
+    (tmp_path / "ptpd.log").write_text(
+        "".join(f"{t}: offset from master: 0s 237000000ns\n" for t in range(5, 50, 5))
+    )
+    command = [
+        *("sync", str(tmp_path / "odometry.csv"), str(tmp_path / "truth.csv")),
+        *("-o", str(tmp_path / "clock.json"), "--apply", str(tmp_path / "moved.csv")),
+        *("--ptpd", str(tmp_path / "ptpd.log")),
+    ]
+    assert main(command) == 0
+    printed = capsys.readouterr().out
+    assert "offset +23" in printed
+    assert "ptpd: 9 reports, 9 compared, rms difference" in printed
+    moved = read_planar_poses(tmp_path / "moved.csv")
+    np.testing.assert_allclose(moved.times_s, odometry.times_s - 0.237, atol=0.003)
+    assert read_clock(tmp_path / "clock.json").segments[0].status == "ok"
+    assert main(command) == 1
+    assert "give --force" in capsys.readouterr().err

@@ -1,0 +1,326 @@
+"""Fusion: least squares on small problems, honest covariances, gaps, outliers, spoilt files."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from groundtruth.cli import main
+from groundtruth.errors import GroundTruthError
+from groundtruth.fusion.fuse import FuseSettings, fuse
+from groundtruth.trajectories.interpolation import interpolate_poses
+from groundtruth.trajectories.streams import PlanarPoses, read_planar_poses, write_planar_poses
+from landmarks import wrap_angle
+
+FloatArray = NDArray[np.float64]
+LASER_COVARIANCE = np.array([[4e-4, 1e-4, 0.0], [1e-4, 9e-4, 2e-5], [0.0, 2e-5, 1e-4]])
+
+
+def drive(
+    rng: np.random.Generator, seconds: float, settings: FuseSettings, rate_hz: float = 50.0
+) -> tuple[PlanarPoses, PlanarPoses]:
+    """True path, and odometry whose errors are exactly as the settings say."""
+    times = np.arange(0.0, seconds, 1.0 / rate_hz)
+    speed = 0.5 + 0.3 * np.sin(0.3 * times + rng.uniform(0, 6))
+    turning = 0.5 * np.sin(0.2 * times + rng.uniform(0, 6))
+    step = np.column_stack([speed, 0 * times, turning]) / rate_hz
+    # The truth differs from what odometry says by the noise of its movements.
+    distance = np.abs(step[:, 0])
+    sigma = np.column_stack(
+        [
+            settings.distance_sigma * np.sqrt(distance),
+            settings.distance_sigma * np.sqrt(distance),
+            np.sqrt(
+                settings.turn_sigma**2 * np.abs(step[:, 2])
+                + settings.turn_per_metre_sigma**2 * distance
+            ),
+        ]
+    )
+    return (
+        PlanarPoses(times, chain(step + rng.normal(size=step.shape) * sigma, rng.normal(size=3))),
+        PlanarPoses(times, chain(step, np.array([7.0, -3.0, 2.0]))),
+    )
+
+
+def chain(steps: FloatArray, start: FloatArray) -> FloatArray:
+    poses = [start]
+    for dx, dy, turn in steps[1:]:
+        x, y, theta = poses[-1]
+        c, s = math.cos(theta), math.sin(theta)
+        poses.append(np.array([x + c * dx - s * dy, y + s * dx + c * dy, theta + turn]))
+    result = np.array(poses)
+    result[:, 2] = wrap_angle(result[:, 2])
+    return result
+
+
+def measure(
+    rng: np.random.Generator, truth: PlanarPoses, times: FloatArray, covariance: FloatArray
+) -> PlanarPoses:
+    exact, _ = interpolate_poses(truth, times)
+    noise = rng.multivariate_normal(np.zeros(3), covariance, len(exact))
+    return PlanarPoses(
+        exact.times_s, exact.poses + noise, np.broadcast_to(covariance, (len(exact), 3, 3)).copy()
+    )
+
+
+def normalised_error(poses: PlanarPoses, truth: PlanarPoses) -> FloatArray:
+    exact, _ = interpolate_poses(truth, poses.times_s)
+    error = poses.poses - exact.poses
+    error[:, 2] = wrap_angle(error[:, 2])
+    assert poses.covariances is not None
+    return np.asarray(np.einsum("ni,nij,nj->n", error, np.linalg.inv(poses.covariances), error))
+
+
+@pytest.mark.parametrize("systematic", [0.0, 1.0])
+def test_it_is_the_least_squares_solution(systematic: float) -> None:
+    """Filter and smoother together solve the batch problem, up to linearisation."""
+    rng = np.random.default_rng(1)
+    settings = FuseSettings(
+        learn_noise=False,
+        turn_scale_sigma=0.03 * systematic,
+        turn_bias_per_metre_sigma=0.01 * systematic,
+        distance_scale_sigma=0.03 * systematic,
+    )
+    truth, odometry = drive(rng, 6.0, settings, rate_hz=5.0)
+    laser = measure(rng, truth, truth.times_s[[0, 3, 4, 9, 20, 28]], LASER_COVARIANCE / 25)
+    found = fuse(odometry, {"laser": laser}, settings).poses
+    within = odometry.times_s <= laser.times_s[-1]
+    own = odometry.poses[within]
+
+    def movement(path: FloatArray) -> FloatArray:
+        change = np.diff(path, axis=0)
+        c, s = np.cos(path[:-1, 2]), np.sin(path[:-1, 2])
+        return np.column_stack(
+            [
+                c * change[:, 0] + s * change[:, 1],
+                -s * change[:, 0] + c * change[:, 1],
+                wrap_angle(change[:, 2]),
+            ]
+        )
+
+    steps = movement(own)
+    distance = np.hypot(steps[:, 0], steps[:, 1])
+    xy = np.sqrt(settings.distance_sigma**2 * distance + 1e-8 * 0.2)
+    turn = np.sqrt(
+        settings.turn_sigma**2 * np.abs(steps[:, 2])
+        + settings.turn_per_metre_sigma**2 * distance
+        + 1e-8 * 0.2
+    )
+    root = np.linalg.inv(np.linalg.cholesky(LASER_COVARIANCE / 25))
+    seen = np.searchsorted(odometry.times_s, laser.times_s)
+
+    def residuals(flat: FloatArray) -> FloatArray:
+        path, scaled = flat[:-3].reshape(-1, 3), flat[-3:] * systematic
+        turn_scale, bend, way_scale = 0.03 * scaled[0], 0.01 * scaled[1], 0.03 * scaled[2]
+        expected = steps * [1.0 + way_scale, 1.0 + way_scale, 1.0 + turn_scale]
+        expected[:, 2] += bend * distance
+        off = movement(path) - expected
+        off[:, 2] = wrap_angle(off[:, 2])
+        difference = path[seen] - laser.poses
+        difference[:, 2] = wrap_angle(difference[:, 2])
+        return np.concatenate(
+            [
+                (off / np.column_stack([xy, xy, turn])).ravel(),
+                (difference @ root.T).ravel(),
+                flat[-3:],
+            ]
+        )
+
+    begin = np.concatenate([found.poses.ravel(), np.zeros(3)])
+    solved = least_squares(residuals, begin, x_scale="jac", xtol=1e-12, ftol=1e-12)
+    batch = solved.x[:-3].reshape(-1, 3)
+    covariance = np.linalg.inv(solved.jac.T @ solved.jac)
+    assert found.covariances is not None
+    np.testing.assert_allclose(found.poses, batch, atol=5e-4)
+    for k in range(len(batch)):
+        block = covariance[3 * k : 3 * k + 3, 3 * k : 3 * k + 3]
+        np.testing.assert_allclose(found.covariances[k], block, rtol=0.05, atol=2e-6)
+
+
+def test_what_odometry_is_off_by_is_found_and_bridges_a_gap() -> None:
+    rng = np.random.default_rng(12)
+    exact = FuseSettings(distance_sigma=0.003, turn_sigma=0.003, turn_per_metre_sigma=0.001)
+    truth, odometry = drive(rng, 120.0, exact)
+    # Odometry that takes turns for 2 % and ways for 1 % shorter than they are, and bends.
+    steps = np.diff(odometry.poses, axis=0)
+    steps[:, 2] = wrap_angle(steps[:, 2])
+    c, s = np.cos(odometry.poses[:-1, 2]), np.sin(odometry.poses[:-1, 2])
+    along = (c * steps[:, 0] + s * steps[:, 1]) / 1.01
+    turn = (steps[:, 2] - 0.005 * along * 1.01) / 1.02
+    own = np.vstack([np.zeros((1, 3)), np.column_stack([along, 0 * along, turn])])
+    biased = PlanarPoses(odometry.times_s, chain(own, np.zeros(3)))
+    times = np.concatenate([np.arange(0.0, 50.0, 0.1), np.arange(70.0, 119.9, 0.1)])
+    fusion = fuse(biased, {"laser": measure(rng, truth, times, LASER_COVARIANCE / 100)})
+    learnt = fusion.odometry
+    assert abs(learnt.turn_scale - 0.02) < 4 * learnt.turn_scale_sigma < 0.02
+    assert abs(learnt.distance_scale - 0.01) < 4 * learnt.distance_scale_sigma < 0.01
+    assert abs(learnt.turn_bias_per_metre - 0.005) < 4 * learnt.turn_bias_per_metre_sigma < 0.01
+    assert learnt.turn_sigma < 0.01
+    exact_poses, _ = interpolate_poses(truth, fusion.poses.times_s)
+    off = np.linalg.norm((fusion.poses.poses - exact_poses.poses)[:, :2], axis=1)
+    assert np.max(off) < 0.12
+    assert np.mean(normalised_error(fusion.poses, truth)) < 9.0
+
+
+@pytest.mark.long
+def test_covariances_are_right() -> None:
+    settings = FuseSettings()
+    ends, middles = [], []
+    for seed in range(50):
+        rng = np.random.default_rng(100 + seed)
+        truth, odometry = drive(rng, 30.0, settings)
+        times = np.concatenate([np.arange(0.0, 8.0, 0.1), np.arange(22.0, 29.9, 0.1)])
+        fusion = fuse(odometry, {"laser": measure(rng, truth, times, LASER_COVARIANCE)}, settings)
+        squared = normalised_error(fusion.poses, truth)
+        ends.append(squared[fusion.poses.times_s < 8.0][200])
+        middles.append(squared[np.argmin(np.abs(fusion.poses.times_s - 15.0))])
+    # 99.9 % bands of the mean of 50 draws of chi-squared with 3 degrees of freedom.
+    for values in (ends, middles):
+        assert 2.0 < np.mean(values) < 4.25
+
+
+def test_a_gap_is_bridged_with_covariance_that_grows_towards_its_middle() -> None:
+    rng = np.random.default_rng(3)
+    truth, odometry = drive(rng, 40.0, FuseSettings())
+    times = np.concatenate([np.arange(0.0, 10.0, 0.05), np.arange(30.0, 39.9, 0.05)])
+    fusion = fuse(odometry, {"laser": measure(rng, truth, times, LASER_COVARIANCE)})
+    assert fusion.poses.covariances is not None
+    spread = np.sqrt(np.trace(fusion.poses.covariances[:, :2, :2], axis1=1, axis2=2))
+    at = {t: spread[np.argmin(np.abs(fusion.poses.times_s - t))] for t in (5, 12, 20, 28, 35)}
+    assert at[5] < at[12] < at[20] > at[28] > at[35]
+    assert at[20] > 3.0 * at[5]
+    assert len(fusion.poses) == np.count_nonzero(odometry.times_s <= times[-1])
+
+
+def test_outliers_are_kept_out_and_listed() -> None:
+    rng = np.random.default_rng(4)
+    truth, odometry = drive(rng, 20.0, FuseSettings())
+    laser = measure(rng, truth, np.arange(0.0, 19.9, 0.1), LASER_COVARIANCE)
+    laser.poses[50:55, 0] += 1.0
+    fusion = fuse(odometry, {"laser": laser})
+    np.testing.assert_allclose(
+        [rejected.time_s for rejected in fusion.rejected], laser.times_s[50:55]
+    )
+    exact, _ = interpolate_poses(truth, fusion.poses.times_s)
+    assert np.max(np.abs(fusion.poses.poses[:, :2] - exact.poses[:, :2])) < 0.1
+
+
+def test_a_robot_that_was_carried_away_is_found_again() -> None:
+    rng = np.random.default_rng(5)
+    truth, odometry = drive(rng, 40.0, FuseSettings())
+    moved = PlanarPoses(truth.times_s, truth.poses.copy())
+    moved.poses[truth.times_s > 20.0, :2] += [4.0, -3.0]
+    laser = measure(rng, moved, np.arange(0.0, 39.9, 0.1), LASER_COVARIANCE)
+    fusion = fuse(odometry, {"laser": laser})
+    assert len(fusion.restarts_s) == 1
+    assert 20.0 < fusion.restarts_s[0] < 25.0
+    exact, _ = interpolate_poses(moved, fusion.poses.times_s)
+    off = np.linalg.norm(fusion.poses.poses[:, :2] - exact.poses[:, :2], axis=1)
+    settled = (fusion.poses.times_s < 19.5) | (fusion.poses.times_s > fusion.restarts_s[0] + 1.0)
+    assert np.max(off[settled]) < 0.15
+
+
+def test_two_streams_are_better_than_each() -> None:
+    rng = np.random.default_rng(6)
+    truth, odometry = drive(rng, 60.0, FuseSettings())
+    streams = {
+        "laser": measure(rng, truth, np.arange(0.0, 59.9, 0.1), LASER_COVARIANCE),
+        "camera": measure(rng, truth, np.arange(0.05, 59.9, 0.2), LASER_COVARIANCE * 4),
+    }
+
+    def rms(chosen: dict[str, PlanarPoses]) -> float:
+        poses = fuse(odometry, chosen).poses
+        exact, _ = interpolate_poses(truth, poses.times_s)
+        return float(np.sqrt(np.mean((poses.poses - exact.poses)[:, :2] ** 2)))
+
+    both = rms(streams)
+    assert all(both < rms({name: streams[name]}) for name in streams)
+    assert both < 0.5 * np.sqrt(np.trace(LASER_COVARIANCE[:2, :2]) / 2)
+
+
+@pytest.mark.parametrize(
+    "covariance",
+    [
+        np.zeros((3, 3)),
+        np.diag([1e-6, 0.0, 1e-6]),
+        np.array([[4e-6, 4e-6, 0.0], [4e-6, 4e-6, 0.0], [0.0, 0.0, 1e-6]]),
+        np.array([[1e-6, 2e-6, 0.0], [2e-6, 1e-6, 0.0], [0.0, 0.0, 1e-6]]),
+    ],
+)
+def test_covariances_that_rounding_spoilt_are_survived(covariance: FloatArray) -> None:
+    rng = np.random.default_rng(7)
+    truth, odometry = drive(rng, 10.0, FuseSettings())
+    laser = measure(rng, truth, np.arange(0.0, 9.9, 0.02), 1e-6 * np.eye(3))
+    spoilt = PlanarPoses(
+        laser.times_s, laser.poses, np.broadcast_to(covariance, (len(laser), 3, 3)).copy()
+    )
+    fusion = fuse(odometry, {"laser": spoilt})
+    assert fusion.repaired["laser"] == len(laser)
+    assert np.all(np.isfinite(fusion.poses.poses))
+    assert fusion.poses.covariances is not None
+    assert np.all(np.linalg.eigvalsh(fusion.poses.covariances) > 0.0)
+    exact, _ = interpolate_poses(truth, fusion.poses.times_s)
+    assert np.max(np.abs((fusion.poses.poses - exact.poses)[:, :2])) < 0.02
+
+
+def test_a_covariance_that_no_rounding_explains_is_refused() -> None:
+    rng = np.random.default_rng(8)
+    truth, odometry = drive(rng, 5.0, FuseSettings())
+    laser = measure(rng, truth, np.arange(0.0, 4.9, 0.1), LASER_COVARIANCE)
+    assert laser.covariances is not None
+    laser.covariances[3] = -np.eye(3)
+    with pytest.raises(GroundTruthError, match="laser: pose 4 has a covariance with eigenvalue -1"):
+        fuse(odometry, {"laser": laser})
+
+
+def test_what_cannot_be_fused_is_refused() -> None:
+    rng = np.random.default_rng(9)
+    truth, odometry = drive(rng, 5.0, FuseSettings())
+    with pytest.raises(GroundTruthError, match="laser: no covariances"):
+        fuse(odometry, {"laser": truth})
+    late = measure(rng, truth, np.arange(0.0, 4.0, 0.1), LASER_COVARIANCE)
+    with pytest.raises(GroundTruthError, match="no measured pose within the odometry's time"):
+        fuse(odometry, {"laser": PlanarPoses(late.times_s + 99, late.poses, late.covariances)})
+    with pytest.raises(GroundTruthError, match="gate_probability is 1"):
+        FuseSettings(gate_probability=1.0)
+    with pytest.raises(GroundTruthError, match="turn_sigma is -1"):
+        FuseSettings(turn_sigma=-1.0)
+
+
+def test_headings_past_pi_in_files_do_no_harm() -> None:
+    rng = np.random.default_rng(10)
+    truth, odometry = drive(rng, 20.0, FuseSettings())
+    laser = measure(rng, truth, np.arange(0.0, 19.9, 0.1), LASER_COVARIANCE)
+    slipped = PlanarPoses(laser.times_s, laser.poses.copy(), laser.covariances)
+    slipped.poses[::3, 2] -= 2 * math.pi
+    np.testing.assert_allclose(
+        fuse(odometry, {"laser": slipped}).poses.poses,
+        fuse(odometry, {"laser": laser}).poses.poses,
+        atol=1e-9,
+    )
+
+
+def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rng = np.random.default_rng(11)
+    truth, odometry = drive(rng, 10.0, FuseSettings())
+    laser = measure(rng, truth, np.arange(0.0, 9.9, 0.1), LASER_COVARIANCE)
+    write_planar_poses(tmp_path / "odometry.csv", odometry)
+    write_planar_poses(tmp_path / "laser.csv", laser)
+    command = [
+        *("fuse", str(tmp_path / "odometry.csv"), "--laser", str(tmp_path / "laser.csv")),
+        *("-o", str(tmp_path / "fused.csv")),
+    ]
+    assert main(command) == 0
+    assert "99 from laser; 0 rejected, 0 restarts" in capsys.readouterr().out
+    fused = read_planar_poses(tmp_path / "fused.csv")
+    assert fused.covariances is not None
+    assert (tmp_path / "fused.json").exists()
+    assert main(command) == 1
+    assert "give --force" in capsys.readouterr().err
+    assert main(["fuse", str(tmp_path / "odometry.csv")]) == 1
+    assert "expected at least one ground truth" in capsys.readouterr().err

@@ -1,0 +1,386 @@
+"""Rigs from images of several markers: consensus, bridges, adjustment, the robot's frame."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from groundtruth.errors import GroundTruthError
+from groundtruth.geometry.covariance import mean_pose
+from groundtruth.geometry.transforms import exp_se3, inverse, log_se3, planar_transform
+from groundtruth.markers.calibration import Rig
+from groundtruth.markers.pairs import (
+    MarkerPose,
+    chained_poses,
+    pair_consensus,
+    pair_estimates,
+    spanning_tree,
+)
+from groundtruth.markers.rig_estimation import RigEstimate, estimate_rig
+from groundtruth.markers.rig_frame import rig_by_known_markers, rig_by_reference_poses
+from groundtruth.markers.rig_picture import draw_rig
+from groundtruth.markers.session import MarkerFrame
+from groundtruth.markers.settings import RigSettings
+from groundtruth.trajectories.streams import PlanarPoses
+from tests.groundtruth.markers.scene import (
+    box_rig,
+    frames_of,
+    hall_cameras,
+    lens,
+    looking_at,
+    marker_rows,
+    points_of,
+    visible,
+)
+
+FloatArray = NDArray[np.float64]
+
+
+def walk_round(
+    rig: Rig,
+    count: int,
+    *,
+    seed: int,
+    sigma_px: float = 0.15,
+    scale_px: float = 900.0,
+    distance_m: tuple[float, float] = (1.5, 3.5),
+    kept: tuple[set[int], ...] | None = None,
+) -> list[tuple[MarkerFrame]]:
+    """A hand-held camera round a standing robot; `kept` limits what an image shows."""
+    generator = np.random.default_rng(seed)
+    camera = (lens(scale_px),)
+    groups: list[tuple[MarkerFrame]] = []
+    while len(groups) < count:
+        bearing = generator.uniform(-np.pi, np.pi)
+        distance = generator.uniform(*distance_m)
+        place = np.array(
+            [distance * np.cos(bearing), distance * np.sin(bearing), generator.uniform(0.6, 2.2)]
+        )
+        pose = looking_at(place, np.array([0.0, 0.0, 0.55]) + generator.normal(0, 0.1, 3))[None]
+        pairs = visible(camera, pose, np.eye(4), rig, steepest_deg=78.0)
+        if kept is not None:
+            allowed = kept[len(groups) % len(kept)]
+            pairs = [(c, m) for c, m in pairs if m in allowed]
+        if len(pairs) < 2:
+            continue
+        seen, _ = points_of(pairs, camera, pose, np.eye(4), rig, sigma_px=sigma_px, noise=generator)
+        rows = marker_rows(rig, pairs, 0, seen)
+        groups.append((MarkerFrame(0, f"{len(groups):04d}", float(len(groups)), rows),))
+    return groups
+
+
+def estimated(
+    groups: list[tuple[MarkerFrame]],
+    rig: Rig,
+    scale_px: float = 900.0,
+    reference: int | None = None,
+) -> RigEstimate:
+    return estimate_rig(
+        groups,
+        (lens(scale_px),),
+        np.eye(4)[None],
+        dict(zip(rig.ids, rig.widths_m.tolist())),
+        rig.dictionary,
+        RigSettings(corner_floor_px=0.0),
+        reference=reference,
+    )
+
+
+def truth_in(rig: Rig, reference: int) -> FloatArray:
+    root = rig.ids.index(reference)
+    return inverse(rig.robot_from_marker[root]) @ rig.robot_from_marker
+
+
+def normalised_error(estimate: RigEstimate, rig: Rig, covariance: FloatArray) -> tuple[float, int]:
+    error = log_se3(inverse(truth_in(rig, estimate.reference)) @ estimate.rig.robot_from_marker)
+    free = np.repeat(np.array(rig.ids) != estimate.reference, 6)
+    vector = error.ravel()[free]
+    return float(vector @ np.linalg.solve(covariance[np.ix_(free, free)], vector)), int(free.sum())
+
+
+def test_the_rig_comes_back_without_noise() -> None:
+    rig = box_rig()
+    estimate = estimated(walk_round(rig, 25, seed=1, sigma_px=1e-7), rig)
+    np.testing.assert_allclose(
+        estimate.rig.robot_from_marker, truth_in(rig, estimate.reference), atol=1e-7
+    )
+    assert estimate.rig.ids == rig.ids
+    assert not estimate.left_out
+
+
+def test_a_free_camera_can_be_the_reference() -> None:
+    rig = box_rig()
+    groups = walk_round(rig, 20, seed=2)
+    estimate = estimated(groups, rig, reference=35)
+    assert estimate.reference == 35
+    np.testing.assert_array_equal(estimate.rig.robot_from_marker[4], np.eye(4))
+    with pytest.raises(GroundTruthError, match="marker 99 cannot be the reference"):
+        estimated(groups, rig, reference=99)
+
+
+@pytest.mark.long
+def test_the_rigs_covariance_is_true() -> None:
+    rig = box_rig()
+    squares, freedom = 0.0, 0
+    for seed in range(12):
+        estimate = estimated(walk_round(rig, 40, seed=100 + seed), rig)
+        square, dof = normalised_error(estimate, rig, estimate.adjusted.part_covariance)
+        squares, freedom = squares + square, freedom + dof
+        assert estimate.adjusted.reduced_cost == pytest.approx(1.0, abs=0.2)
+        assert estimate.adjusted.used.all()
+    low, high = chi2.ppf([0.005, 0.995], freedom)
+    assert low < squares < high
+
+
+@pytest.mark.long
+def test_wrong_solutions_of_small_markers_do_not_reach_the_rig() -> None:
+    """Far, frontal, noisy: the better fitting solution is often the mirror image."""
+    rig = box_rig()
+    groups = walk_round(rig, 60, seed=3, sigma_px=0.4, scale_px=500.0, distance_m=(3.0, 4.5))
+    estimate = estimated(groups, rig, scale_px=500.0)
+    second = sum(int((p.agrees & ~p.first).sum()) for p in estimate.pairs.values())
+    assert second > 10  # it does happen
+    square, dof = normalised_error(estimate, rig, estimate.adjusted.part_covariance)
+    assert square / dof < 2.5
+    error = log_se3(inverse(truth_in(rig, estimate.reference)) @ estimate.rig.robot_from_marker)
+    assert np.abs(error).max() < 0.03
+
+
+def test_a_consensus_stands_thirty_percent_of_flipped_solutions() -> None:
+    generator = np.random.default_rng(4)
+    truth = exp_se3(np.array([0.3, 0.1, -0.2, 0.4, 1.2, -0.3]))
+    sigma = np.array([0.003, 0.003, 0.01, 0.02, 0.02, 0.01])
+    covariance = np.diag(sigma**2)
+    for flipped in (0.3, 0.45):
+        times = []
+        for _ in range(60):
+            near = truth @ exp_se3(sigma * generator.normal(size=6))
+            # A mirror image depends on where the camera stood: everywhere else.
+            flip = near @ exp_se3(
+                np.concatenate([generator.normal(0, 0.05, 3), generator.normal(0, 0.6, 3)])
+            )
+            others = [near @ exp_se3(generator.normal(0, 0.5, 6)) for _ in range(2)]
+            first_is_wrong = generator.random() < flipped
+            poses = np.stack(
+                [flip if first_is_wrong else near, near if first_is_wrong else flip, *others]
+            )
+            times.append(
+                MarkerPose(poses, np.tile(covariance, (4, 1, 1)), np.array([1.0, 2.0, 4.0, 6.0]))
+            )
+        consensus = pair_consensus((0, 1), times)
+        error = log_se3(inverse(truth) @ consensus.a_from_b)
+        assert np.all(np.abs(error) < 4 * sigma / np.sqrt(60) + 1e-3)
+        assert consensus.support >= 57
+        assert 0.55 - flipped < consensus.first.mean() < 1.15 - flipped
+
+
+def test_a_consensus_stands_misread_markers() -> None:
+    """Times without any right estimate are outvoted and said not to agree."""
+    generator = np.random.default_rng(5)
+    truth = exp_se3(np.array([0.3, 0.1, -0.2, 0.4, 1.2, -0.3]))
+    covariance = np.tile(np.diag(np.full(6, 0.01) ** 2), (1, 1, 1))
+    times = [
+        MarkerPose(
+            (
+                exp_se3(generator.normal(0, 1.0, 6))
+                if i % 3 == 0
+                else truth @ exp_se3(generator.normal(0, 0.01, 6))
+            )[None],
+            covariance,
+            np.zeros(1),
+        )
+        for i in range(30)
+    ]
+    consensus = pair_consensus((0, 1), times)
+    assert consensus.agrees.tolist() == [i % 3 != 0 for i in range(30)]
+
+
+def test_estimates_of_a_pair_are_all_combinations() -> None:
+    generator = np.random.default_rng(6)
+    poses = exp_se3(generator.normal(size=(4, 6)))
+    covariances = np.tile(np.eye(6) * 1e-4, (2, 1, 1))
+    a = MarkerPose(poses[:2], covariances, np.array([1.0, 3.0]))
+    b = MarkerPose(poses[2:], covariances, np.array([0.0, 5.0]))
+    pairs = pair_estimates(a, b)
+    np.testing.assert_allclose(pairs.poses[2], inverse(poses[1]) @ poses[2], atol=1e-12)
+    np.testing.assert_array_equal(pairs.costs, [1.0, 6.0, 3.0, 8.0])
+
+
+def test_markers_never_seen_together_are_bridged_by_a_third() -> None:
+    rig = box_rig()
+    # No image shows 31 with 33 or 34, nor 32 with 34; 36 is seen with 33 only.
+    kept = ({0, 4}, {4, 1}, {1, 5}, {5, 2}, {2, 3})
+    estimate = estimated(walk_round(rig, 40, seed=7, kept=kept), rig, reference=31)
+    assert set(estimate.pairs) == {(0, 4), (1, 4), (1, 5), (2, 5), (2, 3)}
+    assert [rig.ids[p] for p in estimate.parents] == [31, 35, 36, 33, 31, 32]
+    square, dof = normalised_error(estimate, rig, estimate.adjusted.part_covariance)
+    assert square / dof < 2.0
+
+
+def test_a_marker_that_is_not_connected_is_left_out_and_named() -> None:
+    rig = box_rig()
+    kept = ({0, 4}, {4, 1}, {2, 3})
+    estimate = estimated(walk_round(rig, 30, seed=8, kept=kept), rig, reference=31)
+    assert estimate.rig.ids == (31, 32, 35)
+    assert set(estimate.left_out) == {33, 34}
+    assert "not 3 times in agreement" in estimate.left_out[33]
+    with pytest.raises(GroundTruthError, match="no two markers were seen together"):
+        estimated(walk_round(rig, 2, seed=9, kept=({0, 4},)), rig)
+
+
+def test_a_misread_marker_is_left_out_of_the_adjustment() -> None:
+    rig = box_rig()
+    groups = walk_round(rig, 30, seed=10)
+    (frame,) = groups[5]
+    assert len(frame.markers) > 1
+    wrong = replace(
+        frame.markers[0],
+        corners=tuple(  # type: ignore[arg-type]
+            replace(c, u=c.u + 40.0) for c in frame.markers[0].corners
+        ),
+    )
+    groups[5] = (replace(frame, markers=(wrong, *frame.markers[1:])),)
+    clean = estimated(walk_round(rig, 30, seed=10), rig)
+    estimate = estimated(groups, rig)
+    assert not estimate.adjusted.used.all()
+    error = log_se3(inverse(clean.rig.robot_from_marker) @ estimate.rig.robot_from_marker)
+    assert np.abs(error).max() < 2e-3
+
+
+@pytest.mark.long
+def test_cameras_of_a_network_see_the_rig_together() -> None:
+    """With two cameras calibrated to each other, markers of different images are a pair."""
+    rig = box_rig(4)
+    times = np.arange(30.0)
+    generator = np.random.default_rng(11)
+    poses = np.stack(
+        [
+            planar_transform(generator.normal(0, 0.5), generator.normal(0, 0.5), 0.5 * i)
+            for i in range(len(times))
+        ]
+    )
+    frames = frames_of(times, poses, rig=rig)
+    groups = [tuple(f for f in frames if f.time_s == t) for t in times]
+    estimate = estimate_rig(
+        groups,
+        (lens(),) * 4,
+        hall_cameras(4),
+        dict(zip(rig.ids, rig.widths_m.tolist())),
+        rig.dictionary,
+        RigSettings(corner_floor_px=0.0),
+    )
+    assert (0, 2) in estimate.pairs  # front and back: no single camera sees both
+    square, dof = normalised_error(estimate, rig, estimate.adjusted.part_covariance)
+    assert square / dof < 2.0
+
+
+# -- the robot's frame ----------------------------------------------------------------------
+
+
+def frame_error(estimate: RigEstimate, rig: Rig, known: tuple[int, ...] = ()) -> float:
+    """Normalised error squared per degree of freedom of all markers but the known ones."""
+    error = log_se3(inverse(rig.robot_from_marker) @ estimate.rig.robot_from_marker)
+    free = np.repeat(~np.isin(rig.ids, known), 6)
+    vector = error.ravel()[free]
+    covariance = estimate.adjusted.part_covariance[np.ix_(free, free)]
+    return float(vector @ np.linalg.solve(covariance, vector)) / len(vector)
+
+
+def test_the_frame_follows_from_known_markers() -> None:
+    rig = box_rig()
+    estimate = estimated(walk_round(rig, 25, seed=12), rig)
+    exact = Rig("rawseeds", (33,), rig.widths_m[2:3], rig.robot_from_marker[2:3], np.zeros((6, 6)))
+    moved = rig_by_known_markers(estimate, exact, RigSettings())
+    np.testing.assert_allclose(moved.rig.robot_from_marker[2], rig.robot_from_marker[2], atol=1e-5)
+    assert frame_error(moved, rig, (33,)) < 2.0
+    # What was the frame before is as unsure now as anything else.
+    sigmas = np.sqrt(np.diagonal(moved.adjusted.part_covariance)).reshape(6, 6)
+    assert sigmas[rig.ids.index(estimate.reference)].min() > 1e-5
+    other = Rig("rawseeds", (77,), rig.widths_m[:1], rig.robot_from_marker[:1], np.zeros((6, 6)))
+    with pytest.raises(GroundTruthError, match="none of \\[77\\]"):
+        rig_by_known_markers(estimate, other, RigSettings())
+
+
+def test_several_measured_markers_define_the_frame_together() -> None:
+    rig = box_rig()
+    generator = np.random.default_rng(13)
+    sigmas = np.array([2e-3] * 3 + [5e-3] * 3)
+    estimate = estimated(walk_round(rig, 40, seed=13), rig)
+    measured = replace(
+        rig,
+        robot_from_marker=rig.robot_from_marker @ exp_se3(sigmas * generator.normal(size=(6, 6))),
+        covariance=np.diag(np.tile(sigmas**2, 6)),
+    )
+    moved = rig_by_known_markers(estimate, measured, RigSettings())
+    assert frame_error(moved, rig) < 2.0
+
+
+@pytest.mark.long
+def test_the_frame_follows_from_reference_poses() -> None:
+    rig = box_rig()
+    generator = np.random.default_rng(14)
+    times = np.arange(0.0, 120.0, 10.0)
+    planar = np.column_stack(
+        [generator.uniform(-1, 1, (12, 2)), generator.uniform(-np.pi, np.pi, 12)]
+    )
+    poses = np.stack([planar_transform(*map(float, row)) for row in planar])
+    frames = frames_of(times, poses, rig=rig)
+    sigmas = np.array([1e-3] * 6)
+    believed = hall_cameras(4) @ exp_se3(sigmas * generator.normal(size=(4, 6)))
+    estimate = estimate_rig(
+        [tuple(f for f in frames if f.time_s == t) for t in times],
+        (lens(),) * 4,
+        believed,
+        dict(zip(rig.ids, rig.widths_m.tolist())),
+        rig.dictionary,
+        RigSettings(corner_floor_px=0.0),
+        camera_covariance=np.diag(np.tile(sigmas**2, 4)),
+    )
+    measured = planar + generator.normal(0, 0.002, planar.shape)
+    covariances = np.tile(np.eye(3) * 0.002**2, (12, 1, 1))
+    moved, used = rig_by_reference_poses(
+        estimate, PlanarPoses(times, measured, covariances), RigSettings()
+    )
+    assert used == 12
+    error = log_se3(inverse(rig.robot_from_marker) @ moved.rig.robot_from_marker)
+    assert np.abs(error).max() < 8e-3
+    assert frame_error(moved, rig) < 2.0
+    _, used = rig_by_reference_poses(estimate, PlanarPoses(times[:5], planar[:5]), RigSettings())
+    assert used == 5
+    late = PlanarPoses(np.asarray(times + 3.0), planar)
+    with pytest.raises(GroundTruthError, match="at the time of any reference pose"):
+        rig_by_reference_poses(estimate, late, RigSettings())
+
+
+# -- parts ----------------------------------------------------------------------------------
+
+
+def test_the_tree_prefers_support() -> None:
+    pairs = {(0, 1): 5, (0, 2): 50, (1, 2): 40, (3, 4): 9}
+    assert spanning_tree(pairs, 5, 0) == [0, 2, 0, -1, -1]
+    with pytest.raises(GroundTruthError, match="not connected"):
+        chained_poses({}, [0, -1], 0)
+
+
+def test_the_mean_of_poses_weights_by_covariance() -> None:
+    generator = np.random.default_rng(15)
+    truth = exp_se3(generator.normal(size=6))
+    roots = generator.normal(0, 0.01, (400, 6, 6))
+    poses = np.stack([truth @ exp_se3(root @ generator.normal(size=6)) for root in roots])
+    covariances = roots @ roots.transpose(0, 2, 1) + 1e-9 * np.eye(6)
+    mean, covariance, spread = mean_pose(poses, covariances)
+    error = log_se3(inverse(truth) @ mean)
+    assert error @ np.linalg.solve(covariance, error) < 25.0
+    assert spread == pytest.approx(1.0, abs=0.15)
+
+
+def test_the_picture_is_a_png_and_always_the_same() -> None:
+    rig = box_rig()
+    estimate = estimated(walk_round(rig, 12, seed=16), rig)
+    picture = draw_rig(estimate)
+    assert picture.startswith(b"\x89PNG")
+    assert picture == draw_rig(estimate)

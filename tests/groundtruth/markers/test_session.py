@@ -1,0 +1,155 @@
+"""Sessions: images grouped by time, corners as points, and what becomes of each time."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from groundtruth.errors import GroundTruthError
+from groundtruth.geometry.transforms import inverse, planar_transform, rotation_angle
+from groundtruth.markers.calibration import Network
+from groundtruth.markers.session import (
+    MarkerFrame,
+    chain_points,
+    find_runs,
+    group_by_time,
+    rig_views,
+)
+from groundtruth.markers.settings import PoseSettings
+from groundtruth.markers.track import report_entry, track_robot
+from landmarks import MarkerCorner
+from tests.groundtruth.markers.scene import box_rig, frames_of, hall_cameras, lens
+
+NETWORK = Network(
+    ("a", "b", "c", "d"), (lens(),) * 4, ("",) * 4, hall_cameras(4), np.zeros((24, 24))
+)
+
+
+def frame(camera: int, time_s: float) -> MarkerFrame:
+    return MarkerFrame(camera, f"{camera}@{time_s}", time_s, ())
+
+
+@given(
+    st.lists(st.tuples(st.integers(0, 3), st.integers(0, 200)), max_size=30),
+    st.integers(0, 20),
+)
+def test_groups_hold_each_camera_once_within_the_tolerance(
+    images: list[tuple[int, int]], tolerance_ms: int
+) -> None:
+    frames = [frame(camera, ms / 1000.0) for camera, ms in images]
+    groups = group_by_time(frames, tolerance_ms / 1000.0 + 1e-9)
+    assert sorted(map(id, frames)) == sorted(id(f) for group in groups for f in group)
+    for group in groups:
+        times = [f.time_s for f in group]
+        assert max(times) - min(times) <= tolerance_ms / 1000.0 + 1e-6
+        assert len({f.camera for f in group}) == len(group)
+    firsts = [group[0].time_s for group in groups]
+    assert firsts == sorted(firsts)
+
+
+def test_cameras_that_are_a_little_apart_are_used_together() -> None:
+    frames = [frame(0, 1.000), frame(1, 1.004), frame(0, 1.010), frame(1, 1.013), frame(2, 1.5)]
+    groups = group_by_time(frames, 0.005)
+    assert [[f.camera for f in group] for group in groups] == [[0, 1], [0, 1], [2]]
+
+
+def test_markers_that_are_not_on_the_rig_are_no_views() -> None:
+    rig = box_rig()
+    (first, *_) = [
+        f for f in frames_of(np.zeros(1), np.eye(4)[None], cameras=1) if len(f.markers) > 1
+    ]
+    other = replace(first.markers[0], dictionary="aruco")
+    unknown = replace(first.markers[1], id=300)
+    views = rig_views([replace(first, markers=(other, unknown, first.markers[0]))], rig)
+    assert [view.marker for view in views] == [first.markers[0]]
+
+
+def test_corners_without_a_covariance_are_refused_by_image_and_marker() -> None:
+    rig = box_rig()
+    (first, *_) = [f for f in frames_of(np.zeros(1), np.eye(4)[None], cameras=1) if f.markers]
+    corners = first.markers[0].corners
+    bad = MarkerCorner(corners[2].u, corners[2].v, 0.01, 0.02, 0.01)
+    marker = replace(first.markers[0], corners=(corners[0], corners[1], bad, corners[3]))
+    views = rig_views([replace(first, markers=(marker,))], rig)
+    with pytest.raises(GroundTruthError, match=f"image 0000, marker {marker.id}: the covariance"):
+        chain_points(views, rig.widths_m.tolist(), 0.01)
+    zero = MarkerCorner(corners[2].u, corners[2].v, 0.0, 0.0, 0.0)
+    exact = replace(first.markers[0], corners=(corners[0], corners[1], zero, corners[3]))
+    views = rig_views([replace(first, markers=(exact,))], rig)
+    points = chain_points(views, rig.widths_m.tolist(), 0.01)  # the floor is all that is left
+    np.testing.assert_allclose(points.covariances[2], 1e-4 * np.eye(2))
+
+
+def test_every_time_is_accounted_for() -> None:
+    """Clear, unseen, and a lone frontal marker that its neighbours decide."""
+    rig = box_rig()
+    camera = hall_cameras(1)[0]
+    bearing = float(np.arctan2(camera[1, 3] - 1.5, camera[0, 3] - 1.5))
+    times = np.arange(12) / 10.0
+    poses = np.stack([planar_transform(1.5, 1.5, bearing + 0.05 * (i - 6)) for i in range(12)])
+    frames = frames_of(times, poses, cameras=1, sigma_px=0.3, scale_px=500.0, seed=3)
+    for i in range(4, 9):
+        only = tuple(m for m in frames[i].markers if m.id == 31)
+        frames[i] = replace(frames[i], markers=only)
+    frames[1] = replace(frames[1], markers=())
+    network = replace(NETWORK, cameras=(lens(500.0),) * 4)
+    track = track_robot(frames, rig, network, PoseSettings())
+    assert track.counts["unseen"] == 1
+    assert track.counts["resolved"] >= 2
+    assert sum(track.counts.values()) == 12
+    for tracked, truth in zip(track.times, poses):
+        entry = report_entry(tracked, network)
+        assert entry["status"] == tracked.status
+        assert entry["images"] == {"a": tracked.images[0].prefix}
+        if tracked.status == "resolved":
+            assert "planar ambiguity, decided by the neighbours" in entry["reason"]
+            assert len(entry["candidates"]) > 1
+            assert entry["margin"] > np.log(1000.0)
+        if tracked.pose is not None:
+            wrong = rotation_angle(inverse(truth) @ tracked.pose.world_from_robot)
+            assert np.degrees(wrong) < 10.0
+    planar = track.planar()
+    assert len(planar) == sum(t.pose is not None for t in track.times)
+    assert planar.covariances is not None
+    assert np.linalg.eigvalsh(planar.covariances).min() > 0.0
+
+
+def test_an_undecided_time_has_no_pose() -> None:
+    """The same lone marker without anybody to decide: reported, not written."""
+    rig = box_rig()
+    camera = hall_cameras(1)[0]
+    bearing = float(np.arctan2(camera[1, 3] - 1.5, camera[0, 3] - 1.5))
+    pose = planar_transform(1.5, 1.5, bearing)[None]
+    network = replace(NETWORK, cameras=(lens(500.0),) * 4)
+    undecided = 0
+    for seed in range(8):
+        (only,) = frames_of(np.zeros(1), pose, cameras=1, sigma_px=0.3, scale_px=500.0, seed=seed)
+        only = replace(only, markers=tuple(m for m in only.markers if m.id == 31))
+        track = track_robot([only], rig, network, PoseSettings())
+        if track.times[0].status == "unresolved":
+            undecided += 1
+            assert len(track.planar()) == 0
+            assert "not decided" in report_entry(track.times[0], network)["reason"]
+            floored = track_robot([only], rig, network, PoseSettings(floor=True))
+            assert floored.times[0].status == "clear"
+    assert undecided > 2
+
+
+def test_runs_are_found_in_a_session(tmp_path: Path) -> None:
+    for name in ("b", "a", "other"):
+        (tmp_path / name).mkdir()
+    for name in ("a", "b"):
+        (tmp_path / name / "detected.markers").touch()
+    assert find_runs([tmp_path], None) == (
+        [tmp_path / "a", tmp_path / "b"],
+        tmp_path / "network.json",
+    )
+    runs, network = find_runs([tmp_path / "a"], None)
+    assert runs == [tmp_path / "a"]
+    assert network == tmp_path.resolve() / "network.json"
+    assert find_runs([tmp_path], Path("x.json"))[1] == Path("x.json")

@@ -1,0 +1,305 @@
+"""The report: what a session holds is on the page, what it lacks is said, and nothing can run."""
+
+from __future__ import annotations
+
+import json
+import math
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from groundtruth.cli import main
+from groundtruth.errors import GroundTruthError
+from groundtruth.lasers.building import Building, write_building
+from groundtruth.report.inputs import Interval, gather
+from groundtruth.report.page import report_page
+from groundtruth.report.svg import Series, Track, draw_map, draw_series
+from groundtruth.trajectories.streams import PlanarPoses, write_planar_poses
+from groundtruth.validation.scoring import compare_streams
+
+HOSTILE = "\"><script>alert(1)</script><img src=x onerror=alert(2)>\x00\ud800 </style> & 'onload="
+NAMES = """html head meta title style body a header nav ul li main section h1 h2 p div table caption
+thead tbody tr th td figure figcaption svg rect path polyline ellipse text img"""
+KNOWN = set(NAMES.split())
+VOID = {"meta", "img", "link", "br", "input"}
+
+
+class Page(HTMLParser):
+    """Elements, attributes and text of a page, as a browser would take them."""
+
+    def __init__(self, page: bytes) -> None:
+        super().__init__(convert_charrefs=True)
+        self.tags: list[str] = []
+        self.attributes: list[tuple[str, str, str]] = []
+        self.words: list[str] = []
+        self.open: list[str] = []
+        self.feed(page.decode("utf-8"))
+        self.close()
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self.attributes += [(tag, name, value or "") for name, value in attrs]
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.words.append(data)
+
+    @property
+    def text(self) -> str:
+        return " ".join(" ".join(self.words).split())
+
+
+def assert_harmless(page: Page) -> None:
+    assert not page.open
+    assert not set(page.tags) & {"script", "iframe", "object", "embed", "form", "base", "link"}
+    for tag, name, value in page.attributes:
+        assert not name.startswith("on"), (tag, name)
+        if name in ("src", "href"):
+            assert value.startswith(("#", "data:image/png;base64,")), (tag, value)
+        if name == "style":
+            raise AssertionError(tag)
+
+
+def stream(offset: float, seed: int, covariance: bool = True) -> PlanarPoses:
+    """Two visits of a robot on a circle, with noise of known size."""
+    times = np.concatenate([np.arange(0.0, 20.0, 0.2), np.arange(100.0, 120.0, 0.2)])
+    angle = 0.1 * times
+    truth = np.column_stack([3 + 2 * np.cos(angle), 3 + 2 * np.sin(angle), angle + np.pi / 2])
+    truth[:, 2] = (truth[:, 2] + np.pi) % (2 * np.pi) - np.pi
+    sigma = np.array([offset, offset, offset])
+    noisy = truth + sigma * np.random.default_rng(seed).normal(size=truth.shape)
+    covariances = np.tile(np.diag(sigma**2), (len(times), 1, 1)) if covariance else None
+    return PlanarPoses(times, noisy, covariances)
+
+
+@pytest.fixture
+def session(tmp_path: Path) -> Path:
+    folder = tmp_path / "a session <b>"
+    folder.mkdir()
+    walls = np.array([[0, 0, 6, 0], [6, 0, 6, 6], [6, 6, 0, 6], [0, 6, 0, 0]], dtype=float)
+    write_building(folder / "building.csv", Building(walls))
+    for seed, (name, noise) in enumerate({"laser": 0.003, "camera": 0.05, "fused": 0.002}.items()):
+        write_planar_poses(folder / f"{name}.csv", stream(noise, seed))
+    write_planar_poses(folder / "truth.csv", stream(0.0, 9, covariance=False))
+    return folder
+
+
+def test_figures_on_the_page_are_those_of_the_streams(session: Path) -> None:
+    inputs = gather(session)
+    np.testing.assert_allclose(inputs.visits, [(0.0, 19.8), (100.0, 119.8)])
+    page = Page(report_page(inputs, "1.2.3"))
+    assert_harmless(page)
+    assert inputs.truth is not None
+    for name in ("laser", "camera", "fused"):
+        score = compare_streams(inputs.streams[name], inputs.truth)
+        row = (
+            f"{score.poses} {1e3 * score.position_mean_m:.2f} {1e3 * score.position_sigma_m:.2f} "
+            f"{1e3 * score.position_rmse_m:.2f} {1e3 * score.position_max_m:.2f} "
+            f"{math.degrees(score.angle_mean_rad):+.3f}"
+        )
+        assert row in page.text
+        assert f"{score.normalised_error:.3f} {score.poses}" in page.text
+    assert "Ground truth: a session <b>" in page.text
+    assert "version 1.2.3" in page.text
+    assert "visit 2: 20 s" in page.text
+
+
+def test_the_page_can_be_used_with_keyboard_and_without_eyes(session: Path) -> None:
+    page = Page(report_page(gather(session), "1"))
+    ids = [value for _, name, value in page.attributes if name == "id"]
+    assert len(ids) == len(set(ids))
+    for tag, name, value in page.attributes:
+        if name == "href" and tag == "a":
+            assert value.removeprefix("#") in ids
+        if name == "aria-labelledby":
+            assert value in ids
+    assert page.tags.count("main") == page.tags.count("h1") == page.tags.count("nav") == 1
+    assert ("html", "lang", "en") in page.attributes
+    assert page.tags.count("caption") == page.tags.count("table")
+    drawings = [value for tag, name, value in page.attributes if (tag, name) == ("svg", "role")]
+    labels = [v for tag, name, v in page.attributes if (tag, name) == ("svg", "aria-label")]
+    assert len(drawings) == len(labels) >= 6
+    assert all(labels)
+    assert "@media print" in page.text
+
+
+def test_hostile_text_from_files_is_only_text(session: Path) -> None:
+    (session / "validation").mkdir()
+    hostile = {
+        "version": HOSTILE, "settings": {HOSTILE: {HOSTILE: HOSTILE}}, "poses": HOSTILE,
+        "figures": {"linear_mean_m": HOSTILE, "nees": [1], "poses": True},
+        "refused": [{"index": HOSTILE, "status": HOSTILE, "reason": HOSTILE}, HOSTILE],
+        "rejected": [{"stream": HOSTILE, "time_s": 1e999, "squared_innovation": HOSTILE}, 5],
+        "used": {HOSTILE: HOSTILE}, "restarts_s": HOSTILE,
+        "scanners": [{"name": HOSTILE, "suspect": 1}, None],
+    }  # fmt: skip
+    for name in ("fused.json", "laser.json", "aligned.json", "validation/validation.json"):
+        (session / name).write_text(json.dumps(hostile))
+    segment = {
+        "from_s": 0.0, "to_s": 120.0, "reference_s": 0.0, "offset_s": 0.1, "rate": 1.0,
+        "angle_rad": 0.0, "sigma_offset_s": None, "sigma_rate": None, "sigma_angle_rad": None,
+        "turned_rad": 1.0, "status": "ok", "note": HOSTILE,
+    }  # fmt: skip
+    document = {"segments": [segment], "ptpd": {HOSTILE: HOSTILE}}
+    (session / "clock.json").write_text(json.dumps(document))
+    (session / "laser.jsonl").write_text(json.dumps({"t": 5.0, "status": HOSTILE}) + "\n")
+    (session / "camera.csv").write_text("1,2,<script>alert(1)</script>,4\n")
+    (session / "validation" / "errors.png").write_bytes(b"<svg onload=alert(1)>")
+    assert main(["report", str(session)]) == 0
+    page = Page((session / "report.html").read_bytes())
+    assert_harmless(page)
+    assert page.text.count("<script>alert(1)</script>") > 10
+    assert "\x00" not in page.text
+    assert "errors.png: is no PNG" in page.text
+    assert set(page.tags) <= KNOWN
+
+
+def test_what_is_missing_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["report", str(tmp_path)]) == 0
+    assert "no poses" in capsys.readouterr().out
+    page = Page((tmp_path / "report.html").read_bytes())
+    assert_harmless(page)
+    for name in ("building.csv or building.dxf", "laser.csv", "camera.csv", "fused.csv",
+                 "clock.json", "validation/validation.json", "truth.csv"):  # fmt: skip
+        assert name in page.text
+    assert "nothing to draw" in page.text
+    assert main(["report", str(tmp_path)]) == 1
+    assert "--force" in capsys.readouterr().err
+
+
+def test_what_cannot_be_read_is_said_and_the_rest_is_shown(
+    session: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (session / "laser.csv").write_text("1,2,three,4\n")
+    (session / "fused.json").write_text("[" * 100_000)
+    (session / "laser.json").write_text("[1]")
+    (session / "clock.json").write_text('{"segments": []}')
+    (session / "laser.jsonl").write_text('{"t": 1, "status": "ok"}\nnonsense\n')
+    (session / "building.csv").write_text("1,2,3\n")
+    output = session / "page.html"
+    assert main(["report", str(session), "-o", str(output)]) == 0
+    page = Page(output.read_bytes())
+    assert_harmless(page)
+    warnings = capsys.readouterr().err
+    for words in ("laser.csv:1: 'three'", "fused.json: is no JSON", "laser.json: expected an",
+                  "clock.json: no list", "laser.jsonl:2: expected", "building.csv:1:"):  # fmt: skip
+        assert words in page.text
+        assert words in warnings
+    assert "cameras" in page.text
+    with pytest.raises(GroundTruthError, match="no such folder"):
+        gather(session / "nothing")
+    assert main(["report", str(session), "--truth", str(session / "none.csv"), "--force"]) == 1
+
+
+def test_the_same_session_gives_the_same_page(session: Path) -> None:
+    assert report_page(gather(session), "1") == report_page(gather(session), "1")
+
+
+def test_streams_without_covariances_or_truth_in_common(session: Path) -> None:
+    write_planar_poses(session / "laser.csv", stream(0.01, 3, covariance=False), overwrite=True)
+    late = stream(0.0, 4)
+    late = PlanarPoses(late.times_s + 1e4, late.poses)
+    write_planar_poses(session / "truth.csv", late, overwrite=True)
+    page = Page(report_page(gather(session), "1"))
+    assert "laser: no covariances, no ellipses" in page.text
+    assert "no pose has the truth beside it" in page.text
+    assert_harmless(page)
+
+
+def test_streams_of_other_times_and_many_visits_are_survived(session: Path) -> None:
+    fused = stream(0.001, 5)
+    elsewhere = PlanarPoses(fused.times_s + 1e5, fused.poses, fused.covariances)
+    write_planar_poses(session / "fused.csv", elsewhere, overwrite=True)
+    write_planar_poses(session / "odometry.csv", elsewhere)
+    inputs = gather(session)
+    assert inputs.odometry is None
+    page = Page(report_page(inputs, "1"))
+    assert "fused: 0 poses and" in page.text
+    assert "fused, pauses included: no pose has the truth beside it" in page.text
+    assert_harmless(page)
+    times = np.repeat(np.arange(400.0) * 60.0, 3) + np.tile([0.0, 0.1, 0.2], 400)
+    many = PlanarPoses(times, np.zeros((1200, 3)), np.zeros((1200, 3, 3)))
+    for name in ("laser", "truth"):
+        write_planar_poses(session / f"{name}.csv", many, overwrite=True)
+    (session / "camera.csv").unlink()
+    inputs = gather(session)
+    assert len(inputs.visits) == 400
+    series = Series("a", "red", "", times, np.ones(1200))
+    drawing = draw_series("s", "mm", [series], inputs.visits)
+    points = " ".join(line.attrib["points"] for line in drawing.iter("polyline"))
+    across = [float(point.split(",")[0]) for point in points.split()]
+    assert 70.0 < min(across) < max(across) < 760.0
+    assert "400 visits" in Page(report_page(inputs, "1")).text
+
+
+def test_odometry_is_brought_to_the_truth(session: Path) -> None:
+    truth = gather(session).truth
+    assert truth is not None
+    c, s = math.cos(1.0), math.sin(1.0)
+    moved = truth.poses @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) + [5.0, -7.0, 1.0]
+    write_planar_poses(session / "odometry.csv", PlanarPoses(truth.times_s + 0.4, moved))
+    segment = {
+        "from_s": 0.0, "to_s": 120.0, "reference_s": 0.0, "offset_s": 0.4, "rate": 1.0,
+        "angle_rad": 0.0, "sigma_offset_s": 1e-3, "sigma_rate": 1e-6, "sigma_angle_rad": 1e-3,
+        "turned_rad": 1.0, "status": "ok", "note": "",
+    }  # fmt: skip
+    (session / "clock.json").write_text(json.dumps({"segments": [segment]}))
+    odometry = gather(session).odometry
+    assert odometry is not None
+    assert compare_streams(odometry, truth).position_max_m < 1e-5
+
+
+def test_stretches_without_a_pose_are_counted(session: Path) -> None:
+    status = ["lost", "ok", "ok", "coasting", "coasting", "ok", "undetermined", "reacquired"]
+    lines = [json.dumps({"t": 1.0 + k, "status": name}) for k, name in enumerate(status)]
+    (session / "laser.jsonl").write_text("\n".join(lines) + "\n")
+    inputs = gather(session)
+    assert inputs.sets == {"lost": 1, "ok": 3, "coasting": 2, "undetermined": 1, "reacquired": 1}
+    assert inputs.intervals == [
+        Interval("lost", 1.0, 1.0, 1),
+        Interval("coasting", 4.0, 5.0, 2),
+        Interval("undetermined", 7.0, 7.0, 1),
+    ]
+    page = Page(report_page(inputs, "1"))
+    assert "was not determined 3 times" in page.text
+
+
+def test_ellipses_are_three_sigma() -> None:
+    turn = np.array([[math.cos(0.5), -math.sin(0.5)], [math.sin(0.5), math.cos(0.5)]])
+    covariance = np.zeros((2, 3, 3))
+    covariance[:, :2, :2] = turn @ np.diag([0.09, 0.01]) @ turn.T
+    poses = PlanarPoses(np.arange(2.0), np.array([[0, 0, 0], [4.0, 2, 0]]), covariance)
+    drawing, factor = draw_map("m", [Track("a", "red", "", poses)], None, width=600.0, ellipses=2)
+    assert factor == 1.0
+    scale = 600.0 / 6.0  # the path and a metre on either side
+    for ellipse in drawing.iter("ellipse"):
+        assert float(ellipse.attrib["rx"]) == pytest.approx(3 * 0.3 * scale, abs=0.06)
+        assert float(ellipse.attrib["ry"]) == pytest.approx(3 * 0.1 * scale, abs=0.06)
+        degrees = float(ellipse.attrib["transform"].split("(")[1].split()[0])
+        # On the page y points down.
+        assert (degrees + math.degrees(0.5)) % 180 == pytest.approx(0.0, abs=0.1)
+    small = PlanarPoses(poses.times_s, poses.poses, covariance / 1e4)
+    drawing, factor = draw_map("m", [Track("a", "red", "", small)], None, width=600.0, ellipses=2)
+    assert factor == 10.0 or factor == 20.0
+    (first, _) = drawing.iter("ellipse")
+    assert float(first.attrib["rx"]) == pytest.approx(3 * 0.003 * scale * factor, abs=0.06)
+
+
+def test_the_worst_of_each_stretch_is_drawn() -> None:
+    times = np.linspace(0.0, 100.0, 20_001)
+    values = np.ones_like(times)
+    values[7777] = 100.0
+    series = Series("a", "red", "", times, values)
+    drawing = draw_series("s", "mm", [series], [(0.0, 100.0)], width=400.0, height=100.0)
+    line = max(drawing.iter("polyline"), key=lambda e: len(e.attrib["points"]))
+    heights = [float(point.split(",")[1]) for point in line.attrib["points"].split()]
+    assert min(heights) == pytest.approx(8.0)  # the top of the plot
+    assert sum(height < 20.0 for height in heights) == 1
+    empty = draw_series("s", "mm", [], [(0.0, 1.0)])
+    assert "nothing to show" in "".join(empty.itertext())

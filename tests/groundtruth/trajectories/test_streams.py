@@ -1,0 +1,173 @@
+"""Files of poses and times: the real ones come back, malformed ones are refused by line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from groundtruth.errors import GroundTruthError, StreamError
+from groundtruth.geometry.transforms import exp_se3, transform_from_quaternion
+from groundtruth.trajectories.streams import (
+    RAWSEEDS_ROUNDING,
+    PlanarPoses,
+    format_planar_poses,
+    format_tum,
+    is_positive_definite,
+    read_planar_poses,
+    read_times,
+    write_planar_poses,
+)
+from storage import OutputExistsError
+
+SESSIONS = ("Bicocca_2009-02-25a", "Bicocca_2009-02-26a")
+
+micro = st.integers(-20_000_000, 20_000_000).map(lambda n: n / 1e6)
+tiny = st.integers(-(10**9), 10**9).map(lambda n: n / 1e12)
+
+
+@pytest.mark.parametrize("session", SESSIONS)
+def test_real_ground_truth_comes_back_byte_by_byte(shared_data: Path, session: str) -> None:
+    path = shared_data / "rawseeds" / "gt" / session / f"{session}-GROUNDTRUTH.csv"
+    poses = read_planar_poses(path)
+    assert format_planar_poses(poses, covariance_decimals=6) == path.read_text()
+    assert np.diff(poses.times_s).max() > 60.0  # segments, minutes apart
+    assert np.isfinite(poses.poses).all()
+    if session.endswith("25a"):
+        assert poses.poses[:, 2].min() < -np.pi  # past the cut, and kept so
+
+
+@pytest.mark.parametrize("session", SESSIONS)
+def test_real_solutions_without_covariances_are_read(shared_data: Path, session: str) -> None:
+    folder = shared_data / "rawseeds" / "gt" / session
+    for name in ("ndt_mcl_0.5.csv", f"{session}-GT-extended.csv"):
+        poses = read_planar_poses(folder / name)
+        assert poses.covariances is None
+        assert len(poses) > 1000
+
+
+@given(
+    st.lists(st.tuples(micro, micro, micro, st.lists(tiny, min_size=9, max_size=9)), max_size=5),
+    st.booleans(),
+)
+def test_what_is_written_is_read_back(
+    rows: list[tuple[float, float, float, list[float]]], with_covariance: bool
+) -> None:
+    import tempfile
+
+    poses = PlanarPoses(
+        np.array([1235561680.680798 + 0.5 * i for i in range(len(rows))]),
+        np.array([row[:3] for row in rows]).reshape(-1, 3),
+        np.array([row[3] for row in rows]).reshape(-1, 3, 3) if with_covariance else None,
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "poses.csv"
+        write_planar_poses(path, poses)
+        if not rows:
+            with pytest.raises(StreamError, match="no poses"):
+                read_planar_poses(path)
+            return
+        read = read_planar_poses(path)
+    np.testing.assert_array_equal(read.times_s, poses.times_s)
+    np.testing.assert_array_equal(read.poses, poses.poses)
+    if poses.covariances is None:
+        assert read.covariances is None
+    else:
+        np.testing.assert_array_equal(read.covariances, poses.covariances)
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "problem"),
+    [
+        ("1,2,3,4\n1,2,3\n", 2, "3 numbers: expected 4"),
+        ("1,2,3\n", 1, "expected 4 or 13"),
+        ("1,2,3,4\n\n0.5,2,3,4\n", 3, "before the row above"),
+        ("1,2,nan,4\n", 1, "'nan': expected a finite number"),
+        ("1,2,1e999,4\n", 1, "expected a finite number"),
+        ("1,2,1_0,4\n", 1, "expected a finite number"),
+        ("1,2,,4\n", 1, "'': expected a finite number"),
+        ("1 2 3 4\n1,2,3,4" + ",0" * 9, 2, "13 numbers: expected 4"),
+    ],
+)
+def test_malformed_streams_are_refused_by_line(
+    tmp_path: Path, text: str, line: int, problem: str
+) -> None:
+    path = tmp_path / "poses.csv"
+    path.write_text(text)
+    with pytest.raises(StreamError, match=problem) as caught:
+        read_planar_poses(path)
+    assert str(caught.value).startswith(f"{path}:{line}: ")
+
+
+@given(st.binary(max_size=200))
+def test_any_bytes_are_poses_or_a_typed_error(content: bytes) -> None:
+    import tempfile
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "poses.csv"
+        path.write_bytes(content)
+        for read in (read_planar_poses, read_times):
+            message = str(path)
+            try:
+                read(path)
+            except GroundTruthError as error:
+                message = str(error)
+            assert message.startswith(str(path))
+
+
+def test_files_are_not_overwritten_unasked(tmp_path: Path) -> None:
+    poses = PlanarPoses(np.zeros(1), np.zeros((1, 3)))
+    path = tmp_path / "poses.csv"
+    write_planar_poses(path, poses)
+    with pytest.raises(OutputExistsError):
+        write_planar_poses(path, poses)
+    write_planar_poses(path, poses, overwrite=True)
+    with pytest.raises(StreamError, match="no such file"):
+        read_planar_poses(tmp_path / "absent.csv")
+
+
+def test_poses_that_cannot_be_are_refused() -> None:
+    with pytest.raises(GroundTruthError, match="expected times in order"):
+        PlanarPoses(np.array([2.0, 1.0]), np.zeros((2, 3)))
+    with pytest.raises(GroundTruthError, match="not finite"):
+        PlanarPoses(np.zeros(1), np.full((1, 3), np.nan))
+    with pytest.raises(GroundTruthError, match="expected \\(2, 3, 3\\)"):
+        PlanarPoses(np.zeros(2), np.zeros((2, 3)), np.zeros((1, 3, 3)))
+
+
+def test_singular_covariances_are_told_from_good_ones() -> None:
+    good = np.diag([1e-8, 1e-6, 1e-5])
+    singular = np.array([[4e-6, 4e-6, 0], [4e-6, 4e-6, 0], [0, 0, 1e-5]])
+    assert is_positive_definite(np.stack([good, singular, np.zeros((3, 3))])).tolist() == [
+        True,
+        False,
+        False,
+    ]
+    assert not is_positive_definite(good, RAWSEEDS_ROUNDING)
+
+
+def test_tum_rows_are_the_pose(tmp_path: Path) -> None:
+    poses = exp_se3(np.random.default_rng(1).normal(size=(3, 6)))
+    rows = [
+        [float(word) for word in line.split()]
+        for line in format_tum(np.array([1.5, 2.0, 2.5]), poses).splitlines()
+    ]
+    for row, time, pose in zip(rows, (1.5, 2.0, 2.5), poses):
+        assert row[0] == time
+        np.testing.assert_allclose(transform_from_quaternion(row[4:], row[1:4]), pose, atol=1e-6)
+    assert format_tum(np.zeros(0), np.zeros((0, 4, 4))) == ""
+
+
+def test_times_are_read_by_prefix(tmp_path: Path) -> None:
+    path = tmp_path / "a.times"
+    path.write_text("# prefix seconds\na0001 1235.250000\na0002 1235.300000 # late\n")
+    assert read_times(path) == {"a0001": 1235.25, "a0002": 1235.3}
+    path.write_text("a 1\na 2\n")
+    with pytest.raises(StreamError, match="a second time"):
+        read_times(path)
+    path.write_text("a 1 2\n")
+    with pytest.raises(StreamError, match="expected a prefix and seconds"):
+        read_times(path)

@@ -1,0 +1,335 @@
+"""Reference poses: exact distances give exact poses, honest covariances, and refusals."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from groundtruth.errors import GeometryError, GroundTruthError
+from groundtruth.lasers.scanners import Scanner
+from groundtruth.lasers.scans import Scans
+from groundtruth.validation.fiducials import Distance, Survey
+from groundtruth.validation.reference_poses import (
+    DistancePose,
+    DistanceSettings,
+    distance_residuals,
+    poses_from_distances,
+)
+from groundtruth.validation.reference_poses_scans import (
+    Onboard,
+    RefineSettings,
+    refine_pose,
+    still_points,
+)
+from landmarks import wrap_angle
+
+FloatArray = NDArray[np.float64]
+
+FIDUCIALS = {"SW": (0.0, 0.0), "SE": (10.0, 0.0), "NE": (10.0, 7.0), "NW": (0.0, 7.0)}
+POINTS = {"left": (0.2, 0.3), "right": (0.2, -0.3), "back": (-0.4, 0.0)}
+# A room that no turn and no mirror image takes to itself.
+ROOM = np.array(
+    [
+        [0, 0, 10, 0], [10, 0, 10, 7], [10, 7, 6, 7], [6, 7, 6, 6], [6, 6, 0, 6], [0, 6, 0, 0],
+        [3, 0, 3, 0.8],
+    ],
+    dtype=float,
+)  # fmt: skip
+
+
+def survey_of(
+    fiducials: dict[str, tuple[float, float]] | None = None,
+    points: dict[str, tuple[float, float]] | None = None,
+    sigma_m: float = 0.005,
+) -> Survey:
+    return Survey(
+        {name: np.array(xy) for name, xy in (fiducials or FIDUCIALS).items()},
+        {name: np.array(xy) for name, xy in (points or POINTS).items()},
+        sigma_m,
+    )
+
+
+def measured(
+    pose: tuple[float, float, float] | FloatArray,
+    survey: Survey,
+    rng: np.random.Generator | None = None,
+) -> list[Distance]:
+    x, y, theta = pose
+    c, s = math.cos(theta), math.sin(theta)
+    rows = []
+    for name, (px, py) in survey.robot_points.items():
+        for fiducial, (fx, fy) in survey.fiducials.items():
+            length = math.hypot(x + c * px - s * py - fx, y + s * px + c * py - fy)
+            noise = 0.0 if rng is None else survey.sigma_m * rng.normal()
+            rows.append(Distance(0, 5.0, name, fiducial, length + noise))
+    return rows
+
+
+def solved(rows: list[Distance], survey: Survey) -> DistancePose:
+    (pose,) = poses_from_distances(survey, rows)
+    return pose
+
+
+def scanner(name: str, pose: tuple[float, float, float], sigma_m: float = 0.01) -> Scanner:
+    step = math.radians(1.0)
+    return Scanner(name, np.array(pose), np.zeros((3, 3)), -math.pi / 2, step, 181, 30.0, sigma_m)
+
+
+def cast(pose: FloatArray, mounted: Scanner, walls: FloatArray) -> FloatArray:
+    """(readings,) exact ranges from a robot's pose (m)."""
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    origin = pose[:2] + np.array([[c, -s], [s, c]]) @ mounted.pose[:2]
+    angles = pose[2] + mounted.pose[2] + mounted.angles_rad
+    ray = np.column_stack([np.cos(angles), np.sin(angles)])
+    along = walls[:, 2:] - walls[:, :2]
+    to_wall = walls[:, :2] - origin
+    det = ray[:, None, 0] * along[:, 1] - ray[:, None, 1] * along[:, 0]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        distance = (to_wall[:, 0] * along[:, 1] - to_wall[:, 1] * along[:, 0]) / det
+        part = (to_wall[:, 0] * ray[:, None, 1] - to_wall[:, 1] * ray[:, None, 0]) / det
+    hit = (distance > 0) & (part >= 0) & (part <= 1)
+    return np.asarray(np.where(hit, distance, np.inf).min(axis=1))
+
+
+def onboard(
+    pose: FloatArray, walls: FloatArray, rng: np.random.Generator, drift_m: float = 0.0
+) -> list[Onboard]:
+    """A second of scans of a robot that stands, or is pushed along x by `drift_m`."""
+    boards = []
+    times = np.arange(4.5, 5.5, 0.02)
+    for mounted in (scanner("front", (0.3, 0.0, 0.0)), scanner("rear", (-0.4, 0.0, math.pi))):
+        ranges = []
+        for k in range(len(times)):
+            moved = pose + np.array([drift_m * k / len(times), 0.0, 0.0])
+            exact = cast(moved, mounted, walls)
+            noisy = exact + mounted.sigma_m * rng.normal(size=len(exact))
+            ranges.append(np.where(np.isfinite(noisy), np.rint(1e3 * noisy), 0).astype(np.uint16))
+        boards.append(Onboard(mounted, Scans(times, np.stack(ranges))))
+    return boards
+
+
+@given(st.floats(0.5, 9.5), st.floats(0.5, 6.5), st.floats(-math.pi, math.pi))
+@settings(max_examples=40, deadline=None)
+def test_exact_distances_give_the_exact_pose(x: float, y: float, theta: float) -> None:
+    survey = survey_of()
+    found = solved(measured((x, y, theta), survey), survey)
+    assert found.status == "ok"
+    np.testing.assert_allclose(found.candidates[0, :2], [x, y], atol=1e-7)
+    assert abs(float(wrap_angle(found.candidates[0, 2:] - theta)[0])) < 1e-7
+    assert found.freedom == 9
+    assert found.used.all()
+
+
+@pytest.mark.long
+def test_the_covariance_is_that_of_the_errors() -> None:
+    rng = np.random.default_rng(1)
+    survey = survey_of()
+    truth = np.array([3.0, 2.0, 3.1])
+    squared, costs = [], []
+    for _ in range(150):
+        found = solved(measured(truth, survey, rng), survey)
+        error = found.candidates[0] - truth
+        error[2] = (error[2] + math.pi) % (2 * math.pi) - math.pi
+        squared.append(error @ np.linalg.solve(found.covariances[0], error))
+        costs.append(found.chi2)
+    low, high = chi2.ppf([0.001, 0.999], 450)
+    assert low < sum(squared) < high
+    low, high = chi2.ppf([0.001, 0.999], 1350)
+    assert low < sum(costs) < high
+
+
+def test_the_derivative_is_that_of_the_residuals() -> None:
+    rng = np.random.default_rng(2)
+    fiducials, levers = rng.normal(size=(5, 2)) * 4, rng.normal(size=(5, 2))
+    pose, lengths = rng.normal(size=3), np.ones(5)
+    _, jacobian = distance_residuals(pose, fiducials, levers, lengths)
+    for axis in range(3):
+        ends = []
+        for sign in (1, -1):
+            other = pose.copy()
+            other[axis] += sign * 1e-6
+            ends.append(distance_residuals(other, fiducials, levers, lengths)[0])
+        np.testing.assert_allclose((ends[0] - ends[1]) / 2e-6, jacobian[:, axis], atol=1e-8)
+
+
+def test_points_in_a_line_leave_the_mirror_image_and_it_is_said() -> None:
+    line = {"a": (0.0, 0.0), "b": (4.0, 0.0), "c": (10.0, 0.0)}
+    points = {"front": (0.3, 0.0), "back": (-0.4, 0.0)}
+    survey = survey_of(line, points)
+    found = solved(measured((3.0, 2.0, 0.4), survey), survey)
+    assert found.status == "ambiguous"
+    assert "2 poses fit" in found.reason
+    signs = sorted(np.sign(found.candidates[:, 1]).tolist())
+    assert signs == [-1.0, 1.0]
+    # Three points that are not in a line fit one side only.
+    survey = survey_of(line)
+    found = solved(measured((3.0, 2.0, 0.4), survey), survey)
+    assert found.status == "ok"
+    np.testing.assert_allclose(found.candidates[0], [3.0, 2.0, 0.4], atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("keep", "message"),
+    [
+        (lambda row: row.fiducial == "SW" and row.point != "back", "2 distances"),
+        (lambda row: row.fiducial == "SW", "leave it open"),
+    ],
+)
+def test_too_little_for_a_pose_is_said(keep: object, message: str) -> None:
+    assert callable(keep)
+    survey = survey_of()
+    rows = [row for row in measured((3.0, 2.0, 0.4), survey) if keep(row)]
+    found = solved(rows, survey)
+    assert found.status == "undetermined"
+    assert message in found.reason
+
+
+def test_a_gross_error_is_found_and_left_out() -> None:
+    rng = np.random.default_rng(3)
+    survey = survey_of()
+    rows = measured((6.0, 3.0, -2.0), survey, rng)
+    wrong = rows[7]
+    rows[7] = Distance(0, 5.0, wrong.point, wrong.fiducial, wrong.distance_m + 0.5)
+    found = solved(rows, survey)
+    assert found.status == "ok"
+    assert np.flatnonzero(~found.used).tolist() == [7]
+    assert "1 gross error" in found.reason
+    np.testing.assert_allclose(found.candidates[0], [6.0, 3.0, -2.0], atol=0.03)
+    assert found.residuals_m[7] == pytest.approx(0.5, abs=0.03)
+    none = DistanceSettings(most_gross=0)
+    assert poses_from_distances(survey, rows, none)[0].status == "inconsistent"
+
+
+def test_distances_that_contradict_each_other_are_refused() -> None:
+    survey = survey_of()
+    rows = measured((6.0, 3.0, -2.0), survey)
+    rows = [Distance(0, 5.0, r.point, r.fiducial, r.distance_m + 0.3 * (k % 3)) for k, r in
+            enumerate(rows)]  # fmt: skip
+    found = solved(rows, survey)
+    assert found.status == "inconsistent"
+    # One degree of freedom shows that something is wrong, but not what.
+    few = measured((6.0, 3.0, -2.0), survey)[:4]
+    few[0] = Distance(0, 5.0, few[0].point, few[0].fiducial, few[0].distance_m + 0.5)
+    few[3] = measured((6.0, 3.0, -2.0), survey)[5]
+    assert solved(few, survey).status != "ok"
+
+
+@pytest.mark.long
+def test_scans_make_a_pose_surer_and_its_covariance_is_right() -> None:
+    rng = np.random.default_rng(4)
+    survey = survey_of(sigma_m=0.02)
+    total = 0.0
+    for _ in range(40):
+        truth = np.array([rng.uniform(2, 8), rng.uniform(2, 4.5), rng.uniform(-3.1, 3.1)])
+        prior = solved(measured(truth, survey, rng), survey)
+        refined = refine_pose(prior, still_points(onboard(truth, ROOM, rng), 5.0), ROOM)
+        assert refined is not None
+        assert refined.scans == "used", refined.reason
+        error = refined.pose - truth
+        error[2] = (error[2] + math.pi) % (2 * math.pi) - math.pi
+        total += float(error @ np.linalg.solve(refined.covariance, error))
+        assert math.hypot(error[0], error[1]) < 0.003
+        assert np.all(np.linalg.eigvalsh(prior.covariances[0] - refined.covariance) > 0)
+    low, high = chi2.ppf([0.001, 0.999], 120)
+    assert low < total < high
+
+
+def test_walls_decide_between_mirror_images() -> None:
+    rng = np.random.default_rng(5)
+    survey = survey_of(
+        {"a": (0.0, 3.0), "b": (4.0, 3.0), "c": (10.0, 3.0)},
+        {"front": (0.3, 0.0), "back": (-0.4, 0.0)},
+    )
+    truth = np.array([4.0, 1.9, 0.7])
+    prior = solved(measured(truth, survey, rng), survey)
+    assert prior.status == "ambiguous"
+    refined = refine_pose(prior, still_points(onboard(truth, ROOM, rng), 5.0), ROOM)
+    assert refined is not None
+    assert refined.scans == "used"
+    np.testing.assert_allclose(refined.pose, truth, atol=0.005)
+    # Walls that no reading lies on decide nothing.
+    points = still_points(onboard(truth, ROOM, rng), 5.0)
+    assert refine_pose(prior, points, ROOM + 300.0) is None
+
+
+def test_a_corridor_leaves_a_direction_open_and_distances_stand() -> None:
+    rng = np.random.default_rng(6)
+    corridor = np.array([[-500.0, 0, 500, 0], [-500, 3, 500, 3]])
+    survey = survey_of()
+    truth = np.array([4.0, 1.5, 0.2])
+    prior = solved(measured(truth, survey, rng), survey)
+    refined = refine_pose(prior, still_points(onboard(truth, corridor, rng), 5.0), corridor)
+    assert refined is not None
+    assert refined.scans == "undetermined"
+    np.testing.assert_array_equal(refined.pose, prior.candidates[0])
+
+
+def test_walls_elsewhere_disagree_and_distances_stand() -> None:
+    rng = np.random.default_rng(7)
+    survey = survey_of()
+    truth = np.array([4.0, 2.5, 0.2])
+    prior = solved(measured(truth, survey, rng), survey)
+    points = still_points(onboard(truth, ROOM, rng), 5.0)
+    refined = refine_pose(prior, points, ROOM + np.array([0.1, 0.05, 0.1, 0.05]))
+    assert refined is not None
+    assert refined.scans == "disagrees"
+    assert "more than both allow" in refined.reason
+    np.testing.assert_array_equal(refined.pose, prior.candidates[0])
+    # No readings at all about the time.
+    nothing = refine_pose(prior, still_points(onboard(truth, ROOM, rng), 99.0), ROOM)
+    assert nothing is not None
+    assert nothing.scans == "no scans"
+
+
+def test_an_unsure_mount_makes_the_pose_unsure() -> None:
+    rng = np.random.default_rng(8)
+    survey = survey_of(sigma_m=0.05)
+    truth = np.array([4.0, 2.5, 0.2])
+    prior = solved(measured(truth, survey, rng), survey)
+    points = still_points(onboard(truth, ROOM, rng), 5.0)
+    sure = refine_pose(prior, points, ROOM)
+    sigma = np.diag([0.01, 0.01, 0.005]) ** 2
+    loose = type(points)(
+        points.scanner_points,
+        tuple(
+            Scanner(s.name, s.pose, sigma, s.first_angle_rad, s.angle_step_rad, s.readings,
+                    s.max_range_m, s.sigma_m)
+            for s in points.scanners
+        ),
+    )  # fmt: skip
+    unsure = refine_pose(prior, loose, ROOM)
+    assert sure is not None
+    assert unsure is not None
+    assert unsure.scans == "used"
+    # Two mounts, each 1 cm unsure, share the pose: somewhere about 7 mm.
+    assert 0.003 < math.sqrt(unsure.covariance[0, 0]) < 0.015
+    assert sure.covariance[0, 0] < 0.1 * unsure.covariance[0, 0]
+
+
+def test_a_robot_that_moves_is_noticed() -> None:
+    rng = np.random.default_rng(9)
+    truth = np.array([4.0, 2.5, 0.2])
+    with pytest.raises(GeometryError, match=r"^moved: a quarter"):
+        still_points(onboard(truth, ROOM, rng, drift_m=0.2), 5.0)
+
+
+@pytest.mark.parametrize(
+    ("kind", "values"),
+    [
+        (DistanceSettings, {"gross_probability": 0.0}),
+        (DistanceSettings, {"most_gross": -1}),
+        (DistanceSettings, {"largest_sigma_m": math.nan}),
+        (RefineSettings, {"still_s": 0.0}),
+        (RefineSettings, {"least_share": 1.0}),
+        (RefineSettings, {"gates_m": ()}),
+    ],
+)
+def test_settings_out_of_range_are_refused(kind: type, values: dict[str, object]) -> None:
+    with pytest.raises(GroundTruthError, match=next(iter(values))):
+        kind(**values)
