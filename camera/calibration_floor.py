@@ -19,6 +19,8 @@ from camera.calibration_projection import intrinsics_of
 from camera.calibration_start import best_poses, board_poses
 from camera.errors import CalibrationError
 from camera.model import Camera, Pose
+from storage.bounded import read_bounded
+from storage.messages import excerpt
 
 FloatArray = NDArray[np.float64]
 
@@ -166,17 +168,19 @@ def read_floor_points(path: Path) -> tuple[FloatArray, FloatArray]:
         If it cannot be read; the message names the line.
     """
     try:
-        if path.stat().st_size > _LARGEST_FILE_BYTES:
-            raise CalibrationError(f"{path}: larger than {_LARGEST_FILE_BYTES} bytes")
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise CalibrationError(f"{path}: cannot be read as floor points: {error}") from None
-    rows = list(csv.reader(lines))
+        lines = read_bounded(path, _LARGEST_FILE_BYTES).decode("utf-8-sig").splitlines()
+        rows = list(csv.reader(lines))
+    except (UnicodeDecodeError, csv.Error):
+        raise CalibrationError(f"{path}: is no text: expected floor points") from None
+    except OSError as error:
+        raise CalibrationError(
+            f"{path}: cannot be read as floor points: {error.strerror}"
+        ) from None
     header = tuple(name.strip().lower() for name in rows[0]) if rows else ()
     if header != FLOOR_COLUMNS:
         raise CalibrationError(
-            f"{path}:1: the header is {','.join(header)[:40]!r}: expected u,v,x,y (pixels; metres, "
-            "X left and Y backward of the robot)"
+            f"{path}:1: the header is {excerpt(','.join(header))}: expected u,v,x,y (pixels; "
+            "metres, X left and Y backward of the robot)"
         )
     numbers = []
     for line, row in enumerate(rows[1:], start=2):

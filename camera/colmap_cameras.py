@@ -12,11 +12,13 @@ from camera.conversion_models import COEFFICIENTS, ForeignCamera, Model
 from camera.convert_yaml import shortest
 from camera.errors import ConversionError
 from camera.opencv_yaml import foreign
+from storage.messages import excerpt, one_line
 
 if TYPE_CHECKING:
     import pycolmap
 
 _HALF_PIXEL = 0.5
+_LONGEST_LIST = 100
 
 #: COLMAP's models: ours, number of focal lengths, and where its distortion goes in our order.
 _MODELS: dict[str, tuple[Model, int, tuple[int, ...]]] = {
@@ -54,11 +56,12 @@ def parse_colmap(text: str, name: str = "<text>", camera_name: str = "") -> Fore
                     f"{name}:{number}: expected CAMERA_ID MODEL WIDTH HEIGHT PARAMS..."
                 )
             rows[fields[0]] = (number, fields)
+    held = one_line(", ".join(rows), _LONGEST_LIST)
     if camera_name and camera_name not in rows:
-        raise ConversionError(f"{name}: no camera {camera_name}: it holds {', '.join(rows)}")
+        raise ConversionError(f"{name}: no camera {camera_name}: it holds {held}")
     if not camera_name and len(rows) != 1:
-        held = f"it holds {', '.join(rows)}: give --camera-name" if rows else "it holds none"
-        raise ConversionError(f"{name}: expected one camera, {held}")
+        there = f"it holds {held}: give --camera-name" if rows else "it holds none"
+        raise ConversionError(f"{name}: expected one camera, {there}")
     number, fields = rows[camera_name or next(iter(rows))]
     where = f"{name}:{number}"
     try:
@@ -86,7 +89,9 @@ def _from_parameters(
     where: str, model_name: str, width: int, height: int, parameters: list[float]
 ) -> ForeignCamera:
     if model_name not in _MODELS:
-        raise ConversionError(f"{where}: model {model_name[:40]!r}: expected {', '.join(_MODELS)}")
+        raise ConversionError(
+            f"{where}: model {excerpt(model_name)}: expected {', '.join(_MODELS)}"
+        )
     model, focals, order = _MODELS[model_name]
     if len(parameters) != focals + 2 + len(order):
         raise ConversionError(

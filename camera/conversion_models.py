@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera.errors import ConversionError
+from storage.messages import excerpt
 
 FloatArray = NDArray[np.float64]
 Model = Literal["radtan", "rational", "fisheye"]
@@ -74,10 +75,12 @@ class ForeignCamera:
     def __post_init__(self) -> None:
         for name, side in (("width", self.width), ("height", self.height)):
             if not 1 <= side <= _LARGEST_SIDE_PX:
-                raise ConversionError(f"{name} is {side}: expected 1 to {_LARGEST_SIDE_PX} pixels")
+                raise ConversionError(
+                    f"{name} is {excerpt(side)}: expected 1 to {_LARGEST_SIDE_PX} pixels"
+                )
         numbers = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
         if not np.all(np.isfinite(numbers)):
-            raise ConversionError(f"a number of the camera is not finite: {numbers}")
+            raise ConversionError(f"a number of the camera is not finite: {excerpt(numbers)}")
         if min(self.fx, self.fy) <= 0.0:
             raise ConversionError(
                 f"focal lengths are {self.fx:g} and {self.fy:g}: expected pixels above 0"

@@ -11,8 +11,11 @@ from typing import Any
 import numpy as np
 
 from camera.errors import ConversionError
+from storage.bounded import read_bounded
+from storage.messages import excerpt, one_line
 
 _LARGEST_FILE_BYTES = 1 << 20
+_MOST_CAMERAS = 1000
 
 
 def read_text(path: Path) -> str:
@@ -24,15 +27,15 @@ def read_text(path: Path) -> str:
         If it cannot be read or is larger than any calibration.
     """
     try:
-        if path.stat().st_size > _LARGEST_FILE_BYTES:
-            raise ConversionError(
-                f"{path}: larger than {_LARGEST_FILE_BYTES} bytes: not a calibration"
-            )
-        return path.read_text(encoding="utf-8-sig")
+        return read_bounded(path, _LARGEST_FILE_BYTES).decode("utf-8-sig")
     except FileNotFoundError:
         raise ConversionError(f"{path}: no such calibration file") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConversionError(f"{path}: cannot be read as a calibration: {error}") from None
+    except UnicodeDecodeError:
+        raise ConversionError(f"{path}: is no text: expected a calibration") from None
+    except OSError as error:
+        raise ConversionError(
+            f"{path}: cannot be read as a calibration: {error.strerror}"
+        ) from None
 
 
 def parse_yaml(text: str, name: str) -> dict[str, Any]:
@@ -71,10 +74,17 @@ def parse_yaml(text: str, name: str) -> dict[str, Any]:
     except (ValueError, RecursionError) as error:
         if isinstance(error, ConversionError):
             raise
-        raise ConversionError(f"{name}: not YAML that can be read: {error}") from None
+        raise ConversionError(
+            f"{name}: not YAML that can be read: {one_line(str(error), 100)}"
+        ) from None
     if not isinstance(content, dict):
         raise ConversionError(f"{name}: expected YAML with keys and values")
-    return {str(key): value for key, value in content.items()}
+    # Keys of calibrations are words, or cameras' numbers; others may be too long to be written.
+    return {
+        str(key): value
+        for key, value in content.items()
+        if isinstance(key, str) or (isinstance(key, int) and abs(key) < _MOST_CAMERAS)
+    }
 
 
 def numbers(value: Any, key: str, name: str) -> list[float]:
@@ -100,10 +110,10 @@ def numbers(value: Any, key: str, name: str) -> list[float]:
         # YAML 1.1 takes 1e-3 for text, because it lacks the dot.
         try:
             number = float(item) if not isinstance(item, bool) else float("nan")
-        except (TypeError, ValueError):
+        except (OverflowError, TypeError, ValueError):
             number = float("nan")
         if not np.isfinite(number):
-            raise ConversionError(f"{name}: {key} has {str(item)[:40]!r}: expected numbers")
+            raise ConversionError(f"{name}: {key} has {excerpt(item)}: expected numbers")
         result.append(number)
     return result
 
@@ -131,7 +141,7 @@ def whole(value: Any, key: str, name: str) -> int:
         If it is none.
     """
     if isinstance(value, bool) or not isinstance(value, int):
-        raise ConversionError(f"{name}: {key} is {str(value)[:40]!r}: expected a whole number")
+        raise ConversionError(f"{name}: {key} is {excerpt(value)}: expected a whole number")
     return value
 
 
@@ -145,7 +155,9 @@ def pinhole_matrix(value: Any, key: str, name: str) -> tuple[float, float, float
     """
     m = numbers(value, key, name)
     if len(m) != 9 or m[3:4] + m[6:] != [0.0, 0.0, 0.0, 1.0]:
-        raise ConversionError(f"{name}: {key} is {m}: expected the 9 numbers fx 0 cx 0 fy cy 0 0 1")
+        raise ConversionError(
+            f"{name}: {key} is {excerpt(m)}: expected the 9 numbers fx 0 cx 0 fy cy 0 0 1"
+        )
     if m[1] != 0.0:
         raise ConversionError(f"{name}: {key} has a skew of {m[1]:g}: only 0 can be converted")
     return m[0], m[4], m[2], m[5]

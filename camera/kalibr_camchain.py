@@ -8,9 +8,11 @@ from camera.conversion_models import ForeignCamera, Model
 from camera.convert_yaml import first_of, numbers, parse_yaml, shortest, whole
 from camera.errors import ConversionError
 from camera.opencv_yaml import foreign
+from storage.messages import excerpt, one_line
 
 _MODELS: dict[str, Model] = {"radtan": "radtan", "equi": "fisheye", "equidistant": "fisheye"}
 _COEFFICIENTS = 4
+_LONGEST_LIST = 100
 
 
 def parse_kalibr(text: str, name: str = "<text>", camera_name: str = "") -> ForeignCamera:
@@ -24,21 +26,23 @@ def parse_kalibr(text: str, name: str = "<text>", camera_name: str = "") -> Fore
     content = parse_yaml(text, name)
     cameras = {key: value for key, value in content.items() if isinstance(value, dict)}
     cameras = {key: value for key, value in cameras.items() if "intrinsics" in value}
+    held = one_line(", ".join(cameras), _LONGEST_LIST)
     if camera_name:
         if camera_name not in cameras:
-            raise ConversionError(f"{name}: no {camera_name}: it holds {', '.join(cameras)}")
+            raise ConversionError(f"{name}: no {camera_name}: it holds {held}")
     elif len(cameras) != 1:
-        held = f"it holds {', '.join(cameras)}: give --camera-name" if cameras else "it holds none"
-        raise ConversionError(f"{name}: expected one camera (cam0 with intrinsics), {held}")
+        there = f"it holds {held}: give --camera-name" if cameras else "it holds none"
+        raise ConversionError(f"{name}: expected one camera (cam0 with intrinsics), {there}")
     else:
         camera_name = next(iter(cameras))
     entry: dict[str, Any] = cameras[camera_name]
-    where = f"{name}: {camera_name}"
+    where = f"{name}: {one_line(camera_name, _LONGEST_LIST)}"
     if entry.get("camera_model", "pinhole") != "pinhole":
         raise ConversionError(
-            f"{where}: camera_model {str(entry['camera_model'])[:40]!r}: expected pinhole"
+            f"{where}: camera_model {excerpt(entry['camera_model'])}: expected pinhole"
         )
-    label = str(entry.get("distortion_model", "none"))
+    model = entry.get("distortion_model", "none")
+    label = model if isinstance(model, str) else excerpt(model)
     d = numbers(entry.get("distortion_coeffs", []), "distortion_coeffs", where)
     if label == "none":
         label, d = "radtan", [0.0] * _COEFFICIENTS

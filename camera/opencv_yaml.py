@@ -9,6 +9,7 @@ from __future__ import annotations
 from camera.conversion_models import COEFFICIENTS, ForeignCamera, Model
 from camera.convert_yaml import first_of, numbers, parse_yaml, pinhole_matrix, shortest, whole
 from camera.errors import ConversionError
+from storage.messages import excerpt
 
 _MATRIX = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K")
 _DISTORTION = (
@@ -19,6 +20,7 @@ _DISTORTION = (
     "D",
 )
 _TILT = 12
+_FISHEYE = ("1", "true", "fisheye", "equidistant")
 
 
 def parse_opencv(text: str, name: str = "<text>") -> ForeignCamera:
@@ -34,8 +36,8 @@ def parse_opencv(text: str, name: str = "<text>") -> ForeignCamera:
     height = whole(first_of(content, ("image_height", "image_Height"), name), "image_height", name)
     fx, fy, cx, cy = pinhole_matrix(first_of(content, _MATRIX, name), "camera_matrix", name)
     d = numbers(first_of(content, _DISTORTION, name), "distortion_coefficients", name)
-    kind = str(content.get("fisheye_model", content.get("distortion_model", "0"))).lower()
-    fisheye = kind in ("1", "true", "fisheye", "equidistant")
+    kind = content.get("fisheye_model", content.get("distortion_model", 0))
+    fisheye = kind.lower() in _FISHEYE if isinstance(kind, str) else kind == 1
     model = opencv_model(d, fisheye=fisheye, name=name)
     return foreign(name, model, width, height, (fx, fy, cx, cy), d)
 
@@ -61,7 +63,7 @@ def opencv_model(coefficients: list[float], *, fisheye: bool, name: str) -> Mode
         )
     if any(coefficients[_TILT:]):
         raise ConversionError(
-            f"{name}: a tilted sensor (tau {coefficients[_TILT:]}) can't be converted"
+            f"{name}: a tilted sensor (tau {excerpt(coefficients[_TILT:])}) can't be converted"
         )
     return "radtan" if count <= 5 else "rational"
 

@@ -8,6 +8,7 @@ from camera.conversion_models import ForeignCamera, Model
 from camera.convert_yaml import first_of, numbers, parse_yaml, pinhole_matrix, shortest, whole
 from camera.errors import ConversionError
 from camera.opencv_yaml import foreign
+from storage.messages import excerpt
 
 #: What ROS calls the models (sensor_msgs/distortion_models.h).
 ROS_NAMES: dict[Model, str] = {
@@ -56,7 +57,7 @@ def camera_from_message(
     label = distortion_model or ("plumb_bob" if not any(d) else "")
     if label not in _MODELS:
         raise ConversionError(
-            f"{name}: distortion model {distortion_model[:40]!r}: expected {', '.join(_MODELS)}"
+            f"{name}: distortion model {excerpt(distortion_model)}: expected {', '.join(_MODELS)}"
         )
     model = _MODELS[label]
     allowed = {"radtan": (0, 4, 5), "rational": (8, 12, 14), "fisheye": (4,)}[model]
@@ -89,11 +90,15 @@ def parse_ros(text: str, name: str = "<text>") -> ForeignCamera:
     return camera_from_message(
         whole(first_of(content, ("image_width", "width"), name), "image_width", name),
         whole(first_of(content, ("image_height", "height"), name), "image_height", name),
-        str(content.get("distortion_model", "plumb_bob")),
+        _word(content.get("distortion_model", "plumb_bob")),
         numbers(coefficients, "distortion_coefficients", name),
         numbers(matrix, "camera_matrix", name),
         name,
     )
+
+
+def _word(value: object) -> str:
+    return value if isinstance(value, str) else excerpt(value)
 
 
 def format_ros(camera: ForeignCamera, camera_name: str = "camera") -> str:

@@ -41,7 +41,10 @@ def one_line(text: str, longest: int = LONGEST_MESSAGE) -> str:
 
 def excerpt(value: object) -> str:
     """Show a value of a file, however large and deep it is, in some 60 characters."""
-    return one_line(_SHORT.repr(value), _LONGEST_EXCERPT)
+    try:
+        return one_line(_SHORT.repr(value), _LONGEST_EXCERPT)
+    except ValueError:  # Python does not write numbers of thousands of digits
+        return "a very long number"
 
 
 class OneLineError(Exception):

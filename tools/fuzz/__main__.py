@@ -20,7 +20,7 @@ from typing import Any
 from tools.fuzz.readers import READERS
 
 _RUNS = re.compile(rb"^(?:Done (\d+) runs|#(\d+)\t)", re.MULTILINE)
-_FAULT = re.compile(rb"=== Uncaught Python exception: ===\n(.*)|(ERROR: libFuzzer: .*)")
+_FAULT = re.compile(rb"=== Uncaught Python exception: ===\n(.*)|(ERROR: libFuzzer: (?!fuzz t).*)")
 _MEMORY = re.compile(rb" rss: (\d+)Mb")
 _SLOWEST = re.compile(rb"slowest_unit_time_sec:\s*(\d+)")
 _MEMORY_FILES = Path("/dev/shm")
@@ -62,8 +62,8 @@ def fuzz(name: str, seconds: int, corpora: Path | None) -> dict[str, Any]:
         command.append(f"-max_total_time={seconds}")
         environment = {**os.environ, "OPENCV_LOG_LEVEL": "OFF", "TMPDIR": folder}
         shown = subprocess.run(
-            command, check=False, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
-        ).stderr
+            command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
+        ).stdout
     counts = [int(done or so_far) for done, so_far in _RUNS.findall(shown)]
     fault = _FAULT.search(shown)
     said = ascii((fault[1] or fault[2]).decode(errors="replace")) if fault else None
