@@ -20,7 +20,10 @@ from typing import Any
 from tools.fuzz.readers import READERS
 
 _RUNS = re.compile(rb"^(?:Done (\d+) runs|#(\d+)\t)", re.MULTILINE)
-_FAULT = re.compile(rb"=== Uncaught Python exception: ===\n(.*)|(ERROR: libFuzzer: (?!fuzz t).*)")
+_FAULTS = (
+    re.compile(rb"=== Uncaught Python exception: ===\n(.*)"),
+    re.compile(rb"(ERROR: libFuzzer: .*)"),
+)
 _MEMORY = re.compile(rb" rss: (\d+)Mb")
 _SLOWEST = re.compile(rb"slowest_unit_time_sec:\s*(\d+)")
 _MEMORY_FILES = Path("/dev/shm")
@@ -65,8 +68,8 @@ def fuzz(name: str, seconds: int, corpora: Path | None) -> dict[str, Any]:
             command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
         ).stdout
     counts = [int(done or so_far) for done, so_far in _RUNS.findall(shown)]
-    fault = _FAULT.search(shown)
-    said = ascii((fault[1] or fault[2]).decode(errors="replace")) if fault else None
+    faults = [fault[1] for pattern in _FAULTS if (fault := pattern.search(shown))]
+    said = ascii(faults[0].decode(errors="replace")) if faults else None
     if not counts and said is None:
         said = ascii(shown.decode(errors="replace")[-300:])
     return {
