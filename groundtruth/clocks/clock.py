@@ -7,7 +7,6 @@ their lines go on.
 
 from __future__ import annotations
 
-import json
 import math
 import os
 from collections.abc import Sequence
@@ -20,12 +19,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from groundtruth.errors import GroundTruthError
-from storage.bounded import read_bounded
+from groundtruth.json_file import read_json_value
 
 FloatArray = NDArray[np.float64]
 Status = Literal["ok", "no turns", "jump", "at a bound"]
 
-_LARGEST_FILE_BYTES = 1 << 26
 _MOST_SEGMENTS = 100_000
 _LARGEST_RATE_ERROR = 0.5
 _LARGEST_NUMBER = 1e15
@@ -183,12 +181,7 @@ def read_clock(path: str | os.PathLike[str]) -> ClockModel:
         If the file cannot be read or a value is missing or impossible; the message names it.
     """
     place = Path(path)
-    try:
-        document = json.loads(read_bounded(place, _LARGEST_FILE_BYTES).decode("utf-8-sig"))
-    except OSError as error:
-        raise GroundTruthError(f"{place}: cannot be read: {error.strerror}") from None
-    except (ValueError, RecursionError):
-        raise GroundTruthError(f"{place}: is no JSON: expected a clock file") from None
+    document = read_json_value(place)
     rows = document.get("segments") if isinstance(document, dict) else None
     if not isinstance(rows, list) or not 0 < len(rows) <= _MOST_SEGMENTS:
         raise GroundTruthError(f"{place}: no list of segments: expected what `sync` writes")

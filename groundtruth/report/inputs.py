@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 from collections.abc import Callable
@@ -14,9 +15,12 @@ from numpy.typing import NDArray
 
 from groundtruth.clocks.clock import ClockModel, read_clock
 from groundtruth.errors import GroundTruthError
+from groundtruth.json_file import read_json_value
+from groundtruth.lasers.building import find_building, read_building
 from groundtruth.trajectories.alignment import align_poses
 from groundtruth.trajectories.interpolation import matched_streams
 from groundtruth.trajectories.streams import PlanarPoses, read_planar_poses
+from storage.bounded import read_bounded
 
 FloatArray = NDArray[np.float64]
 T = TypeVar("T")
@@ -25,7 +29,6 @@ T = TypeVar("T")
 STREAMS = {"laser": "laser", "camera": "cameras", "fused": "fused"}
 
 _GAP_S = 5.0
-_MOST_JSON_BYTES = 1 << 26
 _MOST_LINES_BYTES = 1 << 28
 _MOST_PICTURE_BYTES = 1 << 24
 _PNG = b"\x89PNG\r\n\x1a\n"
@@ -125,7 +128,7 @@ def gather(session: Path, truth: Path | None = None) -> Inputs:
         session / "fused.json",
         session / "validation" / "validation.json",
     ):
-        document = _read(inputs, path, _json, quiet=path.name == "clock.json")
+        document = _read(inputs, path, _document, quiet=path.name == "clock.json")
         if document is not None:
             inputs.documents[path.name] = document
     inputs.visits = _visits(inputs)
@@ -169,8 +172,6 @@ def _read(
 
 
 def _building(session: Path, inputs: Inputs) -> FloatArray | None:
-    from groundtruth.lasers.building import find_building, read_building
-
     try:
         path = find_building(session)
     except GroundTruthError:
@@ -180,13 +181,8 @@ def _building(session: Path, inputs: Inputs) -> FloatArray | None:
     return None if building is None else building.segments
 
 
-def _json(path: Path) -> dict[str, Any]:
-    if path.stat().st_size > _MOST_JSON_BYTES:
-        raise GroundTruthError(f"{path}: larger than {_MOST_JSON_BYTES} bytes")
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError):
-        raise GroundTruthError(f"{path}: is no JSON that can be read") from None
+def _document(path: Path) -> dict[str, Any]:
+    content = read_json_value(path)
     if not isinstance(content, dict):
         raise GroundTruthError(f"{path}: expected an object")
     return content
@@ -194,38 +190,40 @@ def _json(path: Path) -> dict[str, Any]:
 
 def _sets_of_scans(path: Path) -> tuple[dict[str, int], list[Interval]]:
     """How many sets there are of each status, and stretches of those that are not determined."""
-    if path.stat().st_size > _MOST_LINES_BYTES:
-        raise GroundTruthError(f"{path}: larger than {_MOST_LINES_BYTES} bytes")
     counts: dict[str, int] = {}
     intervals: list[Interval] = []
     before = ""
-    with path.open(encoding="utf-8") as stream:
-        for number, line in enumerate(stream, 1):
-            try:
-                entry = json.loads(line)
-                status, time = str(entry["status"]), float(entry["t"])
-            except (ValueError, TypeError, KeyError, RecursionError):
-                raise GroundTruthError(
-                    f"{path}:{number}: expected an object with t and status"
-                ) from None
-            counts[status] = counts.get(status, 0) + 1
-            if status not in ("ok", "reacquired"):
-                if status == before:
-                    last = intervals[-1]
-                    intervals[-1] = Interval(status, last.from_s, time, last.sets + 1)
-                else:
-                    intervals.append(Interval(status, time, time, 1))
-            before = status
+    for number, line in enumerate(io.BytesIO(_content(path, _MOST_LINES_BYTES)), 1):
+        try:
+            entry = json.loads(line.decode("utf-8"))
+            status, time = str(entry["status"]), float(entry["t"])
+        except (ValueError, TypeError, KeyError, RecursionError):
+            raise GroundTruthError(
+                f"{path}:{number}: expected an object with t and status"
+            ) from None
+        counts[status] = counts.get(status, 0) + 1
+        if status not in ("ok", "reacquired"):
+            if status == before:
+                last = intervals[-1]
+                intervals[-1] = Interval(status, last.from_s, time, last.sets + 1)
+            else:
+                intervals.append(Interval(status, time, time, 1))
+        before = status
     return counts, intervals
 
 
 def _picture(path: Path) -> bytes:
-    if path.stat().st_size > _MOST_PICTURE_BYTES:
-        raise GroundTruthError(f"{path}: larger than {_MOST_PICTURE_BYTES} bytes")
-    content = path.read_bytes()
+    content = _content(path, _MOST_PICTURE_BYTES)
     if not content.startswith(_PNG):
         raise GroundTruthError(f"{path}: is no PNG")
     return content
+
+
+def _content(path: Path, largest_bytes: int) -> bytes:
+    try:
+        return read_bounded(path, largest_bytes)
+    except OSError as error:
+        raise GroundTruthError(f"{path}: cannot be read: {error.strerror}") from None
 
 
 def _visits(inputs: Inputs) -> list[tuple[float, float]]:

@@ -1,7 +1,4 @@
-"""The report as one HTML page: no scripts, nothing loaded, everything from files escaped.
-
-`groundtruth.report.html` escapes.
-"""
+"""The report as one HTML page: no scripts, nothing loaded, everything from files escaped."""
 
 from __future__ import annotations
 
@@ -10,12 +7,11 @@ import json
 import math
 from collections.abc import Iterable
 from typing import Any
-from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from groundtruth.report.html import element, figure, page, paragraph, table
 from groundtruth.report.inputs import STREAMS, Inputs, in_visits
+from groundtruth.report.parts import Part, Section, figure, page, paragraph, picture, table
 from groundtruth.report.svg import Series, Track, draw_map, draw_series, legend
 from groundtruth.trajectories.interpolation import matched_streams
 from groundtruth.trajectories.streams import PlanarPoses
@@ -45,18 +41,18 @@ def report_page(inputs: Inputs, version: str) -> bytes:
         Of the program, for the page's foot.
     """
     sections = [
-        ("state", "What there is", _state(inputs)),
-        ("map", "Map and path", _maps(inputs)),
-        ("errors", "Errors against the truth", _errors(inputs)),
-        ("validation", "Validation at reference poses", _validation(inputs)),
-        ("clock", "Clocks", _clock(inputs)),
-        ("rejected", "Rejected and lost", _rejected(inputs)),
-        ("settings", "Settings and versions", _settings(inputs, version)),
+        Section("state", "What there is", _state(inputs)),
+        Section("map", "Map and path", _maps(inputs)),
+        Section("errors", "Errors against the truth", _errors(inputs)),
+        Section("validation", "Validation at reference poses", _validation(inputs)),
+        Section("clock", "Clocks", _clock(inputs)),
+        Section("rejected", "Rejected and lost", _rejected(inputs)),
+        Section("settings", "Settings and versions", _settings(inputs, version)),
     ]
     return page(f"Ground truth: {inputs.name}", sections)
 
 
-def _state(inputs: Inputs) -> list[Element]:
+def _state(inputs: Inputs) -> list[Part]:
     rows = []
     for name, label in STREAMS.items():
         poses = inputs.streams.get(name)
@@ -64,7 +60,7 @@ def _state(inputs: Inputs) -> list[Element]:
             rows.append((label, *_extent(poses)))
     if inputs.truth is not None:
         rows.append(("truth", *_extent(inputs.truth)))
-    content: list[Element] = []
+    content: list[Part] = []
     if rows:
         head = ("stream", "poses", "from / s", "to / s", "covariances")
         content.append(table("Streams of poses", head, rows, text=(4,)))
@@ -93,7 +89,7 @@ def _track(name: str, poses: PlanarPoses, inputs: Inputs) -> Track:
     return Track(STREAMS.get(name, name), colour, dashes, in_visits(poses, inputs.visits))
 
 
-def _maps(inputs: Inputs) -> list[Element]:
+def _maps(inputs: Inputs) -> list[Part]:
     tracks = [_track(name, poses, inputs) for name, poses in inputs.streams.items()]
     everything = list(tracks)
     if inputs.odometry is not None:
@@ -124,7 +120,7 @@ def _maps(inputs: Inputs) -> list[Element]:
     return content
 
 
-def _errors(inputs: Inputs) -> list[Element]:
+def _errors(inputs: Inputs) -> list[Part]:
     if inputs.truth is None:
         words = "No truth in the session: give one by --truth to see errors over time."
         return [paragraph(words, kind="note")]
@@ -203,7 +199,7 @@ def _score_words(score: PoseScore) -> tuple[str, ...]:
     )  # fmt: skip
 
 
-def _validation(inputs: Inputs) -> list[Element]:
+def _validation(inputs: Inputs) -> list[Part]:
     document = inputs.documents.get("validation.json")
     if document is None:
         words = "No validation in the session: groundtruth validate writes it."
@@ -237,7 +233,7 @@ def _validation(inputs: Inputs) -> list[Element]:
     if inputs.picture is not None:
         source = "data:image/png;base64," + base64.b64encode(inputs.picture).decode("ascii")
         alt = "Plots of the linear and angular errors at each reference pose"
-        content.append(figure("Errors pose by pose.", element("img", src=source, alt=alt)))
+        content.append(picture("Errors pose by pose.", source, alt))
     refused = [r for r in _entry(document, "refused", list) if isinstance(r, dict)]
     if refused:
         content.append(
@@ -255,7 +251,7 @@ def _validation(inputs: Inputs) -> list[Element]:
     return content
 
 
-def _clock(inputs: Inputs) -> list[Element]:
+def _clock(inputs: Inputs) -> list[Part]:
     if inputs.clock is None:
         words = "No clock.json: all times are taken to be of one clock."
         return [paragraph(words, kind="note")]
@@ -293,8 +289,8 @@ def _clock(inputs: Inputs) -> list[Element]:
     return content
 
 
-def _rejected(inputs: Inputs) -> list[Element]:
-    content: list[Element] = []
+def _rejected(inputs: Inputs) -> list[Part]:
+    content: list[Part] = []
     if inputs.sets:
         counts = ", ".join(f"{number} {status}" for status, number in sorted(inputs.sets.items()))
         content.append(
@@ -344,7 +340,7 @@ def _rejected(inputs: Inputs) -> list[Element]:
     return content
 
 
-def _settings(inputs: Inputs, version: str) -> list[Element]:
+def _settings(inputs: Inputs, version: str) -> list[Part]:
     rows = []
     for name, document in inputs.documents.items():
         # A file of scanners has the version of its form there.

@@ -15,7 +15,8 @@ from groundtruth.errors import GroundTruthError
 from groundtruth.lasers.building import Building, write_building
 from groundtruth.report.inputs import Interval, gather
 from groundtruth.report.page import report_page
-from groundtruth.report.svg import Series, Track, draw_map, draw_series
+from groundtruth.report.parts import Section, figure, page, picture, table
+from groundtruth.report.svg import Series, Track, draw_map, draw_series, legend
 from groundtruth.trajectories.streams import PlanarPoses, write_planar_poses
 from groundtruth.validation.scoring import compare_streams
 
@@ -158,6 +159,42 @@ def test_hostile_text_from_files_is_only_text(session: Path) -> None:
     assert "\x00" not in page.text
     assert "errors.png: is no PNG" in page.text
     assert set(page.tags) <= KNOWN
+
+
+def test_hostile_text_in_drawings_is_only_text() -> None:
+    poses = PlanarPoses(np.arange(2.0), np.array([[0, 0, 0], [4.0, 2, 0]]))
+    drawing, _ = draw_map(HOSTILE, [Track(HOSTILE, HOSTILE, HOSTILE, poses)], None)
+    curves = draw_series(HOSTILE, HOSTILE, [], [])
+    key = legend([(HOSTILE, HOSTILE, HOSTILE)])
+    shown = [figure(HOSTILE, key, drawing, curves), picture(HOSTILE, "data:,", HOSTILE)]
+    text = page(HOSTILE, [Section("a", HOSTILE, [*shown, table(HOSTILE, [HOSTILE], [[HOSTILE]])])])
+    told = Page(text)
+    assert not told.open
+    assert set(told.tags) <= KNOWN | {"title"}
+    assert not any(name.startswith("on") for _, name, _ in told.attributes)
+    assert told.text.count("<script>alert(1)</script>") >= 8
+    assert not set("\x00\x7f") & set(text.decode("utf-8"))
+
+
+def test_files_larger_than_the_bounds_are_not_read(
+    session: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (session / "validation").mkdir()
+    (session / "validation" / "errors.png").write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(100))
+    (session / "laser.jsonl").write_text('{"t": 1, "status": "ok"}\n' * 10)
+    (session / "laser.json").write_text(json.dumps({"settings": "x" * 100}))
+    assert not gather(session).problems
+    for module, name in (
+        ("report.inputs", "_MOST_LINES_BYTES"),
+        ("report.inputs", "_MOST_PICTURE_BYTES"),
+        ("json_file", "_LARGEST_FILE_BYTES"),
+    ):
+        monkeypatch.setattr(f"groundtruth.{module}.{name}", 64)
+    inputs = gather(session)
+    for place in ("validation/errors.png", "laser.jsonl", "laser.json"):
+        assert f"{place}: cannot be read: larger than 64 bytes" in inputs.problems
+    assert inputs.picture is None
+    assert not inputs.sets
 
 
 def test_what_is_missing_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
