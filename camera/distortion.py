@@ -112,7 +112,19 @@ def _first_positive_root(polynomial: Polynomial) -> float:
 
 
 @lru_cache(maxsize=64)
-def _inverse_table(coef: Coef) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def inverse_table(coef: Coef) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Distorted radii, growing, and the undistorted radii that are seen there.
+
+    Parameters
+    ----------
+    coef : tuple of 5 floats
+        a2, a3, b1, b2, b3.
+
+    Returns
+    -------
+    distorted, undistorted : (16384,) float64
+        Normalised radii, from 0 to the fold or `RADIUS_LIMIT`. Read only.
+    """
     limit = min(fold_radius(coef), RADIUS_LIMIT)
     radius = np.tan(np.linspace(0.0, np.arctan(limit), _TABLE_NODES))
     radius[-1] = limit
@@ -126,7 +138,7 @@ def _inverse_table(coef: Coef) -> tuple[NDArray[np.float64], NDArray[np.float64]
 
 def largest_distorted_radius(coef: Coef) -> float:
     """Largest distorted radius at which a ray is seen: g at the fold or at `RADIUS_LIMIT`."""
-    return float(_inverse_table(coef)[0][-1])
+    return float(inverse_table(coef)[0][-1])
 
 
 def undistorted_radius(distorted: NDArray[np.float64], coef: Coef) -> NDArray[np.float64]:
@@ -151,7 +163,7 @@ def undistorted_radius(distorted: NDArray[np.float64], coef: Coef) -> NDArray[np
         Undistorted radii; NaN where no ray is seen at that radius.
     """
     target = np.asarray(distorted, dtype=np.float64)
-    table_g, table_r = _inverse_table(coef)
+    table_g, table_r = inverse_table(coef)
     flat = target.ravel()
     result = np.full(flat.shape, np.nan)
     active = np.flatnonzero((flat >= 0.0) & (flat <= table_g[-1]))

@@ -8,6 +8,8 @@ def __getattr__(name: str) -> str:
     from importlib.metadata import PackageNotFoundError, version
 
     try:
-        return version("redetect")
+        found = version("redetect")
     except PackageNotFoundError:  # a checkout that was never installed
-        return "unknown"
+        found = "unknown"
+    globals()["__version__"] = found  # the next one that asks finds it there
+    return found

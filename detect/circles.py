@@ -10,12 +10,16 @@ neighbours in the floor plane and refines the position.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera
+from camera.distortion import inverse_table
 from camera.kernels import camera_numbers
+from camera.model import PUBLISHED_STEP_PX
 from detect.centres import best_centres
 from detect.centres import quality_of_centres as quality_of_centres
 from detect.disc_covariance_kernels import refined_covariances
@@ -23,6 +27,7 @@ from detect.disc_fit import blur_ratio_of, fit_settings, fitted_positions
 from detect.disc_search_kernels import search_discs, strong_and_alone
 from detect.errors import FrameError
 from detect.noise import estimate_noise
+from detect.pixel_floor_kernels import published_positions as pixel_positions
 from detect.settings import CircleSettings
 from lut import DiscShape, DiscTable
 
@@ -105,10 +110,11 @@ def detect_circles(
             pixels, found_quality, contrast, table.floor_xy, weakest, settings.separation_m
         )
         pixels = pixels[keep]
+        floor_xy, covariance = published_positions(camera, pixels)
         return CircleDetections(
             pixels=pixels,
-            floor_xy=camera.floor_from_pixel(pixels.astype(np.float64)),
-            covariance=published_covariance(camera, pixels),
+            floor_xy=floor_xy,
+            covariance=covariance,
             quality=found_quality[keep],
             evidence=np.full(len(keep), np.nan),
         )
@@ -139,8 +145,7 @@ def detect_circles(
         floor_xy, fitted = fitted_positions(results)
         covariance = refined_covariance(camera, floor_xy, fitted, settings)
     else:
-        floor_xy = camera.floor_from_pixel(pixels.astype(np.float64))
-        covariance = published_covariance(camera, pixels)
+        floor_xy, covariance = published_positions(camera, pixels)
     return CircleDetections(
         pixels=pixels,
         floor_xy=floor_xy,
@@ -161,8 +166,8 @@ def disc_shape(settings: CircleSettings) -> DiscShape:
     )
 
 
-def published_covariance(camera: Camera, pixels: NDArray[np.int64]) -> FloatArray:
-    """The data set's covariance of positions that are pixels: (0.04 m)^2 I + 2 px^2 J J^T.
+def published_positions(camera: Camera, pixels: NDArray[np.int64]) -> tuple[FloatArray, FloatArray]:
+    """Positions on the floor that are pixels, as the data set has them.
 
     Parameters
     ----------
@@ -173,12 +178,43 @@ def published_covariance(camera: Camera, pixels: NDArray[np.int64]) -> FloatArra
 
     Returns
     -------
-    (N, 2, 2) float64
-        Square metres.
+    floor_xy : (N, 2) float64
+        Robot frame, metres; NaN where a pixel does not see the floor.
+    covariance : (N, 2, 2) float64
+        (0.04 m)^2 I + 2 px^2 J J^T, square metres. J is the Jacobian of the position by central
+        differences over 0.1 px (`Camera.floor_jacobian_published`).
     """
-    jacobian = camera.floor_jacobian_published(pixels.astype(np.float64))
-    spread = jacobian @ jacobian.swapaxes(-1, -2)
-    return np.asarray(PUBLISHED_FLOOR_M**2 * np.eye(2) + PUBLISHED_PIXEL_VARIANCE * spread)
+    kernel = _kernel_camera(camera)
+    return pixel_positions(
+        pixels, kernel.lens, kernel.pose, kernel.distorted, kernel.undistorted,
+        PUBLISHED_STEP_PX, PUBLISHED_FLOOR_M**2, PUBLISHED_PIXEL_VARIANCE,
+    )  # fmt: skip
+
+
+def published_covariance(camera: Camera, pixels: NDArray[np.int64]) -> FloatArray:
+    """The covariance of `published_positions`."""
+    return published_positions(camera, pixels)[1]
+
+
+class _KernelCamera(NamedTuple):
+    """A camera in the forms that kernels take."""
+
+    numbers: FloatArray
+    lens: FloatArray
+    pose: FloatArray
+    distorted: FloatArray
+    undistorted: FloatArray
+
+
+@lru_cache(maxsize=4)
+def _kernel_camera(camera: Camera) -> _KernelCamera:
+    lens = [camera.scale_x, camera.scale_y, camera.offset_x, camera.offset_y, *camera.coef]
+    return _KernelCamera(
+        camera_numbers(camera),
+        np.array(lens),
+        np.array(camera.robot_from_camera),
+        *inverse_table(camera.coef),
+    )
 
 
 def refined_covariance(
@@ -204,7 +240,7 @@ def refined_covariance(
     """
     return np.asarray(
         refined_covariances(
-            camera_numbers(camera),
+            _kernel_camera(camera).numbers,
             camera.centre,
             np.ascontiguousarray(floor_xy, np.float64),
             np.ascontiguousarray(fitted, np.float64),

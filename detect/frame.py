@@ -167,8 +167,16 @@ def tables_of(plan: FramePlan) -> Tables:
     lut.TableError
         If there can be none for the camera and the settings.
     """
-    shape = None if plan.circles is None else disc_shape(plan.circles)
-    return _tables(plan.camera, plan.lines is not None, shape)
+    global _latest
+    if _latest is None or _latest[0] is not plan:
+        # Whether two plans are equal takes longer to tell.
+        shape = None if plan.circles is None else disc_shape(plan.circles)
+        _latest = plan, _tables(plan.camera, plan.lines is not None, shape)
+    return _latest[1]
+
+
+#: The plan that this process was asked about last, and its tables.
+_latest: tuple[FramePlan, Tables] | None = None
 
 
 @lru_cache(maxsize=1)

@@ -6,7 +6,7 @@ This is all that a worker sends back, whichever process or machine it runs on: s
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from textwrap import indent
@@ -18,15 +18,19 @@ from detect.circles import CircleDetections
 from detect.errors import FrameError
 from detect.frame import FrameDetections, FramePlan, Tables, detect_frame
 from detect.line_identity import carry_ids
+from detect.lines import LineDetections
+from detect.row_text import unknown_rows
 from detect.run import RunFrame
 from detect.sources.times import format_time
 from landmarks import (
     Frame,
     FrameTilt,
+    Landmark,
     LineLandmark,
     circle_landmarks,
     format_frame,
     format_no_tilt,
+    format_record,
     format_tilt,
 )
 
@@ -94,26 +98,21 @@ def rows_of_frame(task: FrameTask, plan: FramePlan, tables: Tables) -> FrameRows
         return rows_of_failure(task, f"{name}: {type(error).__name__}: {error}")
 
     step = task.frame.step
+    head = _line(format_record(step))
     circles = lines = tilt = markers = record = b""
-    verticals: tuple[LineLandmark, ...] = ()
     if found.lines is not None:
-        verticals = found.lines.landmarks()
-        if task.reference is not None:
-            verticals = carry_ids(verticals, task.reference)
-        lines = format_frame(Frame(step, verticals))
+        lines = head + _line_rows(found.lines, task.reference)
         if found.tilt is None:
-            tilt = _line(format_no_tilt(step.prefix, len(verticals)))
+            tilt = _line(format_no_tilt(step.prefix, len(found.lines)))
         else:
             tilt = _line(format_tilt(found.tilt))
     if found.discs is not None:
         discs = found.discs
-        unknown = np.full(len(discs), -1)
-        landmarks = circle_landmarks(discs.floor_xy, discs.quality, discs.covariance, unknown)
-        circles = format_frame(Frame(step, landmarks))
+        circles = head + _circle_rows(discs)
         if plan.json:
             record = _json({"frame": step.prefix, "discs": _disc_records(discs)})
     if found.markers is not None:
-        markers = format_frame(Frame(step, found.markers.landmarks()))
+        markers = head + _rows(found.markers.landmarks())
     return FrameRows(
         circles=circles,
         lines=lines,
@@ -123,7 +122,7 @@ def rows_of_frame(task: FrameTask, plan: FramePlan, tables: Tables) -> FrameRows
         times=_time_row(task),
         pictures=tuple(_pictures(step.prefix, found, plan, tables)),
         disc_count=0 if found.discs is None else len(found.discs),
-        line_count=len(verticals),
+        line_count=0 if found.lines is None else len(found.lines),
         marker_count=0 if found.markers is None else len(found.markers),
         rejected=() if found.markers is None else tuple(sorted(found.markers.rejected.items())),
         has_tilt=found.lines is not None and found.tilt is not None,
@@ -143,6 +142,28 @@ def rows_of_failure(task: FrameTask, reason: str) -> FrameRows:
         times=_time_row(task),
         error=reason,
     )
+
+
+def _line_rows(found: LineDetections, reference: tuple[LineLandmark, ...] | None) -> bytes:
+    if reference is not None:
+        return _rows(carry_ids(found.landmarks(), reference))
+    columns = (found.ends, found.alpha_rad, found.beta_rad, np.zeros(len(found)), found.sigma_rad)
+    rows = unknown_rows("LANDMARK_L", *columns)
+    return _rows(found.landmarks()) if rows is None else rows
+
+
+def _circle_rows(found: CircleDetections) -> bytes:
+    spread = found.covariance
+    columns = (found.floor_xy, found.quality, spread[:, 0], spread[:, 1, 1])
+    rows = unknown_rows("LANDMARK_C", *columns)
+    if rows is not None:
+        return rows
+    unknown = np.full(len(found), -1)
+    return _rows(circle_landmarks(found.floor_xy, found.quality, spread, unknown))
+
+
+def _rows(landmarks: Iterable[Landmark]) -> bytes:
+    return b"".join(_line(format_record(landmark)) for landmark in landmarks)
 
 
 def _time_row(task: FrameTask) -> bytes:
@@ -178,6 +199,8 @@ def _disc_records(found: CircleDetections) -> list[dict[str, object]]:
 def _pictures(
     prefix: str, found: FrameDetections, plan: FramePlan, tables: Tables
 ) -> Iterator[tuple[str, bytes]]:
+    if plan.drawing is None and not plan.draw_response:
+        return
     from detect.drawing import draw_circles
     from detect.line_drawing import draw_lines, draw_response, draw_tracks
     from detect.line_tracks import line_response

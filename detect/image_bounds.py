@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import stat
 from pathlib import Path
@@ -17,13 +18,18 @@ MOST_PIXELS = 1 << 27
 _BYTES_PER_PIXEL = 16
 _BYTES_BESIDE = 1 << 23
 
+# Opening a pipe would wait for somebody at its other end.
+_WITHOUT_WAITING = os.O_RDONLY
+for _flag in ("O_NONBLOCK", "O_CLOEXEC", "O_BINARY"):
+    _WITHOUT_WAITING |= getattr(os, _flag, 0)
 
-def bounded_content(path: Path, name: object, size: tuple[int, int] | None) -> bytes:
+
+def bounded_content(path: Path | str, name: object, size: tuple[int, int] | None) -> bytes:
     """The content of an image file that may be anything: a pipe, a device, a film.
 
     Parameters
     ----------
-    path : path
+    path : path or str
         The file.
     name : object
         What messages call it.
@@ -42,16 +48,25 @@ def bounded_content(path: Path, name: object, size: tuple[int, int] | None) -> b
     pixels = MOST_PIXELS if size is None else size[0] * size[1]
     limit = _BYTES_BESIDE + _BYTES_PER_PIXEL * pixels
     try:
-        with open(path, "rb", opener=_without_waiting) as stream:
-            status = os.fstat(stream.fileno())
+        handle = os.open(path, _WITHOUT_WAITING)
+        try:
+            status = os.fstat(handle)
+            if stat.S_ISDIR(status.st_mode):
+                raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
             if not stat.S_ISREG(status.st_mode):
                 raise FrameError(f"{name}: cannot be read: is no file, but a pipe or a device")
             if status.st_size > limit:
                 raise FrameError(
                     f"{name}: has {status.st_size} bytes: expected an image, at most {limit}"
                 )
-            # Memory is taken for as much as is asked for, whatever there is.
-            return stream.read(status.st_size)
+            # Memory is taken for as much as is asked for, whatever there is. A file object would
+            # ask the system five times as often.
+            content = os.read(handle, status.st_size)
+            while (left := status.st_size - len(content)) and (more := os.read(handle, left)):
+                content += more  # some file systems give no more than so much at once
+            return content
+        finally:
+            os.close(handle)
     except OSError as error:
         raise FrameError(f"{name}: cannot be read: {error.strerror}") from None
 
@@ -90,8 +105,3 @@ def demand_bounded(content: bytes, name: object, size: tuple[int, int] | None) -
             f"expected {size[0]}x{size[1]}, the calibration's size: "
             "name the calibration of these images by --camera"
         )
-
-
-def _without_waiting(path: str, flags: int) -> int:
-    """Open a file; opening a pipe would wait for somebody at its other end."""
-    return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))

@@ -29,10 +29,17 @@ class ImageNames:
         Where the images are. It is listed once.
     pattern : str
         What the names of files must match, as in `fnmatch`.
+
+    Attributes
+    ----------
+    folder : path
+    has_links : bool
+        Whether any of them is a symbolic link.
     """
 
     def __init__(self, folder: Path, pattern: str = "*") -> None:
         self.folder = folder
+        self.has_links = False
         suffixes = set()
         keys = []
         matches = re.compile("" if pattern == "*" else fnmatch.translate(pattern)).match
@@ -40,6 +47,7 @@ class ImageNames:
             for entry in entries:
                 suffix = os.path.splitext(entry.name)[1]  # noqa: PTH122 - a Path for each is slow
                 if suffix.lower() in IMAGE_SUFFIXES and matches(entry.name):
+                    self.has_links |= entry.is_symlink()
                     suffixes.add(os.fsencode(suffix))
                     keys.append(_natural_order(entry.name))
         keys.sort()
@@ -47,7 +55,7 @@ class ImageNames:
             [os.fsencode(key.rpartition("/")[2]) for key in keys], dtype=np.bytes_
         )
         self._index = NameIndex(bytes(name) for name in self._names)
-        self._suffixes = (b"", *sorted(suffixes))
+        self._suffixes = tuple(sorted(suffixes))
 
     def __len__(self) -> int:
         return len(self._names)
@@ -60,6 +68,8 @@ class ImageNames:
         """The place of the image of a name, with or without its ending; the first of several."""
         stem = name.encode("utf-8", "surrogateescape")
         found = [self._index.find(stem + suffix) for suffix in self._suffixes]
+        if stem.endswith(self._suffixes):  # else there is nothing of that name as it stands
+            found.append(self._index.find(stem))
         return min((place for place in found if place is not None), default=None)
 
 

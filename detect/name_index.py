@@ -26,6 +26,7 @@ class NameIndex:
         order = np.argsort(keys, kind="stable")
         self._keys = keys[order]
         self._places = order.astype(np.uint32)
+        self._next = 0  # in a run, after a name mostly comes its successor
 
     def __len__(self) -> int:
         return len(self._keys)
@@ -33,11 +34,17 @@ class NameIndex:
     def find(self, name: bytes) -> int | None:
         """The place of a name in the sequence; None if it is not there."""
         key = _key(name)
+        keys = self._keys
         # For a wider needle numpy would copy the whole haystack to its width.
-        if not len(self._keys) or len(key) > self._keys.itemsize:
+        if not len(keys) or len(key) > keys.itemsize:
             return None
-        after = int(np.searchsorted(self._keys, np.bytes_(key), side="right"))
-        return int(self._places[after - 1]) if after and self._keys[after - 1] == key else None
+        after = self._next + 1
+        if after >= len(keys) or keys.item(after - 1) != key or keys.item(after) == key:
+            after = int(keys.searchsorted(np.bytes_(key), side="right"))
+            if not after or keys.item(after - 1) != key:
+                return None
+        self._next = after
+        return self._places.item(after - 1)
 
 
 def _key(name: bytes) -> bytes:

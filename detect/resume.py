@@ -54,7 +54,7 @@ from storage.parts import PartFile, folder_locked, left_part, new_part, remove_l
 _log = logging.getLogger("redetect")
 
 #: Raised with every change of what a journal or the rows that it stands for look like.
-_JOURNAL_VERSION = 1
+_JOURNAL_VERSION = 2
 
 
 class RunOutput(Protocol):
@@ -346,9 +346,8 @@ class RunFiles:
         for file, part in zip(self._files, content):
             file.write(part)
         if self._journal is not None:
-            lengths = tuple(len(part) for part in content)
-            self._check = checked(self._check, lengths, task, rows, content)
-            self._journal.add(JournalLine(lengths, task, rows, self._check, 0))
+            lengths = tuple([len(part) for part in content])
+            self._check = self._journal.add(self._check, lengths, task, rows, content)
         self._frames += 1
         self._failed += rows.error is not None
 
@@ -356,7 +355,7 @@ class RunFiles:
         def rows_of(rows: FrameRows, _: str) -> bytes:
             content = getattr(rows, output.part)
             assert isinstance(content, bytes)
-            return output.between + content if self._frames else content
+            return output.between + content if output.between and self._frames else content
 
         return rows_of
 

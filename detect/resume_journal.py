@@ -15,9 +15,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from detect.frame_rows import FrameRows, FrameTask
-from storage.parts import named, new_locked, old_locked
+from storage.parts import named, new_locked, old_locked, write_all
 
 _DIGITS = 16
+_COMPLETE = b'"complete"\n'
+_JSON = json.JSONEncoder(separators=(",", ":"))
 _LONGEST_LINE = 1 << 20
 _MOST_PARTS = 16
 
@@ -75,15 +77,25 @@ class Journal:
 
     def begin(self, head: JournalHead) -> None:
         """Write the first line."""
-        self._write([head.made_by, list(head.parts), head.overwrite])
+        self._write(_JSON.encode([head.made_by, list(head.parts), head.overwrite]).encode() + b"\n")
 
-    def add(self, line: JournalLine) -> None:
-        """Write a line for a frame."""
-        self._write([*_values(line.lengths, line.task, line.rows), line.check])
+    def add(
+        self,
+        before: str,
+        lengths: tuple[int, ...],
+        task: str,
+        rows: FrameRows,
+        content: list[bytes],
+    ) -> str:
+        """Write a line for a frame; returns its digest (see `checked`)."""
+        values = _encoded(lengths, task, rows)
+        check = _digest(before, values, content)
+        self._write(b'%b,"%b"]\n' % (values[:-1], check.encode()))
+        return check
 
     def complete(self) -> None:
         """Note that the files are complete and on the disk: they only have to take their places."""
-        self._write("complete")
+        self._write(_COMPLETE)
         os.fsync(self._handle)
 
     def read(self) -> tuple[JournalHead | None, Iterator[JournalLine]]:
@@ -116,7 +128,7 @@ class Journal:
 
     def is_complete(self) -> bool:
         """Whether the last line says so."""
-        end = b'\n"complete"\n'
+        end = b"\n" + _COMPLETE
         size = os.fstat(self._handle).st_size
         os.lseek(self._handle, max(0, size - len(end)), os.SEEK_SET)
         return os.read(self._handle, len(end)) == end
@@ -138,11 +150,9 @@ class Journal:
             os.close(self._handle)
             self._handle = -1
 
-    def _write(self, value: object) -> None:
-        left = memoryview(json.dumps(value, separators=(",", ":")).encode() + b"\n")
+    def _write(self, line: bytes) -> None:
         try:
-            while left:
-                left = left[os.write(self._handle, left) :]
+            write_all(self._handle, line)
         except OSError as error:
             raise named(error, self.place) from None
 
@@ -171,11 +181,11 @@ def checked(
     before: str, lengths: tuple[int, ...], task: str, rows: FrameRows, content: list[bytes]
 ) -> str:
     """The digest of a frame's line, the frame's rows and all before."""
-    digest = hashlib.sha256(before.encode())
-    digest.update(json.dumps(_values(lengths, task, rows)).encode())
-    for part in content:
-        digest.update(part)
-    return digest.hexdigest()[:_DIGITS]
+    return _digest(before, _encoded(lengths, task, rows), content)
+
+
+def _digest(before: str, values: bytes, content: list[bytes]) -> str:
+    return hashlib.sha256(b"".join([before.encode(), values, *content])).hexdigest()[:_DIGITS]
 
 
 def task_digest(task: FrameTask) -> str:
@@ -188,11 +198,13 @@ def task_digest(task: FrameTask) -> str:
     if frame.image is not None:
         image = frame.image.name
         try:
-            status = frame.image.stat()
+            status = os.stat(frame.image)  # noqa: PTH116 - that of a Path takes longer
             image = (image, status.st_size, status.st_mtime_ns)
         except (OSError, ValueError):
             pass  # nothing there: that counts as well
-    beside = (frame.step, image, frame.time_s, frame.bits, frame.failure, task.tilt, task.reference)
+    s = frame.step  # a record's own representation takes longer than all else here
+    step = (s.prefix, s.dx, s.dy, s.dphi, s.cxx, s.cxy, s.cyy, s.cxphi, s.cyphi, s.cphiphi)
+    beside = (step, image, frame.time_s, frame.bits, frame.failure, task.tilt, task.reference)
     digest = hashlib.sha256(repr(beside).encode("utf-8", "surrogateescape"))
     if frame.content is not None:
         content = frame.content
@@ -200,17 +212,18 @@ def task_digest(task: FrameTask) -> str:
     return digest.hexdigest()[:_DIGITS]
 
 
-def _values(lengths: tuple[int, ...], task: str, rows: FrameRows) -> list[object]:
-    return [
-        list(lengths),
+def _encoded(lengths: tuple[int, ...], task: str, rows: FrameRows) -> bytes:
+    values = [
+        lengths,
         task,
         rows.disc_count,
         rows.line_count,
         rows.marker_count,
         int(rows.has_tilt),
-        [list(pair) for pair in rows.rejected],
+        rows.rejected,
         rows.error,
     ]
+    return _JSON.encode(values).encode()
 
 
 def _parsed(text: bytes, end: int) -> JournalLine | None:

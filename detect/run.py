@@ -121,12 +121,13 @@ class RunFrames:
         return self._count
 
     def __iter__(self) -> Generator[RunFrame, None, None]:
+        homes = _homes(self._images)
         if self._odometry is None:
             for place in range(len(self._images)):
                 path = self._images.path(place)
                 step = _standing_still(path.stem)
                 try:
-                    _demand_no_link_out(path, self._images)
+                    _demand_no_link_out(path, homes)
                 except FrameError as error:
                     yield RunFrame(step, None, failure=str(error))
                     continue
@@ -134,11 +135,10 @@ class RunFrames:
             return
         for step in _steps(self._odometry):
             try:
-                found = _image_of(step, self._images)
+                image = _image_of(step, self._images, homes)
             except FrameError as error:
                 yield RunFrame(step, None, failure=str(error))
                 continue
-            image = None if found is None else self._images.path(found)
             yield RunFrame(step, image, bits=self._bits)
 
 
@@ -292,11 +292,14 @@ def _image_run(folder: Path, bits: int | None) -> ImageRun:
     else:
         named = np.zeros(len(images), bool)
         count = 0
+        homes = _homes(images)
         for step in _steps(odometry):
             count += 1
             with suppress(FrameError):  # told when it is the frame's turn
-                found = _image_of(step, images)
+                found = _place_of(step, images, homes)
                 if found is not None:
+                    if images.has_links:
+                        _demand_no_link_out(images.path(found), homes)
                     named[found] = True
         frames = RunFrames(images, odometry, count, int(np.count_nonzero(~named)), bits)
     return ImageRun(folder, frames, odometry, folder / "detected")
@@ -337,7 +340,9 @@ def read_image(
     elif frame.image is None:
         raise FrameError(f"{frame.step.prefix}: no image of that name in the run")
     else:
-        path = (working_folder or Path()).joinpath(frame.image)
+        path = os.fspath(frame.image)
+        if working_folder is not None:
+            path = os.path.join(working_folder, path)  # noqa: PTH118 - a Path costs several times that
         content = bounded_content(path, frame.image, size)
         image = decode_gray(content, name, frame.bits, size)
     if camera is not None and image.shape != (camera.height, camera.width):
@@ -375,8 +380,8 @@ def _odometry(folder: Path) -> Path | None:
     return None
 
 
-def _image_of(step: Step, images: ImageNames) -> int | None:
-    """The place of a step's image; None if there is none.
+def _image_of(step: Step, images: ImageNames, homes: tuple[str, ...]) -> Path | None:
+    """A step's image; None if there is none.
 
     Raises
     ------
@@ -384,18 +389,25 @@ def _image_of(step: Step, images: ImageNames) -> int | None:
         If the step's prefix, or a link of that name, leads out of the run: whoever made the file of
         steps does not decide which other files are read.
     """
+    found = _place_of(step, images, homes)
+    if found is None:
+        return None
+    path = images.path(found)
+    _demand_no_link_out(path, homes)
+    return path
+
+
+def _place_of(step: Step, images: ImageNames, homes: tuple[str, ...]) -> int | None:
+    """The place of a step's image, by its name alone."""
     name = step.prefix.strip('"')
-    why = leads_out(name, *_homes(images))
+    why = leads_out(name, *homes)
     if why is not None:
         raise FrameError(f"{excerpt(step.prefix)}: the prefix {why}: expected an image of the run")
-    found = images.find(name.replace("\\", "/").rsplit("/", 1)[-1])
-    if found is not None:
-        _demand_no_link_out(images.path(found), images)
-    return found
+    return images.find(name.replace("\\", "/").rsplit("/", 1)[-1])
 
 
-def _demand_no_link_out(path: Path, images: ImageNames) -> None:
-    if path.is_symlink() and link_out(path, *map(Path, _homes(images))):
+def _demand_no_link_out(path: Path, homes: tuple[str, ...]) -> None:
+    if os.path.islink(path) and link_out(path, *map(Path, homes)):  # noqa: PTH114 - much sooner
         raise FrameError(
             f"{path}: cannot be read: is a link that leads out of the run: expected an image in it"
         )

@@ -105,7 +105,8 @@ class RunSummary:
         self.lines += rows.line_count
         self.tilts += rows.has_tilt
         self.markers += rows.marker_count
-        self.rejected.update(dict(rows.rejected))
+        if rows.rejected:
+            self.rejected.update(dict(rows.rejected))
         if rows.error is not None:
             self.failed += 1
             if len(self.failures) < KEPT_FAILURES:

@@ -37,7 +37,9 @@ _LONGEST_ID_DIGITS = 20
 _BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 
 # Narrower than `float`, which also takes nan, infinity and 1_000.
-_NUMBER = re.compile(rb"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
+_NUMBER_PATTERN = rb"[+-]?(?:[0-9]++(?:\.[0-9]*+)?|\.[0-9]++)(?:[eE][+-]?[0-9]++)?"
+_NUMBER = re.compile(_NUMBER_PATTERN)
+_NUMBERS = re.compile(rb"(?:%b )*+" % _NUMBER_PATTERN)
 _WHOLE_NUMBER = re.compile(rb"[+-]?[0-9]+")
 
 
@@ -256,12 +258,11 @@ def _numbers_and_ids(
 
 
 def _numbers(words: list[bytes], names: tuple[str, ...]) -> list[float]:
-    numbers = []
-    for word, name in zip(words, names):
-        if not _NUMBER.fullmatch(word):
-            raise LandmarkError(f"{name} is {excerpt(word)}: expected a finite number")
-        numbers.append(float(word))
-    return numbers
+    if not _NUMBERS.fullmatch(b" ".join([*words, b""])):
+        for word, name in zip(words, names):
+            if not _NUMBER.fullmatch(word):
+                raise LandmarkError(f"{name} is {excerpt(word)}: expected a finite number")
+    return [float(word) for word in words]
 
 
 def _identifier(word: bytes) -> int:

@@ -7,8 +7,11 @@ metres and radians. The field names are the format's own.
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from math import isfinite
+from operator import attrgetter
 
 from landmarks.errors import LandmarkError, excerpt
 
@@ -287,7 +290,17 @@ class Row:
         return self if record == self.record else Row(record, line=self.line)
 
 
+@cache
+def _values_of(names: tuple[str, ...]) -> Callable[[object], tuple[float, ...]]:
+    """What takes attributes of those names off a record."""
+    if len(names) == 1:
+        return lambda record: (getattr(record, names[0]),)
+    return attrgetter(*names)
+
+
 def _demand_finite(record: object, names: tuple[str, ...]) -> None:
+    if all(map(isfinite, _values_of(names)(record))):
+        return
     for name in names:
         value = getattr(record, name)
         if not isfinite(value):

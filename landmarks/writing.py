@@ -60,7 +60,7 @@ def format_head(head: str, line_end: LineEnd = "\n") -> bytes:
 def format_frame(frame: Frame, line_end: LineEnd = "\n") -> bytes:
     """The rows of a frame as they stand in a file: its STEP and its landmarks."""
     records = (frame.step, *frame.landmarks)
-    return b"".join(_encode(format_record(record) + line_end) for record in records)
+    return _encode("".join([format_record(record) + line_end for record in records]))
 
 
 def write_frames(

@@ -63,10 +63,8 @@ class PartFile:
         OSError
             That names the result, not the part.
         """
-        left = memoryview(content)
         try:
-            while left:
-                left = left[os.write(self._handle, left) :]
+            write_all(self._handle, content)
         except OSError as error:
             raise named(error, self.path) from None
 
@@ -125,6 +123,13 @@ class PartFile:
         if self._handle >= 0:
             os.close(self._handle)
             self._handle = -1
+
+
+def write_all(handle: int, content: bytes) -> None:
+    """Write to a descriptor, which may take less than it is given at once."""
+    written = os.write(handle, content) if content else 0
+    while written < len(content):
+        written += os.write(handle, content[written:])
 
 
 def new_part(path: Path) -> PartFile:

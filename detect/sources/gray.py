@@ -52,7 +52,7 @@ def decode_gray(
     """
     if not content:
         raise FrameError(f"{name}: is empty: expected an image")
-    if content.startswith(_JPEG_BEGIN) and _JPEG_END not in content[len(content) // 2 :]:
+    if content.startswith(_JPEG_BEGIN) and content.rfind(_JPEG_END, len(content) // 2) < 0:
         raise FrameError(f"{name}: the JPEG is cut off: its end is missing")
     demand_bounded(content, name, size)
     image = _decoded(content, deep=bits < 16)
@@ -82,6 +82,8 @@ def gray_of_pixels(pixels: NDArray[Any], name: object, bits: int = 16) -> NDArra
     FrameError
         If there are other numbers in it, or values that need more bits.
     """
+    if pixels.ndim == 2 and pixels.dtype == np.uint8:  # of all images but a few
+        return np.ascontiguousarray(pixels)
     if pixels.dtype not in (np.uint8, np.uint16):
         raise FrameError(f"{name}: holds {pixels.dtype}: expected images of 8 or 16 bits")
     if pixels.ndim == 3:

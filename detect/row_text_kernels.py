@@ -1,0 +1,142 @@
+"""Compiled: rows of numbers as C's ``%g`` writes them."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+#: Powers of ten that a double holds exactly.
+_POWERS = np.array([10.0**k for k in range(23)])
+_DIGITS = 6
+_LEAST, _MOST = 10.0 ** (_DIGITS - 1), 10.0**_DIGITS
+#: A product with a power of ten is off by some 1e-10 of a last digit; what is farther than this
+#: from the middle between two digits is rounded right.
+_DOUBTFUL = 1e-7
+
+_ZERO, _POINT, _MINUS, _PLUS, _SPACE, _E = (ord(c) for c in "0.-+ e")
+
+#: Most bytes of a number and the space before it.
+LONGEST = 14
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _significant_digits(size: float) -> tuple[int, int]:
+    """The 6 digits of a number above 0 as an integer, and the exponent of the first; -1 if unsure.
+
+    The digits are 100000 to 999999.
+    """
+    exponent = math.floor(math.log10(size))
+    for _ in range(2):
+        power = _DIGITS - 1 - exponent
+        if not -len(_POWERS) < power < len(_POWERS):
+            return -1, 0
+        scaled = size * _POWERS[power] if power >= 0 else size / _POWERS[-power]
+        # The logarithm may be rounded over a whole number.
+        if scaled < _LEAST:
+            exponent -= 1
+        elif scaled >= _MOST:
+            exponent += 1
+        else:
+            break
+    digits = math.floor(scaled)
+    rest = scaled - digits
+    if not _LEAST <= scaled < _MOST or abs(rest - 0.5) < _DOUBTFUL:
+        return -1, 0
+    number = int(digits) + (1 if rest > 0.5 else 0)
+    if number == 1000000:
+        return 100000, exponent + 1
+    return number, exponent
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _write_number(value: float, text: NDArray[np.uint8], at: int) -> int:
+    """Write a number; returns where it ends, -1 if its digits are not sure."""
+    if math.copysign(1.0, value) < 0.0:
+        text[at] = _MINUS
+        at += 1
+    if value == 0.0:
+        text[at] = _ZERO
+        return at + 1
+    number, exponent = _significant_digits(abs(value))
+    if number < 0:
+        return -1
+    count = _DIGITS
+    while number % 10 == 0:
+        number //= 10
+        count -= 1
+    scientific = exponent < -4 or exponent >= _DIGITS
+    # Digits before the point; none at all is a zero.
+    whole = 1 if scientific else exponent + 1
+    if whole <= 0:
+        text[at] = _ZERO
+        text[at + 1] = _POINT
+        at += 2
+        for _ in range(-whole):
+            text[at] = _ZERO
+            at += 1
+        whole = 0
+    length = max(count, whole) + (1 if 0 < whole < count else 0)
+    place = at + length - 1
+    for _ in range(whole - count):
+        text[place] = _ZERO
+        place -= 1
+    for k in range(count - 1, -1, -1):
+        text[place] = _ZERO + number % 10
+        number //= 10
+        place -= 1
+        if k == whole and whole > 0:
+            text[place] = _POINT
+            place -= 1
+    at += length
+    if scientific:
+        text[at] = _E
+        text[at + 1] = _MINUS if exponent < 0 else _PLUS
+        size = abs(exponent)
+        text[at + 2] = _ZERO + size // 10
+        text[at + 3] = _ZERO + size % 10
+        at += 4
+    return at
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def write_rows(
+    head: NDArray[np.uint8],
+    numbers: NDArray[np.float64],
+    tail: NDArray[np.uint8],
+    text: NDArray[np.uint8],
+) -> int:
+    """Write rows: the head, the numbers with a space before each, the tail.
+
+    Parameters
+    ----------
+    head, tail : (A,), (B,) uint8
+    numbers : (N, K) float64
+    text : (N * (A + K * LONGEST + B),) uint8
+        Result.
+
+    Returns
+    -------
+    int
+        How many bytes there are; -1 if a number is not finite, or is so close to the middle between
+        two numbers of 6 digits, so large or so small that this arithmetic cannot tell its digits.
+    """
+    at = 0
+    for i in range(numbers.shape[0]):
+        for k in range(len(head)):
+            text[at + k] = head[k]
+        at += len(head)
+        for j in range(numbers.shape[1]):
+            value = numbers[i, j]
+            if not math.isfinite(value):
+                return -1
+            text[at] = _SPACE
+            at = _write_number(value, text, at + 1)
+            if at < 0:
+                return -1
+        for k in range(len(tail)):
+            text[at + k] = tail[k]
+        at += len(tail)
+    return at
