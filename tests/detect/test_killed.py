@@ -21,6 +21,14 @@ from pathlib import Path
 import pytest
 
 from detect.cli import main
+from tests.detect.forked_runs import (
+    DieAfter,
+    DieAtPlacing,
+    ForkedRuns,
+    Room,
+    StopAfter,
+    forked_runs,
+)
 
 Captured = pytest.CaptureFixture[str]
 
@@ -30,28 +38,6 @@ PATIENCE_S = 120.0
 PREVIOUS = b"what was there before\n"
 
 pytestmark = pytest.mark.skipif(not Path("/proc").is_dir(), reason="kills as Linux does")
-
-#: Runs `detect`, but is killed at the so manyth file that takes its place; or may only write files
-#: of so many bytes.
-PROGRAM = """
-import os, resource, signal, sys
-from pathlib import Path
-from detect.cli import main
-
-how, number = sys.argv[1], int(sys.argv[2])
-if how == "placing":
-    replace, placed = Path.replace, []
-    def killed(self, target):
-        if len(placed) == number:
-            os.kill(os.getpid(), signal.SIGKILL)
-        placed.append(target)
-        return replace(self, target)
-    Path.replace = killed
-if how == "room":
-    resource.setrlimit(resource.RLIMIT_FSIZE, (number, resource.RLIM_INFINITY))
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[3:]))
-"""
 
 
 def a_run(project_root: Path, run: Path) -> Path:
@@ -85,18 +71,19 @@ def undisturbed(run_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> d
     return results(output)
 
 
+@pytest.fixture(scope="module")
+def runs(
+    run_folder: Path, undisturbed: dict[str, bytes], tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[ForkedRuns]:
+    with forked_runs(run_folder, tmp_path_factory.mktemp("forked")) as started_runs:
+        yield started_runs
+
+
 @pytest.fixture
 def output(tmp_path: Path) -> Path:
     folder = tmp_path / "output"
     folder.mkdir()
     return folder
-
-
-@pytest.fixture
-def program(tmp_path: Path) -> Path:
-    path = tmp_path / "program.py"
-    path.write_text(PROGRAM)
-    return path
 
 
 def results(folder: Path) -> dict[str, bytes]:
@@ -135,12 +122,6 @@ def started(arguments: list[str]) -> subprocess.Popen[str]:
     )
 
 
-def ended(arguments: list[str]) -> tuple[int, str]:
-    with started(arguments) as process:
-        _, err = process.communicate(timeout=PATIENCE_S)
-    return process.returncode, err
-
-
 def wait_until(condition: Callable[[], bool], process: subprocess.Popen[str]) -> None:
     end = time.monotonic() + PATIENCE_S
     while not condition() and process.poll() is None:
@@ -156,14 +137,19 @@ def journalled(folder: Path) -> int:
         return 0
 
 
-def killed(run: Path, output: Path, frames: int, *flags: str) -> int:
-    """Kill a run once it has done so many frames; gives how many it had done."""
-    with started(["-m", "detect", *command(run, output, *flags)]) as process:
-        wait_until(lambda: journalled(output) >= frames, process)
+def killed(runs: ForkedRuns, run: Path, output: Path, frames: int, *flags: str) -> int:
+    """Kill a run once it has done so many frames; gives how many are done."""
+    with runs.started(command(run, output, *flags), StopAfter(frames)) as process:
+        process.wait_until_stopped()
         process.kill()
-        process.communicate(timeout=PATIENCE_S)
-    assert process.returncode == -signal.SIGKILL
+        assert process.wait() == -signal.SIGKILL
     return journalled(output)
+
+
+def processor_s_of(arguments: list[str]) -> float:
+    begun = time.process_time()
+    assert main(arguments) == 3
+    return time.process_time() - begun
 
 
 def resumed(run: Path, output: Path, capsys: Captured, *flags: str) -> int:
@@ -184,8 +170,14 @@ def resumed(run: Path, output: Path, capsys: Captured, *flags: str) -> int:
 def test_a_killed_run_is_resumed(
     run_folder: Path, output: Path, undisturbed: dict[str, bytes], capsys: Captured, jobs: str
 ) -> None:
+    """As a user starts it, with and without workers."""
     before = lay_previous(output)
-    done = killed(run_folder, output, 14, "--jobs", jobs)
+    with started(["-m", "detect", *command(run_folder, output, "--jobs", jobs)]) as process:
+        wait_until(lambda: journalled(output) >= 14, process)
+        process.kill()
+        process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == -signal.SIGKILL
+    done = journalled(output)
     assert results(output) == before
     assert resumed(run_folder, output, capsys, "--jobs", jobs) == done >= 14
     assert results(output) == undisturbed
@@ -194,38 +186,53 @@ def test_a_killed_run_is_resumed(
 
 @pytest.mark.long
 def test_a_resumed_run_may_be_killed_again(
-    run_folder: Path, output: Path, undisturbed: dict[str, bytes], capsys: Captured
+    runs: ForkedRuns,
+    run_folder: Path,
+    output: Path,
+    undisturbed: dict[str, bytes],
+    capsys: Captured,
 ) -> None:
-    first = killed(run_folder, output, 8)
-    second = killed(run_folder, output, first + 8, "--resume")
-    assert second >= first + 8 or results(output) == undisturbed
+    first = killed(runs, run_folder, output, 8)
+    second = killed(runs, run_folder, output, 8, "--resume")
+    assert (first, second) == (8, 16)
     assert resumed(run_folder, output, capsys) == second
     assert results(output) == undisturbed
 
 
 @pytest.mark.long
 def test_killed_at_any_moment(
-    run_folder: Path, output: Path, undisturbed: dict[str, bytes], capsys: Captured
+    runs: ForkedRuns,
+    run_folder: Path,
+    output: Path,
+    undisturbed: dict[str, bytes],
+    capsys: Captured,
 ) -> None:
     """At fifty moments, from the program's start to its end, with and without workers."""
     moments = random.Random(5)
     outcomes = {"previous": 0, "new": 0}
+    whole_s = processor_s_of(command(run_folder, output))
     for trial in range(50):
         jobs = "2" if trial % 5 == 4 else "1"
         before = lay_previous(output)
-        with started(["-m", "detect", *command(run_folder, output, "--jobs", jobs)]) as process:
-            if trial % 2:  # half of them surely while frames are worked on
-                frames = moments.randrange(FRAMES)
-                wait_until(lambda frames=frames: journalled(output) >= frames, process)  # type: ignore[misc]
+        arguments = command(run_folder, output, "--jobs", jobs)
+        if trial % 2:  # half of them surely while frames are worked on
+            with runs.started(arguments, StopAfter(moments.randrange(FRAMES))) as process:
+                process.wait_until_stopped()
+                process.go_on()
                 time.sleep(moments.uniform(0.0, 0.02))
-            else:
+                process.kill()
+        elif trial % 10 == 0 or jobs == "2":  # as users start it
+            with started(["-m", "detect", *arguments]) as program:
                 time.sleep(moments.uniform(0.0, 4.0))
-            process.kill()
-            process.communicate(timeout=PATIENCE_S)
+                program.kill()
+                program.communicate(timeout=PATIENCE_S)
+        else:
+            code, err = runs.ended(arguments, DieAfter(moments.uniform(0.0, 1.1 * whole_s)))
+            assert code in (-signal.SIGPROF, 3), err
         found = results(output)
         assert found in (before, undisturbed)
         outcomes["new" if found == undisturbed else "previous"] += 1
-        resumed(run_folder, output, capsys, "--jobs", jobs)
+        resumed(run_folder, output, capsys, "--jobs", "2" if trial in (4, 9) else "1")
         assert results(output) == undisturbed
         assert hidden(output) == set()
     assert outcomes["previous"] > 20
@@ -235,9 +242,9 @@ def test_killed_at_any_moment(
 @pytest.mark.parametrize("placed", [0, 1, 2, 3])
 @pytest.mark.long
 def test_killed_while_files_take_their_places(
+    runs: ForkedRuns,
     run_folder: Path,
     output: Path,
-    program: Path,
     undisturbed: dict[str, bytes],
     capsys: Captured,
     placed: int,
@@ -245,7 +252,7 @@ def test_killed_while_files_take_their_places(
 ) -> None:
     """The next run does what was left, whether or not it resumes, and whatever else it does."""
     lay_previous(output)
-    code, _ = ended([str(program), "placing", str(placed), *command(run_folder, output)])
+    code, _ = runs.ended(command(run_folder, output), DieAtPlacing(placed))
     assert code == -signal.SIGKILL
     if resume:
         assert resumed(run_folder, output, capsys) == 0
@@ -258,9 +265,9 @@ def test_killed_while_files_take_their_places(
 
 @pytest.mark.long
 def test_what_a_killed_run_left_is_removed(
-    run_folder: Path, output: Path, undisturbed: dict[str, bytes]
+    runs: ForkedRuns, run_folder: Path, output: Path, undisturbed: dict[str, bytes]
 ) -> None:
-    killed(run_folder, output, 10)
+    killed(runs, run_folder, output, 10)
     assert hidden(output) == {".detected.journal", *[f".detected.{kind}.part" for kind in KINDS]}
     assert main(command(run_folder, output)) == 3
     assert results(output) == undisturbed
@@ -269,10 +276,14 @@ def test_what_a_killed_run_left_is_removed(
 
 @pytest.mark.long
 def test_files_that_must_stay_do_not_cost_what_was_kept(
-    run_folder: Path, output: Path, undisturbed: dict[str, bytes], capsys: Captured
+    runs: ForkedRuns,
+    run_folder: Path,
+    output: Path,
+    undisturbed: dict[str, bytes],
+    capsys: Captured,
 ) -> None:
     """Who forgets `--force` is told, and loses nothing."""
-    done = killed(run_folder, output, 10)
+    done = killed(runs, run_folder, output, 10)
     lay_previous(output)
     for flags in ([], ["--resume"]):
         assert main(["all", str(run_folder), "-o", str(output), *flags]) == 1
@@ -481,9 +492,9 @@ def test_pictures_of_the_frame_under_way(run_folder: Path, tmp_path: Path) -> No
 @pytest.mark.long
 @pytest.mark.parametrize("room", [100, 2_000, 9_000, 30_000])
 def test_no_room_left(
+    runs: ForkedRuns,
     run_folder: Path,
     output: Path,
-    program: Path,
     undisturbed: dict[str, bytes],
     capsys: Captured,
     room: int,
@@ -491,7 +502,7 @@ def test_no_room_left(
     """The largest file may have so many bytes: too few for it at first, then half-way."""
     assert room < max(len(content) for content in undisturbed.values())
     before = lay_previous(output)
-    code, err = ended([str(program), "room", str(room), *command(run_folder, output)])
+    code, err = runs.ended(command(run_folder, output), Room(room))
     assert code == 1, err
     *_, line = err.splitlines()
     assert line.startswith("error: ")
@@ -510,12 +521,13 @@ def test_the_limit_is_the_tests_own() -> None:
 
 
 @pytest.mark.long
-def test_the_folder_vanishes(run_folder: Path, output: Path) -> None:
-    with started(["-m", "detect", *command(run_folder, output)]) as process:
-        wait_until(lambda: journalled(output) >= 5, process)
+def test_the_folder_vanishes(runs: ForkedRuns, run_folder: Path, output: Path) -> None:
+    with runs.started(command(run_folder, output), StopAfter(5)) as process:
+        process.wait_until_stopped()
         shutil.rmtree(output)
-        _, err = process.communicate(timeout=PATIENCE_S)
-    assert process.returncode == 1, err
+        process.go_on()
+        code, err = process.wait(), process.said()
+    assert code == 1, err
     *_, line = err.splitlines()
     assert line.startswith("error: ")
     assert "No such file or directory" in line
@@ -525,15 +537,18 @@ def test_the_folder_vanishes(run_folder: Path, output: Path) -> None:
 
 
 @pytest.mark.long
-def test_a_folder_of_the_same_name_comes_back(run_folder: Path, output: Path) -> None:
+def test_a_folder_of_the_same_name_comes_back(
+    runs: ForkedRuns, run_folder: Path, output: Path
+) -> None:
     """Somebody moved the results away and laid others there: nothing of them is touched."""
-    with started(["-m", "detect", *command(run_folder, output)]) as process:
-        wait_until(lambda: journalled(output) >= 5, process)
+    with runs.started(command(run_folder, output), StopAfter(5)) as process:
+        process.wait_until_stopped()
         output.rename(output.with_name("moved"))
         output.mkdir()
         before = lay_previous(output)
-        process.communicate(timeout=PATIENCE_S)
-    assert process.returncode == 1
+        process.go_on()
+        code = process.wait()
+    assert code == 1
     assert results(output) == before
     assert hidden(output) == set()
 
