@@ -252,10 +252,12 @@ def test_timing_is_measured_if_asked_for(judged_run: Path, tmp_path: Path) -> No
     assert "medians of 2 frames" in words
 
 
-HOSTILE = "<script>alert(1)</script><img/src=x/onerror=alert(2)>\"'&amp;{{7*7}}"
+HOSTILE = "<script>document.title='in'</script><img/src=x/onerror=alert(2)>\"'&amp;{{7*7}}"
 
 
-def test_everything_from_files_is_escaped(small_run: Path, tmp_path: Path) -> None:
+@pytest.fixture
+def hostile_run(small_run: Path, tmp_path: Path) -> tuple[Path, str]:
+    """A run whose every name and line is hostile, and its frame's name."""
     name = HOSTILE.replace("/", "")
     step = f"STEP {name} 0 0 0 0 0 0 0 0 0\n"
     (small_run / "s.txt").write_bytes(step.encode() + b"STEP x\xff\x01y 0 0 0 0 0 0 0 0 0\n")
@@ -265,7 +267,11 @@ def test_everything_from_files_is_escaped(small_run: Path, tmp_path: Path) -> No
     (small_run / "map.circles").write_text(step + row + row.replace("0.1", "0.9"))
     # An image of such a name, so that it is in captions and alternative texts as well.
     shutil.copy(small_run / "images" / "s.0000.png", small_run / "images" / f"{name}.png")
-    folder = Path(shutil.copytree(small_run, tmp_path / "<b>&run"))
+    return Path(shutil.copytree(small_run, tmp_path / "<b>&run")), name
+
+
+def test_everything_from_files_is_escaped(hostile_run: tuple[Path, str], tmp_path: Path) -> None:
+    folder, name = hostile_run
     page = reported(folder, tmp_path / "r.html")
     assert not page.of("b")
     words = " ".join(page.words)
@@ -277,20 +283,40 @@ def test_everything_from_files_is_escaped(small_run: Path, tmp_path: Path) -> No
     assert not re.search(r"[\x00-\x08\x0b-\x1f\x7f]", words)
 
 
-@pytest.mark.long
-def test_browser_has_nothing_to_complain_of(judged_run: Path, tmp_path: Path) -> None:
+def in_browser(page: Path, folder: Path) -> tuple[str, str]:
+    """What a browser made of a page, and what it said."""
     browser = shutil.which("chromium") or shutil.which("google-chrome")
     if browser is None:
         pytest.skip("no Chromium on this machine")
-    reported(judged_run, tmp_path / "r.html")
     flags = ("--headless", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr", "--v=0")
-    profile = f"--user-data-dir={tmp_path / 'profile'}"
     shown = subprocess.run(
-        [browser, *flags, profile, "--dump-dom", (tmp_path / "r.html").as_uri()],
+        [browser, *flags, f"--user-data-dir={folder}", "--dump-dom", page.as_uri()],
         capture_output=True, text=True, timeout=120, check=True,
     )  # fmt: skip
-    assert "Effective configuration" in shown.stdout
-    assert "CONSOLE" not in shown.stderr
+    return shown.stdout, shown.stderr
+
+
+@pytest.mark.long
+def test_nothing_of_a_file_is_executed(hostile_run: tuple[Path, str], tmp_path: Path) -> None:
+    """Not even if the browser took no notice of the page's own prohibition of scripts."""
+    reported(hostile_run[0], tmp_path / "r.html")
+    text = (tmp_path / "r.html").read_text()
+    prohibition = re.compile(r'<meta http-equiv="Content-Security-Policy"[^>]*>')
+    (tmp_path / "r.html").write_text(prohibition.sub("", text))
+    shown, _ = in_browser(tmp_path / "r.html", tmp_path / "profile")
+    assert "<title>Detections of &lt;b&gt;&amp;run</title>" in shown
+    # The same words as they are would be.
+    (tmp_path / "x.html").write_text(f"<!DOCTYPE html><title>not in</title>{HOSTILE}")
+    shown, _ = in_browser(tmp_path / "x.html", tmp_path / "profile")
+    assert "<title>in</title>" in shown
+
+
+@pytest.mark.long
+def test_browser_has_nothing_to_complain_of(judged_run: Path, tmp_path: Path) -> None:
+    reported(judged_run, tmp_path / "r.html")
+    shown, said = in_browser(tmp_path / "r.html", tmp_path / "profile")
+    assert "Effective configuration" in shown
+    assert "CONSOLE" not in said
 
 
 def test_refusals(judged_run: Path, tmp_path: Path, capsys: Captured) -> None:
