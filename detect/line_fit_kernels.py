@@ -149,7 +149,7 @@ def fit_eigenlines(
     return reference, pixel, line, scatter_px, middle, spread, rise, off
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"})
+@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"}, forceinline=True)
 def refine_lines(
     image: NDArray[np.uint8],
     table_column: NDArray[np.float32],

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from detect.line_fit import LineFits
 from detect.line_settings import LineSettings
+from detect.line_step_filters import StepFilters, step_filters
 from detect.line_tracks import LineTracks
-from detect.tilt import TiltEstimate, consensus, level_rotation
+from detect.tilt import REFINEMENTS, SOFTENING, TiltEstimate
 from lut.verticals import VerticalTable
 
 FloatArray = NDArray[np.float64]
@@ -36,81 +39,82 @@ FATES = (
     "same edge",
     "beside a stronger edge",
 )
-_NOT_VERTICAL = FATES.index("not vertical")
 
 
-def judge_lines(
-    tracks: LineTracks, fits: LineFits, table: VerticalTable, settings: LineSettings
-) -> tuple[FloatArray, FateArray]:
-    """Tell for each track what speaks for it, and whether it can be a vertical, by itself.
+@dataclass(frozen=True, slots=True, eq=False)
+class Judgement:
+    """Lines through tracks, and what they are.
 
-    Returns
-    -------
+    Attributes
+    ----------
+    fits : LineFits
+        A line for each track; those too short or too faint to be lines have none.
     evidence : (T,) float64
         Response summed over the track's length in pixel widths, weakened by the square of its
         sharpness: soft edges are shadows and glare more often than the building's.
     fate : (T,) int8
         Places in `FATES`.
+    tilt : TiltEstimate or None
+        That most lines agree with; None where too few do.
+    votes : float
+        Part of all votes that is for that tilt; NaN for none.
+    lean_deviation_rad : float
+        Standard deviation, due to that of the tilt, of the lean that verticals should show, where
+        in the image it is largest; NaN for none.
     """
-    from detect.line_judgement_kernels import judge_tracks
 
-    evidence, fate = judge_tracks(
-        tracks.bounds, tracks.row, tracks.column, tracks.score, table.horizon_row,
-        table.row_aspect, fits.pixel_rad, fits.line, fits.covariance, fits.scatter_px,
-        fits.shift_px, fits.contrast, fits.sharpness, settings.least_points(table.row_aspect),
-        settings.least_evidence, settings.largest_shift_px, settings.largest_scatter_px,
-        settings.largest_horizon_gap_px, settings.largest_noise_px, settings.least_sharpness,
-        settings.soft_evidence,
-    )  # fmt: skip
-    return evidence, fate
+    fits: LineFits
+    evidence: FloatArray
+    fate: FateArray
+    tilt: TiltEstimate | None
+    votes: float
+    lean_deviation_rad: float
 
 
-def agree_on_tilt(
-    fits: LineFits, evidence: FloatArray, fate: FateArray, settings: LineSettings
-) -> TiltEstimate | None:
-    """Estimate the tilt from the accepted lines; those that disagree are marked "not vertical"."""
-    from detect.line_judgement_kernels import weigh_verticals
+def judge_tracks(
+    image: NDArray[np.uint8], tracks: LineTracks, table: VerticalTable, settings: LineSettings
+) -> Judgement:
+    """Fit lines to tracks, judge them one by one, and let them agree on a tilt.
 
-    accepted, normal, variance, tolerance, weight = weigh_verticals(
-        fits.reference_rad, fits.pixel_rad, fits.line, fits.covariance, fits.spread, evidence, fate,
-        settings.bend_px, math.radians(settings.largest_lean_deg), settings.largest_lean_sigmas,
-        settings.largest_lean_px, settings.weight_limit,
-    )  # fmt: skip
-    tilt, consistent = consensus(normal, variance, tolerance, weight, settings.consensus)
-    fate[accepted[~consistent]] = _NOT_VERTICAL
-    return tilt
+    Parameters
+    ----------
+    image : (H, W) uint8
+        Grey values, in scan order.
+    tracks : LineTracks
+        The tracks.
+    table : VerticalTable
+        Of the image's camera.
+    settings : LineSettings
+        See there.
 
-
-def line_bearings(
-    fits: LineFits, tilt: TiltEstimate | None, settings: LineSettings
-) -> tuple[FloatArray, FloatArray]:
-    """(T,) bearings of lines in the settings' convention, and their noise (rad).
-
-    Level bearings take into account that verticals lean as the tilt says.
+    Returns
+    -------
+    Judgement
+        Lines that disagree with the tilt are "not vertical".
     """
-    from detect.line_bearing_kernels import turned_bearings
+    from detect.line_pass_kernels import fit_and_judge
 
-    pitch, roll = (tilt.pitch_rad, tilt.roll_rad) if tilt is not None else (0.0, 0.0)
-    level = settings.alpha == "level"
-    rotation = level_rotation(pitch, roll) if level else level_rotation(-pitch, -roll)
-    building = settings.consensus.building_rad if tilt is not None and level else math.inf
-    alpha, noise = turned_bearings(
-        fits.reference_rad, fits.line, fits.covariance, rotation, pitch, roll, building
-    )
-    return alpha, noise
+    filters, farthest = refinement_of(settings)
+    fits, evidence, fate, tilt = fit_and_judge(
+        image, table.column, table.elevation_tan, table.bearing_rad, table.horizon_row,
+        table.row_aspect, tracks.polarity, tracks.bounds, tracks.row, tracks.column, tracks.score,
+        filters.half, filters.begin, filters.height, filters.first, filters.second, farthest,
+        limits_of(settings, table.row_aspect),
+    )  # fmt: skip
+    pitch, roll, *_, lines, votes, deviation = tilt.tolist()
+    agreed = None
+    if not math.isnan(pitch):
+        agreed = TiltEstimate(pitch, roll, tilt[2:6].reshape(2, 2), int(lines))
+    return Judgement(LineFits(fits), evidence, fate, agreed, votes, deviation)
 
 
-def group_lines(
-    alpha: FloatArray,
-    tracks: LineTracks,
-    fits: LineFits,
-    evidence: FloatArray,
-    fate: FateArray,
-    settings: LineSettings,
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Gather tracks to lines: one for each edge, close ones together.
+def lines_of_tracks(
+    tracks: LineTracks, judged: Judgement, table: VerticalTable, settings: LineSettings
+) -> tuple[NDArray[np.int64], NDArray[np.int64], FloatArray]:
+    """Gather accepted tracks to lines: one for each edge, close ones joined.
 
-    Tracks that are left out or joined are marked so in `fate`.
+    Tracks that are left out or joined are marked so in the fates of `judged`. Level bearings take
+    into account that verticals lean as the tilt says.
 
     Returns
     -------
@@ -118,12 +122,76 @@ def group_lines(
         Tracks, line by line from the left, the strongest of each line first.
     bounds : (N + 1,) int64
         Line n's members are ``bounds[n] : bounds[n + 1]``.
+    lines : (8, N) float64
+        xtop, ytop, xbottom, ybottom, alpha, beta, sigma and the noise in it, each in a row (see
+        `detect.lines.LineDetections`).
     """
-    from detect.line_judgement_kernels import group_tracks
+    from detect import line_pass_kernels as kernels
 
-    members, bounds = group_tracks(
-        alpha, fits.pixel_rad, fits.contrast, tracks.polarity, evidence, fate,
-        settings.same_edge_px, settings.join_px, settings.join_share, settings.shoulder_px,
-        settings.shoulder_share,
+    tilt = judged.tilt
+    pitch, roll = (tilt.pitch_rad, tilt.roll_rad) if tilt is not None else (0.0, 0.0)
+    level = settings.alpha == "level"
+    building = settings.consensus.building_rad if tilt is not None and level else math.inf
+    members, bounds, lines = kernels.lines_of_tracks(
+        table.bearing_rad, table.elevation_tan, table.robot_from_camera, tracks.polarity,
+        tracks.bounds, tracks.row, tracks.column, judged.fits.numbers, judged.evidence, judged.fate,
+        pitch, roll, 1.0 if level else -1.0, building, grouping_of(settings),
     )  # fmt: skip
-    return members, bounds
+    return members, bounds, lines
+
+
+@lru_cache(maxsize=16)
+def refinement_of(settings: LineSettings) -> tuple[StepFilters, FloatArray]:
+    """Filters of the refinement's steps and of the two contrasts; how far each step may go."""
+    scales = [scale for scale, _ in settings.refine_steps_px]
+    farthest = [distance for _, distance in settings.refine_steps_px]
+    filters = step_filters((*scales, settings.fine_scale_px, settings.coarse_scale_px))
+    return filters, np.array(farthest, np.float64)
+
+
+@lru_cache(maxsize=16)
+def limits_of(settings: LineSettings, row_aspect: float) -> FloatArray:
+    """What tracks are judged by, as numbers in the order in which compiled code takes them."""
+    consensus = settings.consensus
+    return np.array(
+        [
+            settings.least_points(row_aspect),
+            settings.least_evidence / row_aspect,
+            settings.least_evidence,
+            settings.largest_shift_px,
+            settings.largest_scatter_px,
+            settings.largest_horizon_gap_px,
+            settings.largest_noise_px,
+            settings.least_sharpness,
+            settings.soft_evidence,
+            settings.bend_px,
+            math.radians(settings.largest_lean_deg),
+            settings.largest_lean_sigmas,
+            settings.largest_lean_px,
+            settings.weight_limit,
+            consensus.building_rad**2,
+            consensus.proposers,
+            consensus.largest_rad,
+            consensus.prior_rad,
+            SOFTENING,
+            REFINEMENTS,
+            consensus.least_lines,
+        ],
+        np.float64,
+    )
+
+
+@lru_cache(maxsize=16)
+def grouping_of(settings: LineSettings) -> FloatArray:
+    """What lines are gathered by, as `limits_of`."""
+    return np.array(
+        [
+            settings.same_edge_px,
+            settings.join_px,
+            settings.join_share,
+            settings.shoulder_px,
+            settings.shoulder_share,
+            settings.sigma_px,
+        ],
+        np.float64,
+    )

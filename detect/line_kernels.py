@@ -23,7 +23,7 @@ _AHEAD = 12
 def find_starts(
     response: NDArray[np.float32], band_row: NDArray[np.int32], threshold: float
 ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float32], NDArray[np.float32]]:
-    """Maxima of the response along rows parallel to the horizon.
+    """Maxima of the response along rows parallel to the horizon, the highest first.
 
     Parameters
     ----------
@@ -62,7 +62,8 @@ def find_starts(
                 signs[n] = sign
                 score[n] = here
                 n += 1
-    return row[:n], column[:n], signs[:n], score[:n]
+    order = np.argsort(-score[:n], kind="mergesort")
+    return row[order], column[order], signs[order], score[order]
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)

@@ -155,9 +155,7 @@ def line_starts(
     from detect.line_kernels import find_starts
 
     response, band = start_response(image, table, settings)
-    row, column, polarity, score = find_starts(response, band.row, settings.threshold)
-    order = np.argsort(-score, kind="stable")
-    return LineStarts(row[order], column[order], polarity[order], score[order])
+    return LineStarts(*find_starts(response, band.row, settings.threshold))
 
 
 def start_response(

@@ -21,16 +21,8 @@ from numpy.typing import NDArray
 
 from detect.errors import FrameError
 from detect.line_filter import FilteredColumns
-from detect.line_fit import LineFits, fit_lines
-from detect.line_judgement import (
-    ACCEPTED,
-    FATES,
-    JOINED,
-    agree_on_tilt,
-    group_lines,
-    judge_lines,
-    line_bearings,
-)
+from detect.line_fit import LineFits
+from detect.line_judgement import ACCEPTED, FATES, JOINED, judge_tracks, lines_of_tracks
 from detect.line_settings import DEFAULT, LineSettings
 from detect.line_tracks import LineTracks, line_starts, line_tracks
 from detect.tilt import TiltEstimate
@@ -129,40 +121,29 @@ def detect_lines(
             f"image is {image.dtype} of shape {image.shape}: expected uint8 of the table's shape "
             f"{table.column.shape}"
         )
-    from detect.line_judgement_kernels import join_tracks
-
+    image = np.ascontiguousarray(image)
     starts = line_starts(image, table, settings)
     filtered = FilteredColumns.none_yet(table)
 
     tracks = line_tracks(image, starts, table, settings, filtered=filtered)
-    fits = fit_lines(image, tracks, table, settings)
-    evidence, fate = judge_lines(tracks, fits, table, settings)
-    tilt = agree_on_tilt(fits, evidence, fate, settings)
-    if settings.guided and tilt is not None:
-        tracks = line_tracks(image, starts, table, settings, tilt, filtered)
-        fits = fit_lines(image, tracks, table, settings)
-        evidence, fate = judge_lines(tracks, fits, table, settings)
-        tilt = agree_on_tilt(fits, evidence, fate, settings)
+    judged = judge_tracks(image, tracks, table, settings)
+    if settings.guided and judged.tilt is not None:
+        tracks = line_tracks(image, starts, table, settings, judged.tilt, filtered)
+        judged = judge_tracks(image, tracks, table, settings)
 
-    alpha, noise = line_bearings(fits, tilt, settings)
-    members, bounds = group_lines(alpha, tracks, fits, evidence, fate, settings)
-    joined, sigma = join_tracks(
-        alpha, noise, fits.pixel_rad, evidence, members, bounds, settings.sigma_px
-    )
-    strongest = members[bounds[:-1]]
-    ends, beta = line_ends(tracks, fits, table, strongest)
+    members, bounds, lines = lines_of_tracks(tracks, judged, table, settings)
     return LineDetections(
-        ends=ends,
-        alpha_rad=joined,
-        beta_rad=beta,
-        sigma_rad=sigma,
-        noise_rad=noise[strongest],
+        ends=lines[:4].T,
+        alpha_rad=lines[4],
+        beta_rad=lines[5],
+        sigma_rad=lines[6],
+        noise_rad=lines[7],
         members=_split(members, bounds),
-        tilt=tilt,
+        tilt=judged.tilt,
         tracks=tracks,
-        fits=fits,
-        evidence=evidence,
-        fate=tuple(FATES[number] for number in fate.tolist()),
+        fits=judged.fits,
+        evidence=judged.evidence,
+        fate=tuple(FATES[number] for number in judged.fate.tolist()),
     )
 
 

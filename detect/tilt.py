@@ -23,9 +23,10 @@ from storage.bounds import ABOVE_0, demand, whole
 
 FloatArray = NDArray[np.float64]
 
-_REFINEMENTS = 6
+#: How often the tilt is estimated anew over the lines that agree with it.
+REFINEMENTS = 6
 #: Standard deviations from which on a line's pull no longer grows.
-_SOFTENING = 2.0
+SOFTENING = 2.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -125,8 +126,8 @@ def consensus(
         settings.proposers,
         limit,
         settings.prior_rad,
-        _SOFTENING,
-        _REFINEMENTS,
+        SOFTENING,
+        REFINEMENTS,
     )
     lines = int(np.count_nonzero(consistent))
     if lines < settings.least_lines or abs(pitch) > limit or abs(roll) > limit:
