@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera.board import Board
+from camera.charuco_corners import find_charuco
 from camera.errors import CalibrationError
 
 FloatArray = NDArray[np.float64]
@@ -70,14 +71,10 @@ def _checkerboard_stretched(image: GreyImage, size: tuple[int, int]) -> tuple[bo
     """Look again in an image of twice the height: half-height images flatten the squares."""
     import cv2
 
-    height, width = image.shape
-    taller = cv2.resize(image, (width, 2 * height), interpolation=cv2.INTER_LINEAR)
-    found, corners = cv2.findChessboardCorners(taller, size)
+    found, corners = cv2.findChessboardCorners(_twice_as_high(image), size)
     if not found:
         return False, np.empty(0)
-    # Row v of the image is at 2 v + 0.5 of the taller one.
-    upright = np.asarray(corners, dtype=np.float64).reshape(-1, 2)
-    return True, np.column_stack([upright[:, 0], 0.5 * (upright[:, 1] - 0.5)])
+    return True, _of_half_height(np.asarray(corners, dtype=np.float64).reshape(-1, 2))
 
 
 def _refined(image: GreyImage, grid: NDArray[np.float32], share: float = _WINDOW) -> FloatArray:
@@ -148,44 +145,13 @@ def _from_the_front(grid: FloatArray) -> FloatArray:
 
 
 def _charuco(image: GreyImage, board: Board) -> tuple[IntArray, FloatArray]:
-    import cv2
-
-    number = getattr(cv2.aruco, board.dictionary, None)
-    if not board.dictionary.startswith("DICT_") or number is None:
+    indices, pixels = find_charuco(image, board)
+    if len(indices) < _FEWEST_POINTS:
         raise CalibrationError(
-            f"dictionary {board.dictionary!r} is unknown: expected a name of OpenCV's, such as "
-            "DICT_5X5_100"
+            f"{len(indices)} corners of a {board} in the image: expected at least "
+            f"{_FEWEST_POINTS}; is --dictionary {board.dictionary} right?"
         )
-    pattern = cv2.aruco.CharucoBoard(
-        (board.columns, board.rows),
-        board.square_m,
-        board.marker_m,
-        cv2.aruco.getPredefinedDictionary(number),
-    )
-    try:
-        corners, identities, _, _ = cv2.aruco.CharucoDetector(pattern).detectBoard(image)
-    except cv2.error as error:
-        raise CalibrationError(f"no {board} in the image: OpenCV says {error.err}") from None
-    if identities is None or len(identities) < _FEWEST_POINTS:
-        seen = 0 if identities is None else len(identities)
-        raise CalibrationError(
-            f"{seen} corners of a {board} in the image: expected at least {_FEWEST_POINTS}; is "
-            f"--dictionary {board.dictionary} right?"
-        )
-    indices = np.asarray(identities, dtype=np.int64).ravel()
-    found = np.asarray(corners, dtype=np.float32).reshape(-1, 2)
-    order = np.argsort(indices)
-    indices, found = indices[order], found[order]
-    columns = board.columns - 1
-    grid = np.full((board.rows - 1, columns, 2), np.nan, dtype=np.float32)
-    grid[indices // columns, indices % columns] = found
-    # The window must not reach the markers in the white squares.
-    share = min(_WINDOW, 0.5 * (1.0 - board.marker_m / board.square_m))
-    fine = _refined(image, grid, share)[indices // columns, indices % columns]
-    # A corner that wandered off was not one, or its squares are too blurred.
-    room = np.maximum(_WINDOW * _spacing(grid), 1.0)[indices // columns, indices % columns]
-    kept = np.all(np.abs(fine - found) <= room, axis=1)
-    return indices[kept], fine[kept]
+    return indices, pixels
 
 
 def _least_spacing(grid: NDArray[np.float32]) -> float:
@@ -206,18 +172,39 @@ def _circles(image: GreyImage, board: Board) -> FloatArray:
         else cv2.CALIB_CB_SYMMETRIC_GRID
     )
     size = (board.columns, board.rows)
-    # Clustering bears more perspective, the plain search more clutter; and light circles on a
-    # dark ground are dark ones in the negative.
-    for negative in (False, True):
-        picture = 255 - image if negative else image
-        for extra in (0, cv2.CALIB_CB_CLUSTERING):
-            found, centres = cv2.findCirclesGrid(picture, size, flags=flag | extra)
-            if found:
-                grid = np.asarray(centres, dtype=np.float64).reshape(board.rows, board.columns, 2)
+    # Clustering bears more perspective, the plain search more clutter; light circles on a dark
+    # ground are dark ones in the negative; and half-height images flatten circle and grid.
+    for taller in (False, True):
+        for negative in (False, True):
+            picture = 255 - image if negative else image
+            searched = _twice_as_high(picture) if taller else picture
+            for extra in (0, cv2.CALIB_CB_CLUSTERING):
+                found, centres = cv2.findCirclesGrid(searched, size, flags=flag | extra)
+                if not found:
+                    continue
+                flat = np.asarray(centres, dtype=np.float64).reshape(-1, 2)
+                grid = (_of_half_height(flat) if taller else flat).reshape(
+                    board.rows, board.columns, 2
+                )
                 if board.kind == "circles":
                     grid = _from_the_front(grid)
                 return circle_centroids(picture, grid)
     raise _not_found(board)
+
+
+def _twice_as_high(image: GreyImage) -> GreyImage:
+    """The image stretched: half-height ones flatten what is square or round."""
+    import cv2
+
+    height, width = image.shape
+    return np.asarray(
+        cv2.resize(image, (width, 2 * height), interpolation=cv2.INTER_LINEAR), dtype=np.uint8
+    )
+
+
+def _of_half_height(pixels: FloatArray) -> FloatArray:
+    """(N, 2) pixels of `_twice_as_high` in the image itself: row v is at 2 v + 0.5 there."""
+    return np.column_stack([pixels[:, 0], 0.5 * (pixels[:, 1] - 0.5)])
 
 
 def circle_centroids(image: GreyImage, grid: FloatArray) -> FloatArray:

@@ -174,7 +174,7 @@ def calibrate(
     # What a model lacks is no picture's fault, so outliers are told by the fullest one.
     most = 5 if settings.coefficients is None else settings.coefficients
     for count in range(min(2, most), most + 1):
-        first = _fit(start, measured, settings, count, radius)
+        first = fit_points(start, measured, settings, count, radius)
         start = first[0].estimate
     rms = _view_rms(*first)
     far = rms > _OUTLIER_FACTOR * np.median(rms)
@@ -192,7 +192,7 @@ def calibrate(
     holdout: dict[int, float] = {}
     estimate = start
     for count in counts:
-        fits[count] = _fit(estimate, measured, settings, count, radius)
+        fits[count] = fit_points(estimate, measured, settings, count, radius)
         estimate = fits[count][0].estimate
         holdout[count] = holdout_error(fits[count][0].estimate, fits[count][1], settings, count)
     chosen = _fewest_needed(holdout, measured, fits)
@@ -292,15 +292,32 @@ def _staged(
 ) -> Estimate:
     """One and then two coefficients, with the poses' second solutions tried in between."""
     for count in (1, min(2, 2 if settings.coefficients is None else settings.coefficients)):
-        estimate = _fit(start, points, settings, count, radius_m)[0].estimate
+        estimate = fit_points(start, points, settings, count, radius_m)[0].estimate
         start = best_poses(estimate, points)
     return start
 
 
-def _fit(
+def fit_points(
     start: Estimate, points: Points, settings: CalibrationSettings, count: int, radius_m: float
 ) -> tuple[Adjusted, Points]:
-    """Adjust; the second result are the points with circles' shifts taken off."""
+    """Adjust intrinsics and poses; of circles, to their centroids.
+
+    Parameters
+    ----------
+    start : Estimate
+    points : Points
+    settings : CalibrationSettings
+    count : int
+        Number of free coefficients.
+    radius_m : float
+        Radius of the circles; 0 for points.
+
+    Returns
+    -------
+    fit : Adjusted
+    points : Points
+        With the circles' shifts taken off (`circle_shifts`).
+    """
     span = free_span(count, settings.aspect)
     start = replace(start, intrinsics=_within(start.intrinsics, points, span, settings.aspect))
     fit = adjust(start, points, span, robust=settings.robust)

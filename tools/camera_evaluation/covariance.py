@@ -5,7 +5,7 @@ Example: python -m tools.camera_evaluation covariance images/e/e.cam --trials 10
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +15,11 @@ from tyro.conf import Positional
 
 from camera import Camera, read_camera
 from camera.board import Board
-from camera.calibration_adjustment import Estimate, Points, adjust
+from camera.calibration import CalibrationSettings, circle_shifts, fit_points
+from camera.calibration_adjustment import Estimate, Points
 from camera.calibration_model import INTRINSICS, free_span
 from camera.calibration_projection import intrinsics_of
+from tools.camera_evaluation.rendered import BOARDS
 from tools.camera_evaluation.rendering import board_poses
 
 FloatArray = NDArray[np.float64]
@@ -54,6 +56,7 @@ def monte_carlo(
     seed: int,
     distances_m: tuple[float, float] = (0.2, 0.45),
     outliers: float = 0.0,
+    seen: float = 1.0,
 ) -> Trials:
     """Calibrate again and again from the same poses with new noise.
 
@@ -70,28 +73,36 @@ def monte_carlo(
         Of the boards.
     outliers : float
         Share of points that are 20 standard deviations off.
+    seen : float
+        Share of each board's points that are seen, others in every picture.
     """
     poses = board_poses(camera, board, views, seed, distances_m=distances_m)
     truth = Estimate(
         intrinsics_of(camera), np.stack([R for R, _ in poses]), np.stack([t for _, t in poses])
     )
-    pixels = np.concatenate([camera.project(board.points @ R.T + t) for R, t in poses])
-    count = len(board.points)
-    span = free_span(5, camera.scale_y / camera.scale_x)
     rng = np.random.default_rng(seed + 1)
+    count = max(round(seen * len(board.points)), 6)
+    chosen = np.stack([np.sort(rng.choice(len(board.points), count, replace=False)) for _ in poses])
+    exact = Points(
+        board.points[chosen].reshape(-1, 3),
+        np.concatenate(
+            [camera.project(board.points[k] @ R.T + t) for k, (R, t) in zip(chosen, poses)]
+        ),
+        np.arange(views) * count,
+        camera.width,
+        camera.height,
+    )
+    radius_m = 0.5 * board.circle_m
+    pixels = exact.pixels + (circle_shifts(truth, exact, radius_m) if radius_m > 0.0 else 0.0)
+    aspect = camera.scale_y / camera.scale_x
+    span, settings = free_span(5, aspect), CalibrationSettings(aspect=aspect)
     errors, covariances, nees = [], [], []
     for _ in range(trials):
         noise = rng.normal(scale=sigma_px, size=pixels.shape)
         wrong = rng.random(len(pixels)) < outliers
         noise[wrong] += 20.0 * sigma_px * rng.normal(size=(int(wrong.sum()), 2))
-        points = Points(
-            np.tile(board.points, (views, 1)),
-            pixels + noise,
-            np.arange(views) * count,
-            camera.width,
-            camera.height,
-        )
-        fit = adjust(truth, points, span)
+        points = replace(exact, pixels=pixels + noise)
+        fit, _ = fit_points(truth, points, settings, 5, radius_m)
         error = fit.estimate.intrinsics - truth.intrinsics
         free = np.linalg.pinv(span)
         reduced = free @ fit.covariance @ free.T
@@ -113,6 +124,9 @@ class Options:
     ----------
     camera : Path
         The true camera.
+    boards : several str
+        `checkerboard`, `charuco` (of which 70 % of the corners are seen), `asymmetric-circles` (by
+        their centroids).
     views : int
         Boards in each calibration.
     trials : int
@@ -126,6 +140,7 @@ class Options:
     """
 
     camera: Positional[Path]
+    boards: tuple[str, ...] = ("checkerboard", "charuco", "asymmetric-circles")
     views: int = 25
     trials: int = 100
     sigma_px: float = 0.03
@@ -136,22 +151,28 @@ class Options:
 def main(arguments: list[str]) -> int:
     """Run the study."""
     options = tyro.cli(Options, prog="covariance", args=arguments)
-    trials = monte_carlo(
-        read_camera(options.camera),
-        Board("checkerboard", 9, 6, 0.04),
-        views=options.views,
-        trials=options.trials,
-        sigma_px=options.sigma_px,
-        seed=options.seed,
-        outliers=options.outliers,
-    )
-    predicted = np.sqrt(np.diag(trials.covariances.mean(axis=0)))
-    print(f"{options.trials} calibrations, {options.views} views, noise {options.sigma_px} px")
-    print("            observed   predicted   ratio")
-    for name, seen, said in zip(INTRINSICS, trials.errors.std(axis=0), predicted):
-        print(f"{name:8s} {seen:11.5g} {said:11.5g} {seen / said:7.3f}")
-    print(
-        f"normalised squared error {trials.nees.mean():.2f} "
-        f"(expected {trials.freedom}, +- {np.sqrt(2 * trials.freedom / len(trials.nees)):.2f})"
-    )
+    camera = read_camera(options.camera)
+    for name in options.boards:
+        board, distances_m = BOARDS[name]
+        trials = monte_carlo(
+            camera,
+            board,
+            views=options.views,
+            trials=options.trials,
+            sigma_px=options.sigma_px,
+            seed=options.seed,
+            distances_m=distances_m,
+            outliers=options.outliers,
+            seen=0.7 if board.kind == "charuco" else 1.0,
+        )
+        predicted = np.sqrt(np.diag(trials.covariances.mean(axis=0)))
+        print(f"{name}: {options.trials} x {options.views} views, noise {options.sigma_px} px")
+        print("            observed   predicted   ratio")
+        for parameter, seen, said in zip(INTRINSICS, trials.errors.std(axis=0), predicted):
+            print(f"{parameter:8s} {seen:11.5g} {said:11.5g} {seen / said:7.3f}")
+        print(
+            f"normalised squared error {trials.nees.mean():.2f} "
+            f"(expected {trials.freedom}, +- {np.sqrt(2 * trials.freedom / len(trials.nees)):.2f})",
+            flush=True,
+        )
     return 0
