@@ -49,7 +49,13 @@ def undistorted_radius(
     low, high = table_r[upper - 1], table_r[upper]
     span = table_g[upper] - table_g[upper - 1]
     share = (goal - table_g[upper - 1]) / span if span > 0.0 else 0.0
-    r: float = low + share * (high - low)
+    return _newton(goal, coef, low + share * (high - low), low, high)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _newton(goal: float, coef: NDArray[np.float64], start: float, low: float, high: float) -> float:
+    """The radius within a bracket, bisecting where a step of Newton's method would leave it."""
+    r = start
     for _ in range(_NEWTON_STEPS):
         f = _factor(coef, r)
         error = r * f - goal
@@ -78,7 +84,8 @@ def floor_of_pixel(
     pose: NDArray[np.float64],
     table_g: NDArray[np.float64],
     table_r: NDArray[np.float64],
-) -> tuple[float, float]:
+    near: float,
+) -> tuple[float, float, float]:
     """Where the ray of a pixel meets the floor, metres; both NaN where it does not.
 
     Parameters
@@ -91,20 +98,36 @@ def floor_of_pixel(
         `robot_from_camera`.
     table_g, table_r : (N,) float64
         `camera.distortion.inverse_table`.
+    near : float
+        Undistorted radius of a pixel nearby, which saves looking into the table; NaN without.
+
+    Returns
+    -------
+    x, y : float
+        Metres.
+    r : float
+        Undistorted radius.
     """
     x = (u - lens[2]) / lens[0]
     y = (v - lens[3]) / lens[1]
     coef = lens[4:]
-    factor = _factor(coef, undistorted_radius(math.hypot(x, y), coef, table_g, table_r))
+    last = len(table_g) - 1
+    goal = math.hypot(x, y)
+    if near >= 0.0 and goal <= table_g[last]:
+        r = _newton(goal, coef, near, 0.0, table_r[last])
+    else:
+        r = undistorted_radius(goal, coef, table_g, table_r)
+    factor = _factor(coef, r)
     x /= factor
     y /= factor
     down = _along(pose, 2, x, y)
     if not down * pose[2, 3] < 0.0:
-        return math.nan, math.nan
+        return math.nan, math.nan, r
     along = -pose[2, 3] / down
     return (
         pose[0, 3] + along * _along(pose, 0, x, y),
         pose[1, 3] + along * _along(pose, 1, x, y),
+        r,
     )
 
 
@@ -145,12 +168,14 @@ def published_positions(
     for k in range(len(pixels)):
         u = np.float64(pixels[k, 0])
         v = np.float64(pixels[k, 1])
-        floor_xy[k] = floor_of_pixel(u, v, lens, pose, table_g, table_r)
-        x1, y1 = floor_of_pixel(u + step_px, v, lens, pose, table_g, table_r)
-        x0, y0 = floor_of_pixel(u - step_px, v, lens, pose, table_g, table_r)
+        x, y, r = floor_of_pixel(u, v, lens, pose, table_g, table_r, math.nan)
+        floor_xy[k, 0] = x
+        floor_xy[k, 1] = y
+        x1, y1, _ = floor_of_pixel(u + step_px, v, lens, pose, table_g, table_r, r)
+        x0, y0, _ = floor_of_pixel(u - step_px, v, lens, pose, table_g, table_r, r)
         xu, yu = (x1 - x0) / per_px, (y1 - y0) / per_px
-        x1, y1 = floor_of_pixel(u, v + step_px, lens, pose, table_g, table_r)
-        x0, y0 = floor_of_pixel(u, v - step_px, lens, pose, table_g, table_r)
+        x1, y1, _ = floor_of_pixel(u, v + step_px, lens, pose, table_g, table_r, r)
+        x0, y0, _ = floor_of_pixel(u, v - step_px, lens, pose, table_g, table_r, r)
         xv, yv = (x1 - x0) / per_px, (y1 - y0) / per_px
         covariance[k, 0, 0] = floor_variance + pixel_variance * (xu * xu + xv * xv)
         covariance[k, 0, 1] = pixel_variance * (xu * yu + xv * yv)

@@ -9,11 +9,13 @@ at all.
 from __future__ import annotations
 
 import dataclasses
+import gc
 import json
 from collections import Counter
-from collections.abc import Callable, Generator, Sequence
-from contextlib import ExitStack, closing
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 from typing import Literal, Protocol
 
@@ -33,6 +35,8 @@ LANDMARK_SUFFIXES = frozenset({".circles", ".lines", ".markers"})
 
 #: So many failures are kept word for word.
 KEPT_FAILURES = 100
+
+_TASKS_AHEAD = 16
 
 
 class TiltSource(Protocol):
@@ -173,13 +177,17 @@ def detect_run(
     if run.has_times:
         outputs = [*outputs, times_file([output.path for output in outputs])]
     with ExitStack() as stack:
+        stack.enter_context(_settled())
         files = stack.enter_context(RunFiles(outputs, plan, conduct, overwrite=overwrite))
         tasks = stack.enter_context(closing(_tasks(run, tilts, reference)))
         for rows in files.kept(tasks):
             summary.add(rows)
             if on_progress is not None:
                 on_progress()
-        found = stack.enter_context(closing(detect_frames(files.left(tasks), plan, workers)))
+        left = files.left(tasks)
+        if not run.frames.ships_images:
+            left = stack.enter_context(closing(_ahead(left)))
+        found = stack.enter_context(closing(detect_frames(left, plan, workers)))
         for rows in found:
             if pictures is not None:
                 redraw = overwrite or files.may_be_drawn_already
@@ -219,6 +227,29 @@ def json_file(path: Path, plan: FramePlan, version: str) -> Output:
     }
     head, tail = json.dumps(document, indent=1).rsplit("]", 1)
     return Output(path, "json", head.encode(), f"\n ]{tail}\n".encode(), b",")
+
+
+def _ahead(tasks: Iterable[FrameTask]) -> Generator[FrameTask, None, None]:
+    """The same tasks, made some at a time: what makes them is in the processor's caches then."""
+    source = iter(tasks)
+    while batch := tuple(islice(source, _TASKS_AHEAD)):
+        yield from batch
+
+
+@contextmanager
+def _settled() -> Iterator[None]:
+    """Have Python's collections of garbage leave out what is there already, as long as a run lasts.
+
+    Without this each of them would look through all that was imported.
+    """
+    if gc.get_freeze_count():  # somebody has done so, or wants other things left out
+        yield
+        return
+    gc.freeze()
+    try:
+        yield
+    finally:
+        gc.unfreeze()
 
 
 def _tasks(
