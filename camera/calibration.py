@@ -223,12 +223,15 @@ def of_views(estimate: Estimate, views: IntArray) -> Estimate:
 
 
 def holdout_error(
-    estimate: Estimate, points: Points, settings: CalibrationSettings, count: int
+    estimate: Estimate,
+    points: Points,
+    settings: CalibrationSettings,
+    count: int,
+    folds: Sequence[IntArray] | None = None,
 ) -> float:
     """RMS reprojection error in views that the intrinsics were not fitted to, pixels.
 
-    Every `_FOLDS`-th view is held out in turn (each on its own where there are few); of it only the
-    pose is fitted.
+    Of what is held out only the poses are fitted.
 
     Parameters
     ----------
@@ -238,13 +241,18 @@ def holdout_error(
     settings : CalibrationSettings
     count : int
         Number of free coefficients.
+    folds : sequence of int64 arrays, optional
+        The views that are held out together; each view in one of them. Else every `_FOLDS`-th
+        (each on its own where there are few).
     """
     every = np.arange(len(points.starts))
-    folds = min(_FOLDS, len(every))
+    if folds is None:
+        number = min(_FOLDS, len(every))
+        folds = [every[every % number == fold] for fold in range(number)]
     squares = 0.0
     span, nothing = free_span(count, settings.aspect), np.zeros((9, 0))
-    for fold in range(folds):
-        out, used = every[every % folds == fold], every[every % folds != fold]
+    for out in folds:
+        used = np.setdiff1d(every, out)
         fit = adjust(of_views(estimate, used), points.of(used), span, robust=settings.robust)
         held = points.of(out)
         there = replace(of_views(estimate, out), intrinsics=fit.estimate.intrinsics)

@@ -1,7 +1,8 @@
 """Hold-out error on real photographs of disc boards, against OpenCV's rational model.
 
 The points are the centroids of the discs in the photographs, found from where the truth has them;
-both calibrations get the same points and the same board, and leave one photograph out at a time.
+both calibrations get the same points and the same board, and leave out the same photographs: each
+in turn, every third, and thirds of the series.
 
 Example: python -m tools.camera_evaluation photographs ../shared/data/discs/dev
 """
@@ -24,6 +25,7 @@ from camera.calibration import (
     BoardView,
     CalibrationSettings,
     calibrate,
+    holdout_error,
 )
 from camera.calibration_adjustment import Points
 
@@ -70,8 +72,24 @@ def read_group(folder: Path, group: str) -> tuple[list[BoardView], Board, tuple[
     return views, fixed_board(np.concatenate(places)), size
 
 
-def opencv_holdout(points: Points, *, rational: bool, tangential: bool = True) -> float:
-    """RMS error (px) in the photograph left out, by OpenCV: its pose alone is fitted."""
+def splits(views: int) -> dict[str, list[NDArray[np.int64]]]:
+    """Ways to leave photographs out, by name: which ones together."""
+    every = np.arange(views)
+    return {
+        "each": [every[v : v + 1] for v in every],
+        "every third": [every[every % 3 == k] for k in range(3)],
+        "thirds": [np.asarray(part) for part in np.array_split(every, 3)],
+    }
+
+
+def opencv_holdout(
+    points: Points,
+    folds: list[NDArray[np.int64]],
+    *,
+    rational: bool,
+    tangential: bool = True,
+) -> float:
+    """RMS error (px) in the photographs left out, by OpenCV: their poses alone are fitted."""
     import cv2
 
     every = np.arange(len(points.starts))
@@ -79,18 +97,19 @@ def opencv_holdout(points: Points, *, rational: bool, tangential: bool = True) -
     flags |= 0 if tangential else cv2.CALIB_ZERO_TANGENT_DIST
     squares = 0.0
     size = (points.width, points.height)
-    for out in every:
-        used = points.of(every[every != out])
+    for out in folds:
+        used = points.of(np.setdiff1d(every, out))
         board = [used.board[s : s + n].astype(np.float32) for s, n in zip(used.starts, used.counts)]
         seen = [used.pixels[s : s + n].astype(np.float32) for s, n in zip(used.starts, used.counts)]
         _, K, d, _, _ = cv2.calibrateCamera(
             board, seen, size, np.eye(3), np.zeros(8 if rational else 5), flags=flags
         )
-        held = points.of(np.array([out]))
-        _, rvec, tvec = cv2.solvePnP(held.board, held.pixels, K, d)
-        rvec, tvec = cv2.solvePnPRefineLM(held.board, held.pixels, K, d, rvec, tvec)
-        found = cv2.projectPoints(held.board, rvec, tvec, K, d)[0].reshape(-1, 2)
-        squares += float(np.sum((found - held.pixels) ** 2))
+        for view in out:
+            held = points.of(np.array([view]))
+            _, rvec, tvec = cv2.solvePnP(held.board, held.pixels, K, d)
+            rvec, tvec = cv2.solvePnPRefineLM(held.board, held.pixels, K, d, rvec, tvec)
+            found = cv2.projectPoints(held.board, rvec, tvec, K, d)[0].reshape(-1, 2)
+            squares += float(np.sum((found - held.pixels) ** 2))
     return float(np.sqrt(squares / len(points.board)))
 
 
@@ -115,40 +134,67 @@ class Options:
     free_aspect: bool = True
 
 
-def compare(folder: Path, group: str, *, free_aspect: bool) -> dict[str, float]:
-    """Hold-out errors in px: `ours`, `opencv_rational`, `opencv`, all on the same points."""
+@dataclass(frozen=True)
+class Comparison:
+    """Errors (px) in what was held out of a camera's photographs, all on the same points.
+
+    Attributes
+    ----------
+    views, points, coefficients : int
+        Photographs; points in all of them; coefficients that are free here.
+    ours, rational, radial, five : dict of str to float
+        By split: this project; OpenCV's rational model (k1 to k6, p1, p2), the same without p1 and
+        p2, and its k1 k2 p1 p2 k3.
+    """
+
+    views: int
+    points: int
+    coefficients: int
+    ours: dict[str, float]
+    rational: dict[str, float]
+    radial: dict[str, float]
+    five: dict[str, float]
+
+
+def compare(folder: Path, group: str, *, free_aspect: bool) -> Comparison:
+    """Hold out photographs of a camera, by each of `splits`."""
     views, board, size = read_group(folder, group)
     settings = CalibrationSettings(
         aspect=None if free_aspect else 1.0, robust=False, keep_outliers=True
     )
     result = calibrate(views, board, size, settings)
     # The same corrected points for both: OpenCV knows nothing of circles.
-    points = result.points
-    return {
-        "views": float(len(points.starts)),
-        "points": float(len(points.board)),
-        "ours": result.holdout_px[result.coefficients],
-        "coefficients": float(result.coefficients),
-        "opencv_rational": opencv_holdout(points, rational=True),
-        "opencv_radial": opencv_holdout(points, rational=True, tangential=False),
-        "opencv": opencv_holdout(points, rational=False),
-    }
+    points, count = result.points, result.coefficients
+    estimate = result.adjusted.estimate
+    ways = splits(len(points.starts))
+    return Comparison(
+        views=len(points.starts),
+        points=len(points.board),
+        coefficients=count,
+        ours={
+            name: holdout_error(estimate, points, settings, count, w) for name, w in ways.items()
+        },
+        rational={name: opencv_holdout(points, w, rational=True) for name, w in ways.items()},
+        radial={
+            name: opencv_holdout(points, w, rational=True, tangential=False)
+            for name, w in ways.items()
+        },
+        five={name: opencv_holdout(points, w, rational=False) for name, w in ways.items()},
+    )
 
 
 def main(arguments: list[str]) -> int:
     """Run the study."""
     options = tyro.cli(Options, prog="photographs", args=arguments)
     print("RMS of what was held out, px; OpenCV: rational, the same without p1 p2, k1 k2 p1 p2 k3")
-    print("group      views points     ours  free rational   radial    five")
+    print("group      views points  free  held out        ours rational   radial     five")
     for group in options.groups:
-        r = compare(
-            options.folder,
-            group,
-            free_aspect=options.free_aspect,
-        )
-        print(
-            f"{group:10s} {r['views']:4.0f} {r['points']:6.0f} {r['ours']:8.4f} "
-            f"{r['coefficients']:5.0f} {r['opencv_rational']:8.4f} {r['opencv_radial']:8.4f} "
-            f"{r['opencv']:7.4f}"
-        )
+        r = compare(options.folder, group, free_aspect=options.free_aspect)
+        for name in r.ours:
+            print(
+                f"{group:10s} {r.views:4d} {r.points:6d} {r.coefficients:5d}  {name:11s} "
+                f"{r.ours[name]:8.4f} {r.rational[name]:8.4f} {r.radial[name]:8.4f} "
+                f"{r.five[name]:8.4f}",
+                flush=True,
+            )
     return 0
