@@ -13,20 +13,25 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 GreyImage = NDArray[np.uint8]
 
-# Half the side of the window round a corner, as a share of the least distance between corners.
+# Half the side of the window round a corner, as a share of its squares in the image.
 _WINDOW = 0.3
 _SMALLEST_HALF_WINDOW = 2
 _LARGEST_HALF_WINDOW = 9
 _FEWEST_POINTS = 8
 
 
-def find_board(image: GreyImage, board: Board) -> tuple[IntArray, FloatArray]:
+def find_board(
+    image: GreyImage, board: Board, *, window: float = _WINDOW
+) -> tuple[IntArray, FloatArray]:
     """Find a board's points in an image.
 
     Parameters
     ----------
     image : (H, W) uint8 array
     board : Board
+    window : float
+        Half the side of the window in which a checkerboard's corner is refined, as a share of its
+        squares in the image: a larger one averages more, and follows the lens's bending more.
 
     Returns
     -------
@@ -42,8 +47,10 @@ def find_board(image: GreyImage, board: Board) -> tuple[IntArray, FloatArray]:
     """
     if board.kind == "charuco":
         return _charuco(image, board)
-    find = _checkerboard if board.kind == "checkerboard" else _circles
-    grid = find(image, board)
+    if board.kind == "checkerboard":
+        grid = _checkerboard(image, board, window)
+    else:
+        grid = _circles(image, board)
     return np.arange(board.columns * board.rows), grid.reshape(-1, 2)
 
 
@@ -54,7 +61,7 @@ def _not_found(board: Board) -> CalibrationError:
     )
 
 
-def _checkerboard(image: GreyImage, board: Board) -> FloatArray:
+def _checkerboard(image: GreyImage, board: Board, window: float) -> FloatArray:
     import cv2
 
     size = (board.columns, board.rows)
@@ -64,7 +71,7 @@ def _checkerboard(image: GreyImage, board: Board) -> FloatArray:
     if not found:
         raise _not_found(board)
     grid = np.asarray(corners, dtype=np.float32).reshape(board.rows, board.columns, 2)
-    return _in_order(image, _refined(image, grid))
+    return _in_order(image, _refined(image, grid, window))
 
 
 def _checkerboard_stretched(image: GreyImage, size: tuple[int, int]) -> tuple[bool, FloatArray]:
@@ -77,7 +84,7 @@ def _checkerboard_stretched(image: GreyImage, size: tuple[int, int]) -> tuple[bo
     return True, _of_half_height(np.asarray(corners, dtype=np.float64).reshape(-1, 2))
 
 
-def _refined(image: GreyImage, grid: NDArray[np.float32], share: float = _WINDOW) -> FloatArray:
+def _refined(image: GreyImage, grid: NDArray[np.float32], share: float) -> FloatArray:
     """Saddle points, from as much round each as holds nothing else.
 
     The window is small, and a corner's own: a larger one follows the lens's bending of the edges,
