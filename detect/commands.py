@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from detect.announcing import show_announcements
 from detect.cli import EXIT_FRAMES_FAILED, Command
-from detect.errors import WorkerError
+from detect.errors import DetectError, WorkerError
 from detect.options import All, Circles, Compare, DetectorFlags, Lines, Markers
 from detect.progress import print_failures, progress_bar
 from detect.viewing_options import PERFORMED_BY
@@ -161,6 +161,8 @@ def _all(command: All) -> int:
         run.output(kind) if command.output is None else command.output / f"detected.{kind}"
         for kind in ("lines", "tilt", "circles")
     )
+    if command.output is not None:
+        command.output.mkdir(parents=True, exist_ok=True)
     conduct = _conduct(command, log_place(lines.with_suffix("")))
     _demand_new([lines, tilt, circles], command.force, run, conduct)
     with progress_bar("lines, tilt and discs", run.frames.expected) as advance:
@@ -209,11 +211,16 @@ def _conduct(command: DetectorFlags, log: Path) -> Conduct:
 def _demand_new(
     outputs: Sequence[Path | None], force: bool, run: ImageRun, conduct: Conduct
 ) -> None:
-    """Refuse to overwrite results before there is any work done."""
+    """Refuse what cannot be written, or would be overwritten, before there is any work done."""
     from detect.resume_journal import journal_place
     from detect.stream import times_file
     from storage import OutputExistsError
 
+    for path in outputs:
+        if path is not None and not path.parent.is_dir():
+            raise DetectError(
+                f"{path}: no such folder: {path.parent}: make it first, or name another file"
+            )
     if conduct.log is not None and journal_place(conduct.log).exists():
         return  # the results may be half of those of a run that was killed: told when that is over
     if run.has_times:
@@ -237,6 +244,7 @@ def _compare(command: Compare) -> int:
     from detect.compare_result import unmet_demands
     from storage import write_whole
 
+    _demand_rows(command)
     tables, text, result = _compared_lines(command) if command.lines else _compared_discs(command)
     Console().print(tables)
     if command.json is not None:
@@ -248,6 +256,22 @@ def _compare(command: Compare) -> int:
     for sentence in unmet:
         print(sentence, file=sys.stderr)
     return EXIT_ERROR if unmet else 0
+
+
+def _demand_rows(command: Compare) -> None:
+    """Refuse to compare what is not there, and say where it comes from."""
+    kind = "lines" if command.lines else "circles"
+    reference = command.reference or command.run / f"map.{kind}"
+    detected = command.detected or command.run / f"detected.{kind}"
+    if not reference.exists():
+        raise DetectError(
+            f"{reference}: no such landmark file: name the reference rows by --reference"
+        )
+    if not detected.exists():
+        raise DetectError(
+            f"{detected}: no such landmark file: `detect {kind}` writes it, --detected names "
+            "another"
+        )
 
 
 def _compared_discs(command: Compare) -> tuple[Group, str, Rates]:

@@ -357,8 +357,14 @@ def read_image(
 def _only_camera(folder: Path) -> Path:
     cameras = sorted(folder.glob("*.cam"))
     if not cameras:
+        if not any(p.is_dir() or p.suffix.lower() in IMAGE_SUFFIXES for p in folder.iterdir()):
+            raise DetectError(
+                f"{folder}: neither images nor a calibration: expected a run folder, or a folder "
+                "of images with a .cam file in it or named by --camera"
+            )
         raise DetectError(
-            f"{folder}: no calibration: expected a .cam file in it, or one named by --camera"
+            f"{folder}: no calibration: expected a .cam file in it, or one named by --camera; "
+            "`camera calibrate` makes one, `camera convert` brings one over from other programs"
         )
     own = folder / f"{folder.resolve().name}.cam"
     if own in cameras:

@@ -40,7 +40,8 @@ def perform(options: View) -> int:
     run = open_source(options.run, options.camera, options.source)
     if not isinstance(run, Run):
         raise DetectError(
-            f"{options.run}: no calibration: expected a .cam file in it, or one named by --camera"
+            f"{options.run}: no calibration: expected a .cam file in it, or one named by --camera; "
+            "`camera calibrate` makes one"
         )
     files = find_files(run, options.files)
     if options.output is not None and options.output.exists() and not options.force:
@@ -55,7 +56,7 @@ def perform(options: View) -> int:
     with tempfile.TemporaryDirectory() as folder:
         raw = Path(folder) / "view.rrd"
         if options.output is None:
-            recording.spawn()
+            _show(recording)
         else:
             recording.save(str(raw))
         recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
@@ -183,6 +184,17 @@ def _log_image(rr: Any, recording: Any, run: Run, rows: SeenRows, settings: Circ
         ]
         labels = [f"{row.id}" for row in rows.markers]
         recording.log("camera/image/markers", rr.LineStrips2D(squares, colors=_LINE, labels=labels))
+
+
+def _show(recording: Any) -> None:
+    """Start the viewer."""
+    try:
+        recording.spawn()
+    except RuntimeError:
+        raise DetectError(
+            "Rerun's viewer cannot be started: expected the program `rerun` on the PATH, which the "
+            "package rerun-sdk brings; or name a recording to write by -o and open it elsewhere"
+        ) from None
 
 
 def _rerun() -> Any:

@@ -244,10 +244,13 @@ def _read(
 ) -> Iterator[tuple[int, list[str]]]:
     """Rows of a file with their line numbers, after its head was checked."""
     place = Path(path)
+    what = "a map, map.csv" if columns is MAP_COLUMNS else "a path, path.csv"
     try:
         text = read_bounded(place, _LARGEST_FILE_BYTES).decode("utf-8", "surrogateescape")
     except OSError as error:
-        raise LandmarkFileError(place, None, f"cannot be read: {error.strerror or error}") from None
+        raise LandmarkFileError(
+            place, None, f"cannot be read: {error.strerror or error}: expected {what} of `slam map`"
+        ) from None
     head: list[str] | None = None
     count = 0
     for number, line in enumerate(text.splitlines(), 1):

@@ -24,7 +24,7 @@ from slam.g2o import write_g2o
 from slam.g2o_frames import demand_readable, frames_of_graph, graph_of_frames, poses_of_run
 from slam.g2o_reading import read_g2o
 from slam.options import Export, Import
-from slam.recording import Recording, landmark_file, read_recording
+from slam.recording import Recording, demand_landmarks, landmark_file, read_recording
 from slam.run_camera import camera_of_run
 from slam.tables import (
     identified_discs,
@@ -36,6 +36,7 @@ from slam.tables import (
 from slam.tum import read_tum, write_tum
 from storage import OutputExistsError
 
+_LANDMARKS = (".circles", ".lines", ".markers")
 _G2O_WORDS = ("VERTEX_SE2", "VERTEX_XY", "EDGE_SE2", "EDGE_SE2_XY", "FIX")
 
 
@@ -56,6 +57,8 @@ def _export_g2o(command: Export) -> int:
     file = command.run
     if file.is_dir():
         file = landmark_file(file, ".circles", command.stem)
+    else:
+        demand_landmarks(file)
     frames = list(read_frames(file))
     graph = graph_of_frames(frames, str(file), command.solution)
     total = sum(isinstance(row, CircleLandmark) for frame in frames for row in frame.landmarks)
@@ -128,6 +131,11 @@ def _export_tables(command: Export) -> int:
 
 
 def _import(command: Import) -> int:
+    if command.file.suffix in _LANDMARKS:
+        raise SlamError(
+            f"{command.file}: is a landmark file: expected a .g2o graph or a .tum trajectory; "
+            "`slam export` writes them"
+        )
     if command.file.suffix == ".tum" or (
         command.file.suffix != ".g2o" and _first_word(command.file) not in _G2O_WORDS
     ):

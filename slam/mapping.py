@@ -217,6 +217,11 @@ def _check_usable(
     recording: Recording, camera: Camera | None, weighting: Weighting, name: str
 ) -> None:
     known = bool(np.any(recording.circles.ids >= 0)) or any(recording.lines.ids)
+    if not len(recording.circles) and not len(recording.lines):
+        raise SlamError(
+            f"{name}: no landmark in it: expected rows of discs or, with --lines, of verticals, as "
+            "`detect circles` and `detect lines` write them"
+        )
     if not known:
         raise SlamError(
             f"{name}: no row has an identifier: expected a run with IDs (slam associate gives them)"

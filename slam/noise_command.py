@@ -7,7 +7,7 @@ import sys
 from landmarks import read_rows, write_rows
 from slam.noise import AddedNoise, noisy_rows
 from slam.options import Noise
-from slam.recording import landmark_file
+from slam.recording import demand_landmarks, landmark_file
 
 
 def perform(options: Noise) -> int:
@@ -28,6 +28,8 @@ def perform(options: Noise) -> int:
     source = options.run
     if source.is_dir():
         source = landmark_file(source, ".lines" if options.lines else ".circles", options.stem)
+    else:
+        demand_landmarks(source)
     target = options.output or source.with_name(f"noisy{source.suffix}")
     write_rows(target, noisy_rows(read_rows(source), noise), overwrite=options.force)
     print(f"{target}: {noise.comment if not noise.nothing else 'no noise added'}", file=sys.stderr)

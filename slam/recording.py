@@ -18,6 +18,7 @@ IntArray = NDArray[np.int64]
 
 UNKNOWN_ID = -1
 
+_PICTURES = {".bmp", ".gif", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff"}
 _STEP_COLUMNS = (
     *("dx", "dy", "dphi"),
     *("cxx", "cxy", "cxphi"),
@@ -133,7 +134,47 @@ def landmark_file(run: Path, suffix: str, stem: str | None = None) -> Path:
         if path.is_file():
             return path
     expected = " or ".join(path.name for path in candidates)
-    raise SlamError(f"{run}: no landmarks: expected {expected} in it")
+    command = "circles" if suffix == ".circles" else "lines"
+    raise SlamError(
+        f"{run}: no landmarks: expected {expected} in it: `detect {command}` writes "
+        f"detected{suffix}, --stem says how another file is called"
+    )
+
+
+def demand_landmarks(path: Path) -> Path:
+    """A file that is named as a run, refused where it can't be one.
+
+    Parameters
+    ----------
+    path : Path
+        What the command line names instead of a run folder.
+
+    Returns
+    -------
+    Path
+        The same.
+
+    Raises
+    ------
+    SlamError
+        If there is no such file, or it is a picture or a calibration.
+    """
+    if not path.exists():
+        raise SlamError(
+            f"{path}: no such landmark file or folder: expected a run folder, or a .circles or "
+            ".lines file"
+        )
+    if path.suffix.lower() in _PICTURES:
+        raise SlamError(
+            f"{path}: is a picture: expected a run folder, or a .circles or .lines file: `detect "
+            "circles` and `detect lines` find the landmarks in pictures"
+        )
+    if path.suffix.lower() == ".cam":
+        raise SlamError(
+            f"{path}: is a calibration: expected a run folder, or a .circles or .lines file; "
+            "calibrations are named by --camera"
+        )
+    return path
 
 
 def read_recording(
@@ -168,7 +209,7 @@ def read_recording(
     """
     path = Path(run)
     if not path.is_dir():
-        return recording_of_frames(list(read_frames(path)), os.fspath(path))
+        return recording_of_frames(list(read_frames(demand_landmarks(path))), os.fspath(path))
     if not circles and not lines:
         raise SlamError(f"{path}: neither circles nor lines: expected at least one to be used")
     files = [
@@ -206,6 +247,11 @@ def recording_of_frames(frames: Sequence[Frame], name: str) -> Recording:
     steps = [frame.step for frame in frames]
     numbers = np.array([[getattr(step, name) for name in _STEP_COLUMNS] for step in steps])
     covariance = numbers[:, 3:].reshape(-1, 3, 3)
+    if not np.any(numbers):
+        raise SlamError(
+            f"{name}: no odometry: all {len(steps)} steps and their covariances are 0; expected "
+            "the robot's movements: `detect` takes them along, --odometry says where from"
+        )
     for bad in _not_positive_definite(covariance):
         raise SlamError(
             f"{name}: step {bad + 1} ({steps[bad].prefix}): its covariance is not positive "

@@ -39,5 +39,8 @@ def camera_of_run(run: Path, camera: Path | None = None) -> Camera:
         names = ", ".join(path.name for path in found)
         raise SlamError(f"{folder}: several calibrations ({names}): expected one by --camera")
     if not found:
-        raise SlamError(f"{folder}: no calibration: expected a .cam file in it, or one by --camera")
+        raise SlamError(
+            f"{folder}: no calibration: expected a .cam file in it, or one by --camera; `camera "
+            "calibrate` makes one, `camera convert` brings one over from other programs"
+        )
     return read_camera(own if own in found else found[0])

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable
+from pathlib import Path
 
 from storage.messages import one_line
 
@@ -39,7 +41,7 @@ def exit_code_of(work: Callable[[], int]) -> int:
 
 def say_error(error: BaseException | str) -> int:
     """Say what was wrong; returns the exit code."""
-    print(f"error: {one_line(str(error))}", file=sys.stderr)
+    print(f"error: {one_line(_said(error))}", file=sys.stderr)
     return EXIT_ERROR
 
 
@@ -47,3 +49,12 @@ def say_interrupted() -> int:
     """Say that there was an interrupt; returns the exit code."""
     print("interrupted", file=sys.stderr, flush=True)
     return EXIT_INTERRUPTED
+
+
+def _said(error: BaseException | str) -> str:
+    """The error in words; of a file in a folder that is not there, what to do about it."""
+    if isinstance(error, FileNotFoundError) and isinstance(error.filename, str | os.PathLike):
+        folder = Path(error.filename).parent
+        if not folder.is_dir():
+            return f"{error.filename}: no such folder: {folder}: make it first, or name another"
+    return str(error)

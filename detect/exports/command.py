@@ -14,6 +14,8 @@ from detect.sources.times import TimesByImage
 from landmarks.columns import TableName
 from storage import OutputExistsError, write_whole
 
+_LANDMARKS = (".circles", ".lines", ".markers", ".tilt")
+
 
 def perform(command: Export) -> int:
     """Export a file; returns the exit code.
@@ -27,6 +29,13 @@ def perform(command: Export) -> int:
     storage.OutputExistsError
         If an output exists and must not be replaced.
     """
+    if command.file.is_dir():
+        found = sorted(path.name for path in command.file.iterdir() if path.suffix in _LANDMARKS)
+        such = f", such as {', '.join(found)} in it" if found else ""
+        raise DetectError(
+            f"{command.file}: is a folder: expected a .circles, .lines, .markers or .tilt "
+            f"file{such}"
+        )
     rows = ExportedRows(command.file, _times(command), command.rate_hz)
     output = command.output
     if output is None:

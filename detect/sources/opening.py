@@ -69,7 +69,8 @@ def open_calibrated(
     if isinstance(run, Run):
         return run
     raise DetectError(
-        f"{name}: no calibration: expected a .cam file beside the images, or one named by --camera"
+        f"{name}: no calibration: expected a .cam file beside the images, or one named by "
+        "--camera; `camera calibrate` makes one"
     )
 
 

@@ -18,6 +18,11 @@ class WrongFileError(OneLineError, ValueError):
         (WrongFileError("e.cam:3: wrong"), EXIT_ERROR, "error: e.cam:3: wrong\n"),
         (ValueError("two\nlines\x1b[2J"), EXIT_ERROR, "error: two\\nlines\\x1b[2J\n"),
         (OSError(28, "No space left", "e.csv"), 1, "error: [Errno 28] No space left: 'e.csv'\n"),
+        (
+            FileNotFoundError(2, "No such file or directory", "gone/e.csv"),
+            EXIT_ERROR,
+            "error: gone/e.csv: no such folder: gone: make it first, or name another\n",
+        ),
         (KeyboardInterrupt(), EXIT_INTERRUPTED, "interrupted\n"),
     ],
 )
