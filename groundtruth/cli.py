@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Sequence
 from importlib import import_module
 from typing import Annotated
 
@@ -29,10 +30,7 @@ from groundtruth.commands.options import (
     Sync,
     Validate,
 )
-from groundtruth.commands.outputs import EXIT_ERROR
-from storage.messages import one_line
-
-EXIT_INTERRUPTED = 130
+from storage.exit_codes import exit_code_of
 
 #: The module whose `perform` carries a command out.
 PERFORMED_BY: dict[type, str] = {
@@ -53,6 +51,12 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
     # Matrices are small here: threads of BLAS would cost more than they save.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    command = parsed(sys.argv[1:] if arguments is None else arguments)
+    return exit_code_of(lambda: import_module(PERFORMED_BY[type(command)]).perform(command))
+
+
+def parsed(arguments: Sequence[str]) -> Command:
+    """What a command line says; exits, as `--help` does, where it says nothing that can be done."""
     command: Command = tyro.cli(
         Annotated[
             Annotated[Rig, subcommand("rig")]
@@ -68,14 +72,8 @@ def main(arguments: list[str] | None = None) -> int:
             arg(name=""),
         ],
         prog="groundtruth",
-        description="Where the robot really was: markers, lasers, clocks, and their fusion.",
-        args=sys.argv[1:] if arguments is None else arguments,
+        description="Where the robot really was: markers, lasers, clocks, and their fusion.\n\n"
+        "Example: groundtruth poses images/m -o poses.csv",
+        args=arguments,
     )
-    try:
-        return int(import_module(PERFORMED_BY[type(command)]).perform(command))
-    except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
-        return EXIT_INTERRUPTED
-    except (ValueError, OSError) as error:
-        print(f"error: {one_line(str(error))}", file=sys.stderr)
-        return EXIT_ERROR
+    return command

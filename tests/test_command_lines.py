@@ -8,7 +8,7 @@ from importlib import import_module
 
 import pytest
 
-PROGRAMS = ("camera", "detect", "slam")
+PROGRAMS = ("camera", "detect", "groundtruth", "slam")
 
 
 def help_of(program: str, words: list[str], capsys: pytest.CaptureFixture[str]) -> str:

@@ -12,9 +12,6 @@ from typing import Any
 from groundtruth import __version__
 from storage import OutputExistsError
 
-#: Exit code of a command that could not be carried out, or gave no pose.
-EXIT_ERROR = 1
-
 
 def check_outputs(paths: Sequence[Path | None], force: bool) -> None:
     """Refuse to begin where an output exists, unless it may be replaced."""

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from groundtruth.commands.options import Poses
-from groundtruth.commands.outputs import EXIT_ERROR, check_outputs, progress, provenance
+from groundtruth.commands.outputs import check_outputs, progress, provenance
 from groundtruth.errors import GroundTruthError
 from groundtruth.json_file import write_json
 from groundtruth.markers.calibration import Network, read_network, read_rig
@@ -18,6 +18,7 @@ from groundtruth.markers.session import RIG_NAME, MarkerFrame, find_runs, read_m
 from groundtruth.markers.track import report_entry, track_robot
 from groundtruth.trajectories.streams import format_tum, write_planar_poses
 from storage import write_whole
+from storage.exit_codes import EXIT_ERROR
 
 
 def perform(command: Poses) -> int:
