@@ -14,9 +14,9 @@ from scipy.stats import chi2
 from groundtruth.errors import GroundTruthError
 from groundtruth.fusion.settings import FuseSettings
 from groundtruth.fusion.smoother_kernels import STATE, filter_forward, smooth_backward
+from groundtruth.geometry.plane import between
 from groundtruth.trajectories.interpolation import interpolate_poses
 from groundtruth.trajectories.streams import RAWSEEDS_ROUNDING, PlanarPoses
-from landmarks import wrap_angle
 
 FloatArray = NDArray[np.float64]
 
@@ -305,13 +305,7 @@ def _usable(name: str, covariances: FloatArray) -> tuple[FloatArray, int]:
 
 def _controls(path: FloatArray) -> FloatArray:
     """(N, 3) movements between nodes, in the robot's frame of the node before."""
-    controls = np.zeros((len(path), 3))
-    change = np.diff(path, axis=0)
-    cos, sin = np.cos(path[:-1, 2]), np.sin(path[:-1, 2])
-    controls[1:, 0] = cos * change[:, 0] + sin * change[:, 1]
-    controls[1:, 1] = -sin * change[:, 0] + cos * change[:, 1]
-    controls[1:, 2] = wrap_angle(change[:, 2])
-    return controls
+    return np.concatenate([np.zeros((1, 3)), between(path[:-1], path[1:])])
 
 
 def _variances(times_s: FloatArray, controls: FloatArray, noise: FloatArray) -> FloatArray:

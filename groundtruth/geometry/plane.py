@@ -33,8 +33,14 @@ def invert(a_from_b: ArrayLike) -> FloatArray:
 
 
 def between(world_from_a: ArrayLike, world_from_b: ArrayLike) -> FloatArray:
-    """(..., 3) poses a_from_b of two poses in one world."""
-    return compose(invert(world_from_a), world_from_b)
+    """(..., 3) poses a_from_b of two poses in one world; the heading is wrapped."""
+    a, b = np.asarray(world_from_a, dtype=np.float64), np.asarray(world_from_b, dtype=np.float64)
+    # The difference is turned, not each pose: far from the origin that keeps more digits.
+    apart = b - a
+    c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
+    x = c * apart[..., 0] + s * apart[..., 1]
+    y = -s * apart[..., 0] + c * apart[..., 1]
+    return np.stack([x, y, wrap_angle(apart[..., 2])], axis=-1)
 
 
 def apply(a_from_b: ArrayLike, points: ArrayLike) -> FloatArray:

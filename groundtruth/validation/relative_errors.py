@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from groundtruth.errors import GroundTruthError
+from groundtruth.geometry.plane import between
 from groundtruth.trajectories.interpolation import interpolate_poses
 from groundtruth.trajectories.streams import PlanarPoses, read_rows_of_numbers
-from landmarks import wrap_angle
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -112,7 +112,7 @@ def score_relations(
     after, known_after = _at(poses, relations.to_s, largest_gap_s)
     known = known_before & known_after
     return relative_score(
-        relations.from_to[known], _between(before[known], after[known]), int((~known).sum())
+        relations.from_to[known], between(before[known], after[known]), int((~known).sum())
     )
 
 
@@ -144,7 +144,7 @@ def score_steps(
     if step < 1:
         raise GroundTruthError(f"step is {step}: expected 1 or more")
     known = truth.times_s[step:] - truth.times_s[:-step] <= longest_s
-    mine, right = (_between(p.poses[:-step], p.poses[step:])[known] for p in (poses, truth))
+    mine, right = (between(p.poses[:-step], p.poses[step:])[known] for p in (poses, truth))
     return relative_score(right, mine, int((~known).sum()))
 
 
@@ -158,7 +158,7 @@ def relative_score(truth: FloatArray, estimates: FloatArray, unmatched: int = 0)
     """
     if not len(truth):
         raise GroundTruthError("no two times with poses to compare relative to each other")
-    error = _between(truth, estimates)
+    error = between(truth, estimates)
     length = np.hypot(error[:, 0], error[:, 1])
     return RelativeScore(
         len(error),
@@ -174,20 +174,13 @@ def relative_score(truth: FloatArray, estimates: FloatArray, unmatched: int = 0)
     )
 
 
-def _between(a: FloatArray, b: FloatArray) -> FloatArray:
-    """(N, 3) poses of b in the frames of a."""
-    dx, dy = (b - a)[:, 0], (b - a)[:, 1]
-    c, s = np.cos(a[:, 2]), np.sin(a[:, 2])
-    return np.stack([c * dx + s * dy, -s * dx + c * dy, wrap_angle(b[:, 2] - a[:, 2])], axis=-1)
-
-
 def _at(
     poses: PlanarPoses, times_s: FloatArray, largest_gap_s: float
 ) -> tuple[FloatArray, BoolArray]:
     """(N, 3) poses at times in any order, and which of them there are; zeros elsewhere."""
     order = np.argsort(times_s, kind="stable")
-    between, found = interpolate_poses(poses, times_s[order], largest_gap_s)
+    interpolated, found = interpolate_poses(poses, times_s[order], largest_gap_s)
     result, known = np.zeros((len(times_s), 3)), np.zeros(len(times_s), dtype=np.bool_)
-    result[order[found]] = between.poses
+    result[order[found]] = interpolated.poses
     known[order[found]] = True
     return result, known
