@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from camera.errors import CalibrationError
+from storage.bounded import read_bounded
+from storage.image_header import MOST_PIXELS, claimed_size
 
 GreyImage = NDArray[np.uint8]
+
+_LARGEST_FILE_BYTES = 1 << 30
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".pgm", ".ppm", ".bmp", ".tif", ".tiff")
 VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".mjpeg")
@@ -70,12 +75,25 @@ def read_grey(path: Path) -> GreyImage:
     import cv2
 
     try:
-        data = np.fromfile(path, dtype=np.uint8)
+        content = read_bounded(path, _LARGEST_FILE_BYTES)
     except OSError as error:
         raise CalibrationError(f"{path}: cannot be read: {error.strerror}") from None
-    image = cv2.imdecode(data, cv2.IMREAD_ANYDEPTH | cv2.IMREAD_GRAYSCALE) if len(data) else None
+    size = claimed_size(content)
+    if size is not None and size[0] * size[1] > MOST_PIXELS:
+        raise CalibrationError(
+            f"{path}: claims {size[0]}x{size[1]} px: expected at most {MOST_PIXELS} pixels"
+        )
+    image = None
+    if size is not None:
+        data = np.frombuffer(content, np.uint8)
+        with suppress(cv2.error):
+            image = cv2.imdecode(data, cv2.IMREAD_ANYDEPTH | cv2.IMREAD_GRAYSCALE)
     if image is None:
-        raise CalibrationError(f"{path}: not an image that can be read")
+        raise CalibrationError(
+            f"{path}: not an image that can be read: expected JPEG, PNG, PNM, BMP or TIFF"
+        )
+    if image.dtype not in (np.uint8, np.uint16):
+        raise CalibrationError(f"{path}: holds {image.dtype}: expected images of 8 or 16 bits")
     if image.dtype == np.uint8:
         return np.asarray(image)
     # Cameras of 10 to 16 bits leave the upper part of the range unused: by the brightest pixel.

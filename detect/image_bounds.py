@@ -8,10 +8,7 @@ import stat
 from pathlib import Path
 
 from detect.errors import FrameError
-from detect.image_header import claimed_size
-
-#: The largest image that there can be: it fills as many bytes as grey values.
-MOST_PIXELS = 1 << 27
+from storage.image_header import MOST_PIXELS, claimed_size
 
 # A file has at most what its pixels have uncompressed, 16 bits in four channels, twice over for
 # formats that grow, and room for thumbnails and whatever else cameras write.

@@ -30,6 +30,7 @@ from groundtruth.markers.calibration import parse_covariance, parse_pose
 from groundtruth.markers.checkerboard import Checkerboard, find_checkerboard
 from groundtruth.markers.network_estimation import BoardView, DoubleBoard
 from storage.bounded import read_bounded
+from storage.image_header import claimed_size
 from storage.inside import path_inside
 from storage.messages import excerpt, one_line
 
@@ -149,22 +150,30 @@ def find_boards(image: BoardImage, board: Checkerboard, camera: Camera) -> Board
         content = np.frombuffer(read_bounded(image.image, _LARGEST_IMAGE_BYTES), np.uint8)
     except OSError as error:
         raise GroundTruthError(f"{image.image}: cannot be read: {error.strerror}") from None
+    size = claimed_size(content.tobytes())
+    # What claims more is not decoded: memory is taken only for what there should be.
+    if size is not None and sorted(size) != sorted((camera.width, camera.height)):
+        raise _other_size(image.image, size, camera)
     try:
-        grey = cv2.imdecode(content, cv2.IMREAD_GRAYSCALE) if content.size else None
+        grey = None if size is None else cv2.imdecode(content, cv2.IMREAD_GRAYSCALE)
     except cv2.error:
         grey = None
     if grey is None:
         raise GroundTruthError(f"{image.image}: cannot be decoded: expected an image")
     if grey.shape != (camera.height, camera.width):
-        raise GroundTruthError(
-            f"{image.image}: is {grey.shape[1]}x{grey.shape[0]} px: expected "
-            f"{camera.width}x{camera.height}, the calibration's size"
-        )
+        raise _other_size(image.image, (grey.shape[1], grey.shape[0]), camera)
     try:
         corners = find_checkerboard(np.asarray(grey, dtype=np.uint8), board)
     except GeometryError as error:
         raise GroundTruthError(f"{image.image}: {error}") from None
     return BoardView(image.camera, image.board, corners)
+
+
+def _other_size(path: Path, size: tuple[int, int], camera: Camera) -> GroundTruthError:
+    return GroundTruthError(
+        f"{path}: is {size[0]}x{size[1]} px: expected {camera.width}x{camera.height}, the "
+        "calibration's size"
+    )
 
 
 def _inside(place: str, folder: Path, name: str) -> Path:

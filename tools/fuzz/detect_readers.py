@@ -18,7 +18,6 @@ from camera.calibrate_images import read_grey
 from detect.draw_head import read_head
 from detect.errors import DetectError, FrameError
 from detect.image_bounds import bounded_content
-from detect.image_header import claimed_size
 from detect.resume_journal import left_journal
 from detect.run_log import demand_log_place
 from detect.sources.bag_images import pixels_of_message
@@ -33,6 +32,7 @@ from detect.sources.times import TimesByImage
 from detect.sources.tum import TumTrajectory
 from lut.cache import cached_vertical_table
 from storage import OutputExistsError
+from storage.image_header import claimed_size
 from tools.fuzz.reader import Reader
 from tools.fuzz.words import CAMERA_TEXT, NUMBERS
 

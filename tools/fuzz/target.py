@@ -19,7 +19,6 @@ with atheris.instrument_imports(
     include=[
         "camera",
         "detect.draw_head",
-        "detect.image_header",
         "detect.resume_journal",
         "detect.sources",
         "landmarks",

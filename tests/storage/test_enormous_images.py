@@ -1,0 +1,50 @@
+"""Images that are not of a run are refused by their headers, too, before memory is taken."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from camera import Camera, CameraError
+from camera.calibrate_images import read_grey
+from groundtruth.errors import GroundTruthError
+from groundtruth.markers.boards_file import BoardImage, find_boards
+from groundtruth.markers.checkerboard import Checkerboard
+from storage.image_header import MOST_PIXELS
+from tests.detect.test_faults_images import SIDE, jpeg, png
+
+CONTENTS = (jpeg(SIDE, SIDE), png(SIDE, SIDE))
+
+
+@pytest.mark.parametrize("content", CONTENTS, ids=["jpeg", "png"])
+def test_pictures_for_a_calibration(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "a.jpg"
+    path.write_bytes(content)
+    said = f"{path}: claims {SIDE}x{SIDE} px: expected at most {MOST_PIXELS} pixels"
+    with pytest.raises(CameraError, match=re.escape(said)):
+        read_grey(path)
+
+
+@pytest.mark.parametrize("content", CONTENTS, ids=["jpeg", "png"])
+def test_pictures_of_boards(tmp_path: Path, content: bytes, published_camera: Camera) -> None:
+    path = tmp_path / "a.jpg"
+    path.write_bytes(content)
+    said = f"{path}: is {SIDE}x{SIDE} px: expected 768x288"
+    with pytest.raises(GroundTruthError, match=re.escape(said)):
+        find_boards(BoardImage("a", "b", 0, path, None), Checkerboard(5, 4, 0.1), published_camera)
+
+
+def test_pictures_of_other_kinds_of_numbers(tmp_path: Path) -> None:
+    path = tmp_path / "a.tiff"
+    assert cv2.imwrite(str(path), np.full((8, 8), 0.5, np.float32))
+    with pytest.raises(CameraError, match="holds float32: expected images of 8 or 16 bits"):
+        read_grey(path)
+    path.write_bytes(b"")
+    with pytest.raises(CameraError, match="not an image that can be read"):
+        read_grey(path)
+    with pytest.raises(CameraError, match="Is a directory"):
+        read_grey(tmp_path)
