@@ -68,9 +68,9 @@ def associate(costs: ArrayLike, allowed: ArrayLike) -> Association:
         raise ValueError("a cost is negative or not finite where a pair is allowed")
 
     n_first, n_second = cost.shape
-    edges = coo_array(
-        (np.ones(len(rows)), (rows, n_first + columns)), shape=(n_first + n_second,) * 2
-    )
+    # SciPy before 1.12 knows no graphs with indices of 64 bits.
+    ends = (rows.astype(np.int32), (n_first + columns).astype(np.int32))
+    edges = coo_array((np.ones(len(rows)), ends), shape=(n_first + n_second,) * 2)
     _, group = connected_components(edges, directed=False)
     partner = np.full(n_first, -1, dtype=np.intp)
     for label in np.unique(group[rows]):
