@@ -72,7 +72,12 @@ class Judgement:
 
 
 def judge_tracks(
-    image: NDArray[np.uint8], tracks: LineTracks, table: VerticalTable, settings: LineSettings
+    image: NDArray[np.uint8],
+    tracks: LineTracks,
+    table: VerticalTable,
+    settings: LineSettings,
+    *,
+    steps: int | None = None,
 ) -> Judgement:
     """Fit lines to tracks, judge them one by one, and let them agree on a tilt.
 
@@ -86,6 +91,8 @@ def judge_tracks(
         Of the image's camera.
     settings : LineSettings
         See there.
+    steps : int, optional
+        Only so many of the settings' steps refine lines on the grey values.
 
     Returns
     -------
@@ -94,7 +101,7 @@ def judge_tracks(
     """
     from detect.line_pass_kernels import fit_and_judge
 
-    filters, farthest = refinement_of(settings)
+    filters, farthest = refinement_of(settings, steps)
     fits, evidence, fate, tilt = fit_and_judge(
         image, table.column, table.elevation_tan, table.bearing_rad, table.horizon_row,
         table.row_aspect, tracks.polarity, tracks.bounds, tracks.row, tracks.column, tracks.score,
@@ -141,10 +148,12 @@ def lines_of_tracks(
 
 
 @lru_cache(maxsize=16)
-def refinement_of(settings: LineSettings) -> tuple[StepFilters, FloatArray]:
-    """Filters of the refinement's steps and of the two contrasts; how far each step may go."""
-    scales = [scale for scale, _ in settings.refine_steps_px]
-    farthest = [distance for _, distance in settings.refine_steps_px]
+def refinement_of(
+    settings: LineSettings, steps: int | None = None
+) -> tuple[StepFilters, FloatArray]:
+    """Filters of the refinement's first steps and of the two contrasts; how far a step may go."""
+    scales = [scale for scale, _ in settings.refine_steps_px[:steps]]
+    farthest = [distance for _, distance in settings.refine_steps_px[:steps]]
     filters = step_filters((*scales, settings.fine_scale_px, settings.coarse_scale_px))
     return filters, np.array(farthest, np.float64)
 

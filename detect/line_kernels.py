@@ -217,12 +217,16 @@ def follow_edges(
     border: int,
     pull: float,
     reach: float,
+    enough: int,
+    least_points: int,
+    least_score: float,
 ) -> tuple[
     NDArray[np.float64],
     NDArray[np.int64],
     NDArray[np.int32],
     NDArray[np.float64],
     NDArray[np.float32],
+    bool,
 ]:
     """Follow edges up and down from starts; a start on an edge already followed is left out.
 
@@ -259,6 +263,10 @@ def follow_edges(
         first points, whose mean it is. 1 follows any curve, small values only verticals.
     reach : float
         Largest offset of a point from its expected position, columns.
+    enough : int
+        No more edges are followed once there are so many tracks
+    least_points, least_score : int, float
+        of at least so many points and such a sum of scores.
 
     Returns
     -------
@@ -268,6 +276,8 @@ def follow_edges(
         Track t's points are ``bounds[t] : bounds[t + 1]``, from top to bottom.
     row, column, score : (P,) int32, float64, float32
         The points: row and sub-pixel column in the strip, absolute response.
+    complete : bool
+        Whether all edges were followed.
     """
     height, width = elevation_tan.shape
     columns_per_rise = pitch * lean_by_pitch + roll * lean_by_roll
@@ -293,7 +303,12 @@ def follow_edges(
     own_score = np.empty(2 * height + 1, np.float32)
     tracks = 0
     n = 0
+    counting = 0
+    complete = True
     for start in range(len(start_row)):
+        if counting >= enough:
+            complete = False
+            break
         v = start_row[start]
         polarity = start_sign[start]
         layer = 0 if polarity > 0.0 else 1
@@ -331,7 +346,9 @@ def follow_edges(
             grown_score = np.empty(capacity, np.float32)
             grown_score[:n] = score[:n]
             score = grown_score
+        total = 0.0
         for i in range(begin, end):
+            total += own_score[i]
             row[n] = own_row[i]
             column[n] = own_column[i]
             score[n] = own_score[i]
@@ -343,4 +360,5 @@ def follow_edges(
         sign[tracks] = polarity
         tracks += 1
         bounds[tracks] = n
-    return sign[:tracks], bounds[: tracks + 1], row[:n], column[:n], score[:n]
+        counting += end - begin >= least_points and total >= least_score
+    return sign[:tracks], bounds[: tracks + 1], row[:n], column[:n], score[:n], complete

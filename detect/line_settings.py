@@ -59,7 +59,7 @@ _BOUNDS = {
         ),
         LIMIT_OR_0,
     ),
-    **dict.fromkeys(("border_rows", "start_band_rows", "gap_rows"), whole(0)),
+    **dict.fromkeys(("border_rows", "start_band_rows", "gap_rows", "first_edges"), whole(0)),
     **dict.fromkeys(("threshold", "guided_pull"), SHARE_ABOVE_0),
     "start_spacing_rows": whole(1),
     "least_rows": whole(5),
@@ -98,6 +98,9 @@ class LineSettings:
         Rows without a point that a track bridges.
     guided : bool
         Whether tracks are followed a second time, along the verticals of the estimated tilt.
+    first_edges : int
+        The first time only so many edges are followed, those with the highest responses on the
+        horizon, if their tilt is beyond doubt; 0 for all in any case.
     guided_pull, guided_reach_px : float
         In the second time, part of a point's offset that the track yields to, and largest offset.
     refine_steps_px : tuple of (float, float)
@@ -167,6 +170,7 @@ class LineSettings:
     start_spacing_rows: int = 4
     gap_rows: int = 6
     guided: bool = True
+    first_edges: int = 10
     guided_pull: float = 0.07
     guided_reach_px: float = 0.75
     refine_steps_px: tuple[tuple[float, float], ...] = (

@@ -60,6 +60,8 @@ class LineTracks:
         Column in the strip: of the horizon, where the vertical through the point crosses it.
     score : (P,) float32
         Absolute response at the point.
+    complete : bool
+        Whether all edges were followed.
     """
 
     polarity: FloatArray
@@ -67,6 +69,7 @@ class LineTracks:
     row: NDArray[np.int32]
     column: FloatArray
     score: NDArray[np.float32]
+    complete: bool
 
     def __len__(self) -> int:
         return len(self.polarity)
@@ -196,6 +199,7 @@ def line_tracks(
     settings: LineSettings,
     tilt: TiltEstimate | None = None,
     filtered: FilteredColumns | None = None,
+    enough: int | None = None,
 ) -> LineTracks:
     """Follow the edges through the starts up and down.
 
@@ -214,6 +218,8 @@ def line_tracks(
         go.
     filtered : FilteredColumns, optional
         What has been filtered of this very image when its edges were followed before; extended.
+    enough : int, optional
+        No more edges are followed once so many could be lines by their length and response.
 
     Returns
     -------
@@ -251,6 +257,9 @@ def line_tracks(
             settings.border_rows,
             settings.guided_pull if tilt is not None else 1.0,
             settings.guided_reach_px if tilt is not None else 1.0,
+            enough if enough is not None else len(starts.row) + 1,
+            settings.least_points(table.row_aspect),
+            settings.least_evidence / table.row_aspect,
         )
     )
 

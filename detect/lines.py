@@ -9,10 +9,13 @@ The path of an image, each step a function of its own:
     consensus       the tilt that most of them agree with; the others are no verticals
     tracks, fits    once more along the verticals of that tilt
     lines           bearings; one line for each edge, close ones joined
+
+The first time a few edges will do if they leave no doubt about the tilt.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -29,9 +32,18 @@ from detect.tilt import TiltEstimate
 from landmarks import LineLandmark
 from lut.verticals import VerticalTable
 
-__all__ = ["ACCEPTED", "JOINED", "LineDetections", "detect_lines", "line_ends"]
+__all__ = ["ACCEPTED", "JOINED", "LineDetections", "detect_lines", "line_ends", "tilt_beyond_doubt"]
 
 FloatArray = NDArray[np.float64]
+
+#: A few edges tell the tilt beyond doubt if so many lines and such a part of the votes agree with
+#: it, and if it tells the lean of verticals as well as this everywhere in the image. A track that
+#: yields to its points by 7 % follows a lean that is wrong by twice as much at 0.15 px from it.
+_FIRST_LINES = 6
+_FIRST_VOTES = 0.75
+_FIRST_LEAN_RAD = math.radians(0.15)
+#: The refinement's steps that lines need for that.
+_FIRST_STEPS = 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -125,10 +137,16 @@ def detect_lines(
     starts = line_starts(image, table, settings)
     filtered = FilteredColumns.none_yet(table)
 
-    tracks = line_tracks(image, starts, table, settings, filtered=filtered)
-    judged = judge_tracks(image, tracks, table, settings)
-    if settings.guided and judged.tilt is not None:
-        tracks = line_tracks(image, starts, table, settings, judged.tilt, filtered)
+    enough = settings.first_edges if settings.guided and settings.first_edges else None
+    tracks = line_tracks(image, starts, table, settings, filtered=filtered, enough=enough)
+    tilt = None if tracks.complete else tilt_beyond_doubt(image, tracks, table, settings)
+    if tilt is None:
+        if not tracks.complete:
+            tracks = line_tracks(image, starts, table, settings, filtered=filtered)
+        judged = judge_tracks(image, tracks, table, settings)
+        tilt = judged.tilt
+    if settings.guided and tilt is not None:
+        tracks = line_tracks(image, starts, table, settings, tilt, filtered)
         judged = judge_tracks(image, tracks, table, settings)
 
     members, bounds, lines = lines_of_tracks(tracks, judged, table, settings)
@@ -145,6 +163,36 @@ def detect_lines(
         evidence=judged.evidence,
         fate=tuple(FATES[number] for number in judged.fate.tolist()),
     )
+
+
+def tilt_beyond_doubt(
+    image: NDArray[np.uint8], tracks: LineTracks, table: VerticalTable, settings: LineSettings
+) -> TiltEstimate | None:
+    """Tilt from a few edges, good enough to follow all of them by.
+
+    Parameters
+    ----------
+    image : (H, W) uint8
+        Grey values, in scan order.
+    tracks : LineTracks
+        The few edges.
+    table, settings
+        As for `detect_lines`.
+
+    Returns
+    -------
+    TiltEstimate or None
+        None where it is in doubt. Lines are not refined to the end for it.
+    """
+    judged = judge_tracks(image, tracks, table, settings, steps=_FIRST_STEPS)
+    if (
+        judged.tilt is not None
+        and judged.tilt.lines >= _FIRST_LINES
+        and judged.votes >= _FIRST_VOTES
+        and judged.lean_deviation_rad <= _FIRST_LEAN_RAD
+    ):
+        return judged.tilt
+    return None
 
 
 def line_ends(

@@ -7,6 +7,12 @@ import pytest
 from numba import njit
 from numpy.typing import NDArray
 
+from detect.line_filter_vector_kernels import (
+    moments_across,
+    moments_across_two,
+    response_along,
+    response_along_two,
+)
 from detect.line_vector_kernels import LANES, WORD, add_products, slope_and_bend
 
 
@@ -54,3 +60,74 @@ def test_weighted_sums_of_grey_values(words: int) -> None:
         added = sums[LANES:] - np.arange(LANES, 2.0 * LANES)
         products = (own[0] * grey).reshape(words, LANES).sum(axis=0)
         np.testing.assert_allclose(added, products, atol=2e-3)
+
+
+@njit(error_model="numpy")
+def filter_rows(
+    pixels: NDArray[np.uint8],
+    width: int,
+    strip: NDArray[np.float32],
+    weights: NDArray[np.float32],
+    along: NDArray[np.float32],
+    rows: int,
+    together: bool,
+    moments: NDArray[np.float32],
+    response: NDArray[np.float32],
+) -> None:
+    words = weights.shape[1] // WORD
+    plane = rows * LANES
+    one = np.float32(1.0)
+    left = np.float32(3.0)
+    right = np.float32(width - 4.0)
+    for y in range(0, rows, 2 if together else 1):
+        begin, at = y * width - 3, y * LANES
+        if together:
+            moments_across_two(
+                pixels, begin, width, strip, at, left, right, weights, words, moments, plane, at
+            )
+        else:
+            moments_across(
+                pixels, begin, width, strip, at, left, right, weights, words, moments, plane, at
+            )
+    taps = len(along)
+    for y in range(0, rows - taps, 2 if together else 1):
+        at = y * LANES
+        if together:
+            response_along_two(
+                moments, plane, at, along, 0, taps, one, one, strip, at, left, right, response, at
+            )
+        else:
+            response_along(
+                moments, plane, at, along, 0, taps, one, one, strip, at, left, right, response, at
+            )
+
+
+def test_two_rows_at_once_are_filtered_like_one_after_the_other() -> None:
+    rng = np.random.default_rng(3)
+    rows, width = 24, 64
+    pixels = rng.integers(0, 256, rows * width).astype(np.uint8)
+    strip = (10.0 + np.arange(LANES) + rng.uniform(-12.0, 46.0, (rows, 1))).astype(np.float32)
+    strip[5, 3] = np.nan
+    weights = rng.normal(size=(4, WORD)).astype(np.float32)
+    along = rng.uniform(size=6).astype(np.float32)
+    results = []
+    for together in (False, True):
+        moments = np.full(3 * strip.size, -1.0, np.float32)
+        response = np.full(strip.size, -1.0, np.float32)
+        filter_rows(
+            pixels, width, strip.reshape(-1), weights, along, rows, together, moments, response
+        )
+        results.append((moments, response))
+    np.testing.assert_array_equal(results[1][0], results[0][0])
+    np.testing.assert_array_equal(results[1][1], results[0][1])
+    mean = results[0][0][: strip.size].reshape(strip.shape)
+    inside = (strip >= 3.0) & (strip < width - 4.0)
+    assert 20 < inside.sum() < strip.size
+    assert np.all(mean[~inside] == 0.0)
+    # The definition, written out.
+    grey = pixels.reshape(rows, width).astype(np.float64) - 128.0
+    for y, lane in np.argwhere(inside):
+        whole = int(strip[y, lane])
+        own = weights[0] + (strip[y, lane] - whole) * weights[1]
+        expected = own @ grey[y, whole - 3 : whole - 3 + WORD]
+        assert mean[y, lane] == pytest.approx(expected, abs=1e-2)

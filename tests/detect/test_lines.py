@@ -21,8 +21,8 @@ from detect.errors import DetectError, FrameError
 from detect.line_bearing import compensated_bearings, inclinations, plane_normals
 from detect.line_drawing import draw_lines, draw_response, draw_tracks, track_pixels
 from detect.line_settings import DEFAULT, PUBLISHED, LineSettings
-from detect.line_tracks import line_response
-from detect.lines import ACCEPTED, JOINED, detect_lines
+from detect.line_tracks import line_response, line_starts, line_tracks
+from detect.lines import ACCEPTED, JOINED, detect_lines, tilt_beyond_doubt
 from lut.verticals import build_vertical_table
 from tests.detect.line_scene import Edge, edge_columns, mirrored, pinhole, render, tilted
 
@@ -194,6 +194,43 @@ def test_close_edges_are_joined_to_one_row() -> None:
     assert joined.alpha_rad[0] == pytest.approx(mean, abs=1e-6)
     spread = share[order] @ (apart.sigma_rad**2 + (sides - mean) ** 2)
     assert joined.sigma_rad[0] == pytest.approx(np.sqrt(spread), rel=1e-3)
+
+
+def test_a_few_edges_tell_the_tilt_as_well_as_all_of_them() -> None:
+    """What is found by the tilt of the first edges is what is found by the tilt of all."""
+    bearings = np.linspace(-0.5, 0.5, 21)
+    edges = [Edge(bearing, 70.0 * (-1.0) ** k) for k, bearing in enumerate(bearings)]
+    pitch, roll = np.radians((1.8, -1.2))
+    image = scene(tilted(CAMERA, pitch, roll), edges)
+    starts = line_starts(image, TABLE, DEFAULT)
+    few = line_tracks(image, starts, TABLE, DEFAULT, enough=DEFAULT.first_edges)
+    assert not few.complete
+    first = tilt_beyond_doubt(image, few, TABLE, DEFAULT)
+    assert first is not None
+    assert 6 <= first.lines <= DEFAULT.first_edges
+    assert (first.pitch_rad, first.roll_rad) == pytest.approx((pitch, roll), abs=np.radians(0.2))
+
+    found, exact = (
+        detect_lines(image, TABLE, replace(DEFAULT, first_edges=n))
+        for n in (DEFAULT.first_edges, 0)
+    )
+    assert len(found) == len(exact) >= 19
+    np.testing.assert_allclose(found.alpha_rad, exact.alpha_rad, atol=2e-5)
+    assert found.tilt is not None
+    assert exact.tilt is not None
+    assert found.tilt.lines == exact.tilt.lines
+    assert found.tilt.pitch_rad == pytest.approx(exact.tilt.pitch_rad, abs=2e-4)
+    assert found.tilt.roll_rad == pytest.approx(exact.tilt.roll_rad, abs=2e-4)
+
+
+def test_where_a_few_edges_leave_doubt_all_are_followed() -> None:
+    image = scene(tilted(CAMERA, 0.02, -0.01))
+    starts = line_starts(image, TABLE, DEFAULT)
+    few = line_tracks(image, starts, TABLE, DEFAULT, enough=5)
+    assert not few.complete
+    assert tilt_beyond_doubt(image, few, TABLE, DEFAULT) is None
+    hurried, patient = (detect_lines(image, TABLE, replace(DEFAULT, first_edges=n)) for n in (5, 0))
+    assert hurried.landmarks() == patient.landmarks()
 
 
 def test_same_image_gives_the_same_rows() -> None:
