@@ -17,8 +17,8 @@ ROOMS = ("camera", "detect", "groundtruth", "landmarks", "lut", "slam")
 #: commands hand on to settings.
 NO_SETTINGS = frozenset(
     {
-        "Conduct", "ConductOptions", "FileHead", "FrameRows", "FrameSelection", "RowCount",
-        "RowFiles", "RunSummary", "SeenRows", "_Rows",
+        "Conduct", "ConductOptions", "FileHead", "FrameRows", "FrameSelection", "PickedFrames",
+        "RowCount", "RowFiles", "RunSummary", "SeenRows", "_Rows",
     }
 )  # fmt: skip
 
