@@ -5,7 +5,8 @@ Both functions say the same: one as a map, the other only its peaks above a thre
 
 from __future__ import annotations
 
-from typing import Any
+import threading
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,8 @@ FloatArray = NDArray[np.float64]
 _Ints = NDArray[np.int32]
 _Bytes = NDArray[np.uint8]
 _Arguments = tuple[_Bytes, int, NDArray[Any], NDArray[np.int64], _Ints, _Ints, _Ints, _Bytes]
+
+_SIGNS: dict[Polarity, float] = {"any": 0.0, "light": 1.0, "dark": -1.0}
 
 #: Room for so many centres above the threshold at a time.
 _ROOM = 4096
@@ -57,23 +60,30 @@ def best_centres(
     FrameError
         If the image does not belong to the table.
     """
-    sign = {"any": 0.0, "light": 1.0, "dark": -1.0}[polarity]
-    arguments = _kernel_arguments(image, table)
-    memory = working_memory(table.samples)
+    sign = _SIGNS[polarity]
+    space = _working_space(image.size, table.samples)
+    arguments = _kernel_arguments(image, table, space.pixels)
+    room = space.columns, space.rows, space.quality, space.contrast
     parts: list[tuple[NDArray[Any], ...]] = []
     block, blocks = 0, len(table.block_row)
-    while block < blocks or not parts:
-        columns, rows = np.empty(_ROOM, np.int64), np.empty(_ROOM, np.int64)
-        quality, contrast = np.empty(_ROOM), np.empty(_ROOM, np.float32)
+    while True:
         block, count = centres_above(
-            *arguments, threshold, sign, *memory, block, columns, rows, quality, contrast
-        )
-        parts.append((columns[:count], rows[:count], quality[:count], contrast[:count]))
-    columns, rows, quality, contrast = (
-        parts[0] if len(parts) == 1 else (np.concatenate(values) for values in zip(*parts))
-    )
+            *arguments, threshold, sign, *space.memory, block,
+            space.columns, space.rows, space.quality, space.contrast,
+        )  # fmt: skip
+        found: tuple[NDArray[Any], ...] = tuple([values[:count] for values in room])
+        if block == blocks and not parts:
+            break
+        parts.append(tuple([values.copy() for values in found]))
+        if block == blocks:
+            found = tuple(np.concatenate(values) for values in zip(*parts))
+            break
+    columns, rows, quality, contrast = found
     index = maxima(columns, rows, quality)
-    return np.stack([columns[index], rows[index]], axis=-1), quality[index], contrast[index]
+    pixels = np.empty((len(index), 2), np.int64)
+    pixels[:, 0] = columns[index]
+    pixels[:, 1] = rows[index]
+    return pixels, quality[index], contrast[index]
 
 
 def quality_of_centres(
@@ -101,24 +111,59 @@ def quality_of_centres(
     FrameError
         If the image does not belong to the table.
     """
-    arguments = _kernel_arguments(image, table)
+    pixels = np.zeros(image.size + BLOCK, np.uint8)
+    arguments = _kernel_arguments(image, table, pixels)
     quality = np.zeros(image.shape)
     contrast = np.zeros(image.shape, np.float32)
     quality_map(*arguments, *working_memory(table.samples), quality, contrast)
     return quality, contrast
 
 
-def _kernel_arguments(image: NDArray[np.uint8], table: DiscTable) -> _Arguments:
-    """The image's pixels, with the zeros that the table wants behind them, and the table."""
+class _WorkingSpace(NamedTuple):
+    """What `best_centres` works in: memory that is new for every image has to be fetched first."""
+
+    pixels: _Bytes
+    memory: tuple[_Bytes, NDArray[np.uint16], NDArray[np.uint32]]
+    columns: NDArray[np.int64]
+    rows: NDArray[np.int64]
+    quality: FloatArray
+    contrast: NDArray[np.float32]
+
+
+_kept = threading.local()
+
+
+def _working_space(size: int, samples: int) -> _WorkingSpace:
+    """The calling thread's working space for images of so many pixels."""
+    if getattr(_kept, "key", None) != (size, samples):
+        _kept.key = None
+        _kept.space = _WorkingSpace(
+            np.zeros(size + BLOCK, np.uint8),
+            working_memory(samples),
+            np.empty(_ROOM, np.int64),
+            np.empty(_ROOM, np.int64),
+            np.empty(_ROOM),
+            np.empty(_ROOM, np.float32),
+        )
+        _kept.key = size, samples
+    space: _WorkingSpace = _kept.space
+    return space
+
+
+def _kernel_arguments(
+    image: NDArray[np.uint8], table: DiscTable, pixels: NDArray[np.uint8]
+) -> _Arguments:
+    """The image's pixels, with the zeros that the table wants behind them, and the table.
+
+    `pixels` are as many as the image's, and those zeros: they become the image's.
+    """
     expected = table.floor_xy.shape[:2]
     if image.shape != expected or image.dtype != np.uint8:
         raise FrameError(
             f"the image is {image.dtype} of shape {image.shape}: the table is for uint8 of shape "
             f"{expected}"
         )
-    pixels = np.empty(image.size + BLOCK, np.uint8)
     pixels[: image.size].reshape(image.shape)[...] = image
-    pixels[image.size :] = 0
     return (
         pixels,
         table.samples,

@@ -151,9 +151,10 @@ def fit_settings(noise: float, blur_ratio: float) -> FitSettings:
 
 def fitted_positions(results: FloatArray) -> tuple[FloatArray, FloatArray]:
     """(N, 2) centres, metres, and their (N, 2, 2) covariances from (N, RESULT_SIZE) results."""
-    centre = [kernels.X, kernels.Y]
-    spread = [kernels.COV_XX, kernels.COV_XY, kernels.COV_XY, kernels.COV_YY]
-    return results[:, centre], results[:, spread].reshape(-1, 2, 2)
+    covariance = np.empty((len(results), 2, 2))
+    covariance[:, 0] = results[:, kernels.COV_XX : kernels.COV_XY + 1]
+    covariance[:, 1] = results[:, kernels.COV_XY : kernels.COV_YY + 1]
+    return results[:, kernels.X : kernels.Y + 1].copy(), covariance
 
 
 def blur_ratio_of(camera: Camera) -> float:

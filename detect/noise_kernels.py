@@ -16,6 +16,11 @@ _I: Callable[[Any], Any] = np.int16
 _NONE = _I(32767)
 _DARK, _LIGHT = _I(2), _I(253)
 
+#: A median is first guessed from so many responses, as far as it is below this; a guess that is
+#: wrong is moved so often by one.
+_SAMPLE, _SMALL = 2048, 256
+_TRIES = 4
+
 
 @njit(cache=True, error_model="numpy")
 def second_differences(
@@ -75,8 +80,56 @@ def _count_up_to(response: NDArray[np.int16], most: int) -> int:
 
 
 @njit(cache=True, error_model="numpy")
-def order_statistic(response: NDArray[np.int16], rank: int) -> int:
-    """The response that exactly `rank` others are not above, in the sorted order (from 0)."""
+def _count_below_and_at(response: NDArray[np.int16], value: int) -> tuple[int, int]:
+    """How many responses are below a value, and how many not above it."""
+    limit = _I(value)
+    block = 8192
+    below = 0
+    up_to = 0
+    for first in range(0, len(response), block):
+        part = response[first : first + block]
+        less = _I(0)
+        equal = _I(0)
+        for i in range(len(part)):
+            less = _I(less + _I(part[i] < limit))
+            equal = _I(equal + _I(part[i] == limit))
+        below += less
+        up_to += less + equal
+    return below, up_to
+
+
+@njit(cache=True, error_model="numpy")
+def _guess(response: NDArray[np.int16], rank: int) -> int:
+    """About the response of that rank, from a sample."""
+    step = max(1, len(response) // _SAMPLE)
+    counts = np.zeros(_SMALL, np.int64)
+    sampled = 0
+    for i in range(0, len(response), step):
+        counts[min(response[i], _SMALL - 1)] += 1
+        sampled += 1
+    left = rank * sampled // len(response)
+    value = 0
+    while value < _SMALL - 1 and left >= counts[value]:
+        left -= counts[value]
+        value += 1
+    return value
+
+
+@njit(cache=True, error_model="numpy")
+def order_statistic(response: NDArray[np.int16], rank: int) -> tuple[int, int]:
+    """The response that exactly `rank` others are before, in the sorted order (from 0).
+
+    Returns
+    -------
+    response, up_to : int
+        And how many are not above it.
+    """
+    value = _guess(response, rank)
+    for _ in range(_TRIES):
+        below, up_to = _count_below_and_at(response, value)
+        if below <= rank < up_to:
+            return value, up_to
+        value += 1 if rank >= up_to else -1
     low, high = -1, 8
     while _count_up_to(response, high) <= rank:
         low = high
@@ -88,7 +141,7 @@ def order_statistic(response: NDArray[np.int16], rank: int) -> int:
             high = middle
         else:
             low = middle
-    return high
+    return high, _count_up_to(response, high)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -102,7 +155,7 @@ def median_response(
     count = second_differences(image, rows, True, response)
     if count < least_countable:
         count = second_differences(image, rows, False, response)
-    lower = order_statistic(response, (count - 1) // 2)
-    if count % 2 == 1 or _count_up_to(response, lower) > count // 2:
+    lower, up_to = order_statistic(response, (count - 1) // 2)
+    if count % 2 == 1 or up_to > count // 2:
         return float(lower)
-    return 0.5 * (lower + order_statistic(response, count // 2))
+    return 0.5 * (lower + order_statistic(response, count // 2)[0])
