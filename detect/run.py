@@ -168,8 +168,9 @@ class ImageRun:
 
     @property
     def name(self) -> str:
-        """The folder's own name."""
-        return self.folder.resolve().name
+        """The recording's own name, or else the folder's."""
+        recording = self.output_base.name.removesuffix(".detected")
+        return self.folder.resolve().name if recording == "detected" else recording
 
     @property
     def images_without_step(self) -> int:

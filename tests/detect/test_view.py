@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
+from camera import read_camera
 from detect.cli import main
 from detect.view_command import summed_steps
-from landmarks import Step
+from landmarks import Step, read_frames
+from tests.detect.recordings import write_video
 from tests.detect.test_cli import assert_refused
 
 Captured = pytest.CaptureFixture[str]
@@ -32,17 +36,63 @@ def test_missing_package_and_files_are_told(
     assert_refused(view, small_run, "pip install 'redetect[view]'", capsys)
 
 
+def read_back(recording: Path) -> dict[str, list[dict[str, Any]]]:
+    """The rows of each entity of a recording, static ones too, by Rerun's own reader."""
+    reader = pytest.importorskip("rerun.chunk").RrdReader(str(recording))
+    found: dict[str, list[dict[str, Any]]] = {}
+    for chunk in reader.stream().to_chunks():
+        found.setdefault(chunk.entity_path, []).extend(chunk.to_record_batch().to_pylist())
+    return found
+
+
 @pytest.mark.long
-def test_recording_is_written(small_run: Path, tmp_path: Path, capsys: Captured) -> None:
+def test_recording_holds_frames_rows_and_path(
+    small_run: Path, tmp_path: Path, capsys: Captured
+) -> None:
     pytest.importorskip("rerun")
     output = tmp_path / "v.rrd"
     view = ["view", str(small_run), "-o", str(output)]
     assert_refused(view, small_run, "detect all", capsys)
-    assert main(["circles", str(small_run)]) == 0
+    assert main(["all", str(small_run)]) == 0
     assert main(view) == 0
-    content = output.read_bytes()
-    assert content.startswith(b"RRF2")
-    for entity in (b"camera/image/discs", b"world/path", b"world/robot"):
-        assert entity in content
     capsys.readouterr()
     assert_refused(view, small_run, "--force", capsys)
+
+    found = read_back(output)
+    detected = list(read_frames(small_run / "detected.circles"))
+    wanted = [len(frame.circles) for frame in detected]
+    assert sum(wanted) == 3
+    counts = {row["frame"]: row["Scalars:scalars"] for row in found["/count/discs"]}
+    assert counts == {k: [float(count)] for k, count in enumerate(wanted)}
+    for entity in ("/camera/image", "/world/robot", "/count/verticals"):
+        assert [row["frame"] for row in found[entity]] == [0, 1, 2]
+        assert all("time" not in row for row in found[entity])
+    outlines = {r["frame"]: r["LineStrips2D:strips"] for r in found["/camera/image/discs"]}
+    assert [len(outlines[k]) for k in range(3)] == wanted
+    # The outline's middle is where the disc is in the image; Rerun counts from the corner.
+    camera = read_camera(small_run / "s.cam")
+    first = detected[0].circles[0]
+    seen = camera.project_floor(np.array([[first.px, first.py]]))[0] + 0.5
+    middle = np.mean(outlines[0][0][:-1], axis=0)
+    assert np.linalg.norm(middle - seen) < 2.0
+    robot = {r["frame"]: r["Transform3D:translation"][0] for r in found["/world/robot"]}
+    poses = summed_steps([frame.step for frame in detected])
+    np.testing.assert_allclose([robot[k][:2] for k in range(3)], poses[1:, :2], atol=1e-6)
+    (path,) = found["/world/path"][0]["LineStrips3D:strips"]
+    np.testing.assert_allclose(np.array(path)[:, :2], poses[:, :2], atol=1e-6)
+
+
+@pytest.mark.long
+def test_times_of_a_video_are_in_its_recording(small_run: Path, tmp_path: Path) -> None:
+    pytest.importorskip("rerun")
+    images = [
+        np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), np.uint8)
+        for path in sorted((small_run / "images").iterdir())
+    ]
+    video = write_video(tmp_path / "s.avi", images)
+    camera = ["--camera", str(small_run / "s.cam")]
+    assert main(["circles", str(video), *camera]) == 0
+    output = tmp_path / "v.rrd"
+    assert main(["view", str(video), *camera, "-o", str(output)]) == 0
+    times = [row["time"].total_seconds() for row in read_back(output)["/count/discs"]]
+    assert times == pytest.approx([0.0, 0.1, 0.2], abs=1e-6)
