@@ -1,6 +1,6 @@
 """Where the robot really was: markers, lasers, clocks, their fusion and its validation.
 
-Each package imports only from those before it, as named (`errors` and `json_file` serve all):
+Each package imports only from those named here; `errors` and the readers of files serve all:
 
 - `geometry`: rigid motions in space and in the plane, covariances of poses.
 - `trajectories`: poses over time, their files, and poses at other times: `geometry`.

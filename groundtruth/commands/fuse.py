@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict
 from pathlib import Path
 
@@ -10,11 +9,10 @@ import numpy as np
 
 from groundtruth.clocks.clock import read_clock
 from groundtruth.commands.options import Fuse
-from groundtruth.commands.outputs import check_outputs, provenance
+from groundtruth.commands.outputs import check_outputs, provenance, write_account
 from groundtruth.errors import GroundTruthError
 from groundtruth.fusion.fuse import FuseSettings, fuse
 from groundtruth.trajectories.streams import PlanarPoses, read_planar_poses, write_planar_poses
-from storage import write_whole
 
 
 def perform(options: Fuse) -> int:
@@ -52,8 +50,7 @@ def perform(options: Fuse) -> int:
         "rejected": [asdict(rejected) for rejected in fusion.rejected],
     }
     write_planar_poses(options.output, fusion.poses, overwrite=options.force)
-    with write_whole(account, overwrite=options.force) as stream:
-        stream.write((json.dumps(document, indent=1) + "\n").encode())
+    write_account(account, document, overwrite=options.force)
     assert fusion.poses.covariances is not None
     sigma = 1e3 * np.sqrt(
         np.median(np.trace(fusion.poses.covariances[:, :2, :2], axis1=1, axis2=2))

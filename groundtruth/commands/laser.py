@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import json
 import sys
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from groundtruth.commands.options import Laser
-from groundtruth.commands.outputs import check_outputs, provenance
+from groundtruth.commands.outputs import check_outputs, provenance, write_account
 from groundtruth.lasers.blocks import combined_poses
 from groundtruth.lasers.scanners import Scanner
 from groundtruth.lasers.session import load_session
@@ -49,11 +48,12 @@ def perform(options: Laser) -> int:
 
     poses = combined_poses(track, options.average)
     write_planar_poses(output, poses, overwrite=options.force)
-    _write(account, account_lines(track), options.force)
+    with write_whole(account, overwrite=options.force) as stream:
+        stream.write(("\n".join(account_lines(track)) + "\n").encode())
     described = describe(track, scanners, left_out)
     files = [calibration, options.session / "robot.json"]
     content = {**provenance(settings, files), "sets_per_pose": options.average, **described}
-    _write(summary, [json.dumps(content, indent=1)], options.force)
+    write_account(summary, content, overwrite=options.force)
 
     expected = int(np.sum(track.status != LOST))
     determined = int(np.isin(track.status, (OK, REACQUIRED)).sum())
@@ -127,9 +127,3 @@ def describe(
             }
         )
     return {"segments": segments, "scanners": entries}
-
-
-def _write(path: Path, lines: list[str], force: bool) -> None:
-
-    with write_whole(path, overwrite=force) as stream:
-        stream.write(("\n".join(lines) + "\n").encode())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
@@ -10,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from groundtruth import __version__
-from storage import OutputExistsError
+from storage import OutputExistsError, write_whole
 
 
 def check_outputs(paths: Sequence[Path | None], force: bool) -> None:
@@ -29,6 +30,12 @@ def provenance(settings: Any, files: Sequence[Path] = ()) -> dict[str, Any]:
             path.name: {"sha256": hashlib.sha256(path.read_bytes()).hexdigest()} for path in files
         },
     }
+
+
+def write_account(path: Path, content: dict[str, Any], *, overwrite: bool) -> None:
+    """Write what stands beside a result, as JSON."""
+    with write_whole(path, overwrite=overwrite) as stream:
+        stream.write((json.dumps(content, indent=1) + "\n").encode())
 
 
 @contextmanager

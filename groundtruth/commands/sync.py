@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from typing import Any
 
@@ -12,9 +11,8 @@ from groundtruth.clocks.clock import ClockModel, ClockSegment, clock_document
 from groundtruth.clocks.ptpd import PtpdLog, read_ptpd
 from groundtruth.clocks.sync import SyncSettings, synchronise
 from groundtruth.commands.options import Sync
-from groundtruth.commands.outputs import check_outputs, provenance
+from groundtruth.commands.outputs import check_outputs, provenance, write_account
 from groundtruth.trajectories.streams import PlanarPoses, read_planar_poses, write_planar_poses
-from storage import write_whole
 
 _CONFIDENCE = 1.959964
 
@@ -46,8 +44,7 @@ def perform(options: Sync) -> int:
     if log is not None:
         document["ptpd"] = compare_with_ptpd(model, told, log)
         print(_ptpd_line(document["ptpd"]))
-    with write_whole(options.output, overwrite=options.force) as stream:
-        stream.write((json.dumps(document, indent=1) + "\n").encode())
+    write_account(options.output, document, overwrite=options.force)
     if options.apply is not None:
         aligned = PlanarPoses(
             model.groundtruth_times(odometry.times_s), odometry.poses, odometry.covariances

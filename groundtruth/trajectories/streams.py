@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from groundtruth.errors import GroundTruthError, StreamError
 from groundtruth.geometry.transforms import quaternion_xyzw
+from groundtruth.text_file import read_text
 from storage import write_whole
-from storage.bounded import read_bounded
 from storage.messages import excerpt
 
 FloatArray = NDArray[np.float64]
@@ -253,14 +253,7 @@ def read_rows_of_numbers(path: str | os.PathLike[str], columns: int, expected: s
 
 def _rows(path: str | os.PathLike[str]) -> Iterator[tuple[int, list[str]]]:
     """Yield line numbers and words, without comments and blank lines."""
-    try:
-        text = read_bounded(path, _LARGEST_FILE_BYTES).decode("utf-8-sig")
-    except FileNotFoundError:
-        raise StreamError(path, None, "no such file") from None
-    except UnicodeDecodeError:
-        raise StreamError(path, None, "is no text: expected rows of numbers") from None
-    except OSError as error:
-        raise StreamError(path, None, f"cannot be read: {error.strerror}") from None
+    text = read_text(path, _LARGEST_FILE_BYTES, "rows of numbers")
     for number, line in enumerate(text.split("\n"), 1):
         content = line.partition("#")[0].strip()
         if content:

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from groundtruth.errors import GroundTruthError, StreamError
 from groundtruth.json_file import read_json, write_json
+from groundtruth.text_file import read_text
 from storage import write_whole
-from storage.bounded import read_bounded
 from storage.messages import excerpt
 
 FloatArray = NDArray[np.float64]
@@ -125,14 +125,7 @@ def read_distances(path: str | os.PathLike[str], survey: Survey) -> list[Distanc
     StreamError
         If the file cannot be read, a row is malformed or names a point that is not known.
     """
-    try:
-        text = read_bounded(path, _LARGEST_FILE_BYTES).decode("utf-8-sig")
-    except FileNotFoundError:
-        raise StreamError(path, None, "no such file") from None
-    except UnicodeDecodeError:
-        raise StreamError(path, None, "is no text: expected rows") from None
-    except OSError as error:
-        raise StreamError(path, None, f"cannot be read: {error.strerror}") from None
+    text = read_text(path, _LARGEST_FILE_BYTES, "rows")
     rows: list[Distance] = []
     for number, line in enumerate(text.split("\n"), 1):
         content = line.partition("#")[0].strip()
