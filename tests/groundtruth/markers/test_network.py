@@ -123,7 +123,7 @@ def test_its_covariance_is_true(kind: str) -> None:
     sigmas = np.array([2e-3, 2e-3, 2e-3, 4e-3, 4e-3, 4e-3])
     squares, draws = 0.0, 12
     for seed in range(draws):
-        found = shots(0.15, 10 + seed)
+        found = shots(0.15, 10 + seed, per_pair=3)
         offset: FloatArray | None = {"known": OFFSET, "unknown": None}.get(
             kind, OFFSET @ exp_se3(sigmas * generator.normal(size=6))
         )
@@ -200,11 +200,12 @@ def test_corners_come_in_the_boards_order_however_it_is_held(turn_deg: float) ->
     facing_camera[:3, 3] = [0.02, -0.03, 0.9]
     pose = facing_camera @ exp_se3(np.array([0, 0, 0, 0.3, -0.25, 0.0]))
     pose = pose @ exp_se3(np.array([0, 0, 0, 0, 0, np.radians(turn_deg)]))
-    corners = find_checkerboard(painted(board, camera, pose), board)
+    image = painted(board, camera, pose)
+    corners = find_checkerboard(image, board)
     expected = camera.project(apply(pose, board.points))
     assert np.abs(corners - expected).max() < 0.3
     with pytest.raises(GeometryError, match="no checkerboard of 9 x 4"):
-        find_checkerboard(painted(board, camera, pose), Checkerboard(9, 4, 0.08))
+        find_checkerboard(image, Checkerboard(9, 4, 0.08))
 
 
 @pytest.mark.parametrize(
