@@ -20,7 +20,7 @@ from detect.errors import DetectError, FrameError
 from detect.progress import print_failures, progress_bar
 from detect.run import Run, read_image
 from detect.settings import CircleSettings
-from detect.sources.opening import open_source
+from detect.sources.opening import demand_recording, open_source
 from detect.stream import KEPT_FAILURES
 from detect.viewing_options import Draw
 from storage import OutputExistsError, write_whole
@@ -34,6 +34,7 @@ def perform(options: Draw) -> int:
         raise DetectError("nowhere to draw to: expected a folder (-o) or a file (--video)")
     if not (isfinite(options.fps) and options.fps > 0.0):
         raise DetectError(f"fps is {options.fps:g}: expected above 0")
+    demand_recording(options.run)
     run = open_source(options.run, options.camera, options.source)
     files = find_files(run, options.files)
     camera = run.camera if isinstance(run, Run) else None

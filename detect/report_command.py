@@ -8,7 +8,7 @@ from detect.report_inputs import ReportInputs, gather
 from detect.report_page import Picture, report_page
 from detect.run import Run, RunFrame, read_image
 from detect.settings import CircleSettings
-from detect.sources.opening import open_source
+from detect.sources.opening import demand_recording, open_source
 from detect.viewing_options import Report
 from storage import OutputExistsError, write_whole
 
@@ -21,6 +21,7 @@ def perform(options: Report) -> int:
 
     if options.worst < 0:
         raise DetectError(f"worst is {options.worst}: expected 0 or more")
+    demand_recording(options.run)
     run = open_source(options.run, options.camera, options.source)
     output = run.output("html") if options.output is None else options.output
     if output.exists() and not options.force:

@@ -13,7 +13,7 @@ from detect.errors import DetectError
 from detect.line_settings import PRESETS, LineSettings
 from detect.progress import print_failures, progress_bar
 from detect.settings import PUBLISHED, CircleSettings
-from detect.sources.opening import open_calibrated
+from detect.sources.opening import demand_recording, open_calibrated
 from detect.tune_grid import combinations, settings_with
 from detect.tune_run import Settings, tune_run
 from detect.tune_table import curve_picture, records_csv, records_json, trial_records
@@ -41,6 +41,7 @@ def perform(options: Tune) -> int:
     if options.verticals and options.tilt is not None:
         raise DetectError("--tilt and --verticals: verticals show the tilt themselves")
 
+    demand_recording(options.run)
     run = open_calibrated(options.run, options.camera, options.source)
     output = run.output("tune") if options.output is None else options.output
     outputs = {name: output / name for name in ("table.csv", "table.json", "curve.png")}

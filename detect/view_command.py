@@ -20,7 +20,7 @@ from detect.errors import DetectError, FrameError
 from detect.progress import print_failures, progress_bar
 from detect.run import Run, read_image
 from detect.settings import CircleSettings
-from detect.sources.opening import open_source
+from detect.sources.opening import demand_recording, open_source
 from detect.viewing_options import View
 from landmarks import Step, circle_arrays
 from landmarks.map_file import read_map, read_path
@@ -39,6 +39,7 @@ _CORNER = 0.5
 def perform(options: View) -> int:
     """Carry the command out; returns the exit code."""
     rr = _rerun()
+    demand_recording(options.run)
     run = open_source(options.run, options.camera, options.source)
     if not isinstance(run, Run):
         raise DetectError(

@@ -101,6 +101,21 @@ def open_source(
     return _open(name, camera_path, options, posed=False)
 
 
+def demand_recording(name: Path) -> None:
+    """Refuse a live camera where rows are looked at: it shows other images than theirs.
+
+    Raises
+    ------
+    DetectError
+        If this names one.
+    """
+    if _LIVE.fullmatch(str(name)):
+        raise DetectError(
+            f"{name}: shows other images now than those that the rows are from: expected a "
+            "recording: a folder or pattern of images, a video or a bag"
+        )
+
+
 def _open(name: Path, camera_path: Path | None, options: SourceOptions, *, posed: bool) -> ImageRun:
     """Open any source, with a calibration where there is one; `posed`: one with a pose."""
     source = _source(name, options)

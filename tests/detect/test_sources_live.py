@@ -21,6 +21,7 @@ from detect.sources.opening import open_source
 from detect.sources.options import SourceOptions
 from groundtruth.trajectories.streams import read_times
 from landmarks import read_frames
+from tests.detect.recordings import write_video
 
 
 class Played:
@@ -154,3 +155,39 @@ def test_a_second_interrupt_is_meant(
     arguments = ["circles", "camera:0", "--camera", str(small_run / "s.cam"), "-o", str(output)]
     assert main(arguments) == 130
     assert not output.exists()
+
+
+@pytest.mark.long
+def test_the_number_is_opencvs_and_frames_come_as_from_a_device(
+    small_run: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    images = [
+        np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), np.uint8)
+        for path in sorted((small_run / "images").iterdir())
+    ]
+    film = write_video(tmp_path / "device.avi", images)
+    plain, asked = cv2.VideoCapture, []
+
+    def capture_of(number: int) -> cv2.VideoCapture:
+        asked.append(number)
+        return plain(str(film)) if number == 3 else plain(str(tmp_path / "none"))
+
+    monkeypatch.setattr(cv2, "VideoCapture", capture_of)
+    monkeypatch.chdir(tmp_path)
+    camera = ["--camera", str(small_run / "s.cam")]
+    assert main(["circles", "camera:3", *camera]) == 0
+    assert set(asked) == {3}
+    found = list(read_frames(tmp_path / "camera3.detected.circles"))
+    # A camera does not wait: what it showed meanwhile is passed over.
+    assert 1 <= len(found) <= len(images)
+    assert [frame.step.prefix for frame in found] == [f"camera3.{k:04d}" for k in range(len(found))]
+    assert len(read_times("camera3.detected.circles.times")) == len(found)
+    capsys.readouterr()
+    assert main(["circles", "camera:12", *camera]) == 1
+    told = capsys.readouterr().err
+    assert asked[-1] == 12
+    assert told.count("\n") == 1
+    assert "camera:12: no camera of that number answers" in told

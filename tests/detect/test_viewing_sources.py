@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from detect.cli import main
 from tests.detect.recordings import Ros, Said, write_video
+from tests.detect.test_cli import assert_refused
 
 Images = list[NDArray[np.uint8]]
 
@@ -88,3 +89,14 @@ def test_the_same_pictures_page_and_table(
     assert sorted(found) == sorted(expected)
     for name, content in found.items():
         assert content == expected[name], name
+
+
+@pytest.mark.parametrize("command", ["draw", "view", "report", "tune"])
+def test_a_live_camera_shows_something_else_by_now(
+    command: str, small_run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    if command == "view":
+        pytest.importorskip("rerun")
+    arguments = [command, "camera:0", "-o", str(small_run / "output")]
+    arguments += ["--threshold", "0.5"] if command == "tune" else []
+    assert_refused(arguments, small_run, "camera:0: shows other images now", capsys)
