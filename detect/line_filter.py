@@ -54,6 +54,10 @@ class StartBand:
     pixel : (R, W) int32
         Index into the flat image of the pixel on the left of each pixel of the band; -1 beyond the
         ends of the vertical.
+    runs : (R * W // L, 3) int32
+        The same for L pixels of the band together, where these indices are two runs of neighbours:
+        that of the first; that of the second, as if it began at the first pixel too; and the length
+        of the first. Length -1 where they are not.
     part : (R, W) float32
         How far the pixel of the band lies to the right of it.
     scale : (K, W) float32
@@ -69,6 +73,7 @@ class StartBand:
 
     row: NDArray[np.int32]
     pixel: NDArray[np.int32]
+    runs: NDArray[np.int32]
     part: NDArray[np.float32]
     scale: NDArray[np.float32]
     visible: NDArray[np.bool_]
@@ -184,12 +189,29 @@ def start_band(table: VerticalTable, settings: LineSettings) -> StartBand:
     return StartBand(
         row=np.where(allowed, middle, -1).astype(np.int32),
         pixel=pixel,
+        runs=_runs_of_neighbours(pixel, height * width),
         part=(x - left).astype(np.float32),
         scale=scale.astype(np.float32),
         visible=visible,
         weights=np.array(weights, np.float32),
         spacing=settings.start_spacing_rows,
     )
+
+
+def _runs_of_neighbours(pixel: NDArray[np.int32], pixels: int) -> NDArray[np.int32]:
+    """See `StartBand.runs`."""
+    from detect.line_vector_code import LANES
+
+    flat = pixel.reshape(-1)
+    block = flat[: len(flat) // LANES * LANES].reshape(-1, LANES)
+    breaks = np.diff(block, axis=1) != 1
+    length = np.where(breaks.any(axis=1), breaks.argmax(axis=1) + 1, LANES)
+    first = block[:, 0]
+    inside = np.minimum(length, LANES - 1)
+    second = np.where(length < LANES, block[np.arange(len(block)), inside] - length, first)
+    two = (block >= 0).all(axis=1) & (breaks.sum(axis=1) <= 1) & (second >= 0)
+    two &= np.maximum(first, second) + LANES < pixels
+    return np.stack([first, second, np.where(two, length, -1)], axis=1).astype(np.int32)
 
 
 def _typical_spacing(x: FloatArray, shown: NDArray[np.bool_]) -> float:

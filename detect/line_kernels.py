@@ -49,19 +49,33 @@ def find_starts(
     signs = np.empty(len(row), np.float32)
     score = np.empty(len(row), np.float32)
     least = np.float32(threshold)
+    # Maxima are few: they are told by vectors, and looked through eight at a time.
+    inner = max(width - 2, 0)
+    highest = np.zeros(-(-inner // 8) * 8, np.uint8)
+    eight = highest.view(np.uint64)
     n = 0
-    for k in range(steps):
-        for c in range(1, width - 1):
-            here = abs(response[k, c])
-            if here < least or band_row[k, c] < 0:
+    for k in range(steps if inner > 0 else 0):
+        lefts = response[k, : width - 2]
+        heres = response[k, 1 : width - 1]
+        rights = response[k, 2:]
+        allowed = band_row[k, 1 : width - 1]
+        for i in range(inner):
+            left = lefts[i]
+            here = heres[i]
+            right = rights[i]
+            rising = (here >= least) & (left < here) & (right <= here)
+            falling = (here <= -least) & (left > here) & (right >= here)
+            highest[i] = (rising | falling) & (allowed[i] >= 0)
+        for word in range(len(eight)):
+            if eight[word] == 0:
                 continue
-            sign = np.float32(1.0) if response[k, c] > 0.0 else np.float32(-1.0)
-            if sign * response[k, c - 1] < here and sign * response[k, c + 1] <= here:
-                row[n] = band_row[k, c]
-                column[n] = c
-                signs[n] = sign
-                score[n] = here
-                n += 1
+            for i in range(8 * word, 8 * word + 8):
+                if highest[i]:
+                    row[n] = allowed[i]
+                    column[n] = i + 1
+                    signs[n] = np.float32(1.0 if heres[i] > 0.0 else -1.0)
+                    score[n] = abs(heres[i])
+                    n += 1
     order = np.argsort(-score[:n], kind="mergesort")
     return row[order], column[order], signs[order], score[order]
 

@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from detect.line_vector_kernels import LANES, interpolate
+from detect.line_vector_kernels import LANES, interpolate, interpolate_runs
 
 _ZERO = np.float32(0.0)
 #: Grey values about 0 keep the small variances exact in single precision.
@@ -154,6 +154,7 @@ def strip_response(
 def band_response(
     image: NDArray[np.uint8],
     pixel: NDArray[np.int32],
+    runs: NDArray[np.int32],
     part: NDArray[np.float32],
     scale: NDArray[np.float32],
     visible: NDArray[np.bool_],
@@ -176,6 +177,8 @@ def band_response(
     pixel : (R, W) int32
         Index into the flat image of the pixel on the left of each pixel of the strip, for rows that
         are counted from the horizon; -1 beyond the ends of the vertical.
+    runs : (R * W // LANES, 3) int32
+        See `detect.line_filter.StartBand`.
     part : (R, W) float32
         How far the strip's pixel lies to the right of it.
     scale : (K, W) float32
@@ -204,8 +207,15 @@ def band_response(
     flat_grey = grey.reshape(-1)
     flat_square = square.reshape(-1)
     whole = len(flat_pixel) // LANES * LANES
-    for i in range(0, whole, LANES):
-        interpolate(flat, flat_pixel, flat_part, flat_grey, flat_square, i)
+    for block in range(len(runs)):
+        i = block * LANES
+        if runs[block, 2] >= 0:
+            interpolate_runs(
+                flat, runs[block, 0], runs[block, 1], runs[block, 2], flat_part, flat_grey,
+                flat_square, i,
+            )  # fmt: skip
+        else:
+            interpolate(flat, flat_pixel, flat_part, flat_grey, flat_square, i)
     for i in range(whole, len(flat_pixel)):
         flat_grey[i] = _ZERO
         flat_square[i] = _ZERO

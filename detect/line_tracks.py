@@ -180,6 +180,7 @@ def start_response(
     band_response(
         np.ascontiguousarray(image),
         band.pixel,
+        band.runs,
         band.part,
         band.scale,
         band.visible,

@@ -19,9 +19,9 @@ LANES = 8
 #: Pixels that are read at once for each lane.
 WORD = 8
 
-I16, I32, I64 = (ir.IntType(bits) for bits in (16, 32, 64))
+I8, I16, I32, I64 = (ir.IntType(bits) for bits in (8, 16, 32, 64))
 FLOAT = ir.FloatType()
-BYTES = ir.VectorType(ir.IntType(8), LANES)
+BYTES = ir.VectorType(I8, LANES)
 SHORTS = ir.VectorType(I16, LANES)
 INTS = ir.VectorType(I32, LANES)
 LONGS = ir.VectorType(I64, LANES)

@@ -7,12 +7,14 @@ from __future__ import annotations
 
 from typing import Any
 
+from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 
 from detect.line_vector_code import (
     BYTES,
     FLOATS,
+    I8,
     I16,
     INTS,
     LANES,
@@ -24,7 +26,7 @@ from detect.line_vector_code import (
     operation,
 )
 
-__all__ = ["LANES", "WORD", "add_products", "interpolate", "slope_and_bend"]
+__all__ = ["LANES", "WORD", "add_products", "interpolate", "interpolate_runs", "slope_and_bend"]
 
 
 @operation
@@ -158,4 +160,55 @@ def interpolate(
         return context.get_dummy_value()
 
     result = types.void(pixels, where, part, grey, square, types.int64)
+    return result, generate
+
+
+@operation
+def interpolate_runs(
+    _typing: Any,
+    pixels: Any,
+    first: Any,
+    second: Any,
+    count: Any,
+    part: Any,
+    grey: Any,
+    square: Any,
+    at: Any,
+) -> Any:
+    """As `interpolate`, where the pixels on the left of the places are two runs of neighbours.
+
+    Parameters
+    ----------
+    pixels : uint8, contiguous
+        The image in scan order.
+    first, second : int64
+        The pixel on the left of place k is ``first + k`` for the first `count` places, and
+        ``second + k`` for the others; the image goes on for `LANES` pixels behind both.
+    count : int64
+        See above.
+    part, grey, square, at
+        As for `interpolate`.
+    """
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        code = Code(context, builder, signature, args)
+        lane = ir.Constant(BYTES, list(range(LANES)))
+        number = code.everywhere(builder.trunc(args[3], I8), BYTES)
+        of_first = builder.icmp_signed("<", lane, number)
+        sides = []
+        for side in range(2):
+            runs = (builder.add(run, code.number(side)) for run in args[1:3])
+            own, other = (code.load(0, run, BYTES) for run in runs)
+            values = builder.xor(builder.select(of_first, own, other), constant(BYTES, 0x80))
+            sides.append(builder.sitofp(builder.sext(values, INTS), FLOATS))
+        left, right = sides
+        share = code.load(4, args[7], FLOATS)
+        for argument in (5, 6):
+            code.store(argument, args[7], code.add(left, code.mul(share, code.sub(right, left))))
+            left, right = code.mul(left, left), code.mul(right, right)
+        return context.get_dummy_value()
+
+    result = types.void(
+        pixels, types.int64, types.int64, types.int64, part, grey, square, types.int64
+    )
     return result, generate

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from detect.line_filter import FilteredColumns, gaussian_window
+from detect.line_filter import FilteredColumns, gaussian_window, start_band
 from detect.line_settings import DEFAULT, PUBLISHED, LineSettings
 from detect.line_tracks import (
     line_response,
@@ -18,6 +18,7 @@ from detect.line_tracks import (
     line_tracks,
     start_response,
 )
+from detect.line_vector_code import LANES
 from detect.tilt import TiltEstimate
 from lut.verticals import build_vertical_table
 from tests.detect.line_scene import Edge, pinhole, render, tilted
@@ -218,3 +219,20 @@ def test_response_of_the_starts_is_that_of_the_whole_strip(preset: LineSettings)
         k, c = np.nonzero(band.row >= 0)
         np.testing.assert_allclose(response[k, c], whole[band.row[k, c], c], atol=limit)
         assert np.abs(response).max() > 0.4
+
+
+@pytest.mark.parametrize("width", [240, 237])
+def test_runs_of_neighbours_are_the_pixels_of_the_band(width: int) -> None:
+    camera = pinhole(width, 160, 200.0, pitch_deg=8.0, roll_deg=3.0)
+    band = start_band(build_vertical_table(camera), DEFAULT)
+    first, second, length = (band.runs[:, k, None].astype(np.int64) for k in range(3))
+    whole = band.pixel.size // LANES * LANES
+    pixel = band.pixel.reshape(-1)[:whole].reshape(-1, LANES)
+    lane = np.arange(LANES)
+    expected = np.where(lane < length, first + lane, second + lane)
+    two = length[:, 0] >= 0
+    # Most are: that is what makes it fast.
+    assert np.mean(two) > 0.7
+    np.testing.assert_array_equal(expected[two], pixel[two])
+    assert np.minimum(first, second)[two].min() >= 0
+    assert np.maximum(first, second)[two].max() + LANES < width * 160
