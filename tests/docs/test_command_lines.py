@@ -1,0 +1,108 @@
+"""Every command line that a document shows is one that its command accepts."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import warnings
+from collections.abc import Callable
+from importlib import import_module
+from pathlib import Path
+from runpy import run_module
+from typing import Any
+
+import pytest
+import tyro
+
+from tests.docs.blocks import blocks_of, commands_in, documents, shell_lines
+
+
+class Parsed(BaseException):
+    """The command line is accepted, and nothing is to be done about it here."""
+
+
+@pytest.fixture
+def accepts(monkeypatch: pytest.MonkeyPatch) -> Callable[[list[str]], bool]:
+    """Whether a command accepts the words behind its name; it does not come to performing."""
+
+    def parse_only(parse: Callable[..., Any]) -> Callable[..., None]:
+        def parse_and_stop(*arguments: Any, **options: Any) -> None:
+            parse(*arguments, **options)
+            raise Parsed
+
+        return parse_and_stop
+
+    for place, name in (
+        (tyro, "cli"),
+        (tyro.extras, "subcommand_cli_from_dict"),
+        (argparse.ArgumentParser, "parse_args"),
+    ):
+        monkeypatch.setattr(place, name, parse_only(getattr(place, name)))
+
+    def accepts(words: list[str]) -> bool:
+        monkeypatch.setattr(sys, "argv", words)
+        try:
+            start(words)
+        except Parsed:
+            return True
+        except SystemExit:
+            pass  # refused, or `--help`
+        return False
+
+    return accepts
+
+
+def start(words: list[str]) -> None:
+    """Start a program of the project, `slam`, or a script, `tools.soak`."""
+    if words[0].startswith("tools."):
+        with warnings.catch_warnings():
+            # That the module has been imported already does not matter here.
+            warnings.simplefilter("ignore", RuntimeWarning)
+            run_module(words[0], run_name="__main__", alter_sys=True)
+    else:
+        import_module(f"{words[0]}.cli").main(words[1:])
+
+
+def test_every_command_line_is_accepted(
+    project_root: Path, accepts: Callable[[list[str]], bool], capsys: pytest.CaptureFixture[str]
+) -> None:
+    shown: dict[tuple[str, ...], str] = {}
+    for document in documents(project_root):
+        for block in blocks_of(document):
+            if block.language in ("", "console", "bash", "sh"):
+                for line, text in shell_lines(block):
+                    for words in commands_in(text):
+                        place = f"{document.relative_to(project_root)}:{line}"
+                        shown.setdefault(tuple(words), place)
+    assert len(shown) > 100
+    refused = []
+    for command, place in shown.items():
+        if not accepts(list(command)):
+            refused.append(f"{place}: {' '.join(command)}\n{capsys.readouterr()[1]}")
+    assert not refused, "\n".join(refused)
+
+
+def test_a_wrong_command_line_is_noticed(accepts: Callable[[list[str]], bool]) -> None:
+    assert accepts(["detect", "circles", "images/e"])
+    assert not accepts(["detect", "circles", "images/e", "--no-such-flag"])
+    assert not accepts(["tools.simulator", "no-such-command"])
+
+
+def test_command_lines_are_found(tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    page.write_text(
+        "Text.\n\n    detect circles RUN \\\n        --force   # again\n\n"
+        "```console\n$ for c in a b; do detect markers $c; done && slam map RUN\nprinted\n```\n"
+        "    detect all continued paragraph, no block\n"
+    )
+    found = [
+        (line, words)
+        for block in blocks_of(page)
+        for line, text in shell_lines(block)
+        for words in commands_in(text)
+    ]
+    assert found == [
+        (3, ["detect", "circles", "RUN", "--force"]),
+        (7, ["detect", "markers", "1"]),
+        (7, ["slam", "map", "RUN"]),
+    ]

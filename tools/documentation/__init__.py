@@ -1,0 +1,1 @@
+"""What the documentation is made with: its pictures, and the photographs of its tutorial."""
