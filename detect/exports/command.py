@@ -36,6 +36,11 @@ def perform(command: Export) -> int:
             f"{command.file}: is a folder: expected a .circles, .lines, .markers or .tilt "
             f"file{such}"
         )
+    if command.file.suffix == ".cam":
+        raise DetectError(
+            f"{command.file}: is a calibration, not rows: camera convert {command.file} "
+            "cameras.txt writes it for COLMAP (or for OpenCV, ROS, Kalibr)"
+        )
     rows = ExportedRows(command.file, _times(command), command.rate_hz)
     output = command.output
     if output is None:

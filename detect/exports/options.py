@@ -20,6 +20,8 @@ class Export:
     Example: detect export images/e/map.circles --to csv -o /tmp/discs.csv, or:
     detect export drive.detected.circles --to mcap
 
+    Cameras of COLMAP come from the calibration: camera convert e.cam cameras.txt
+
     Parameters
     ----------
     file : Path

@@ -247,6 +247,19 @@ def test_without_the_package(
     assert f"pip install 'redetect{extra}'" in line
 
 
+def test_a_calibration_is_another_commands(project_root: Path, capsys: Captured) -> None:
+    from camera.cli import main as camera_main
+
+    source = project_root / "images" / "e" / "e.cam"
+    assert main(["export", str(source)]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"camera convert {source} cameras.txt" in line
+    with pytest.raises(SystemExit) as left:
+        camera_main(["convert", "--help"])
+    assert left.value.code == 0
+    assert "cameras.txt" in capsys.readouterr().out
+
+
 def test_the_demo_run_reads_back(project_root: Path, tmp_path: Path) -> None:
     """From the CSV, the frames of the file can be put together again."""
     source = project_root / "images" / "e" / "map.circles"
