@@ -48,7 +48,6 @@ def carry_out(command: Command) -> int:
 
 def _circles(command: Circles) -> int:
     from detect import __version__
-    from detect.by_image import TiltsByImage
     from detect.circles_run import detect_circles_run
     from detect.run_log import log_place
     from detect.sources.opening import open_calibrated
@@ -57,6 +56,11 @@ def _circles(command: Circles) -> int:
     output = command.output if command.output is not None else run.output("circles")
     conduct = _conduct(command, log_place(output))
     _demand_new([output, command.json], command.force, run, conduct)
+    tilts = None
+    if command.tilt is not None:
+        from detect.by_image import TiltsByImage
+
+        tilts = TiltsByImage(command.tilt)
     if command.draw is not None:
         command.draw.mkdir(parents=True, exist_ok=True)
     with progress_bar("discs", run.frames.expected) as advance:
@@ -67,7 +71,7 @@ def _circles(command: Circles) -> int:
             version=__version__,
             overwrite=command.force,
             json_output=command.json,
-            tilts=None if command.tilt is None else TiltsByImage(command.tilt),
+            tilts=tilts,
             pictures=command.draw,
             workers=_workers(command, run),
             on_progress=advance,

@@ -8,24 +8,24 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera
-from detect.circles import CircleDetections, detect_circles, disc_shape
-from detect.levelling import levelled
-from detect.line_settings import LineSettings
-from detect.lines import LineDetections, detect_lines
-from detect.markers.detect import detect_markers
-from detect.markers.detections import MarkerDetections
-from detect.markers.settings import MarkerSettings
-from detect.markers.specimen import specimen_image
 from detect.run import RunFrame, read_image
-from detect.settings import CircleSettings
 from landmarks import FrameTilt, tilt_as_written
 from lut import DiscShape, DiscTable, VerticalTable, cached_disc_table, cached_vertical_table
+
+# Detectors are imported when they are asked for: loading them all takes a tenth of a second each.
+if TYPE_CHECKING:
+    from detect.circles import CircleDetections
+    from detect.line_settings import LineSettings
+    from detect.lines import LineDetections
+    from detect.markers.detections import MarkerDetections
+    from detect.markers.settings import MarkerSettings
+    from detect.settings import CircleSettings
 
 
 @dataclass(frozen=True)
@@ -122,20 +122,28 @@ def detect_frame(
 
     lines = None
     if plan.lines is not None:
+        from detect.lines import detect_lines
+
         assert tables.verticals is not None
         lines = detect_lines(image, tables.verticals, plan.lines)
         tilt = tilt_of_lines(frame.step.prefix, lines)
 
     discs = None
     if plan.circles is not None:
+        from detect.circles import detect_circles
+
         assert tables.discs is not None
         assert plan.camera is not None
         discs = detect_circles(image, plan.camera, tables.discs, plan.circles)
         if tilt is not None:
+            from detect.levelling import levelled
+
             discs = levelled(discs, plan.camera, tilt)
 
     markers = None
     if plan.markers is not None:
+        from detect.markers.detect import detect_markers
+
         markers = detect_markers(image, plan.markers, plan.camera)
 
     return FrameDetections(image, lines, tilt, discs, markers)
@@ -170,7 +178,11 @@ def tables_of(plan: FramePlan) -> Tables:
     global _latest
     if _latest is None or _latest[0] is not plan:
         # Whether two plans are equal takes longer to tell.
-        shape = None if plan.circles is None else disc_shape(plan.circles)
+        shape = None
+        if plan.circles is not None:
+            from detect.circles import disc_shape
+
+            shape = disc_shape(plan.circles)
         _latest = plan, _tables(plan.camera, plan.lines is not None, shape)
     return _latest[1]
 
@@ -193,6 +205,9 @@ def rehearse(plan: FramePlan) -> None:
     """Work on a made-up image, so that all tables and kernels that a plan needs are there."""
     tables = tables_of(plan)
     if plan.markers is not None:
+        from detect.markers.detect import detect_markers
+        from detect.markers.specimen import specimen_image
+
         detect_markers(specimen_image(plan.markers), plan.markers)
     if plan.camera is None:
         return
@@ -205,6 +220,10 @@ def rehearse(plan: FramePlan) -> None:
         floor = np.isfinite(seen).all(axis=-1)
         off = np.hypot(*(np.mod(seen[floor], pitch) - 0.5 * pitch).T)
         image[floor] = np.where(off < plan.circles.radius_m, 200, 60)
+        from detect.circles import detect_circles
+
         detect_circles(image, plan.camera, tables.discs, plan.circles)
     if plan.lines is not None and tables.verticals is not None:
+        from detect.lines import detect_lines
+
         detect_lines(image, tables.verticals, plan.lines)

@@ -10,15 +10,13 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from textwrap import indent
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.circles import CircleDetections
 from detect.errors import FrameError
 from detect.frame import FrameDetections, FramePlan, Tables, detect_frame
-from detect.line_identity import carry_ids
-from detect.lines import LineDetections
 from detect.row_text import unknown_rows
 from detect.run import RunFrame
 from detect.sources.times import format_time
@@ -33,6 +31,10 @@ from landmarks import (
     format_record,
     format_tilt,
 )
+
+if TYPE_CHECKING:
+    from detect.circles import CircleDetections
+    from detect.lines import LineDetections
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,6 +148,8 @@ def rows_of_failure(task: FrameTask, reason: str) -> FrameRows:
 
 def _line_rows(found: LineDetections, reference: tuple[LineLandmark, ...] | None) -> bytes:
     if reference is not None:
+        from detect.line_identity import carry_ids
+
         return _rows(carry_ids(found.landmarks(), reference))
     columns = (found.ends, found.alpha_rad, found.beta_rad, np.zeros(len(found)), found.sigma_rad)
     rows = unknown_rows("LANDMARK_L", *columns)
