@@ -96,7 +96,14 @@ def format_markdown(result: Result) -> str:
         "Whole runs, files in, files out, by the clock on the wall:",
         "",
         *_markdown_row(
-            ["", "jobs", "images/s", "per job, share of decoding alone (quartiles)"], head=True
+            [
+                "per job (quartiles)",
+                "jobs",
+                "images/s",
+                "share of decoding from memory",
+                "share of reading and decoding files",
+            ],
+            head=True,
         ),
     ]
     for passes in result.runs:
@@ -106,6 +113,7 @@ def format_markdown(result: Result) -> str:
                 str(passes.jobs),
                 number(passes.images_per_s.median),
                 spread(passes.share_of_decoding),
+                spread(passes.share_of_reading),
             ]
         )
     lines += ["", "Growth, fitted to the medians:", "", *(f"- {t}" for t in growth_lines(result))]
@@ -121,7 +129,8 @@ def format_headline(result: Result) -> str:
         lines += _markdown_row([row[0].name, *cells])
     passes = "; ".join(
         f"`{t.command}` {number(t.images_per_s.median)} images/s, "
-        f"{number(t.share_of_decoding.median)} of decoding alone"
+        f"{number(t.share_of_decoding.median)} of decoding from memory, "
+        f"{number(t.share_of_reading.median)} of reading and decoding files"
         for t in result.runs
     )
     if result.by_frames:
@@ -236,17 +245,19 @@ def _runs_table(title: str, runs: Iterable[RunTimes]) -> Table:
     table = Table(
         title=title,
         title_justify="left",
-        caption="* images per second and job / those of decoding the same files, and nothing else",
+        caption="* images per second and job / those of decoding the same files from memory, or of "
+        "reading and decoding them, and nothing else",
         caption_justify="left",
     )
     table.add_column("command", no_wrap=True)
-    for column in ("share*", "quartiles", "images/s", "frames", "jobs"):
+    for column in ("of decoding*", "quartiles", "of reading*", "images/s", "frames", "jobs"):
         table.add_column(column, justify="right")
     for times in runs:
         table.add_row(
             times.command,
             number(times.share_of_decoding.median),
             _quartiles(times.share_of_decoding),
+            number(times.share_of_reading.median),
             number(times.images_per_s.median),
             str(times.frames),
             str(times.jobs),

@@ -91,6 +91,8 @@ class RunTimes:
     share_of_decoding : Spread
         Images per second and job / images per second when one core decodes the same files from
         memory and does nothing else.
+    share_of_reading : Spread
+        The same, when it reads each file before.
     """
 
     command: str
@@ -98,6 +100,7 @@ class RunTimes:
     jobs: int
     images_per_s: Spread
     share_of_decoding: Spread
+    share_of_reading: Spread
 
 
 @dataclass(frozen=True)
@@ -177,7 +180,12 @@ def comparisons(
 
 
 def run_times(
-    command: str, frames: int, jobs: int, seconds: FloatArray, decoding: FloatArray
+    command: str,
+    frames: int,
+    jobs: int,
+    seconds: FloatArray,
+    decoding: FloatArray,
+    reading: FloatArray,
 ) -> RunTimes:
     """Sum up passes over a run.
 
@@ -185,8 +193,9 @@ def run_times(
     ----------
     command : str
     frames, jobs : int
-    seconds, decoding : (rounds,) float64
-        Of the command, and of decoding the same files in the same round; NaN where left out.
+    seconds, decoding, reading : (rounds,) float64
+        Of the command, of decoding the same files from memory, and of reading and decoding them, in
+        the same round; NaN where left out.
     """
     return RunTimes(
         command,
@@ -194,6 +203,7 @@ def run_times(
         jobs,
         spread_of(frames / seconds),
         spread_of(paired_ratios(decoding, seconds) / jobs),
+        spread_of(paired_ratios(reading, seconds) / jobs),
     )
 
 

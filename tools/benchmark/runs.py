@@ -61,6 +61,13 @@ def decode_run(files: Sequence[NDArray[np.uint8]]) -> None:
         decode(content)
 
 
+def read_and_decode_run(paths: Sequence[Path]) -> None:
+    """Read and decode all of a run's files, and do nothing with them."""
+    for path in paths:
+        with path.open("rb", buffering=0) as stream:
+            decode(np.frombuffer(stream.readall(), np.uint8))
+
+
 def measure_runs(
     performed: Mapping[Key, Command],
     run: Path,
@@ -68,8 +75,8 @@ def measure_runs(
     clock: Callable[[], float] = time.perf_counter,
     *,
     warm_up: bool = True,
-) -> tuple[int, FloatArray, dict[Key, FloatArray]]:
-    """Time whole passes over a run, in turn with decoding its files from memory.
+) -> tuple[int, FloatArray, FloatArray, dict[Key, FloatArray]]:
+    """Time whole passes over a run, in turn with decoding its files, from memory and from the disk.
 
     Parameters
     ----------
@@ -88,7 +95,9 @@ def measure_runs(
     -------
     frames : int
     decoding : (rounds,) float64
-        Seconds of decoding the run.
+        Seconds of decoding the run, whose files are in memory.
+    reading : (rounds,) float64
+        Seconds of reading its files and decoding them.
     seconds : dict of (rounds,) float64
         Seconds of each command; NaN where it was left out.
     """
@@ -99,10 +108,13 @@ def measure_runs(
     def performing(command: Command) -> Callable[[int], object]:
         return lambda _: perform(command)
 
-    functions: dict[str, Callable[[int], object]] = {"": lambda _: decode_run(files)}
+    functions: dict[str, Callable[[int], object]] = {
+        "decoding": lambda _: decode_run(files),
+        "reading": lambda _: read_and_decode_run(paths),
+    }
     functions |= {str(i): performing(command) for i, command in enumerate(performed.values())}
     seconds = measure_in_turn(
         functions, 1, rounds, _BUDGET_S, clock, warm_up=warm_up, least_calls=1
     )
     by_key = {key: seconds[str(i)][:, 0] for i, key in enumerate(performed)}
-    return len(paths), seconds[""][:, 0], by_key
+    return len(paths), seconds["decoding"][:, 0], seconds["reading"][:, 0], by_key

@@ -269,7 +269,10 @@ def _runs(
     performed = {
         (name, count): commands(run, folder, count)[name] for count in jobs for name in names
     }
-    frames, decoding, seconds = measure_runs(performed, run, settings.run_rounds, warm_up=warm_up)
+    frames, decoding, reading, seconds = measure_runs(
+        performed, run, settings.run_rounds, warm_up=warm_up
+    )
     return [
-        run_times(name, frames, count, seconds[name, count], decoding) for name, count in performed
+        run_times(name, frames, count, seconds[name, count], decoding, reading)
+        for name, count in performed
     ]

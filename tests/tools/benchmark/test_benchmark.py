@@ -27,9 +27,9 @@ def test_a_pass_over_a_run_writes_what_the_command_writes(short_run: Path, tmp_p
     output = tmp_path / "output"
     output.mkdir()
     all_commands = commands(short_run, output)
-    frames, decoding, seconds = measure_runs(all_commands, short_run, 1)
+    frames, decoding, reading, seconds = measure_runs(all_commands, short_run, 1)
     assert frames == 2
-    assert decoding.shape == (1,)
+    assert decoding.shape == reading.shape == (1,)
     assert set(seconds) == set(all_commands)
     assert all(np.all(taken > 0.0) for taken in seconds.values())
     written = {path.name for path in output.iterdir()}

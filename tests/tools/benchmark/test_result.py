@@ -41,7 +41,14 @@ def _result() -> Result:
     functions = function_times(_MEASURED, _SECONDS)
     kind = KindTimes("demo", "frames", 2, functions, comparisons([("cv2 LSD", "own")], _SECONDS))
     passes = [
-        run_times("detect all", 10, jobs, np.array([2.0, 2.0, 4.0]) / jobs, np.full(3, 0.5))
+        run_times(
+            "detect all",
+            10,
+            jobs,
+            np.array([2.0, 2.0, 4.0]) / jobs,
+            np.full(3, 0.5),
+            np.full(3, 0.6),
+        )
         for jobs in (1, 2)
     ]
     points = tuple(GrowthPoint(amount, functions) for amount in (0.2, 0.9))
@@ -81,11 +88,13 @@ def test_peers_are_compared_where_both_were_measured() -> None:
 
 
 def test_the_share_of_decoding_is_per_job() -> None:
-    times = run_times("detect all", 100, 2, np.array([1.0, 2.0, 4.0]), np.array([0.2, 0.4, 0.8]))
+    decoding = np.array([0.2, 0.4, 0.8])
+    times = run_times("detect all", 100, 2, np.array([1.0, 2.0, 4.0]), decoding, 1.5 * decoding)
     assert times.images_per_s.median == pytest.approx(50.0)
     # Decoding alone runs at 500, 250, 125 images per second, two jobs at 50, 25, 12.5 each.
     assert times.share_of_decoding.median == pytest.approx(0.1)
     assert times.share_of_decoding.least == pytest.approx(0.1)
+    assert times.share_of_reading.median == pytest.approx(0.15)
 
 
 def test_json_holds_all_of_it() -> None:
@@ -107,7 +116,9 @@ def test_markdown_tells_ratios_first_and_what_is_missing() -> None:
     text = format_markdown(_result())
     assert "| own | 2.50 (1.75 - 3.25); 5.00 ms |" in text
     assert "| cv2 LSD / own | 7.50 (6.25 - 8.75) |" in text
-    assert "| `detect all`, 10 frames | 2 | 10.0 | 0.25 (0.19 - 0.25) |" in text
+    assert (
+        "| `detect all`, 10 frames | 2 | 10.0 | 0.25 (0.19 - 0.25) | 0.30 (0.22 - 0.30) |" in text
+    )
     assert "settings: pictures 2, rounds 7, jobs 1 2" in text
     assert "not installed: something" in text
     assert "not measured: photographs: no folder was given" in text
@@ -131,7 +142,7 @@ def test_the_headline_is_medians_alone() -> None:
     text = format_headline(_result())
     assert "| x decoding (ms) | demo |" in text
     assert "| own | 2.50 (5.00) |" in text
-    assert "`detect all` 5.00 images/s, 0.25 of decoding alone" in text
+    assert "5.00 images/s, 0.25 of decoding from memory, 0.30 of reading and decoding" in text
     assert "`detect all` of 10 frames with 2 jobs 10.0 images/s." in text
     assert "A processor; 2 pictures of each kind, 7 rounds." in text
 
