@@ -62,6 +62,7 @@ def perform(options: View) -> int:
             _show(recording)
         else:
             recording.save(str(raw))
+        rr.send_blueprint(_layout(), recording=recording)
         recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         path = np.column_stack([poses[:, :2], np.zeros(len(poses))])
         recording.log("world/path", rr.LineStrips3D([path]), static=True)
@@ -194,6 +195,23 @@ def _log_image(rr: Any, recording: Any, run: Run, rows: SeenRows, settings: Circ
         ]
         labels = [f"{row.id}" for row in rows.markers]
         recording.log("camera/image/markers", rr.LineStrips2D(squares, colors=_LINE, labels=labels))
+
+
+def _layout() -> Any:
+    """The frame to the left, wide; the floor, counts and tilt to the right of it."""
+    import rerun.blueprint as rrb
+
+    return rrb.Blueprint(
+        rrb.Horizontal(
+            rrb.Spatial2DView(origin="camera/image", name="frame"),
+            rrb.Vertical(
+                rrb.Spatial3DView(origin="world", name="floor"),
+                rrb.TimeSeriesView(origin="count", name="rows in the frame"),
+                rrb.TimeSeriesView(origin="tilt", name="tilt (deg)"),
+            ),
+            column_shares=[2, 1],
+        )
+    )
 
 
 def _show(recording: Any) -> None:
