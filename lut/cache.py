@@ -21,7 +21,6 @@ import stat
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
-from zipfile import BadZipFile
 
 import numpy as np
 
@@ -143,7 +142,7 @@ def _read(path: Path, make: Callable[..., Table]) -> Table | None:
             # Numbers were stored as arrays without dimensions.
             fields = {name: arrays[name] for name in arrays.files}
         return make(**{name: a if a.ndim else a.item() for name, a in fields.items()})
-    except (ValueError, KeyError, TypeError, AttributeError, EOFError, OSError, BadZipFile):
+    except Exception:  # what a hostile archive raises is as manifold as its bytes
         _log.info("%s: is damaged: it is computed again", path)
         return None
 
@@ -196,7 +195,8 @@ def _keep(path: Path, table: DiscTable | VerticalTable, without: Sequence[str] =
     buffer = io.BytesIO()
     names = [field.name for field in dataclasses.fields(table) if field.name not in without]
     fields = {name: getattr(table, name) for name in names}
-    np.savez(buffer, allow_pickle=False, **fields)
+    # NumPy before 2.1 would take `allow_pickle` for an array; these are numbers all.
+    np.savez(buffer, **fields)
     payload = buffer.getvalue()
     try:
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)

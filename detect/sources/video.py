@@ -8,7 +8,7 @@ import os
 from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from detect.errors import DetectError
 from detect.sources.gray import gray_of_pixels
@@ -24,6 +24,9 @@ if TYPE_CHECKING:
     import cv2
 
 _log = logging.getLogger("redetect")
+
+# cv2.utils.logging.LOG_LEVEL_SILENT
+_SILENT = 0
 
 
 class VideoFile:
@@ -115,9 +118,10 @@ def quiet_opencv() -> Iterator[None]:
     import cv2
 
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-    before = cv2.utils.logging.getLogLevel()
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    levels: Any = getattr(cv2.utils, "logging", cv2)  # where OpenCV 4 has them
+    before = levels.getLogLevel()
+    levels.setLogLevel(_SILENT)
     try:
         yield
     finally:
-        cv2.utils.logging.setLogLevel(before)
+        levels.setLogLevel(before)

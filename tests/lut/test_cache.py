@@ -176,6 +176,13 @@ def archive(**arrays: object) -> bytes:
     return buffer.getvalue()
 
 
+def archive_of_version(version: int) -> bytes:
+    """An archive that says it needs a program that there is not."""
+    content = archive(samples=np.array(5))
+    place = content.index(b"PK\x01\x02") + 6
+    return content[:place] + bytes([version]) + content[place + 1 :]
+
+
 @pytest.mark.parametrize(
     "damage",
     [
@@ -196,6 +203,7 @@ def archive(**arrays: object) -> bytes:
         lambda content: signed(archive(samples=np.array(5), copies=np.zeros(3))),
         lambda content: signed(archive(unheard_of=np.zeros(3))),
         lambda content: signed(archive(samples=np.zeros(3), copies=np.zeros(3))),
+        lambda content: signed(archive_of_version(97)),
     ],
 )
 def test_damage_of_any_kind_is_noticed_and_repaired(

@@ -47,7 +47,7 @@ def poisoned(tmp_path: Path, camera: Camera) -> Path:
         if field.name != "floor_xy"
     }
     buffer = io.BytesIO()
-    np.savez(buffer, allow_pickle=False, **fields)
+    np.savez(buffer, **fields)
     payload = buffer.getvalue()
     path.write_bytes(hashlib.sha256(path.name.encode() + b"\0" + payload).digest() + payload)
     assert trusted(camera, path)

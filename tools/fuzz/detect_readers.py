@@ -176,7 +176,7 @@ def _table_content() -> tuple[bytes, ...]:
     stream = io.BytesIO()
     table = build_vertical_table(_TABLE_CAMERA)
     fields = {f.name: getattr(table, f.name) for f in dataclasses.fields(table)}
-    np.savez(stream, allow_pickle=False, **fields)
+    np.savez(stream, **fields)
     return (stream.getvalue(),)
 
 
