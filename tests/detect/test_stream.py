@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import shutil
+from collections.abc import Generator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,7 +16,7 @@ from detect.by_image import LinesByImage, TiltsByImage
 from detect.circles_run import detect_circles_run
 from detect.line_settings import LineSettings
 from detect.lines_run import detect_lines_run
-from detect.run import open_run
+from detect.run import RunFrame, open_run
 from detect.settings import CircleSettings
 from detect.stream import KEPT_FAILURES
 from detect.workers import local_workers
@@ -180,3 +183,56 @@ def test_failures_are_counted_but_not_all_kept(small_run: Path, tmp_path: Path) 
     assert (summary.frames, summary.failed) == (count + 3, count)
     assert len(summary.failures) == KEPT_FAILURES
     assert summary.failures[0].startswith("none.0: no image")
+
+
+class Arriving:
+    """Frames of a run that come one by one, as those of a camera do, and who waits for them."""
+
+    why_left_out = ""
+    left_out = 0
+    expected = None
+
+    def __init__(self, frames: list[RunFrame], *, ships_images: bool) -> None:
+        self.ships_images = ships_images
+        self.frames = frames
+        self.done = 0
+        self.largest_lead = 0
+
+    def __iter__(self) -> Generator[RunFrame, None, None]:
+        for number, frame in enumerate(self.frames):
+            self.largest_lead = max(self.largest_lead, number - self.done)
+            yield frame
+
+    def advance(self) -> None:
+        self.done += 1
+
+
+@pytest.mark.parametrize("ships_images", [True, False])
+def test_only_files_are_asked_for_ahead(
+    run_folder: Path, tmp_path: Path, ships_images: bool
+) -> None:
+    opened = open_run(run_folder)
+    frames = Arriving([*opened.frames] * 5, ships_images=ships_images)
+    run = replace(opened, frames=frames)
+    summary = detect_circles_run(
+        run, LIGHT, tmp_path / "a.circles", version="test", on_progress=frames.advance
+    )
+    assert summary.frames == frames.done == 5 * FRAMES
+    if ships_images:
+        assert frames.largest_lead == 0
+    else:
+        assert 0 < frames.largest_lead < 32
+
+
+def test_what_was_there_is_collected_again_after_a_run(run_folder: Path, tmp_path: Path) -> None:
+    assert gc.get_freeze_count() == 0
+    during = []
+    detect_circles_run(
+        open_run(run_folder),
+        LIGHT,
+        tmp_path / "a.circles",
+        version="test",
+        on_progress=lambda: during.append(gc.get_freeze_count()),
+    )
+    assert min(during) > 0
+    assert gc.get_freeze_count() == 0
