@@ -33,7 +33,6 @@ extensions = ["myst_parser", "sphinx.ext.autodoc"]
 # --- Pages in Markdown ---------------------------------------------------------------------------
 exclude_patterns = ["benchmark/table.md"]  # a part of speed.md
 source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
-myst_enable_extensions = ["colon_fence", "dollarmath"]
 #: Headings that links may name, as GitHub names them.
 myst_heading_anchors = 4
 
