@@ -168,9 +168,9 @@ def _places(points: FloatArray, body: Body, settings: LaserSettings) -> list[Flo
     from scipy.spatial import cKDTree
 
     pairs = cKDTree(points).query_pairs(settings.link_m, output_type="ndarray")
-    graph = coo_array(
-        (np.ones(len(pairs), dtype=np.int8), (pairs[:, 0], pairs[:, 1])), (len(points),) * 2
-    )
+    # SciPy before 1.12 knows no graphs with indices of 64 bits.
+    ends = (pairs[:, 0].astype(np.int32), pairs[:, 1].astype(np.int32))
+    graph = coo_array((np.ones(len(pairs), dtype=np.int8), ends), (len(points),) * 2)
     count, label = connected_components(graph, directed=False)
     places: list[FloatArray] = []
     for k in range(count):
