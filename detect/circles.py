@@ -106,17 +106,18 @@ def detect_circles(
         weakest = 0.0
         if settings.noise_floor > 0.0:
             weakest = settings.noise_floor * max(estimate_noise(image), _LEAST_NOISE)
-        keep = strong_and_alone(
-            pixels, found_quality, contrast, table.floor_xy, weakest, settings.separation_m
-        )
-        pixels = pixels[keep]
+        if weakest > 0.0 or settings.separation_m > 0.0:
+            keep = strong_and_alone(
+                pixels, found_quality, contrast, table.floor_xy, weakest, settings.separation_m
+            )
+            pixels, found_quality = pixels[keep], found_quality[keep]
         floor_xy, covariance = published_positions(camera, pixels)
         return CircleDetections(
             pixels=pixels,
             floor_xy=floor_xy,
             covariance=covariance,
-            quality=found_quality[keep],
-            evidence=np.full(len(keep), np.nan),
+            quality=found_quality,
+            evidence=np.full(len(pixels), np.nan),
         )
 
     noise = estimate_noise(image)

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from detect.errors import FrameError
 from detect.frame import FrameDetections, FramePlan, Tables, detect_frame
 from detect.row_text import unknown_rows
+from detect.row_text_kernels import circle_numbers
 from detect.run import RunFrame
 from detect.sources.times import format_time
 from landmarks import (
@@ -152,18 +153,18 @@ def _line_rows(found: LineDetections, reference: tuple[LineLandmark, ...] | None
 
         return _rows(carry_ids(found.landmarks(), reference))
     columns = (found.ends, found.alpha_rad, found.beta_rad, np.zeros(len(found)), found.sigma_rad)
-    rows = unknown_rows("LANDMARK_L", *columns)
+    rows = unknown_rows("LANDMARK_L", np.column_stack(columns))
     return _rows(found.landmarks()) if rows is None else rows
 
 
 def _circle_rows(found: CircleDetections) -> bytes:
-    spread = found.covariance
-    columns = (found.floor_xy, found.quality, spread[:, 0], spread[:, 1, 1])
-    rows = unknown_rows("LANDMARK_C", *columns)
+    rows = unknown_rows(
+        "LANDMARK_C", circle_numbers(found.floor_xy, found.quality, found.covariance)
+    )
     if rows is not None:
         return rows
     unknown = np.full(len(found), -1)
-    return _rows(circle_landmarks(found.floor_xy, found.quality, spread, unknown))
+    return _rows(circle_landmarks(found.floor_xy, found.quality, found.covariance, unknown))
 
 
 def _rows(landmarks: Iterable[Landmark]) -> bytes:

@@ -16,7 +16,7 @@ _HEADS = {
 
 
 def unknown_rows(
-    keyword: Literal["LANDMARK_C", "LANDMARK_L"], *columns: NDArray[np.float64]
+    keyword: Literal["LANDMARK_C", "LANDMARK_L"], numbers: NDArray[np.float64]
 ) -> bytes | None:
     """Rows of landmarks with the identifier -1, as `landmarks.format_record` lays them out.
 
@@ -24,8 +24,8 @@ def unknown_rows(
     ----------
     keyword : str
         What the rows begin with.
-    columns : (N,) or (N, K) float64
-        The numbers that follow.
+    numbers : (N, K) float64
+        What follows.
 
     Returns
     -------
@@ -33,7 +33,6 @@ def unknown_rows(
         None where a number is not finite or one cannot be rounded with certainty: in some one of a
         million rows. Records will tell.
     """
-    numbers = np.column_stack(columns)
     head = _HEADS[keyword]
     room = len(numbers) * (len(head) + LONGEST * numbers.shape[1] + len(_TAIL))
     text = np.empty(room, np.uint8)

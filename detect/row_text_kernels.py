@@ -102,6 +102,22 @@ def _write_number(value: float, text: NDArray[np.uint8], at: int) -> int:
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
+def circle_numbers(
+    floor_xy: NDArray[np.float64], quality: NDArray[np.float64], covariance: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """The (N, 6) numbers of rows of discs: x, y, quality, cxx, cxy, cyy."""
+    numbers = np.empty((len(quality), 6))
+    for i in range(len(quality)):
+        numbers[i, 0] = floor_xy[i, 0]
+        numbers[i, 1] = floor_xy[i, 1]
+        numbers[i, 2] = quality[i]
+        numbers[i, 3] = covariance[i, 0, 0]
+        numbers[i, 4] = covariance[i, 0, 1]
+        numbers[i, 5] = covariance[i, 1, 1]
+    return numbers
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
 def write_rows(
     head: NDArray[np.uint8],
     numbers: NDArray[np.float64],

@@ -8,7 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from detect.row_text import unknown_rows
-from landmarks import CircleLandmark, format_record
+from detect.row_text_kernels import circle_numbers
+from landmarks import CircleLandmark, circle_landmarks, format_record
 
 FINITE = st.floats(allow_nan=False, allow_infinity=False)
 #: Whatever has few decimals stands near numbers that end in 5, where rounding is a close call.
@@ -26,7 +27,7 @@ def expected(numbers: list[float]) -> bytes:
 @given(rows=st.lists(st.lists(FINITE | DECIMALS, min_size=6, max_size=6), max_size=4))
 def test_rows_are_those_of_records_or_none(rows: list[list[float]]) -> None:
     numbers = np.array(rows, np.float64).reshape(-1, 6)
-    written = unknown_rows("LANDMARK_C", numbers[:, :2], numbers[:, 2], numbers[:, 3:])
+    written = unknown_rows("LANDMARK_C", numbers)
     assert written in (None, b"".join(map(expected, rows)))
 
 
@@ -44,3 +45,11 @@ def test_what_a_frame_holds_is_written() -> None:
 @pytest.mark.parametrize("number", [np.nan, np.inf, -np.inf, 1.000005, -0.1234565, 1e-300, 1e300])
 def test_what_needs_a_second_look_gets_it(number: float) -> None:
     assert unknown_rows("LANDMARK_C", np.full((1, 6), number)) is None
+
+
+def test_numbers_of_discs_stand_in_the_order_of_their_rows() -> None:
+    rng = np.random.default_rng(6)
+    xy, quality, spread = rng.normal(size=(5, 2)), rng.random(5), rng.normal(size=(5, 2, 2))
+    landmarks = circle_landmarks(xy, quality, spread)
+    expected = [(c.px, c.py, c.quality, c.cxx, c.cxy, c.cyy) for c in landmarks]
+    np.testing.assert_array_equal(circle_numbers(xy, quality, spread), expected)
