@@ -14,7 +14,7 @@ _X, _Y, _Z, _INK = "#c0392b", "#1e8449", "#1f4e9c", "#444444"
 
 def draw_frames(figure: Any) -> None:
     """Draw one panel for each frame into a matplotlib figure."""
-    panels = figure.subplots(2, 4)
+    panels = figure.subplots(4, 2)
     draws = (_pixel, _camera, _robot, _bearing, _line, _map, _world, _board)
     for axes, draw in zip(panels.flat, draws, strict=True):
         axes.set_aspect("equal")

@@ -63,7 +63,7 @@ def draw_pictures(options: Pictures) -> None:
     folder = options.output
     folder.mkdir(parents=True, exist_ok=True)
     run = Path("images/e")
-    _save(folder / "frames.png", (16, 8), draw_frames, 75)
+    _save(folder / "frames.png", (9.5, 15.5), draw_frames, 75)
     _save(folder / "discs.png", (8, 9.4), lambda f: draw_discs(f, run, 4), 72)
     _save(folder / "verticals.png", (8, 9.4), lambda f: draw_verticals(f, run, 15), 72)
     _save(folder / "tables.png", (8, 6.4), lambda f: draw_tables(f, run), 72)
