@@ -191,7 +191,7 @@ def tables_of(plan: FramePlan) -> Tables:
 _latest: tuple[FramePlan, Tables] | None = None
 
 
-@lru_cache(maxsize=2)
+@lru_cache(maxsize=4)
 def _tables(camera: Camera | None, verticals: bool, shape: DiscShape | None) -> Tables:
     if camera is None:
         return Tables(None, None)
