@@ -4,7 +4,8 @@ First every row is associated with landmarks seen a moment before (`slam.associa
 comes out is right nearly always, but a landmark that is met again later has several labels. Then
 loops are looked for (`slam.loops`) and closed (`slam.loops_closing`, `slam.loops_path`) in rounds:
 the first looks where odometry's drift may have led, the next ones everywhere, since a closed loop
-straightens the map for the next.
+straightens the map for the next. Verticals, which the local association often mistakes, are then
+associated anew on the path that the discs give (`slam.line_points`).
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 
 from slam.associate_local import LocalSettings, associate_locally
 from slam.errors import SlamError
+from slam.line_points import PointSettings, lines_by_points
 from slam.local_map import tilt_jacobian
 from slam.loops import LoopSettings, Match, find_matches, stretches_of
 from slam.loops_closing import closed_path, in_order, merge_labels, pairs_by_votes, pairs_in_place
@@ -46,6 +48,8 @@ class AssociateSettings:
         Whether loops are looked for.
     loops : LoopSettings
         How, in the first round.
+    points : PointSettings
+        How verticals are then told apart on the path that the discs give.
     most_rounds : int
         Bound of the rounds.
     """
@@ -53,6 +57,7 @@ class AssociateSettings:
     local: LocalSettings = field(default_factory=LocalSettings)
     map_level: bool = True
     loops: LoopSettings = field(default_factory=LoopSettings)
+    points: PointSettings = field(default_factory=PointSettings)
     most_rounds: int = 6
 
     def __post_init__(self) -> None:
@@ -164,7 +169,20 @@ def associate_run(
         path = solution.path
         if by_discs:
             circle_labels = labels
-            line_labels = _merged_lines(recording, path, line_labels, setting, camera_xy)
+            if len(line_labels):
+                tell("verticals on the path of the discs")
+                line_labels, path_of_both = lines_by_points(
+                    _swayed(recording, setting.local),
+                    path,
+                    labels,
+                    line_labels,
+                    setting.points,
+                    camera_xy=camera_xy,
+                    disc_sigma_scale=setting.local.sigma_scale,
+                )
+                line_labels = _merged_lines(
+                    recording, path_of_both, line_labels, setting, camera_xy
+                )
         else:
             line_labels = labels
     return RunAssociation(
