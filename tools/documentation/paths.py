@@ -1,4 +1,4 @@
-"""Pictures of paths: association, lasers, clocks and fusion."""
+"""Pictures of paths: association, filters, lasers, clocks and fusion."""
 
 from __future__ import annotations
 
@@ -16,8 +16,7 @@ _INK, _OWN, _OTHER = "#444444", "#1f4e9c", "#e67e22"
 
 def draw_association(figure: Any, run: Path) -> None:
     """Rows of a run where odometry and where the map puts them, coloured by what was found."""
-    with (run / "slam" / "path.csv").open() as file:
-        rows = list(csv.DictReader(line for line in file if not line.startswith("#")))
+    rows = _table(run / "slam" / "path.csv")
     path = np.array([[float(row[c]) for c in ("x_m", "y_m", "theta_rad")] for row in rows])
     summed = [np.zeros(3)]
     frames: list[Any] = []
@@ -52,6 +51,43 @@ def _colour(number: int) -> Any:
 
     # Neighbouring numbers in colours far from each other.
     return mpl.colormaps["hsv"]((number * 0.381966) % 1.0)
+
+
+def draw_filter(figure: Any, run: Path) -> None:
+    """Errors of EKF-SLAM's poses, as they were at the time, within three standard deviations."""
+    truth = json.loads((run / "truth.json").read_text())
+    x, y, heading = truth["start"]
+    poses = np.array([truth["start"], *(frame["pose"] for frame in truth["frames"])])
+    c, s = np.cos(heading), np.sin(heading)
+    moved = poses - (x, y, heading)
+    exact = np.column_stack(
+        [c * moved[:, 0] + s * moved[:, 1], c * moved[:, 1] - s * moved[:, 0], moved[:, 2]]
+    )
+    rows = _table(run / "ekf" / "path.csv")
+    panels = figure.subplots(1, 3)
+    for axes, number, name, variance, unit in zip(
+        panels,
+        range(3),
+        ("x_m", "y_m", "theta_rad"),
+        ("cxx", "cyy", "cthetatheta"),
+        ("x / m", "y / m", "heading / rad"),
+        strict=True,
+    ):
+        error = np.array([float(row[name]) for row in rows]) - exact[:, number]
+        if number == 2:
+            error = (error + np.pi) % (2.0 * np.pi) - np.pi
+        bound = 3.0 * np.sqrt([float(row[variance]) for row in rows])
+        steps = np.arange(len(error))
+        axes.fill_between(steps, -bound, bound, color="#d5e4f2")
+        axes.plot(steps, error, color=_OWN, lw=0.9)
+        within = 100.0 * np.mean(np.abs(error[1:]) <= bound[1:])
+        axes.set_title(f"error of {unit}, within 3 sigma: {within:.1f} %", fontsize=10)
+        axes.set_xlabel("step")
+
+
+def _table(file: Path) -> list[dict[str, str]]:
+    with file.open() as opened:
+        return list(csv.DictReader(line for line in opened if not line.startswith("#")))
 
 
 def draw_laser(figure: Any, session: Path, time_s: float) -> None:

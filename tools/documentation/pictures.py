@@ -7,7 +7,7 @@ T is the folder in which the tutorial's commands were run. R and S come from
     python -m tools.simulator rows R --frames 900 --seed 1
     slam associate R -o R/found.circles
     slam map R --stem found -o R/slam
-    slam ekf R -o R/ekf --reference R/slam/path.csv
+    slam ekf R -o R/ekf
     python -m tools.simulator laser-session S --visits 2 --visit-s 15 --references 3 --rate-hz 25 \
         --onboard-hz 25 --seed 1
     groundtruth lasers S
@@ -30,7 +30,7 @@ import tyro
 
 from tools.documentation.detection import draw_discs, draw_markers, draw_tables, draw_verticals
 from tools.documentation.frames import draw_frames
-from tools.documentation.paths import draw_association, draw_clock, draw_laser
+from tools.documentation.paths import draw_association, draw_clock, draw_filter, draw_laser
 
 # For `X | None` tyro imports another library that takes a tenth of a second.
 MaybePath = Optional[Path]  # noqa: UP045
@@ -76,7 +76,7 @@ def draw_pictures(options: Pictures) -> None:
         shutil.copyfile(mine / "map" / "map.png", folder / "tutorial-map.png")
     if (rows := options.rows) is not None:
         _save(folder / "association.png", (12, 5.5), lambda f: draw_association(f, rows), 80)
-        shutil.copyfile(rows / "ekf" / "errors.png", folder / "ekf-errors.png")
+        _save(folder / "ekf-errors.png", (13, 3.6), lambda f: draw_filter(f, rows), 80)
     if (session := options.session) is not None:
         _save(folder / "laser.png", (11, 4.6), lambda f: draw_laser(f, session, 8.0), 80)
         _save(folder / "clocks-and-fusion.png", (13, 4), lambda f: draw_clock(f, session), 80)
