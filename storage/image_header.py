@@ -41,8 +41,7 @@ def claimed_size(content: bytes) -> tuple[int, int] | None:
         if content.startswith(b"\xff\xd8"):
             return _jpeg_size(content)
         if content.startswith(_PNG):
-            width, height = struct.unpack_from(">II", content, 16)
-            return (width, height) if content[12:16] == b"IHDR" else None
+            return _png_size(content)
         if content.startswith(b"BM"):
             return _bmp_size(content)
         if content[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
@@ -51,6 +50,24 @@ def claimed_size(content: bytes) -> tuple[int, int] | None:
         return None if found is None else (int(found[1]), int(found[2]))
     except (struct.error, IndexError, OverflowError):  # ends early, or points far away
         return None
+
+
+def _png_size(content: bytes) -> tuple[int, int] | None:
+    """That of the first chunk, if every chunk ends within the file.
+
+    OpenCV takes as much memory for a chunk as it claims to have, up to 4 GiB, before it looks.
+    """
+    if content[12:16] != b"IHDR":
+        return None
+    place, kind = len(_PNG), b""
+    while kind != b"IEND" and place < len(content):
+        (length,) = struct.unpack_from(">I", content, place)
+        kind = content[place + 4 : place + 8]
+        place += 12 + length
+        if place > len(content):
+            return None
+    width, height = struct.unpack_from(">II", content, 16)
+    return width, height
 
 
 def _jpeg_size(content: bytes) -> tuple[int, int] | None:

@@ -11,10 +11,12 @@ import pytest
 
 from camera import Camera, CameraError
 from camera.calibrate_images import read_grey
+from detect.errors import FrameError
+from detect.sources.gray import decode_gray
 from groundtruth.errors import GroundTruthError
 from groundtruth.markers.boards_file import BoardImage, find_boards
 from groundtruth.markers.checkerboard import Checkerboard
-from storage.image_header import MOST_PIXELS
+from storage.image_header import MOST_PIXELS, claimed_size
 from tests.detect.test_faults_images import SIDE, jpeg, png
 
 CONTENTS = (jpeg(SIDE, SIDE), png(SIDE, SIDE))
@@ -36,6 +38,24 @@ def test_pictures_of_boards(tmp_path: Path, content: bytes, published_camera: Ca
     said = f"{path}: is {SIDE}x{SIDE} px: expected 768x288"
     with pytest.raises(GroundTruthError, match=re.escape(said)):
         find_boards(BoardImage("a", "b", 0, path, None), Checkerboard(5, 4, 0.1), published_camera)
+
+
+@pytest.mark.parametrize("deep", [False, True])
+@pytest.mark.parametrize("chunk", [b"IHDR", b"IDAT", b"IEND"])
+def test_chunks_of_a_png_that_claim_gigabytes(tmp_path: Path, chunk: bytes, deep: bool) -> None:
+    """OpenCV would take the memory first; found by fuzzing."""
+    grey = np.arange(64, dtype=np.uint16 if deep else np.uint8).reshape(8, 8)
+    content = bytearray(cv2.imencode(".png", grey)[1].tobytes())
+    assert claimed_size(bytes(content)) == (8, 8)
+    place = content.index(chunk) - 4
+    content[place] |= 0x7F
+    assert claimed_size(bytes(content)) is None
+    path = tmp_path / "a.png"
+    path.write_bytes(content)
+    with pytest.raises(CameraError, match="not an image that can be read"):
+        read_grey(path)
+    with pytest.raises(FrameError, match="cannot be decoded: expected an image"):
+        decode_gray(bytes(content), path, 16, (8, 8))
 
 
 def test_pictures_of_other_kinds_of_numbers(tmp_path: Path) -> None:

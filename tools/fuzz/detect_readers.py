@@ -188,7 +188,7 @@ DETECT_READERS: tuple[Reader, ...] = (
         (),
         (
             _JPEG,
-            b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR\0\0\0\x08\0\0\0\x08\x08\0\0\0\0",
+            b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR\0\0\0\x08\0\0\0\x08\x08\0\0\0\0\0\0\0\0",
             b"P5 8 8 255\n",
             b"BM" + bytes(12) + struct.pack("<Iii", 40, 8, 8),
             _TIFF,
