@@ -14,7 +14,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from sphinx.ext.napoleon import Config, NumpyDocstring
+from sphinx.ext.napoleon import Config
+from sphinx.ext.napoleon.docstring import NumpyDocstring
 
 # Nothing is computed here: threads of BLAS would only be started.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -50,7 +51,7 @@ autodoc_typehints = "none"
 autodoc_use_type_comments = False
 #: Optional at run time, and not needed to describe what there is.
 autodoc_mock_imports = ["rerun"]
-_DOCSTRINGS = Config(
+_DOCSTRINGS: Any = Config(
     napoleon_use_param=False,
     napoleon_use_rtype=False,
     napoleon_custom_sections=[("Attributes", "params_style")],
@@ -99,7 +100,7 @@ def skip_constants(
 
 
 def expand_sections(
-    app: Any, what: str, name: str, member: object, options: Any, lines: list[str]
+    app: Any, what: Any, name: str, member: object, options: Any, lines: list[str]
 ) -> None:
     """Turn the sections of numpydoc into what Sphinx knows; a property's docstring has none."""
     if what not in ("property", "attribute", "data"):
