@@ -14,12 +14,14 @@ from pathlib import Path
 
 import pytest
 
+from detect.cli import main
+from tests.detect.forked_runs import StopAfter, forked_runs
 from tools.soak.long_run import link_run
 from tools.soak.short_runs import repeat_short_runs
 
 PATIENCE_S = 400.0
 FRAMES = 40
-LONG_FRAMES = 800
+LONG_FRAMES = 200
 
 pytestmark = [
     pytest.mark.long,
@@ -40,7 +42,7 @@ def run_folder(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> 
 
 @pytest.fixture(scope="module")
 def long_run(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Long enough for others to start meanwhile."""
+    """Long enough for others to be at work meanwhile."""
     folder = tmp_path_factory.mktemp("long") / "s"
     return link_run(project_root / "images" / "e", folder, LONG_FRAMES)
 
@@ -79,9 +81,8 @@ def wait_until(condition: Callable[[], bool], process: subprocess.Popen[str]) ->
         time.sleep(0.01)
 
 
-def is_under_way(output: Path) -> bool:
-    journal = output / ".detected.journal"
-    return journal.is_file() and journal.read_bytes().count(b"\n") > 2
+def parts_in(output: Path) -> set[str]:
+    return {path.name for path in output.glob(".*.part")}
 
 
 def assert_one_run_wrote_all(folder: Path) -> None:
@@ -98,8 +99,7 @@ def test_different_commands_on_one_folder(run_folder: Path, tmp_path: Path) -> N
     kinds = ("circles", "lines", "markers")
     alone, together = folder_of(tmp_path / "alone"), folder_of(tmp_path / "together")
     for kind in kinds:
-        code, said = ended(started([kind, str(run_folder), "-o", str(alone / f"rows.{kind}")]))
-        assert code == 0, said
+        assert main([kind, str(run_folder), "-o", str(alone / f"rows.{kind}")]) == 0
     cold = {"REDETECT_CACHE": str(tmp_path / "tables")}
     processes = [
         started([kind, str(run_folder), "-o", str(together / f"rows.{kind}")], **cold)
@@ -114,35 +114,48 @@ def test_different_commands_on_one_folder(run_folder: Path, tmp_path: Path) -> N
     assert all(name.endswith(".table") for name in tables)
 
 
-def test_the_same_command_twice_is_refused(long_run: Path, tmp_path: Path) -> None:
+def test_the_same_command_twice_is_refused(run_folder: Path, tmp_path: Path) -> None:
     output = folder_of(tmp_path / "output")
-    arguments = ["all", str(long_run), "-o", str(output)]
-    first = started(arguments)
-    wait_until(lambda: is_under_way(output), first)
-    others = [started(arguments), started([*arguments, "--resume"])]
-    for code, said in map(ended, others):
-        assert code == 1, said
-        *_, line = said.splitlines()
-        assert line.startswith(f"error: {output / '.detected.journal'}: another run is writing")
-    code, said = ended(first)
-    assert code == 0, said
+    arguments = ["all", str(run_folder), "-o", str(output)]
+    with (
+        forked_runs(run_folder, folder_of(tmp_path / "forked")) as runs,
+        runs.started(arguments, StopAfter(FRAMES // 2)) as first,
+    ):
+        first.wait_until_stopped()
+        others = [started(arguments), started([*arguments, "--resume"])]
+        for code, said in map(ended, others):
+            assert code == 1, said
+            *_, line = said.splitlines()
+            journal = output / ".detected.journal"
+            assert line.startswith(f"error: {journal}: another run is writing")
+        first.go_on()
+        assert first.wait() == 0, first.said()
     assert_one_run_wrote_all(output)
     assert len(results(output)) == 4
 
 
-def test_of_two_runs_that_may_overwrite_one_is_the_last(long_run: Path, tmp_path: Path) -> None:
+def test_of_two_runs_that_may_overwrite_one_is_the_last(
+    run_folder: Path, long_run: Path, tmp_path: Path
+) -> None:
     """With other settings each, so that a mixture would be seen."""
     output = folder_of(tmp_path / "output")
     arguments = ["all", str(long_run), "-o", str(output), "--force"]
-    first = started(arguments)
-    wait_until(lambda: is_under_way(output), first)
-    others = [
-        started([*arguments, "--circles.threshold", "0.5", "--lines.alpha", "published"])
-        for _ in range(2)
-    ]
-    for process in (first, *others):
-        code, said = ended(process)
-        assert code == 0, said
+    with (
+        forked_runs(run_folder, folder_of(tmp_path / "forked")) as runs,
+        runs.started(arguments, StopAfter(LONG_FRAMES // 10)) as first,
+    ):
+        first.wait_until_stopped()
+        own = parts_in(output)
+        others = [
+            started([*arguments, "--circles.threshold", "0.5", "--lines.alpha", "published"])
+            for _ in range(2)
+        ]
+        wait_until(lambda: len(parts_in(output)) > len(own), others[0])
+        first.go_on()
+        assert first.wait() == 0, first.said()
+        for process in others:
+            code, said = ended(process)
+            assert code == 0, said
     assert_one_run_wrote_all(output)
     assert len(results(output)) == 4  # and nothing that is hidden
 
