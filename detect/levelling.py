@@ -7,13 +7,10 @@ from numpy.typing import NDArray
 
 from camera import Camera
 from detect.circles import CircleDetections
-from detect.tilt import level_rotation
+from detect.levelling_kernels import level_floor, level_floor_covariances
 from landmarks import FrameTilt
 
 FloatArray = NDArray[np.float64]
-
-_STEP_M = 1e-4
-_STEP_RAD = 1e-6
 
 
 def levelled(found: CircleDetections, camera: Camera, tilt: FrameTilt) -> CircleDetections:
@@ -57,12 +54,11 @@ def level_positions(
     (N, 2) float64
         In the level robot frame, metres; NaN where the levelled ray does not meet the floor.
     """
-    rotation = level_rotation(pitch_rad, roll_rad)
-    ray = np.column_stack([floor_xy, np.zeros(len(floor_xy))]) - camera.centre
-    ray = ray @ rotation.T
-    centre = rotation @ camera.centre
-    down = np.where(ray[:, 2] < 0.0, ray[:, 2], np.nan)
-    return np.asarray(centre[:2] - centre[2] / down[:, None] * ray[:, :2])
+    return np.asarray(
+        level_floor(
+            np.ascontiguousarray(floor_xy, dtype=np.float64), camera.centre, pitch_rad, roll_rad
+        )
+    )
 
 
 def level_covariances(
@@ -90,24 +86,13 @@ def level_covariances(
         Square metres.
     """
 
-    def moved(dx: float, dy: float, dp: float, dr: float) -> FloatArray:
-        at = floor_xy + np.array([dx, dy])
-        return level_positions(camera, at, pitch_rad + dp, roll_rad + dr)
-
-    m, a = _STEP_M, _STEP_RAD
-    by_position = np.stack(
-        [
-            (moved(m, 0, 0, 0) - moved(-m, 0, 0, 0)) / (2 * m),
-            (moved(0, m, 0, 0) - moved(0, -m, 0, 0)) / (2 * m),
-        ],
-        axis=-1,
+    return np.asarray(
+        level_floor_covariances(
+            np.ascontiguousarray(floor_xy, dtype=np.float64),
+            np.ascontiguousarray(covariance, dtype=np.float64),
+            camera.centre,
+            pitch_rad,
+            roll_rad,
+            np.ascontiguousarray(tilt_covariance, dtype=np.float64),
+        )
     )
-    by_tilt = np.stack(
-        [
-            (moved(0, 0, a, 0) - moved(0, 0, -a, 0)) / (2 * a),
-            (moved(0, 0, 0, a) - moved(0, 0, 0, -a)) / (2 * a),
-        ],
-        axis=-1,
-    )
-    own = by_position @ covariance @ by_position.swapaxes(-1, -2)
-    return np.asarray(own + by_tilt @ tilt_covariance @ by_tilt.swapaxes(-1, -2))
