@@ -81,17 +81,25 @@ def shell_lines(block: Block) -> Iterator[tuple[int, str]]:
         joined = ""
 
 
-def commands_in(text: str) -> Iterator[list[str]]:
-    """The words of the project's own commands in a line of shell."""
-    # Loops, lists, and what follows them.
-    for piece in re.split(r"&&|;|\|", re.sub(r"\bdo\b|\bdone\b", ";", text)):
-        try:
-            words = shlex.split(re.sub(r"\$\w+", "1", piece), comments=True)
-        except ValueError:
-            continue
-        if words[:2] == ["python", "-m"] and len(words) > 2 and words[2].startswith("tools."):
-            words = words[2:]
-        elif not words or words[0] not in PROGRAMS:
-            continue
-        if len(words) > 1 and not any(_OPEN.search(word) for word in words):
-            yield words
+def commands_in(block: Block) -> Iterator[tuple[int, list[str]]]:
+    """The words of the project's own commands in a block, with their line in the document.
+
+    A loop's variable has the first of its values, and any other variable the value 1.
+    """
+    values: dict[str, str] = {}
+    for number, text in shell_lines(block):
+        for name, first in re.findall(r"\bfor (\w+) in ([\w./-]+)", text):
+            values[name] = first
+        text = re.sub(r"\$(\w+)", lambda found: values.get(found[1], "1"), text)
+        # Loops, lists, and what follows them.
+        for piece in re.split(r"&&|;|\|", re.sub(r"\bdo\b|\bdone\b", ";", text)):
+            try:
+                words = shlex.split(piece, comments=True)
+            except ValueError:
+                continue
+            if words[:2] == ["python", "-m"] and len(words) > 2 and words[2].startswith("tools."):
+                words = words[2:]
+            elif not words or words[0] not in PROGRAMS:
+                continue
+            if len(words) > 1 and not any(_OPEN.search(word) for word in words):
+                yield number, words
