@@ -156,3 +156,9 @@ def test_chains_of_transforms() -> None:
     np.testing.assert_allclose(found, [left, -forward, up])
     assert pose_in_dataset(tree, "base", "x") is None  # they lead in a circle
     assert pose_in_dataset(tree, "base", "unheard of") is None
+    for none in (0.0, np.nan, np.inf):
+        with pytest.raises(ValueError, match="a rotation of"):
+            rotation_of(none, 0.0, 0.0, 0.0)
+    np.testing.assert_allclose(
+        rotation_of(0.0, 0.0, 1e-200, 1e-200), rotation_of(0.0, 0.0, 1.0, 1.0)
+    )
