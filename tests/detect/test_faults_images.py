@@ -16,10 +16,10 @@ import pytest
 
 from camera import Camera
 from detect.errors import FrameError
-from detect.image_bounds import MOST_PIXELS, bounded_content, demand_bounded
+from detect.image_bounds import bounded_content, demand_bounded
 from detect.run import RunFrame, read_image
 from landmarks import Step
-from storage.image_header import claimed_size
+from storage.image_header import MOST_PIXELS, claimed_size
 
 TEXTURE = np.random.default_rng(3).integers(0, 256, (48, 96)).astype(np.uint8)
 SIDE = 60_000

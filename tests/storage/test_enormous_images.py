@@ -44,7 +44,8 @@ def test_pictures_of_boards(tmp_path: Path, content: bytes, published_camera: Ca
 @pytest.mark.parametrize("chunk", [b"IHDR", b"IDAT", b"IEND"])
 def test_chunks_of_a_png_that_claim_gigabytes(tmp_path: Path, chunk: bytes, deep: bool) -> None:
     """OpenCV would take the memory first; found by fuzzing."""
-    grey = np.arange(64, dtype=np.uint16 if deep else np.uint8).reshape(8, 8)
+    bytes_grey = np.arange(64, dtype=np.uint8).reshape(8, 8)
+    grey = bytes_grey.astype(np.uint16) if deep else bytes_grey
     content = bytearray(cv2.imencode(".png", grey)[1].tobytes())
     assert claimed_size(bytes(content)) == (8, 8)
     place = content.index(chunk) - 4
