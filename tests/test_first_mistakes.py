@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 
 import cv2
@@ -33,7 +34,11 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     ("line", "told"),
     [
         ("detect circles pictures", ["no calibration", "--camera", "camera calibrate"]),
-        ("detect view pictures -o v.rrd", ["no calibration", "--camera"]),
+        pytest.param(
+            "detect view pictures -o v.rrd",
+            ["no calibration", "--camera"],
+            marks=pytest.mark.skipif(find_spec("rerun") is None, reason="rerun is not installed"),
+        ),
         ("detect circles empty", ["neither images nor a calibration", "expected a run folder"]),
         ("detect circles gone", ["no such folder or file", "expected a run folder"]),
         ("detect circles calibrated -o gone/x.circles", ["no such folder: gone: make it first"]),
