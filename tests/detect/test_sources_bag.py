@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 pytest.importorskip("rosbags", reason="the extra [bags] is not installed")
 
+from camera import Camera, write_camera
 from detect.cli import main
 from detect.errors import DetectError, FrameError
 from detect.run import read_image
@@ -358,3 +359,31 @@ def test_a_calibration_beside_the_bag(small_run: Path, tmp_path: Path) -> None:
         format_frame(Frame(frame.step)) for frame in open_source(path).frames
     ).decode()
     assert rows(tmp_path / "s_bag.detected.markers") == expected.splitlines()
+
+
+@pytest.mark.parametrize(
+    ("definition", "fields"),
+    [("string data\nint32 height\n", ("abc", 3)), ("int8 header\nint8 data\n", (1, 1))],
+)
+def test_a_bag_that_defines_images_in_its_own_way(
+    published_camera: Camera,
+    tmp_path: Path,
+    capsys: Captured,
+    definition: str,
+    fields: tuple[Any, ...],
+) -> None:
+    from rosbags.rosbag1 import Writer
+    from rosbags.typesys import get_types_from_msg
+    from rosbags.typesys.store import Typestore
+
+    kind = "sensor_msgs/msg/Image"
+    store = Typestore()
+    store.register(get_types_from_msg(definition, kind))
+    bag, cam = tmp_path / "own.bag", tmp_path / "own.cam"
+    with Writer(bag) as writer:
+        connection = writer.add_connection("/i", kind, typestore=store)
+        writer.write(connection, 10**9, store.serialize_ros1(store.types[kind](*fields), kind))
+    write_camera(published_camera, cam)
+    assert main(["circles", str(bag), "--camera", str(cam)]) == 1
+    *_, line = capsys.readouterr().err.splitlines()  # a table may have been told of before
+    assert line.startswith(f"error: {bag}: own.0000: a message is not as ROS defines it: ")
