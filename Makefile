@@ -43,7 +43,7 @@ lowest:
 	$(LOWEST)/bin/pip install -q -r requirements/lowest.txt
 	$(LOWEST)/bin/pip install -q --no-deps -e .
 	NUMBA_CACHE_DIR=$(LOWEST)/kernels REDETECT_CACHE=$(LOWEST)/tables $(LOWEST)/bin/python -m pytest \
-	    -q -p no:cacheprovider -m "not long" $(LOWEST_TESTS)
+	    -n auto --dist loadfile -q -p no:cacheprovider -m "not long" $(LOWEST_TESTS)
 
 audit: setup
 	$(BIN)/pip install -q pip-audit
