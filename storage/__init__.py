@@ -5,13 +5,17 @@ Every room writes its files through `write_whole`.
 
 from __future__ import annotations
 
+import io
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import BinaryIO
+from typing import TYPE_CHECKING, BinaryIO
 
 from storage.parts import OutputExistsError, named, new_part
+
+if TYPE_CHECKING:
+    from _typeshed import ReadableBuffer
 
 __all__ = ["OutputExistsError", "write_whole"]
 
@@ -41,20 +45,31 @@ def write_whole(path: str | os.PathLike[str], *, overwrite: bool) -> Iterator[Bi
     OutputExistsError
         If `path` exists and `overwrite` is false.
     OSError
-        If the folder cannot be written to.
+        If the folder cannot be written to, or has no room; names `path`.
     """
     path = Path(path)
     if not overwrite and os.path.lexists(path):
         raise OutputExistsError(path)
     part = new_part(path)
     try:
-        with os.fdopen(part.fileno(), "wb", closefd=False) as stream:
+        with io.BufferedWriter(_NamedFile(part.fileno(), path)) as stream:
             yield stream
-            try:
-                stream.flush()
-            except OSError as error:
-                raise named(error, path) from None
+            stream.flush()
         part.sync()
         part.place(overwrite=overwrite)
     finally:
         part.discard()
+
+
+class _NamedFile(io.FileIO):
+    """A descriptor for writing whose errors name the result."""
+
+    def __init__(self, handle: int, path: Path) -> None:
+        super().__init__(handle, "wb", closefd=False)
+        self._path = path
+
+    def write(self, content: ReadableBuffer, /) -> int:
+        try:
+            return super().write(content)
+        except OSError as error:
+            raise named(error, self._path) from None

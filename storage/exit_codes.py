@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+import traceback
 from collections.abc import Callable
 from pathlib import Path
 
@@ -52,9 +53,20 @@ def say_interrupted() -> int:
 
 
 def _said(error: BaseException | str) -> str:
-    """The error in words; of a file in a folder that is not there, what to do about it."""
+    """The error in words; and what to do where a folder is not there, or kernels find no room."""
     if isinstance(error, FileNotFoundError) and isinstance(error.filename, str | os.PathLike):
         folder = Path(error.filename).parent
         if not folder.is_dir():
             return f"{error.filename}: no such folder: {folder}: make it first, or name another"
+    if isinstance(error, OSError) and _while_kernels_were_kept(error):
+        return (
+            f"compiled kernels cannot be kept: {error}: make room for them, or name another folder "
+            "by the environment variable NUMBA_CACHE_DIR"
+        )
     return str(error)
+
+
+def _while_kernels_were_kept(error: OSError) -> bool:
+    """Whether Numba raised it while it wrote its cache: it names no file."""
+    frames = traceback.walk_tb(error.__traceback__)
+    return any(frame.f_globals.get("__name__") == "numba.core.caching" for frame, _ in frames)

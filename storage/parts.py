@@ -10,6 +10,7 @@ next one that writes the same result removes it; beside one that is being writte
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import stat
 import sys
@@ -255,8 +256,34 @@ def _place_new(temporary: Path, path: Path) -> None:
             raise OutputExistsError(path) from None
         temporary.unlink(missing_ok=True)  # a process was killed after it had placed the file
     except OSError:  # a file system without hard links
-        if os.path.lexists(path):
-            raise OutputExistsError(path) from None
-        temporary.replace(path)
+        _rename_new(temporary, path)
     else:
         temporary.unlink(missing_ok=True)
+
+
+def _rename_new(temporary: Path, path: Path) -> None:
+    """Rename the file unless its new name is taken: in one step where the system can."""
+    if sys.platform == "win32":
+        try:
+            temporary.rename(path)
+        except FileExistsError:
+            raise OutputExistsError(path) from None
+        return
+    failed = _rename_without_replacing(temporary, path)
+    if failed == errno.EEXIST or (failed and os.path.lexists(path)):
+        raise OutputExistsError(path) from None
+    if failed:  # here somebody can still come between
+        temporary.replace(path)
+
+
+def _rename_without_replacing(old: Path, new: Path) -> int:
+    """Linux's renameat2: 0, or why it failed, be it that the system has no such thing."""
+    import ctypes
+
+    rename = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
+    if rename is None:
+        return errno.ENOSYS
+    here, without_replacing = -100, 1  # AT_FDCWD, RENAME_NOREPLACE
+    places = os.fsencode(old), os.fsencode(new)
+    done = rename(here, places[0], here, places[1], ctypes.c_uint(without_replacing))
+    return 0 if done == 0 else ctypes.get_errno()

@@ -1,0 +1,65 @@
+"""A cache of tables on a disk that is full: a real one."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+from pathlib import Path
+
+import numpy as np
+
+from camera import Camera
+from lut import DiscShape, build_disc_table, build_vertical_table
+from lut.cache import cached_disc_table, cached_vertical_table
+from tests.storage.own_disks import fill, on_small_disk
+
+SHAPE = DiscShape(samples=5, border_px=3, far_limit_m_per_px=0.2)
+
+
+class Said(logging.Handler):
+    """What the program says meanwhile."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.lines: list[str] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.lines.append(record.getMessage())
+
+
+def tables_are_right(camera: Camera, folder: Path) -> None:
+    discs, verticals = cached_disc_table(camera, SHAPE, folder), build_vertical_table(camera)
+    np.testing.assert_array_equal(discs.copies, build_disc_table(camera, SHAPE).copies)
+    found = cached_vertical_table(camera, folder)
+    for field in dataclasses.fields(verticals):
+        np.testing.assert_array_equal(getattr(found, field.name), getattr(verticals, field.name))
+
+
+def costs_time_only(place: Path, camera: Camera) -> None:
+    folder = place / "cache"
+    folder.mkdir(mode=0o700)
+    for room in (0, 4096):  # none at all, and less than a table needs
+        filler = fill(place)
+        with filler.open("r+b") as stream:
+            stream.truncate(filler.stat().st_size - room)
+        tables_are_right(camera, folder)
+        assert list(folder.iterdir()) == []
+        filler.unlink()
+    tables_are_right(camera, folder)  # there is room again: they are kept
+    assert len(list(folder.iterdir())) == 2
+    said = Said()
+    logging.getLogger("redetect").addHandler(said)
+    logging.getLogger("redetect").setLevel(logging.INFO)
+    fill(place)
+    tables_are_right(camera, folder)
+    assert said.lines == []
+
+
+def test_no_room_for_tables_costs_time_only(tmp_path: Path, published_camera: Camera) -> None:
+    camera = dataclasses.replace(
+        published_camera, width=96, height=36, scale_x=464.762 / 8, scale_y=232.381 / 8,
+        offset_x=48.0, offset_y=18.0,
+    )  # fmt: skip
+    place = tmp_path / "disk"
+    place.mkdir()
+    on_small_disk(place, 1 << 20, costs_time_only, place, camera)
