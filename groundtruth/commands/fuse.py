@@ -25,6 +25,7 @@ def perform(options: Fuse) -> int:
         raise GroundTruthError("neither --laser nor --camera: expected at least one ground truth")
     settings = FuseSettings(
         distance_sigma=options.distance_sigma,
+        lateral_sigma=options.lateral_sigma,
         turn_sigma=options.turn_sigma,
         turn_per_metre_sigma=options.turn_per_metre_sigma,
         learn_noise=options.learn_noise,

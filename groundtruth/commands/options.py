@@ -301,6 +301,8 @@ class Fuse:
         What `groundtruth sync` wrote; without it all clocks are one.
     distance_sigma : float
         Standard deviation of odometry's distance per square root of a metre driven (m).
+    lateral_sigma : float
+        How far the robot slips sideways per square root of a metre driven (m).
     turn_sigma : float
         Standard deviation of odometry's heading per square root of a radian turned (rad).
     turn_per_metre_sigma : float
@@ -323,6 +325,7 @@ class Fuse:
     camera: MaybePath = None
     clock: MaybePath = None
     distance_sigma: float = 0.02
+    lateral_sigma: float = 0.01
     turn_sigma: float = 0.02
     turn_per_metre_sigma: float = 0.01
     learn_noise: bool = True

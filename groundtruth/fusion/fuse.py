@@ -3,8 +3,8 @@
 Odometry is the control, poses from laser and markers are the measurements. What odometry is off by
 systematically (a share of turns and ways, a bend) is estimated along, since it is what decides how
 far a gap can be bridged; how much it errs at random is what makes the measurements likeliest. The
-nodes are the odometry's times and the measurements' own, between which odometry is interpolated
-linearly; so no measurement is interpolated, which would count the same noise twice.
+nodes are the odometry's times and the measurements' own, between which odometry goes on along
+arcs; so no measurement is interpolated, which would count the same noise twice.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class OdometryErrors:
         what share ways are longer.
     turn_scale_sigma, turn_bias_per_metre_sigma, distance_scale_sigma : float
         Their standard deviations.
-    distance_sigma, turn_sigma, turn_per_metre_sigma : float
+    distance_sigma, lateral_sigma, turn_sigma, turn_per_metre_sigma : float
         Its random errors, as in `FuseSettings`.
     """
 
@@ -62,6 +62,7 @@ class OdometryErrors:
     turn_bias_per_metre_sigma: float
     distance_scale_sigma: float
     distance_sigma: float
+    lateral_sigma: float
     turn_sigma: float
     turn_per_metre_sigma: float
 

@@ -12,10 +12,10 @@ from scipy.optimize import minimize_scalar
 from scipy.stats import chi2
 
 from groundtruth.errors import GroundTruthError
+from groundtruth.fusion.motion_kernels import STATE
 from groundtruth.fusion.settings import FuseSettings
-from groundtruth.fusion.smoother_kernels import STATE, filter_forward, smooth_backward
-from groundtruth.geometry.plane import between
-from groundtruth.trajectories.interpolation import interpolate_poses
+from groundtruth.fusion.smoother_kernels import filter_forward, smooth_backward
+from groundtruth.geometry.plane import between, log_motion
 from groundtruth.trajectories.streams import RAWSEEDS_ROUNDING, PlanarPoses
 
 FloatArray = NDArray[np.float64]
@@ -24,10 +24,14 @@ FloatArray = NDArray[np.float64]
 # that cannot be inverted.
 _CREEP_M2_PER_S = (1e-4) ** 2
 _CREEP_RAD2_PER_S = (1e-4) ** 2
+# A turn is distinct if, from a second before to a second after, odometry turned by more than so
+# many of its standard deviations.
+_DISTINCT_OVER_S = 1.0
+_DISTINCT_SIGMAS = 4.0
 _RESTART_AFTER = 40
 _RESTART_VARIANCES = np.array([25.0, 25.0, math.pi**2])
 # The factors on odometry's deviations that are tried, and over how many nodes.
-_NOISE_FACTORS = (0.05, 20.0)
+_NOISE_FACTORS = (0.01, 20.0)
 _MOST_NODES_TO_LEARN_FROM = 30_000
 _LEARNING_ROUNDS = 2
 _RELINEARISATIONS = 1
@@ -62,8 +66,10 @@ class MovementProblem:
     ----------
     times_s : (N,) float64
         The nodes.
-    controls : (N, 3) float64
-        Odometry's movement to each node, in the robot's frame of the node before.
+    controls : (N, 4) float64
+        Odometry's movement to each node: way forward, way to the left (m) and turn (rad), each
+        summed up in the robot's turning frame; and the turn again where it is a distinct one, else
+        0.
     nodes : (M,) int64
         At which node each measurement was made, ascending.
     measured, covariances : (M, 3), (M, 3, 3) float64
@@ -208,10 +214,9 @@ def movement_problem(
     names, times, measured, covariances, repaired = _gather(odometry, streams, settings)
     inside = odometry.times_s[(odometry.times_s >= times[0]) & (odometry.times_s <= times[-1])]
     node_times = np.union1d(inside, times)
-    path, _ = interpolate_poses(odometry, node_times)
     return MovementProblem(
         times_s=node_times,
-        controls=_controls(path.poses),
+        controls=_controls(odometry, node_times, settings),
         nodes=np.searchsorted(node_times, times).astype(np.int64),
         measured=measured,
         covariances=covariances,
@@ -222,22 +227,29 @@ def movement_problem(
 
 
 def noise_of(settings: FuseSettings) -> FloatArray:
-    """Odometry's random errors: of a metre (m), of a radian (rad), of a metre (rad)."""
-    return np.array([settings.distance_sigma, settings.turn_sigma, settings.turn_per_metre_sigma])
+    """Odometry's random errors: along a metre, across it (m), of a radian, of a metre (rad)."""
+    return np.array(
+        [
+            settings.distance_sigma,
+            settings.lateral_sigma,
+            settings.turn_sigma,
+            settings.turn_per_metre_sigma,
+        ]
+    )
 
 
 def likeliest_noise(problem: MovementProblem) -> FloatArray:
     """Odometry's random errors that make the measurements likeliest, near those given."""
     some = problem.shortened(_MOST_NODES_TO_LEARN_FROM)
     given = noise_of(problem.settings)
-    logarithms = np.zeros(2)
+    logarithms = np.zeros(3)
     bounds = tuple(math.log(factor) for factor in _NOISE_FACTORS)
 
     def scaled(values: FloatArray) -> FloatArray:
-        return np.asarray(given * np.exp(values[[0, 1, 1]]))
+        return np.asarray(given * np.exp(values[[0, 1, 2, 2]]))
 
     for _ in range(_LEARNING_ROUNDS):
-        for axis in (1, 0):
+        for axis in (2, 0, 1):
 
             def surprise(value: float, axis: int = axis) -> float:
                 tried = logarithms.copy()
@@ -303,18 +315,54 @@ def _usable(name: str, covariances: FloatArray) -> tuple[FloatArray, int]:
     return symmetric, int(np.count_nonzero(weak))
 
 
-def _controls(path: FloatArray) -> FloatArray:
-    """(N, 3) movements between nodes, in the robot's frame of the node before."""
-    return np.concatenate([np.zeros((1, 3)), between(path[:-1], path[1:])])
+def _controls(
+    odometry: PlanarPoses, node_times_s: FloatArray, settings: FuseSettings
+) -> FloatArray:
+    """(N, 4) movements between nodes: each a share of an arc between two samples of odometry."""
+    arcs = log_motion(between(odometry.poses[:-1], odometry.poses[1:]))
+    arcs = np.column_stack([arcs, np.where(_distinct(odometry, arcs, settings), arcs[:, 2], 0.0)])
+    last = len(odometry) - 2
+    at = np.clip(np.searchsorted(odometry.times_s, node_times_s[:-1], side="right") - 1, 0, last)
+    share = np.diff(node_times_s) / (odometry.times_s[at + 1] - odometry.times_s[at])
+    return np.concatenate([np.zeros((1, 4)), share[:, None] * arcs[at]])
+
+
+def _distinct(odometry: PlanarPoses, arcs: FloatArray, settings: FuseSettings) -> NDArray[np.bool_]:
+    """Between which samples the robot turned by more than odometry's random errors explain.
+
+    Only there its turns tell by what share they are too long. Elsewhere, what looks like turns are
+    those errors; and since they are just what measured headings contradict, the share would be
+    found to be about -1, whatever it is (regression dilution).
+    """
+    from_s = np.maximum(odometry.times_s[:-1] - _DISTINCT_OVER_S, odometry.times_s[0])
+    to_s = np.minimum(odometry.times_s[1:] + _DISTINCT_OVER_S, odometry.times_s[-1])
+
+    def within(steps: FloatArray) -> FloatArray:
+        total = np.concatenate([[0.0], np.cumsum(steps)])
+        ends = (np.interp(at, odometry.times_s, total) for at in (to_s, from_s))
+        return np.asarray(np.subtract(*ends))
+
+    turn = within(arcs[:, 2])
+    variance = (
+        settings.turn_sigma**2 * np.abs(turn)
+        + settings.turn_per_metre_sigma**2 * within(np.hypot(arcs[:, 0], arcs[:, 1]))
+        + _CREEP_RAD2_PER_S * (to_s - from_s)
+    )
+    return np.asarray(turn**2 > _DISTINCT_SIGMAS**2 * variance)
 
 
 def _variances(times_s: FloatArray, controls: FloatArray, noise: FloatArray) -> FloatArray:
-    """(N, 3) variances of movements, for odometry's random errors."""
+    """(N, 3) noise of movements, summed up: along the way, across it (m^2), of the turn (rad^2).
+
+    All of it is proportional to way, turn and time, so that it adds up over parts of a movement.
+    """
+    along, across, by_turn, by_way = np.square(noise)
     way = np.hypot(controls[:, 0], controls[:, 1])
     passed = np.concatenate([[0.0], np.diff(times_s)])
-    variances = np.empty((len(times_s), 3))
-    variances[:, 0] = variances[:, 1] = noise[0] ** 2 * way + _CREEP_M2_PER_S * passed
-    variances[:, 2] = (
-        noise[1] ** 2 * np.abs(controls[:, 2]) + noise[2] ** 2 * way + _CREEP_RAD2_PER_S * passed
+    return np.column_stack(
+        [
+            along * way + _CREEP_M2_PER_S * passed,
+            across * way + _CREEP_M2_PER_S * passed,
+            by_turn * np.abs(controls[:, 2]) + by_way * way + _CREEP_RAD2_PER_S * passed,
+        ]
     )
-    return variances

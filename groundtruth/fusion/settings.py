@@ -10,6 +10,7 @@ from groundtruth.errors import GroundTruthError
 
 _DEVIATIONS = (
     "distance_sigma",
+    "lateral_sigma",
     "turn_sigma",
     "turn_per_metre_sigma",
     "turn_scale_sigma",
@@ -26,13 +27,16 @@ class FuseSettings:
     ----------
     distance_sigma : float
         Standard deviation of odometry's distance after a metre (m); it grows with the root.
+    lateral_sigma : float
+        How far the robot slips sideways within a metre (m), its standard deviation; it grows with
+        the root. What a wrong heading leads aside is not part of it.
     turn_sigma : float
         Standard deviation of its heading after turning a radian (rad).
     turn_per_metre_sigma : float
         The same after a metre driven (rad).
     learn_noise : bool
-        Scale these deviations (distance's, and both of the heading together) by what makes the
-        measurements likeliest; they only begin the search then.
+        Scale these deviations (distance's, the sideways one, and both of the heading together) by
+        what makes the measurements likeliest; they only begin the search then.
     turn_scale_sigma, turn_bias_per_metre_sigma, distance_scale_sigma : float
         Standard deviations, before anything was measured, of what odometry is off by: the share of
         each turn, the turn per metre (rad), the share of each way.
@@ -48,6 +52,7 @@ class FuseSettings:
     """
 
     distance_sigma: float = 0.02
+    lateral_sigma: float = 0.01
     turn_sigma: float = 0.02
     turn_per_metre_sigma: float = 0.01
     learn_noise: bool = True

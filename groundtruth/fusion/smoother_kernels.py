@@ -2,8 +2,8 @@
 
 The state is x, y (m), theta (rad, not wrapped), and what odometry is off by systematically: the
 share by which turns are longer than it says, the turn that it misses per metre driven (rad/m), and
-the share by which ways are longer. The control of a node is the movement since the one before, in
-the robot's frame there.
+the share by which ways are longer. The control of a node is the movement since the one before
+(see `groundtruth.fusion.motion_kernels`).
 """
 
 from __future__ import annotations
@@ -14,13 +14,11 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from groundtruth.fusion.motion_kernels import POSE, STATE, move
+
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
-
-#: Length of the state, and of the pose at its beginning.
-STATE = 6
-_POSE = 3
 
 
 @njit(cache=True, error_model="numpy")
@@ -46,48 +44,6 @@ def _invert_3x3(m: FloatArray, inverse: FloatArray) -> float:
 
 
 @njit(cache=True, error_model="numpy")
-def _predict(
-    x: FloatArray,
-    p: FloatArray,
-    f: FloatArray,
-    control: FloatArray,
-    variances: FloatArray,
-    point: FloatArray,
-) -> None:
-    """Move state and covariance on by a control, linearised at a point; f: the derivative."""
-    dx, dy, turn = control[0], control[1], control[2]
-    way = math.sqrt(dx * dx + dy * dy)
-    cos, sin = math.cos(point[2]), math.sin(point[2])
-    east, north = cos * dx - sin * dy, sin * dx + cos * dy
-    longer = 1.0 + point[5]
-    off_heading, off_scale = x[2] - point[2], x[5] - point[5]
-    x[0] += longer * east - longer * north * off_heading + east * off_scale
-    x[1] += longer * north + longer * east * off_heading + north * off_scale
-    x[2] += (1.0 + x[3]) * turn + x[4] * way
-    f[0, 2] = -longer * north
-    f[1, 2] = longer * east
-    f[0, 5] = east
-    f[1, 5] = north
-    f[2, 3] = turn
-    f[2, 4] = way
-    # f is the identity but for rows 0 to 2: p becomes f p f' row by row, then column by column.
-    for j in range(STATE):
-        p[0, j] += f[0, 2] * p[2, j] + f[0, 5] * p[5, j]
-        p[1, j] += f[1, 2] * p[2, j] + f[1, 5] * p[5, j]
-        p[2, j] += f[2, 3] * p[3, j] + f[2, 4] * p[4, j]
-    for i in range(STATE):
-        p[i, 0] += p[i, 2] * f[0, 2] + p[i, 5] * f[0, 5]
-        p[i, 1] += p[i, 2] * f[1, 2] + p[i, 5] * f[1, 5]
-        p[i, 2] += p[i, 3] * f[2, 3] + p[i, 4] * f[2, 4]
-    vx, vy = variances[0], variances[1]
-    p[0, 0] += cos * cos * vx + sin * sin * vy
-    p[0, 1] += cos * sin * (vx - vy)
-    p[1, 0] += cos * sin * (vx - vy)
-    p[1, 1] += sin * sin * vx + cos * cos * vy
-    p[2, 2] += variances[2]
-
-
-@njit(cache=True, error_model="numpy")
 def _update(
     x: FloatArray,
     p: FloatArray,
@@ -98,17 +54,17 @@ def _update(
 ) -> None:
     """Take a measured pose in; gain and temporary are work space."""
     for i in range(STATE):
-        for j in range(_POSE):
+        for j in range(POSE):
             total = 0.0
-            for n in range(_POSE):
+            for n in range(POSE):
                 total += p[i, n] * s_inverse[n, j]
             gain[i, j] = total
     for i in range(STATE):
-        for j in range(_POSE):
+        for j in range(POSE):
             x[i] += gain[i, j] * innovation[j]
         for j in range(STATE):
             total = 0.0
-            for n in range(_POSE):
+            for n in range(POSE):
                 total += gain[i, n] * p[n, j]
             temporary[i, j] = total
     for i in range(STATE):
@@ -144,10 +100,10 @@ def filter_forward(
 
     Parameters
     ----------
-    controls : (N, 3) array
-        Movement to each node in the robot's frame of the node before; the first is not used.
+    controls : (N, 4) array
+        Movement to each node from the one before, as `move` takes it; the first is not used.
     control_variances : (N, 3) array
-        Of the movements, along the robot's axes and of the turn.
+        What its noise along the way, across it and of the turn sums up to.
     start, start_covariance : (6,), (6, 6) arrays
         Before the measurements at the first node.
     nodes : (M,) int array
@@ -180,10 +136,10 @@ def filter_forward(
     x = start.copy()
     p = start_covariance.copy()
     f = np.eye(STATE)
-    s = np.empty((_POSE, _POSE))
-    s_inverse = np.empty((_POSE, _POSE))
-    innovation = np.empty(_POSE)
-    gain = np.empty((STATE, _POSE))
+    s = np.empty((POSE, POSE))
+    s_inverse = np.empty((POSE, POSE))
+    innovation = np.empty(POSE)
+    gain = np.empty((STATE, POSE))
     temporary = np.empty((STATE, STATE))
     m = 0
     rejections = 0
@@ -192,36 +148,36 @@ def filter_forward(
         restarted[k] = False
         if k > 0:
             if points.shape[0] > 1:
-                _predict(x, p, f, controls[k], control_variances[k], points[k - 1])
+                move(x, p, f, controls[k], control_variances[k], points[k - 1])
             else:
-                _predict(x, p, f, controls[k], control_variances[k], x.copy())
+                move(x, p, f, controls[k], control_variances[k], x.copy())
             if keep:
                 transitions[k] = f
         if keep:
             predicted[k] = x
             predicted_covariance[k] = p
         while m < nodes.shape[0] and nodes[m] == k:
-            for i in range(_POSE):
+            for i in range(POSE):
                 innovation[i] = measured[m, i] - x[i]
             innovation[2] = _wrap(innovation[2])
             if rejections >= restart_after:
-                for i in range(_POSE):
+                for i in range(POSE):
                     for j in range(STATE):
                         p[i, j] = 0.0
                         p[j, i] = 0.0
-                for i in range(_POSE):
+                for i in range(POSE):
                     p[i, i] = restart_variances[i]
                 rejections = 0
                 restarted[k] = True
                 if keep:
                     predicted_covariance[k] = p
-            for i in range(_POSE):
-                for j in range(_POSE):
+            for i in range(POSE):
+                for j in range(POSE):
                     s[i, j] = p[i, j] + measured_covariances[m, i, j]
             determinant = _invert_3x3(s, s_inverse)
             squared = 0.0
-            for i in range(_POSE):
-                for j in range(_POSE):
+            for i in range(POSE):
+                for j in range(POSE):
                     squared += innovation[i] * s_inverse[i, j] * innovation[j]
             squared_innovations[m] = squared
             accepted[m] = squared <= gate
@@ -299,10 +255,12 @@ def smooth_backward(
         _factor(predicted_covariance[k + 1], lower)
         # gain = p f' (predicted covariance)^-1, row by row.
         for i in range(STATE):
-            gain[i, 0] = p[i, 0] + p[i, 2] * f[0, 2] + p[i, 5] * f[0, 5]
-            gain[i, 1] = p[i, 1] + p[i, 2] * f[1, 2] + p[i, 5] * f[1, 5]
+            gain[i, 0], gain[i, 1] = p[i, 0], p[i, 1]
+            for n in range(2, STATE):
+                gain[i, 0] += p[i, n] * f[0, n]
+                gain[i, 1] += p[i, n] * f[1, n]
             gain[i, 2] = p[i, 2] + p[i, 3] * f[2, 3] + p[i, 4] * f[2, 4]
-            for j in range(_POSE, STATE):
+            for j in range(POSE, STATE):
                 gain[i, j] = p[i, j]
             _solve(lower, gain[i])
         for i in range(STATE):

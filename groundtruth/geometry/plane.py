@@ -43,6 +43,25 @@ def between(world_from_a: ArrayLike, world_from_b: ArrayLike) -> FloatArray:
     return np.stack([x, y, wrap_angle(apart[..., 2])], axis=-1)
 
 
+def log_motion(a_from_b: ArrayLike) -> FloatArray:
+    """(..., 3) constant rates vx, vy, turn that lead from a to b within one unit of time.
+
+    They are those of the moving frame itself, so that way and turn are those of an arc.
+    """
+    pose = np.asarray(a_from_b, dtype=np.float64)
+    half = 0.5 * wrap_angle(pose[..., 2])
+    small = np.abs(half) < 1e-3
+    cotangent = np.where(small, 1.0 - half**2 / 3.0, half / np.tan(np.where(small, 1.0, half)))
+    return np.stack(
+        [
+            cotangent * pose[..., 0] + half * pose[..., 1],
+            cotangent * pose[..., 1] - half * pose[..., 0],
+            2.0 * half,
+        ],
+        axis=-1,
+    )
+
+
 def apply(a_from_b: ArrayLike, points: ArrayLike) -> FloatArray:
     """(n, 2) points of frame b taken to frame a by one pose."""
     a, p = np.asarray(a_from_b, dtype=np.float64), np.asarray(points, dtype=np.float64)

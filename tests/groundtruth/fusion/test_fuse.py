@@ -13,6 +13,9 @@ from scipy.optimize import least_squares
 from groundtruth.cli import main
 from groundtruth.errors import GroundTruthError
 from groundtruth.fusion.fuse import FuseSettings, fuse
+from groundtruth.fusion.movement import movement_problem
+from groundtruth.geometry.plane import log_motion
+from groundtruth.geometry.transforms import exp_se3
 from groundtruth.trajectories.interpolation import interpolate_poses
 from groundtruth.trajectories.streams import PlanarPoses, read_planar_poses, write_planar_poses
 from landmarks import wrap_angle
@@ -34,7 +37,7 @@ def drive(
     sigma = np.column_stack(
         [
             settings.distance_sigma * np.sqrt(distance),
-            settings.distance_sigma * np.sqrt(distance),
+            settings.lateral_sigma * np.sqrt(distance),
             np.sqrt(
                 settings.turn_sigma**2 * np.abs(step[:, 2])
                 + settings.turn_per_metre_sigma**2 * distance
@@ -76,6 +79,27 @@ def normalised_error(poses: PlanarPoses, truth: PlanarPoses) -> FloatArray:
     return np.asarray(np.einsum("ni,nij,nj->n", error, np.linalg.inv(poses.covariances), error))
 
 
+def arc_ends(arcs: FloatArray) -> FloatArray:
+    """(N, 3) where constant rates lead within one unit of time."""
+    flat = np.zeros(len(arcs))
+    ends = exp_se3(np.column_stack([arcs[:, 0], arcs[:, 1], flat, flat, flat, arcs[:, 2]]))
+    return np.column_stack([ends[:, 0, 3], ends[:, 1, 3], np.arctan2(ends[:, 1, 0], ends[:, 0, 0])])
+
+
+def arc_noise(arc: FloatArray, rates: FloatArray, parts: int = 100) -> FloatArray:
+    """Covariance of an arc's end, in the frame of its begin: noise of many parts summed up."""
+    end = arc_ends(arc[None])[0]
+    here = arc_ends((np.arange(parts)[:, None] + 0.5) / parts * arc)
+    direction = here[:, 2] + np.arctan2(arc[1], arc[0])
+    by = np.zeros((parts, 3, 3))
+    by[:, 0, 0] = by[:, 1, 1] = np.cos(direction)
+    by[:, 1, 0] = np.sin(direction)
+    by[:, 0, 1] = -by[:, 1, 0]
+    by[:, 0, 2], by[:, 1, 2] = here[:, 1] - end[1], end[0] - here[:, 0]
+    by[:, 2, 2] = 1.0
+    return np.asarray(np.einsum("nij,j,nkj->ik", by, rates / parts, by))
+
+
 @pytest.mark.parametrize("systematic", [0.0, 1.0])
 def test_it_is_the_least_squares_solution(systematic: float) -> None:
     """Filter and smoother together solve the batch problem, up to linearisation."""
@@ -103,13 +127,24 @@ def test_it_is_the_least_squares_solution(systematic: float) -> None:
             ]
         )
 
-    steps = movement(own)
-    distance = np.hypot(steps[:, 0], steps[:, 1])
-    xy = np.sqrt(settings.distance_sigma**2 * distance + 1e-8 * 0.2)
-    turn = np.sqrt(
-        settings.turn_sigma**2 * np.abs(steps[:, 2])
-        + settings.turn_per_metre_sigma**2 * distance
-        + 1e-8 * 0.2
+    # Odometry's arcs, put right by the errors, and what their noise sums up to.
+    arcs = log_motion(movement(own))
+    distinct = movement_problem(odometry, {"laser": laser}, settings).controls[1:, 3]
+    distance = np.hypot(arcs[:, 0], arcs[:, 1])
+    rates = np.column_stack(
+        [
+            settings.distance_sigma**2 * distance + 1e-8 * 0.2,
+            settings.lateral_sigma**2 * distance + 1e-8 * 0.2,
+            settings.turn_sigma**2 * np.abs(arcs[:, 2])
+            + settings.turn_per_metre_sigma**2 * distance
+            + 1e-8 * 0.2,
+        ]
+    )
+    white = np.array(
+        [
+            np.linalg.inv(np.linalg.cholesky(arc_noise(arc, rate)))
+            for arc, rate in zip(arcs, rates, strict=True)
+        ]
     )
     root = np.linalg.inv(np.linalg.cholesky(LASER_COVARIANCE / 25))
     seen = np.searchsorted(odometry.times_s, laser.times_s)
@@ -117,15 +152,15 @@ def test_it_is_the_least_squares_solution(systematic: float) -> None:
     def residuals(flat: FloatArray) -> FloatArray:
         path, scaled = flat[:-3].reshape(-1, 3), flat[-3:] * systematic
         turn_scale, bend, way_scale = 0.03 * scaled[0], 0.01 * scaled[1], 0.03 * scaled[2]
-        expected = steps * [1.0 + way_scale, 1.0 + way_scale, 1.0 + turn_scale]
-        expected[:, 2] += bend * distance
-        off = movement(path) - expected
+        right = arcs * [1.0 + way_scale, 1.0 + way_scale, 1.0]
+        right[:, 2] += turn_scale * distinct + bend * distance
+        off = movement(path) - arc_ends(right)
         off[:, 2] = wrap_angle(off[:, 2])
         difference = path[seen] - laser.poses
         difference[:, 2] = wrap_angle(difference[:, 2])
         return np.concatenate(
             [
-                (off / np.column_stack([xy, xy, turn])).ravel(),
+                np.einsum("nij,nj->ni", white, off).ravel(),
                 (difference @ root.T).ravel(),
                 flat[-3:],
             ]
@@ -144,7 +179,9 @@ def test_it_is_the_least_squares_solution(systematic: float) -> None:
 
 def test_what_odometry_is_off_by_is_found_and_bridges_a_gap() -> None:
     rng = np.random.default_rng(12)
-    exact = FuseSettings(distance_sigma=0.003, turn_sigma=0.003, turn_per_metre_sigma=0.001)
+    exact = FuseSettings(
+        distance_sigma=0.003, lateral_sigma=0.003, turn_sigma=0.003, turn_per_metre_sigma=0.001
+    )
     truth, odometry = drive(rng, 120.0, exact)
     # Odometry that takes turns for 2 % and ways for 1 % shorter than they are, and bends.
     steps = np.diff(odometry.poses, axis=0)
@@ -182,6 +219,57 @@ def test_covariances_are_right() -> None:
     # 99.9 % bands of the mean of 50 draws of chi-squared with 3 degrees of freedom.
     for values in (ends, middles):
         assert 2.0 < np.mean(values) < 4.25
+
+
+@pytest.mark.parametrize("slip", [0.0, 0.006])
+def test_a_short_gap_is_as_uncertain_along_the_way_as_across_it(slip: float) -> None:
+    """Wheels that err along their way, with and without sideways slip; errors found, not given."""
+    along, across, expected = [], [], []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        times = np.arange(0.0, 30.0, 0.02)
+        turning = 0.1 * np.sin(0.5 * times + rng.uniform(0, 6))
+        steps = 0.02 * np.column_stack([0.6 + 0.0 * times, 0.0 * times, turning])
+        truth = PlanarPoses(times, chain(steps, rng.normal(size=3)))
+        way = 0.6 * 0.02
+        sigmas = np.sqrt(way) * np.array([0.006, slip, 0.004])
+        own = steps + rng.normal(size=steps.shape) * sigmas
+        odometry = PlanarPoses(times, chain(own, np.zeros(3)))
+        seen = np.concatenate([np.arange(0.0, 13.0, 0.04), np.arange(17.0, 29.9, 0.04)])
+        spread = np.diag(np.square([1e-3, 1e-3, 3e-3]))
+        found = fuse(odometry, {"laser": measure(rng, truth, seen, spread)}).poses
+        assert found.covariances is not None
+        k = int(np.argmin(np.abs(found.times_s - 15.0)))
+        exact = truth.poses[int(np.argmin(np.abs(truth.times_s - found.times_s[k])))]
+        c, s = np.cos(exact[2]), np.sin(exact[2])
+        turn = np.array([[c, s], [-s, c]])
+        error = turn @ (found.poses[k, :2] - exact[:2])
+        variances = np.diagonal(turn @ found.covariances[k, :2, :2] @ turn.T)
+        along.append(error[0] ** 2 / variances[0])
+        across.append(error[1] ** 2 / variances[1])
+        expected.append(variances[0])
+    # A random walk between two known ends: a quarter of its variance over the whole gap.
+    assert np.mean(expected) == pytest.approx(0.25 * 0.006**2 * 0.6 * 4.0, rel=0.1)
+    # 99.8 % bands of the mean of 12 draws of chi-squared with 1 degree of freedom.
+    for values in (along, across):
+        assert 0.18 < np.mean(values) < 2.75
+
+
+def test_driving_straight_says_nothing_of_turns() -> None:
+    """What odometry errs at random is not taken for turns that measured headings deny."""
+    rng = np.random.default_rng(13)
+    times = np.arange(0.0, 60.0, 0.02)
+    steps = 0.02 * np.column_stack([0.7 + 0.0 * times, 0.0 * times, 0.0 * times])
+    truth = PlanarPoses(times, chain(steps, np.zeros(3)))
+    noise = rng.normal(size=steps.shape) * np.sqrt(0.014) * np.array([0.006, 0.0, 0.004])
+    odometry = PlanarPoses(times, chain(steps + noise, np.zeros(3)))
+    spread = np.diag(np.square([1e-3, 1e-3, 3e-3]))
+    learnt = fuse(odometry, {"laser": measure(rng, truth, times[::2], spread)}).odometry
+    assert abs(learnt.turn_scale) < 0.01
+    assert learnt.turn_scale_sigma > 0.02
+    assert learnt.turn_per_metre_sigma == pytest.approx(0.004, rel=0.2)
+    assert learnt.distance_sigma == pytest.approx(0.006, rel=0.2)
+    assert learnt.lateral_sigma < 0.001
 
 
 def test_a_gap_is_bridged_with_covariance_that_grows_towards_its_middle() -> None:

@@ -43,6 +43,8 @@ class WheelErrors:
     """Random error of the heading per square root of a radian turned (rad)."""
     sigma_turn_per_m: float = 0.004
     """Random error of the heading per square root of a metre (rad)."""
+    sigma_side_m: float = 0.0
+    """Sideways slip per square root of a metre (m)."""
 
 
 @dataclass(frozen=True)
