@@ -41,8 +41,22 @@ def read_back(recording: Path) -> dict[str, list[dict[str, Any]]]:
     reader = pytest.importorskip("rerun.chunk").RrdReader(str(recording))
     found: dict[str, list[dict[str, Any]]] = {}
     for chunk in reader.stream().to_chunks():
-        found.setdefault(chunk.entity_path, []).extend(chunk.to_record_batch().to_pylist())
+        batch = chunk.to_record_batch()
+        columns = {name: plain(batch.column(name)) for name in batch.schema.names}
+        rows = [dict(zip(columns, row)) for row in zip(*columns.values())]
+        found.setdefault(chunk.entity_path, []).extend(rows)
     return found
+
+
+def plain(column: Any) -> list[Any]:
+    """A column's values; Python's own times know no nanoseconds."""
+    import pyarrow as pa
+
+    kinds = {pa.types.is_timestamp: pa.timestamp("us"), pa.types.is_duration: pa.duration("us")}
+    for is_kind, microseconds in kinds.items():
+        if is_kind(column.type):
+            column = column.cast(microseconds, safe=False)
+    return list(column.to_pylist())
 
 
 @pytest.mark.long

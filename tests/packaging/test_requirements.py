@@ -1,0 +1,74 @@
+"""The ends of what `pyproject.toml` allows are what CI tries: the lowest versions, and the lock."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+from packaging.version import Version
+
+#: Withdrawn by their makers: the next version is the lowest that can be had.
+WITHDRAWN = {"scipy": "1.11.0", "pytest-xdist": "3.6.0"}
+
+
+def declared(root: Path, extras: tuple[str, ...]) -> dict[str, Requirement]:
+    """What the project needs, by itself and with extras."""
+    project = tomllib.loads((root / "pyproject.toml").read_text())["project"]
+    optional = project["optional-dependencies"]
+    lines = [*project["dependencies"], *(line for extra in extras for line in optional[extra])]
+    return {canonicalize_name(r.name): r for r in map(Requirement, lines)}
+
+
+def pinned(path: Path) -> dict[str, Version]:
+    """The versions that a file of requirements names, one for each package."""
+    lines = [line.rstrip(" \\") for line in path.read_text().splitlines()]
+    named = [line.partition("==") for line in lines if re.match(r"\w", line)]
+    assert all(between for _, between, _ in named)
+    return {canonicalize_name(name): Version(version) for name, _, version in named}
+
+
+def lower_end(requirement: Requirement) -> Version:
+    (lowest,) = [Version(s.version) for s in requirement.specifier if s.operator == ">="]
+    return lowest
+
+
+def test_what_users_need_has_a_lower_and_an_upper_end(project_root: Path) -> None:
+    project = tomllib.loads((project_root / "pyproject.toml").read_text())["project"]
+    for line in project["dependencies"]:
+        requirement = Requirement(line)
+        assert {s.operator for s in requirement.specifier} == {">=", "<"}, line
+
+
+def test_the_lowest_versions_are_those_that_are_allowed(project_root: Path) -> None:
+    """Of all that users may need: the declared ends, to the last digit that they give."""
+    found = pinned(project_root / "requirements" / "lowest.txt")
+    wanted = declared(project_root, ("cluster", "bags", "parquet", "view", "slam"))
+    assert set(wanted) <= set(found)
+    tools = declared(project_root, ("dev",))
+    for name in set(found) & (set(wanted) | set(tools)):
+        end, version = lower_end((wanted | tools)[name]), found[name]
+        if name in WITHDRAWN:
+            assert end == Version(WITHDRAWN[name])
+            assert version == Version(f"{end.major}.{end.minor}.{end.micro + 1}")
+        else:
+            assert version.release[: len(end.release)] == end.release, name
+            assert all(part == 0 for part in version.release[len(end.release) : 3]), name
+            assert version.pre == end.pre, name
+
+
+@pytest.mark.parametrize("extras", [(), ("cluster", "bags", "parquet", "view", "slam"), ("dev",)])
+def test_the_lock_is_within_what_is_allowed(project_root: Path, extras: tuple[str, ...]) -> None:
+    found = pinned(project_root / "requirements" / "lock.txt")
+    for name, requirement in declared(project_root, extras).items():
+        assert requirement.specifier.contains(found[name], prereleases=True), name
+
+
+def test_every_locked_package_has_hashes(project_root: Path) -> None:
+    text = (project_root / "requirements" / "lock.txt").read_text()
+    entries = re.split(r"\n(?=\w)", text)
+    assert len(entries) == len(pinned(project_root / "requirements" / "lock.txt"))
+    assert all(re.search(r"--hash=sha256:[0-9a-f]{64}", entry) for entry in entries)
