@@ -8,6 +8,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from detect.line_order_kernels import descending
+
 
 @njit(cache=True, error_model="numpy")
 def wrapped(angle: float) -> float:
@@ -44,7 +46,7 @@ def chain_neighbours(
 
     Parameters and results as those of `detect.line_bearing.close_groups`.
     """
-    order = np.argsort(-alpha, kind="mergesort")
+    order = descending(alpha)
     group = np.zeros(len(alpha), np.int64)
     number = 0
     for k in range(1, len(alpha)):

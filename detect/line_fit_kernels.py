@@ -13,6 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from detect.line_step_filters import SUBPIXELS
 from detect.line_vector_kernels import LANES, WORD, add_products, slope_and_bend
 
 #: Up to here series of tangents and arc tangents are as good as these.
@@ -227,7 +228,6 @@ def refine_lines(
     contrast = np.full(count, np.nan)
     sharpness = np.ones(count)
     height, width = image.shape
-    subpixels = len(height_weights) // (2 * np.sum(half))
     grey_values = image.reshape(-1)
     crossing = np.empty(height)
     by_a = np.empty(height)
@@ -302,9 +302,9 @@ def refine_lines(
                 inside = (u > reach) & (u < width - 1 - reach)
                 u = u if inside else float(reach)
                 whole = int(u)
-                node = int((u - whole) * subpixels)
+                node = int((u - whole) * SUBPIXELS)
                 # From the tabulated position to the crossing.
-                off[i] = u - whole - (node + 0.5) / subpixels
+                off[i] = u - whole - (node + 0.5) / SUBPIXELS
                 weight[i] = 1.0 if inside else 0.0
                 shown += weight[i]
                 at_pixel[i] = row[begin + i] * width + whole - reach + 1
@@ -368,7 +368,7 @@ def refine_lines(
             if not (u > margin and u < width - 1 - margin):
                 continue
             whole = int(u)
-            node = int((u - whole) * subpixels)
+            node = int((u - whole) * SUBPIXELS)
             for which in range(2):
                 reach = half[len(farthest) + which]
                 add_products(
@@ -377,8 +377,11 @@ def refine_lines(
                     heights, which * LANES,
                 )  # fmt: skip
             used += 1
-        fine_height = float(np.sum(heights[:LANES]))
-        coarse_height = float(np.sum(heights[LANES:]))
+        fine_height = 0.0
+        coarse_height = 0.0
+        for lane in range(LANES):
+            fine_height += heights[lane]
+            coarse_height += heights[LANES + lane]
         contrast[t] = sign[t] * fine_height / used if used > 0 else 0.0
         sharp = fine_height / coarse_height if sign[t] * coarse_height > 0.0 else 1.0
         sharpness[t] = min(max(sharp, 0.0), 1.0)

@@ -13,7 +13,7 @@ from detect.line_fit import LineFits
 from detect.line_settings import LineSettings
 from detect.line_step_filters import StepFilters, step_filters
 from detect.line_tracks import LineTracks
-from detect.tilt import REFINEMENTS, SOFTENING, TiltEstimate
+from detect.tilt import REFINEMENTS, SOFTENING, TiltEstimate, tilt_of_numbers
 from lut.verticals import VerticalTable
 
 FloatArray = NDArray[np.float64]
@@ -108,43 +108,8 @@ def judge_tracks(
         filters.half, filters.begin, filters.height, filters.first, filters.second, farthest,
         limits_of(settings, table.row_aspect),
     )  # fmt: skip
-    pitch, roll, *_, lines, votes, deviation = tilt.tolist()
-    agreed = None
-    if not math.isnan(pitch):
-        agreed = TiltEstimate(pitch, roll, tilt[2:6].reshape(2, 2), int(lines))
-    return Judgement(LineFits(fits), evidence, fate, agreed, votes, deviation)
-
-
-def lines_of_tracks(
-    tracks: LineTracks, judged: Judgement, table: VerticalTable, settings: LineSettings
-) -> tuple[NDArray[np.int64], NDArray[np.int64], FloatArray]:
-    """Gather accepted tracks to lines: one for each edge, close ones joined.
-
-    Tracks that are left out or joined are marked so in the fates of `judged`. Level bearings take
-    into account that verticals lean as the tilt says.
-
-    Returns
-    -------
-    members : (M,) int64
-        Tracks, line by line from the left, the strongest of each line first.
-    bounds : (N + 1,) int64
-        Line n's members are ``bounds[n] : bounds[n + 1]``.
-    lines : (8, N) float64
-        xtop, ytop, xbottom, ybottom, alpha, beta, sigma and the noise in it, each in a row (see
-        `detect.lines.LineDetections`).
-    """
-    from detect import line_pass_kernels as kernels
-
-    tilt = judged.tilt
-    pitch, roll = (tilt.pitch_rad, tilt.roll_rad) if tilt is not None else (0.0, 0.0)
-    level = settings.alpha == "level"
-    building = settings.consensus.building_rad if tilt is not None and level else math.inf
-    members, bounds, lines = kernels.lines_of_tracks(
-        table.bearing_rad, table.elevation_tan, table.robot_from_camera, tracks.polarity,
-        tracks.bounds, tracks.row, tracks.column, judged.fits.numbers, judged.evidence, judged.fate,
-        pitch, roll, 1.0 if level else -1.0, building, grouping_of(settings),
-    )  # fmt: skip
-    return members, bounds, lines
+    votes, deviation = tilt[-2:].tolist()
+    return Judgement(LineFits(fits), evidence, fate, tilt_of_numbers(tilt), votes, deviation)
 
 
 @lru_cache(maxsize=16)

@@ -12,6 +12,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from detect.line_bearing_kernels import chain_neighbours, join_mixture, wrapped
+from detect.line_order_kernels import descending
 
 ACCEPTED = 0
 JOINED = 1
@@ -29,13 +30,31 @@ BESIDE_A_STRONGER_EDGE = 12
 
 
 @njit(cache=True, error_model="numpy")
+def _chosen(
+    fate: NDArray[np.int8], values: NDArray[np.float64]
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Accepted tracks, and their values."""
+    tracks = np.empty(len(fate), np.int64)
+    own = np.empty(len(fate))
+    n = 0
+    for t in range(len(fate)):
+        if fate[t] == ACCEPTED:
+            tracks[n] = t
+            own[n] = values[t]
+            n += 1
+    return tracks[:n], own[:n]
+
+
+@njit(cache=True, error_model="numpy")
 def _quantile(values: NDArray[np.float64], share: float) -> float:
     """Quantile of at least one value, interpolated linearly."""
-    ordered = np.sort(values)
-    place = share * (len(ordered) - 1)
+    order = descending(values)
+    last = len(values) - 1
+    place = share * last
     below = int(place)
-    above = min(below + 1, len(ordered) - 1)
-    return float(ordered[below] + (place - below) * (ordered[above] - ordered[below]))
+    lower = values[order[last - below]]
+    upper = values[order[max(last - below - 1, 0)]]
+    return float(lower + (place - below) * (upper - lower))
 
 
 @njit(cache=True, error_model="numpy")
@@ -87,8 +106,6 @@ def judge_tracks(
     count = len(bounds) - 1
     evidence = np.empty(count)
     fate = np.empty(count, np.int8)
-    accepted = np.empty(count, np.int64)
-    n = 0
     for t in range(count):
         begin, end = bounds[t], bounds[t + 1]
         total = 0.0
@@ -113,15 +130,13 @@ def judge_tracks(
             fate[t] = UNCERTAIN
         else:
             fate[t] = ACCEPTED
-            accepted[n] = t
-            n += 1
-    if n == 0:
+    accepted, sharpnesses = _chosen(fate, sharpness)
+    if len(accepted) == 0:
         return evidence, fate
     # How sharp an edge can be depends on the image's focus and motion.
-    chosen = accepted[:n]
-    sharp = least_sharpness * _quantile(sharpness[chosen], 0.25)
-    clear = _quantile(contrast[chosen], 0.5)
-    for t in chosen:
+    sharp = least_sharpness * _quantile(sharpnesses, 0.25)
+    clear = _quantile(_chosen(fate, contrast)[1], 0.5)
+    for t in accepted:
         if sharpness[t] < sharp and contrast[t] < clear and evidence[t] < soft_evidence:
             fate[t] = SOFT
     return evidence, fate
@@ -168,7 +183,7 @@ def weigh_verticals(
     variance, tolerance, weight : (N,) float64
         As `detect.tilt.consensus` takes them.
     """
-    accepted = np.flatnonzero(fate == ACCEPTED)
+    accepted, _ = _chosen(fate, evidence)
     count = len(accepted)
     normal = np.empty((count, 3))
     variance = np.empty(count)
@@ -233,11 +248,13 @@ def group_tracks(
     bounds : (N + 1,) int64
         Line n's members are ``bounds[n] : bounds[n + 1]``.
     """
-    accepted = np.flatnonzero(fate == ACCEPTED)
-    order = np.argsort(-evidence[accepted], kind="mergesort")
+    accepted, evidences = _chosen(fate, evidence)
     kept = np.empty(len(accepted), np.int64)
+    near_px = np.empty(len(accepted))
+    places = np.empty(len(accepted))
     n = 0
-    for t in accepted[order]:
+    for k in descending(evidences):
+        t = accepted[k]
         reason = ACCEPTED
         for s in kept[:n]:
             near = abs(wrapped(alpha[s] - alpha[t])) / pixel[t]
@@ -251,12 +268,15 @@ def group_tracks(
         fate[t] = reason
         if reason == ACCEPTED:
             kept[n] = t
+            places[n] = alpha[t]
+            near_px[n] = join_px * pixel[t]
             n += 1
-    lines = kept[:n]
-    group = chain_neighbours(alpha[lines], join_px * pixel[lines])
+    group = chain_neighbours(places[:n], near_px[:n])
     # Leftmost first; stable: the strongest of each line stays its first.
-    by_group = np.argsort(group, kind="mergesort")
-    members = lines[by_group]
+    by_group = descending(-group.astype(np.float64))
+    members = np.empty(n, np.int64)
+    for k in range(n):
+        members[k] = kept[by_group[k]]
     bounds = np.zeros(n + 1, np.int64)
     count = 0
     for k in range(n):
@@ -301,8 +321,18 @@ def join_tracks(
     count = len(bounds) - 1
     joined = np.empty(count)
     sigma = np.empty(count)
+    places = np.empty(len(members))
+    deviations = np.empty(len(members))
+    weights = np.empty(len(members))
     for n in range(count):
-        own = members[bounds[n] : bounds[n + 1]]
-        deviation = np.sqrt(noise[own] ** 2 + (sigma_px * pixel[own]) ** 2)
-        joined[n], sigma[n] = join_mixture(alpha[own], deviation, evidence[own])
+        begin, end = bounds[n], bounds[n + 1]
+        for k in range(begin, end):
+            t = members[k]
+            places[k] = alpha[t]
+            weights[k] = evidence[t]
+            systematic = sigma_px * pixel[t]
+            deviations[k] = math.sqrt(noise[t] * noise[t] + systematic * systematic)
+        joined[n], sigma[n] = join_mixture(
+            places[begin:end], deviations[begin:end], weights[begin:end]
+        )
     return joined, sigma

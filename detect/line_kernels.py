@@ -13,6 +13,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from detect.line_group_kernels import MARGIN, STEP, respond, uncounted
+from detect.line_order_kernels import descending
 from detect.line_vector_code import LANES
 
 #: Rows that are filtered ahead of a track.
@@ -47,7 +48,7 @@ def find_starts(
     row = np.empty(steps * width, np.int32)
     column = np.empty(len(row), np.int32)
     signs = np.empty(len(row), np.float32)
-    score = np.empty(len(row), np.float32)
+    score = np.empty(len(row), np.float64)
     least = np.float32(threshold)
     # Maxima are few: they are told by vectors, and looked through eight at a time.
     inner = max(width - 2, 0)
@@ -76,8 +77,17 @@ def find_starts(
                     signs[n] = np.float32(1.0 if heres[i] > 0.0 else -1.0)
                     score[n] = abs(heres[i])
                     n += 1
-    order = np.argsort(-score[:n], kind="mergesort")
-    return row[order], column[order], signs[order], score[order]
+    order = descending(score[:n])
+    row_of = np.empty(n, np.int32)
+    column_of = np.empty(n, np.int32)
+    sign_of = np.empty(n, np.float32)
+    score_of = np.empty(n, np.float32)
+    for k in range(n):
+        row_of[k] = row[order[k]]
+        column_of[k] = column[order[k]]
+        sign_of[k] = signs[order[k]]
+        score_of[k] = score[order[k]]
+    return row_of, column_of, sign_of, score_of
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)

@@ -22,11 +22,8 @@ from detect.line_judgement_kernels import (
     judge_tracks,
     weigh_verticals,
 )
+from detect.tilt import TILT_NUMBERS
 from detect.tilt_kernels import agree_on_tilt, level_matrix
-
-#: Numbers of a tilt: pitch, roll, covariance, lines that agree, their share of the votes, and the
-#: standard deviation of the lean that verticals should show, where in the image it is largest.
-TILT_NUMBERS = 9
 
 #: Columns from one to the next at which the lean is predicted.
 _LEAN_SPACING = 16

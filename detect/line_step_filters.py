@@ -24,7 +24,7 @@ _REACH = 4.4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StepFilters:
-    """Tables of weights, one behind the other.
+    """Tables of weights, one behind the other, each of them once.
 
     Attributes
     ----------
@@ -58,7 +58,9 @@ def step_filters(sigmas_px: tuple[float, ...]) -> StepFilters:
         One filter for each, in this order.
     """
     halves, tables = [], []
-    for sigma in sigmas_px:
+    # Equal ones share a table.
+    widths = list(dict.fromkeys(sigmas_px))
+    for sigma in widths:
         half = 4 * math.ceil(_REACH * sigma / 4.0)
         halves.append(half)
         position = (np.arange(SUBPIXELS)[:, None] + 0.5) / SUBPIXELS
@@ -72,10 +74,11 @@ def step_filters(sigmas_px: tuple[float, ...]) -> StepFilters:
         weights -= weights.mean(axis=-1, keepdims=True)
         tables.append(weights.reshape(3, -1))
     height, first, second = np.concatenate(tables, axis=-1).astype(np.float32)
-    sizes = [SUBPIXELS * 2 * half for half in halves]
+    begins = np.concatenate([[0], np.cumsum([SUBPIXELS * 2 * half for half in halves])])
+    which = [widths.index(sigma) for sigma in sigmas_px]
     return StepFilters(
-        half=np.array(halves, np.int64),
-        begin=np.concatenate([[0], np.cumsum(sizes)[:-1]]).astype(np.int64),
+        half=np.array(halves, np.int64)[which],
+        begin=begins.astype(np.int64)[which],
         height=height,
         first=first,
         second=second,

@@ -234,7 +234,7 @@ def line_tracks(
         filtered = FilteredColumns.none_yet(table)
     return LineTracks(
         *follow_edges(
-            _padded(image, window),
+            padded_pixels(image, window),
             strip.column,
             strip.ends,
             strip.lean_by_pitch,
@@ -265,7 +265,7 @@ def line_tracks(
     )
 
 
-def _padded(image: NDArray[np.uint8], window: LineFilter) -> NDArray[np.uint8]:
+def padded_pixels(image: NDArray[np.uint8], window: LineFilter) -> NDArray[np.uint8]:
     """The image in scan order, and behind it what the filter's weights of zero need."""
     flat = image.reshape(-1)
     missing = window.weights_between.shape[1] - window.weights.shape[1] - 1

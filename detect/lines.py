@@ -10,26 +10,35 @@ The path of an image, each step a function of its own:
     tracks, fits    once more along the verticals of that tilt
     lines           bearings; one line for each edge, close ones joined
 
-The first time a few edges will do if they leave no doubt about the tilt.
+The first time a few edges will do if they leave no doubt about the tilt. `detect_lines` goes it in
+one compiled call (`detect.line_image_kernels`).
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from itertools import pairwise
+from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from detect.errors import FrameError
-from detect.line_filter import FilteredColumns
+from detect.line_detections import LineDetections
+from detect.line_filter import line_filter, start_band
 from detect.line_fit import LineFits
-from detect.line_judgement import ACCEPTED, FATES, JOINED, judge_tracks, lines_of_tracks
+from detect.line_judgement import (
+    ACCEPTED,
+    JOINED,
+    grouping_of,
+    judge_tracks,
+    limits_of,
+    refinement_of,
+)
 from detect.line_settings import DEFAULT, LineSettings
-from detect.line_tracks import LineTracks, line_starts, line_tracks
+from detect.line_strip import strip_of
+from detect.line_tracks import LineTracks, padded_pixels
 from detect.tilt import TiltEstimate
-from landmarks import LineLandmark
 from lut.verticals import VerticalTable
 
 __all__ = ["ACCEPTED", "JOINED", "LineDetections", "detect_lines", "line_ends", "tilt_beyond_doubt"]
@@ -44,64 +53,6 @@ _FIRST_VOTES = 0.75
 _FIRST_LEAN_RAD = math.radians(0.15)
 #: The refinement's steps that lines need for that.
 _FIRST_STEPS = 2
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class LineDetections:
-    """What was found in one image.
-
-    Attributes
-    ----------
-    ends : (N, 4) float64
-        xtop, ytop, xbottom, ybottom: undistorted normalised coordinates; leftmost line first.
-    alpha_rad, beta_rad : (N,) float64
-        Bearings and inclinations.
-    sigma_rad : (N,) float64
-        Standard deviations of the bearings.
-    noise_rad : (N,) float64
-        The part of them that is due to noise in the grey values.
-    members : (N,) tuple of tuple of int
-        The tracks that each line was made of, the strongest first; its ends are that one's.
-    tilt : TiltEstimate or None
-        None where too few lines agree.
-    tracks : LineTracks
-        All tracks.
-    fits : LineFits
-        Their lines.
-    evidence : (T,) float64
-        Evidence for each track.
-    fate : (T,) tuple of str
-        "accepted", "joined" (to a stronger one), or why the track is no line.
-    """
-
-    ends: FloatArray
-    alpha_rad: FloatArray
-    beta_rad: FloatArray
-    sigma_rad: FloatArray
-    noise_rad: FloatArray
-    members: tuple[tuple[int, ...], ...]
-    tilt: TiltEstimate | None
-    tracks: LineTracks
-    fits: LineFits
-    evidence: FloatArray
-    fate: tuple[str, ...]
-
-    def __len__(self) -> int:
-        return len(self.alpha_rad)
-
-    def landmarks(self) -> tuple[LineLandmark, ...]:
-        """Rows for a landmark file, without identifiers; quality is 0 as in the data set's own."""
-        return tuple(
-            LineLandmark(
-                xtop, ytop, xbottom, ybottom, alpha, beta, quality=0.0, sigma=sigma, ids=(-1,)
-            )
-            for (xtop, ytop, xbottom, ybottom), alpha, beta, sigma in zip(
-                self.ends.tolist(),
-                self.alpha_rad.tolist(),
-                self.beta_rad.tolist(),
-                self.sigma_rad.tolist(),
-            )
-        )
 
 
 def detect_lines(
@@ -133,36 +84,45 @@ def detect_lines(
             f"image is {image.dtype} of shape {image.shape}: expected uint8 of the table's shape "
             f"{table.column.shape}"
         )
+    from detect.line_image_kernels import find_lines
+
     image = np.ascontiguousarray(image)
-    starts = line_starts(image, table, settings)
-    filtered = FilteredColumns.none_yet(table)
+    pixels = padded_pixels(image, line_filter(settings))
+    return LineDetections(find_lines(image, pixels, *_told_beforehand(table, settings)))
 
-    enough = settings.first_edges if settings.guided and settings.first_edges else None
-    tracks = line_tracks(image, starts, table, settings, filtered=filtered, enough=enough)
-    tilt = None if tracks.complete else tilt_beyond_doubt(image, tracks, table, settings)
-    if tilt is None:
-        if not tracks.complete:
-            tracks = line_tracks(image, starts, table, settings, filtered=filtered)
-        judged = judge_tracks(image, tracks, table, settings)
-        tilt = judged.tilt
-    if settings.guided and tilt is not None:
-        tracks = line_tracks(image, starts, table, settings, tilt, filtered)
-        judged = judge_tracks(image, tracks, table, settings)
 
-    members, bounds, lines = lines_of_tracks(tracks, judged, table, settings)
-    return LineDetections(
-        ends=lines[:4].T,
-        alpha_rad=lines[4],
-        beta_rad=lines[5],
-        sigma_rad=lines[6],
-        noise_rad=lines[7],
-        members=_split(members, bounds),
-        tilt=judged.tilt,
-        tracks=tracks,
-        fits=judged.fits,
-        evidence=judged.evidence,
-        fate=tuple(FATES[number] for number in judged.fate.tolist()),
+@lru_cache(maxsize=16)
+def _told_beforehand(table: VerticalTable, settings: LineSettings) -> tuple[Any, ...]:
+    """What `find_lines` takes besides the image."""
+    window, band, strip = line_filter(settings), start_band(table, settings), strip_of(table)
+    filters, farthest = refinement_of(settings)
+    few = [*range(len(farthest))[:_FIRST_STEPS], -2, -1]
+    level = settings.alpha == "level"
+    following = (
+        window.regulariser,
+        band.spacing,
+        settings.threshold,
+        window.weights.shape[1] // 2,
+        settings.gap_rows,
+        settings.border_rows,
+        table.row_aspect,
+        settings.guided_pull,
+        settings.guided_reach_px,
+        settings.guided,
+        settings.first_edges,
+        1.0 if level else -1.0,
+        settings.consensus.building_rad if level else math.inf,
     )
+    return (
+        table.column, table.elevation_tan, table.bearing_rad, table.horizon_row, table.first_row,
+        table.last_row, table.robot_from_camera, strip.column, strip.ends, strip.lean_by_pitch,
+        strip.lean_by_roll, band.row, band.pixel, band.runs, band.part, band.scale, band.visible,
+        band.weights, window.weights_between, window.along, filters.half, filters.begin,
+        filters.height, filters.first, filters.second, farthest, filters.half[few],
+        filters.begin[few], farthest[:_FIRST_STEPS], np.array(following, np.float64),
+        limits_of(settings, table.row_aspect),
+        np.array([_FIRST_LINES, _FIRST_VOTES, _FIRST_LEAN_RAD]), grouping_of(settings),
+    )  # fmt: skip
 
 
 def tilt_beyond_doubt(
@@ -221,8 +181,3 @@ def line_ends(
         tracks.bounds, tracks.row, tracks.column, fits.reference_rad, fits.line, chosen,
     )  # fmt: skip
     return ends, beta
-
-
-def _split(members: NDArray[np.int64], bounds: NDArray[np.int64]) -> tuple[tuple[int, ...], ...]:
-    own, at = members.tolist(), bounds.tolist()
-    return tuple(tuple(own[a:b]) for a, b in pairwise(at))

@@ -13,6 +13,7 @@ set report, line detection; the data set's own rows apply the inverse of this ro
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +23,11 @@ from detect.errors import DetectError
 from storage.bounds import ABOVE_0, demand, whole
 
 FloatArray = NDArray[np.float64]
+
+#: What compiled code tells of a tilt: pitch, roll, covariance, lines that agree, their share of the
+#: votes, and the standard deviation of the lean that verticals should show, where in the image it
+#: is largest; NaN for none.
+TILT_NUMBERS = 9
 
 #: How often the tilt is estimated anew over the lines that agree with it.
 REFINEMENTS = 6
@@ -48,6 +54,14 @@ class TiltEstimate:
     roll_rad: float
     covariance: FloatArray
     lines: int
+
+
+def tilt_of_numbers(numbers: FloatArray) -> TiltEstimate | None:
+    """The tilt that compiled code tells in `TILT_NUMBERS` numbers; None for none."""
+    pitch, roll, *_, lines, _, _ = numbers.tolist()
+    if math.isnan(pitch):
+        return None
+    return TiltEstimate(pitch, roll, numbers[2:6].reshape(2, 2), int(lines))
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,6 +8,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from detect.line_order_kernels import descending
+
 
 @njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"}, forceinline=True)
 def _votes(
@@ -208,6 +210,6 @@ def agree_on_tilt(
 
     Pairs of the `proposers` lines of the largest weight propose.
     """
-    strongest = np.argsort(-weight, kind="mergesort")[:proposers]
+    strongest = descending(weight)[:proposers]
     pitch, roll = vote_for_tilt(normal, tolerance, weight, strongest, limit, prior)
     return refine_tilt(normal, variance, tolerance, pitch, roll, prior, softening, repetitions)

@@ -20,6 +20,7 @@ from camera import Camera, read_camera
 from detect.errors import DetectError, FrameError
 from detect.line_bearing import compensated_bearings, inclinations, plane_normals
 from detect.line_drawing import draw_lines, draw_response, draw_tracks, track_pixels
+from detect.line_judgement import judge_tracks
 from detect.line_settings import DEFAULT, PUBLISHED, LineSettings
 from detect.line_tracks import line_response, line_starts, line_tracks
 from detect.lines import ACCEPTED, JOINED, detect_lines, tilt_beyond_doubt
@@ -221,6 +222,28 @@ def test_a_few_edges_tell_the_tilt_as_well_as_all_of_them() -> None:
     assert found.tilt.lines == exact.tilt.lines
     assert found.tilt.pitch_rad == pytest.approx(exact.tilt.pitch_rad, abs=2e-4)
     assert found.tilt.roll_rad == pytest.approx(exact.tilt.roll_rad, abs=2e-4)
+
+
+def test_one_call_goes_the_path_of_the_steps() -> None:
+    """Starts, tracks, judgement, and tracks once more by the tilt, each by itself."""
+    image = scene(tilted(CAMERA, 0.02, -0.01))
+    for preset in (replace(DEFAULT, first_edges=0), PUBLISHED):
+        found = detect_lines(image, TABLE, preset)
+        starts = line_starts(image, TABLE, preset)
+        tracks = line_tracks(image, starts, TABLE, preset)
+        judged = judge_tracks(image, tracks, TABLE, preset)
+        if preset.guided:
+            assert judged.tilt is not None
+            tracks = line_tracks(image, starts, TABLE, preset, judged.tilt)
+            judged = judge_tracks(image, tracks, TABLE, preset)
+        for name in ("polarity", "bounds", "row", "column", "score"):
+            np.testing.assert_array_equal(getattr(found.tracks, name), getattr(tracks, name))
+        np.testing.assert_array_equal(found.fits.numbers, judged.fits.numbers)
+        np.testing.assert_array_equal(found.evidence, judged.evidence)
+        assert found.tilt is not None
+        assert judged.tilt is not None
+        assert found.tilt.pitch_rad == judged.tilt.pitch_rad
+        np.testing.assert_array_equal(found.tilt.covariance, judged.tilt.covariance)
 
 
 def test_where_a_few_edges_leave_doubt_all_are_followed() -> None:

@@ -1,0 +1,218 @@
+"""The path of one image from grey values to lines, in one call.
+
+Each array that a compiled function takes from Python or returns costs as much as the work on a line
+or two.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from detect.line_detections import COUNTS
+from detect.line_kernels import find_starts, follow_edges
+from detect.line_pass_kernels import fit_and_judge, lines_of_tracks
+from detect.line_response_kernels import band_response
+
+
+@njit(cache=True, error_model="numpy")
+def find_lines(
+    image: NDArray[np.uint8],
+    pixels: NDArray[np.uint8],
+    table_column: NDArray[np.float32],
+    elevation_tan: NDArray[np.float32],
+    bearing: NDArray[np.float64],
+    horizon_row: NDArray[np.float64],
+    first_row: NDArray[np.int32],
+    last_row: NDArray[np.int32],
+    robot_from_camera: NDArray[np.float64],
+    strip: NDArray[np.float32],
+    ends: NDArray[np.int32],
+    lean_by_pitch: NDArray[np.float64],
+    lean_by_roll: NDArray[np.float64],
+    band_row: NDArray[np.int32],
+    band_pixel: NDArray[np.int32],
+    band_runs: NDArray[np.int32],
+    band_part: NDArray[np.float32],
+    band_scale: NDArray[np.float32],
+    band_visible: NDArray[np.bool_],
+    band_weights: NDArray[np.float32],
+    weights: NDArray[np.float32],
+    along: NDArray[np.float32],
+    half: NDArray[np.int64],
+    begin_of: NDArray[np.int64],
+    height_weights: NDArray[np.float32],
+    first_weights: NDArray[np.float32],
+    second_weights: NDArray[np.float32],
+    farthest: NDArray[np.float64],
+    few_half: NDArray[np.int64],
+    few_begin_of: NDArray[np.int64],
+    few_farthest: NDArray[np.float64],
+    following: NDArray[np.float64],
+    limits: NDArray[np.float64],
+    doubt: NDArray[np.float64],
+    grouping: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Find the building's verticals in an image.
+
+    Parameters
+    ----------
+    image : (H, W) uint8
+        Grey values.
+    pixels : (N,) uint8
+        See `detect.line_kernels.follow_edges`.
+    table_column, elevation_tan, bearing, horizon_row, first_row, last_row, robot_from_camera
+        The table (see `lut.verticals.VerticalTable`).
+    strip, ends, lean_by_pitch, lean_by_roll
+        See `detect.line_strip.Strip`.
+    band_row, band_pixel, band_runs, band_part, band_scale, band_visible, band_weights
+        See `detect.line_filter.StartBand`.
+    weights, along
+        See `detect.line_filter.LineFilter`.
+    half, begin_of, height_weights, first_weights, second_weights
+        Filters of the refinement (see `detect.line_step_filters.StepFilters`).
+    farthest
+        How far its steps may go (see `fit_and_judge`).
+    few_half, few_begin_of, few_farthest
+        The same for the few edges that are followed first.
+    following, limits, doubt, grouping : float64
+        Settings as numbers (see `detect.line_judgement`).
+
+    Returns
+    -------
+    (K,) float64
+        See `detect.line_detections.LineDetections`.
+    """
+    response = np.empty(band_row.shape, np.float32)
+    regulariser = np.float32(following[0])
+    band_response(
+        image, band_pixel, band_runs, band_part, band_scale, band_visible, int(following[1]),
+        band_weights, along, regulariser, response,
+    )  # fmt: skip
+    threshold = following[2]
+    start_row, start_column, start_sign, _ = find_starts(response, band_row, threshold)
+
+    groups = len(ends)
+    responses = np.empty(len(strip), np.float32)
+    known = np.zeros((groups, 2), np.int32)
+    half_width = int(following[3])
+    max_gap = int(following[4])
+    border = int(following[5])
+    row_aspect = following[6]
+    guided = following[9] != 0.0
+    first_edges = int(following[10])
+    least_points = int(limits[0])
+    least_score = limits[1]
+    pull, reach, enough = (
+        1.0,
+        1.0,
+        first_edges if guided and first_edges > 0 else len(start_row) + 1,
+    )
+    pitch, roll = 0.0, 0.0
+    # A few edges, if they leave no doubt about the tilt; else all; then all by the tilt.
+    few = enough <= len(start_row)
+    while True:
+        polarity, bounds, row, column, score, complete = follow_edges(
+            pixels, strip, ends, lean_by_pitch, lean_by_roll, first_row, last_row, elevation_tan,
+            weights, half_width, along, regulariser, responses, known, start_row, start_column,
+            start_sign, pitch, roll, threshold, max_gap, border, pull, reach, enough, least_points,
+            least_score,
+        )  # fmt: skip
+        few = not complete
+        fits, evidence, fate, tilt = fit_and_judge(
+            image, table_column, elevation_tan, bearing, horizon_row, row_aspect, polarity, bounds,
+            row, column, score, few_half if few else half, few_begin_of if few else begin_of,
+            height_weights, first_weights, second_weights, few_farthest if few else farthest,
+            limits,
+        )  # fmt: skip
+        enough = len(start_row) + 1
+        if few and not beyond_doubt(tilt, doubt):
+            continue
+        if not guided or np.isnan(tilt[0]):
+            break
+        guided = False
+        pitch, roll = tilt[0], tilt[1]
+        pull, reach = following[7], following[8]
+
+    tilted = not np.isnan(tilt[0])
+    members, member_bounds, lines = lines_of_tracks(
+        bearing, elevation_tan, robot_from_camera, polarity, bounds, row, column, fits, evidence,
+        fate, tilt[0] if tilted else 0.0, tilt[1] if tilted else 0.0, following[11],
+        following[12] if tilted else np.inf, grouping,
+    )  # fmt: skip
+    return _together(
+        polarity, bounds, row, column, score, fits, evidence, fate, tilt, members, member_bounds,
+        lines,
+    )  # fmt: skip
+
+
+@njit(cache=True, error_model="numpy")
+def beyond_doubt(tilt: NDArray[np.float64], doubt: NDArray[np.float64]) -> bool:
+    """Whether a tilt that a few edges tell is good enough to follow all of them by.
+
+    Parameters
+    ----------
+    tilt : (`TILT_NUMBERS`,) float64
+        See `fit_and_judge`.
+    doubt : (3,) float64
+        Least lines that agree and least share of the votes; largest deviation of the lean (rad).
+    """
+    return bool(tilt[6] >= doubt[0] and tilt[7] >= doubt[1] and tilt[8] <= doubt[2])
+
+
+@njit(cache=True, error_model="numpy")
+def _put(numbers: NDArray[np.float64], at: int, values: NDArray[np.float64]) -> int:
+    """Copy values to an index; return the one behind them."""
+    for i in range(len(values)):
+        numbers[at + i] = values[i]
+    return at + len(values)
+
+
+@njit(cache=True, error_model="numpy")
+def _together(
+    polarity: NDArray[np.float64],
+    bounds: NDArray[np.int64],
+    row: NDArray[np.int32],
+    column: NDArray[np.float64],
+    score: NDArray[np.float32],
+    fits: NDArray[np.float64],
+    evidence: NDArray[np.float64],
+    fate: NDArray[np.int8],
+    tilt: NDArray[np.float64],
+    members: NDArray[np.int64],
+    member_bounds: NDArray[np.int64],
+    lines: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    tracks, points = len(polarity), len(row)
+    total = (
+        COUNTS + len(tilt) + 4 * tracks + 1 + len(fits) + 3 * points
+        + len(members) + len(member_bounds) + lines.size
+    )  # fmt: skip
+    numbers = np.empty(total)
+    numbers[0] = tracks
+    numbers[1] = points
+    numbers[2] = lines.shape[1]
+    numbers[3] = len(members)
+    at = _put(numbers, COUNTS, tilt)
+    at = _put(numbers, at, lines.reshape(-1))
+    for n in range(len(members)):
+        numbers[at + n] = members[n]
+    at += len(members)
+    for n in range(len(member_bounds)):
+        numbers[at + n] = member_bounds[n]
+    at += len(member_bounds)
+    at = _put(numbers, at, evidence)
+    for t in range(tracks):
+        numbers[at + t] = fate[t]
+    at += tracks
+    at = _put(numbers, at, fits)
+    at = _put(numbers, at, polarity)
+    for t in range(tracks + 1):
+        numbers[at + t] = bounds[t]
+    at += tracks + 1
+    for i in range(points):
+        numbers[at + i] = row[i]
+        numbers[at + points + i] = column[i]
+        numbers[at + 2 * points + i] = score[i]
+    return numbers
