@@ -32,8 +32,13 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
     # Matrices are small here: threads of BLAS would cost more than they save.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    command = parsed(sys.argv[1:] if arguments is None else arguments)
-    return exit_code_of(lambda: import_module(PERFORMED_BY[type(command)]).perform(command))
+    return exit_code_of(lambda: _perform(sys.argv[1:] if arguments is None else arguments))
+
+
+def _perform(arguments: Sequence[str]) -> int:
+    command = parsed(arguments)
+    code: int = import_module(PERFORMED_BY[type(command)]).perform(command)
+    return code
 
 
 def parsed(arguments: Sequence[str]) -> Command:

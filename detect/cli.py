@@ -48,10 +48,13 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
     with interrupts_noted() as interrupted:
         try:
-            command = parsed(sys.argv[1:] if arguments is None else arguments)
-            from detect.commands import carry_out
+            try:
+                command = parsed(sys.argv[1:] if arguments is None else arguments)
+                from detect.commands import carry_out
 
-            return carry_out(command)
+                return carry_out(command)
+            finally:
+                sys.stdout.flush()
         except KeyboardInterrupt:
             pass
         except (ValueError, OSError, WorkerError) as error:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import select
 import sys
 import traceback
 from collections.abc import Callable
@@ -14,6 +15,8 @@ from storage.messages import one_line
 EXIT_ERROR = 1
 #: It was interrupted from the keyboard.
 EXIT_INTERRUPTED = 130
+#: Nobody reads on what it prints (``| head``): what the system's own tools end with then.
+EXIT_UNREAD = 141
 
 
 def exit_code_of(work: Callable[[], int]) -> int:
@@ -30,10 +33,14 @@ def exit_code_of(work: Callable[[], int]) -> int:
     Returns
     -------
     int
-        The exit code of `work`, `EXIT_ERROR` or `EXIT_INTERRUPTED`.
+        The exit code of `work`, `EXIT_ERROR`, `EXIT_INTERRUPTED` or `EXIT_UNREAD`.
     """
     try:
-        return work()
+        try:
+            return work()
+        finally:
+            # What is still to be printed is part of the work: nobody may be reading it.
+            sys.stdout.flush()
     except KeyboardInterrupt:
         return say_interrupted()
     except (ValueError, OSError) as error:
@@ -41,7 +48,12 @@ def exit_code_of(work: Callable[[], int]) -> int:
 
 
 def say_error(error: BaseException | str) -> int:
-    """Say what was wrong; returns the exit code."""
+    """Say what was wrong; returns the exit code.
+
+    That nobody reads on what is printed is nothing to speak of.
+    """
+    if isinstance(error, BrokenPipeError) and _is_unread():
+        return EXIT_UNREAD
     print(f"error: {one_line(_said(error))}", file=sys.stderr)
     return EXIT_ERROR
 
@@ -50,6 +62,23 @@ def say_interrupted() -> int:
     """Say that there was an interrupt; returns the exit code."""
     print("interrupted", file=sys.stderr, flush=True)
     return EXIT_INTERRUPTED
+
+
+def _is_unread() -> bool:
+    """Whether standard output is a pipe that nobody reads; if so, it is led nowhere."""
+    try:
+        descriptor = sys.stdout.fileno()
+    except (AttributeError, OSError):
+        return False
+    poll = select.poll()
+    poll.register(descriptor, select.POLLOUT)
+    if not any(event & select.POLLERR for _, event in poll.poll(0)):
+        return False
+    # Python itself flushes once more when it ends.
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, descriptor)
+    os.close(nowhere)
+    return True
 
 
 def _said(error: BaseException | str) -> str:

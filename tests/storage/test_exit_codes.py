@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+
 import pytest
 
-from storage.exit_codes import EXIT_ERROR, EXIT_INTERRUPTED, exit_code_of
+from storage.exit_codes import EXIT_ERROR, EXIT_INTERRUPTED, EXIT_UNREAD, exit_code_of
 from storage.messages import OneLineError
 
 
@@ -47,3 +51,37 @@ def test_a_fault_of_the_program_is_not_hidden() -> None:
 
     with pytest.raises(KeyError):
         exit_code_of(work)
+
+
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+@pytest.mark.parametrize("lines", [1, 100_000])
+def test_nobody_reads_on_what_is_printed(lines: int, unbuffered: str) -> None:
+    """As with ``| head``: a quiet end, whether it shows while printing or at the last flush."""
+    code = f"""if True:
+        import sys
+        from storage.exit_codes import exit_code_of
+        sys.stdin.read()
+        sys.exit(exit_code_of(lambda: [print("row") for _ in range({lines})] and 0))
+    """
+    with subprocess.Popen(
+        [sys.executable, "-c", code],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        env={**os.environ, "PYTHONUNBUFFERED": unbuffered},
+    ) as process:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        assert process.stderr is not None
+        process.stdout.close()
+        process.stdin.close()
+        assert process.stderr.read() == b""
+    assert process.returncode == EXIT_UNREAD
+
+
+def test_a_pipe_of_ones_own_that_broke_is_an_error(capfd: pytest.CaptureFixture[str]) -> None:
+    def work() -> int:
+        raise BrokenPipeError(32, "Broken pipe", "elsewhere")
+
+    assert exit_code_of(work) == EXIT_ERROR
+    assert capfd.readouterr().err == "error: [Errno 32] Broken pipe: 'elsewhere'\n"
