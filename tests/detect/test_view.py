@@ -50,7 +50,7 @@ def read_back(recording: Path) -> dict[str, list[dict[str, Any]]]:
 
 def plain(column: Any) -> list[Any]:
     """A column's values; Python's own times know no nanoseconds."""
-    import pyarrow as pa
+    pa = pytest.importorskip("pyarrow")
 
     kinds = {pa.types.is_timestamp: pa.timestamp("us"), pa.types.is_duration: pa.duration("us")}
     for is_kind, microseconds in kinds.items():
