@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from camera import Camera
 from groundtruth.errors import GeometryError, GroundTruthError
 from groundtruth.geometry.transforms import inverse, log_se3, transform
-from groundtruth.markers.bundle import AdjustedBundle, Bundle, PosePrior, adjust_bundle
+from groundtruth.markers.adjustment import AdjustedBundle, adjust_bundle
+from groundtruth.markers.bundle import Bundle, PosePrior
 from groundtruth.markers.chain import ChainPoints
 from groundtruth.markers.checkerboard import Checkerboard
 from groundtruth.markers.pnp import solve_camera

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from camera import Camera
 from groundtruth.errors import GeometryError, GroundTruthError
 from groundtruth.geometry.transforms import inverse
-from groundtruth.markers.bundle import AdjustedBundle, Bundle, PosePrior, adjust_bundle
+from groundtruth.markers.adjustment import AdjustedBundle, adjust_bundle
+from groundtruth.markers.bundle import Bundle, PosePrior
 from groundtruth.markers.calibration import Rig
 from groundtruth.markers.chain import project_chain
 from groundtruth.markers.pairs import (

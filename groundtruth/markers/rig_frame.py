@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from groundtruth.errors import GeometryError, GroundTruthError
 from groundtruth.geometry.covariance import mean_pose
 from groundtruth.geometry.transforms import inverse, planar_transform
-from groundtruth.markers.bundle import PosePrior, adjust_bundle
+from groundtruth.markers.adjustment import adjust_bundle
+from groundtruth.markers.bundle import PosePrior
 from groundtruth.markers.calibration import Rig
 from groundtruth.markers.rig_estimation import RigEstimate
 from groundtruth.markers.settings import RigSettings

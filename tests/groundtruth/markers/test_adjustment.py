@@ -1,0 +1,249 @@
+"""Bundle adjustment: derivatives, elimination of bodies, and SciPy's minimum and covariances."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from groundtruth.errors import GeometryError
+from groundtruth.geometry.transforms import exp_se3, inverse, log_se3
+from groundtruth.markers.adjustment import adjust_bundle
+from groundtruth.markers.bundle import (
+    Bundle,
+    PosePrior,
+    Whiteners,
+    whitened_derivatives,
+    whitened_residuals,
+)
+from groundtruth.markers.chain import ChainPoints
+from groundtruth.markers.normal_equations import NormalEquations, normal_equations
+from tests.groundtruth.markers.scene import (
+    box_rig,
+    hall_cameras,
+    lens,
+    points_of,
+    robot_pose,
+    visible,
+)
+
+FloatArray = NDArray[np.float64]
+SIGMA_PX = 0.2
+
+
+def watched_robot(
+    *,
+    seed: int = 1,
+    times: int = 7,
+    free_cameras: bool = True,
+    free_bodies: bool = True,
+    free_parts: bool = True,
+    off: float = 0.01,
+) -> Bundle:
+    """A robot with markers before four cameras; the start is wrong by some centimetres."""
+    generator = np.random.default_rng(seed)
+    rig, cameras, world_from_camera = box_rig(), (lens(),) * 4, hall_cameras(4)
+    bodies: list[FloatArray] = []
+    pieces: list[ChainPoints] = []
+    views: list[NDArray[np.int64]] = []
+    while len(bodies) < times:
+        pose = robot_pose(generator)
+        pairs = visible(cameras, world_from_camera, pose, rig)
+        if len(pairs) < 3:
+            continue
+        seen, view = points_of(
+            pairs, cameras, world_from_camera, pose, rig, sigma_px=SIGMA_PX, noise=generator
+        )
+        pieces.append(replace(seen, body=np.full(len(seen), len(bodies))))
+        views.append(view + (int(views[-1].max()) + 1 if views else 0))
+        bodies.append(pose)
+    seen = ChainPoints(
+        *(
+            np.concatenate([getattr(piece, name) for piece in pieces])
+            for name in ("camera", "body", "part", "points", "pixels", "covariances")
+        )
+    )
+    # Points in another order than their poses: what belongs together need not stand together.
+    order = generator.permutation(len(seen))
+
+    def disturbed(poses: FloatArray, free: NDArray[np.bool_]) -> FloatArray:
+        steps = generator.normal(0.0, off, (len(poses), 6)) * free[:, None]
+        return np.asarray(poses @ exp_se3(steps))
+
+    free_camera = np.array([False, free_cameras, free_cameras, free_cameras])
+    free_body = np.array([free_bodies] * times)
+    free_part = np.array([False] + [free_parts] * (len(rig.ids) - 1))
+    priors: list[PosePrior] = []
+    if free_cameras:
+        known = world_from_camera[2] @ exp_se3(generator.normal(0.0, 1e-3, 6))
+        priors.append(PosePrior("camera", 2, known, 1e-6 * np.diag([1, 2, 3, 1, 1, 1.0])))
+    if free_parts:
+        known = rig.robot_from_marker[3] @ exp_se3(generator.normal(0.0, 1e-3, 6))
+        priors.append(PosePrior("part", 3, known, 1e-6 * np.eye(6)))
+    if free_bodies:
+        priors.append(PosePrior("body", 4, bodies[4], 1e-6 * np.eye(6)))
+    return Bundle(
+        cameras,
+        disturbed(world_from_camera, free_camera),
+        disturbed(np.stack(bodies), free_body),
+        disturbed(rig.robot_from_marker, free_part),
+        free_camera,
+        free_body,
+        free_part,
+        seen.only(order),
+        np.concatenate(views)[order],
+        tuple(priors),
+    )
+
+
+def moved(bundle: Bundle, x: FloatArray) -> Bundle:
+    """By all unknowns in one vector: cameras, parts, bodies."""
+    steps = x.reshape(-1, 6)
+    cameras, parts = int(bundle.free_camera.sum()), int(bundle.free_part.sum())
+    return bundle.moved(steps[:cameras], steps[cameras + parts :], steps[cameras : cameras + parts])
+
+
+def dense_jacobian(bundle: Bundle) -> FloatArray:
+    """By central differences."""
+    whiten, step = Whiteners.of(bundle), 1e-6
+    columns = []
+    for k in range(bundle.unknowns):
+        d = step * np.eye(bundle.unknowns)[k]
+        change = [whitened_residuals(moved(bundle, sign * d), whiten) for sign in (1, -1)]
+        columns.append((change[0] - change[1]) / (2.0 * step))
+    return np.stack(columns, axis=1)
+
+
+def equations_of(
+    bundle: Bundle, gradient_weights: FloatArray, curvature_weights: FloatArray
+) -> NormalEquations:
+    whiten = Whiteners.of(bundle)
+    return normal_equations(
+        bundle,
+        whitened_derivatives(bundle, whiten),
+        whitened_residuals(bundle, whiten),
+        gradient_weights,
+        curvature_weights,
+    )
+
+
+@pytest.mark.parametrize("fixed", ["nothing", "free_cameras", "free_bodies", "free_parts"])
+def test_the_normal_equations_are_those_of_finite_differences(fixed: str) -> None:
+    bundle = watched_robot(times=5, **({} if fixed == "nothing" else {fixed: False}))
+    jacobian = dense_jacobian(bundle)
+    residuals = whitened_residuals(bundle, Whiteners.of(bundle))
+    generator = np.random.default_rng(2)
+    weights = generator.uniform(0.2, 1.0, (2, len(residuals)))
+    found = equations_of(bundle, *weights)
+    matrix = jacobian.T @ (weights[1][:, None] * jacobian)
+    gradient = jacobian.T @ (weights[0] * residuals)
+    shared = found.shared.shape[0]
+    scale = np.sqrt(np.outer(np.diagonal(matrix), np.diagonal(matrix)))
+    whole = np.zeros_like(matrix)
+    whole[:shared, :shared] = found.shared
+    for b, (own, coupling) in enumerate(zip(found.bodies, found.coupling, strict=True)):
+        rows = slice(shared + 6 * b, shared + 6 * b + 6)
+        whole[rows, rows], whole[rows, :shared], whole[:shared, rows] = own, coupling, coupling.T
+    np.testing.assert_allclose(whole / scale, matrix / scale, atol=1e-6)
+    sizes = np.sqrt(np.diagonal(matrix))
+    both = np.concatenate([found.shared_gradient, found.body_gradient.ravel()])
+    np.testing.assert_allclose(both / sizes, gradient / sizes, atol=1e-3)
+    # The step by elimination is that of the whole matrix.
+    damping = 0.01 * np.diagonal(whole)
+    step = np.linalg.solve(whole + np.diag(damping), -both)
+    of_shared, of_bodies = found.step(damping[:shared], damping[shared:].reshape(-1, 6))
+    np.testing.assert_allclose(np.concatenate([of_shared, of_bodies.ravel()]), step, atol=1e-9)
+    information = np.linalg.inv(np.linalg.inv(whole)[:shared, :shared])
+    found_information = found.shared_information()
+    own = np.sqrt(np.diagonal(information))
+    np.testing.assert_allclose(
+        found_information / np.outer(own, own), information / np.outer(own, own), atol=1e-6
+    )
+
+
+def test_the_minimum_and_the_covariances_are_scipys() -> None:
+    bundle = watched_robot(times=5)
+    adjusted = adjust_bundle(bundle)
+    assert adjusted.used.all()
+    whiten = Whiteners.of(bundle)
+    solved = least_squares(
+        lambda x: whitened_residuals(moved(bundle, x), whiten),
+        np.zeros(bundle.unknowns),
+        x_scale="jac",
+        xtol=1e-12,
+        ftol=1e-12,
+    )
+    assert adjusted.cost == pytest.approx(2.0 * solved.cost, rel=1e-9)
+    best = moved(bundle, solved.x)
+    for mine, theirs in (
+        (adjusted.bundle.world_from_camera, best.world_from_camera),
+        (adjusted.bundle.world_from_body, best.world_from_body),
+        (adjusted.bundle.body_from_part, best.body_from_part),
+    ):
+        np.testing.assert_allclose(log_se3(inverse(theirs) @ mine), 0.0, atol=3e-7)
+    jacobian = dense_jacobian(adjusted.bundle)
+    covariance = np.linalg.inv(jacobian.T @ jacobian)
+    sigmas = np.sqrt(np.diagonal(covariance))
+    for found, begin, count in (
+        (adjusted.camera_covariance[6:, 6:], 0, 18),
+        (adjusted.part_covariance[6:, 6:], 18, 30),
+    ):
+        own = slice(begin, begin + count)
+        scale = np.outer(sigmas[own], sigmas[own])
+        np.testing.assert_allclose(found / scale, covariance[own, own] / scale, atol=1e-5)
+    np.testing.assert_array_equal(adjusted.camera_covariance[:6], 0.0)
+    assert adjusted.reduced_cost == pytest.approx(1.0, abs=0.35)
+
+
+def test_a_wrong_view_is_left_out_and_the_rest_is_as_without_it() -> None:
+    bundle = watched_robot(seed=3, times=8)
+    wrong = bundle.view == 5
+    pixels = bundle.seen.pixels.copy()
+    pixels[wrong] += [12.0, -9.0]
+    spoilt = replace(bundle, seen=replace(bundle.seen, pixels=pixels))
+    adjusted = adjust_bundle(spoilt)
+    np.testing.assert_array_equal(adjusted.used, ~wrong)
+    without = adjust_bundle(replace(bundle.only(~wrong), view=bundle.view[~wrong]))
+    np.testing.assert_allclose(
+        adjusted.bundle.body_from_part, without.bundle.body_from_part, atol=1e-8
+    )
+    assert adjusted.cost == pytest.approx(without.cost, rel=1e-9)
+
+
+def test_bodies_alone_and_shared_poses_alone_are_adjusted() -> None:
+    for fixed in ("cameras and parts", "bodies"):
+        of_bodies = fixed == "bodies"
+        bundle = watched_robot(
+            free_bodies=not of_bodies, free_cameras=of_bodies, free_parts=of_bodies
+        )
+        adjusted = adjust_bundle(bundle)
+        assert adjusted.reduced_cost == pytest.approx(1.0, abs=0.35)
+
+
+def test_a_far_start_is_brought_home() -> None:
+    """Some decimetres and 10 degrees off: the first steps are damped."""
+    bundle = watched_robot(seed=4, times=10, off=0.15)
+    adjusted = adjust_bundle(bundle)
+    assert adjusted.used.all()
+    assert adjusted.reduced_cost == pytest.approx(1.0, abs=0.35)
+
+
+def test_what_is_not_determined_is_refused() -> None:
+    bundle = replace(watched_robot(), priors=())
+    unseen = bundle.seen.part != 4
+    with pytest.raises(GeometryError, match="do not determine all poses"):
+        adjust_bundle(bundle.only(unseen))
+    # The whole may be moved about: nothing says where it is.
+    floating = replace(bundle, free_camera=np.ones(4, bool), free_part=np.ones(6, bool))
+    with pytest.raises(GeometryError, match="do not determine all poses"):
+        adjust_bundle(floating)
+    few = bundle.only(np.isin(np.arange(len(bundle.seen)), np.arange(8)))
+    with pytest.raises(GeometryError, match="16 residuals for 90 unknowns: too little was seen"):
+        adjust_bundle(few)
+    behind = replace(bundle, world_from_body=bundle.world_from_body.copy())
+    behind.world_from_body[0, :3, 3] += [0.0, 0.0, 50.0]
+    with pytest.raises(GeometryError, match="behind its camera or outside its lens"):
+        adjust_bundle(behind)
