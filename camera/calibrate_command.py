@@ -19,9 +19,7 @@ from camera.calibrate_pictures import pictures
 from camera.calibration import (
     BoardView,
     Calibration,
-    CalibrationSettings,
     calibrate,
-    coefficient_names,
 )
 from camera.calibration_checks import coverage
 from camera.calibration_floor import (
@@ -33,6 +31,7 @@ from camera.calibration_floor import (
 )
 from camera.calibration_model import INTRINSICS
 from camera.calibration_projection import projection_sigma
+from camera.calibration_settings import CalibrationSettings
 from camera.camfile import format_camera
 from camera.errors import CalibrationError, CameraError
 from camera.model import Camera
@@ -63,6 +62,7 @@ def perform(options: Calibrate) -> int:
     settings = CalibrationSettings(
         aspect=None if options.free_aspect else 0.5 if options.half else 1.0,
         coefficients=None if options.coefficients == "auto" else int(options.coefficients),
+        tangential={"auto": None, "on": True, "off": False}[options.tangential],
         keep_outliers=options.keep_outliers,
     )
     images = calibration_images(options.images, options.every, options.max_images)
@@ -139,13 +139,13 @@ def find_views(
 
 def camera_of(calibration: Calibration) -> Camera:
     """The calibrated camera, without a pose."""
-    sx, sy, ox, oy, a2, a3, b1, b2, b3 = (float(value) for value in calibration.intrinsics)
+    sx, sy, ox, oy, a2, a3, b1, b2, b3, p1, p2 = (float(x) for x in calibration.intrinsics)
     points = calibration.points
     try:
         return Camera(
             width=points.width, height=points.height,
             scale_x=sx, scale_y=sy, offset_x=ox, offset_y=oy, coef=(a2, a3, b1, b2, b3),
-            robot_from_camera=_IDENTITY, sensor_to_tcp=_IDENTITY,
+            robot_from_camera=_IDENTITY, sensor_to_tcp=_IDENTITY, tangential=(p1, p2),
         )  # fmt: skip
     except CameraError as error:
         raise CalibrationError(
@@ -197,12 +197,9 @@ def describe(calibration: Calibration, camera: Camera) -> str:
         f"RMS residual {calibration.adjusted.rms_px:.3f} px (u and v together), noise "
         f"{calibration.adjusted.sigma_px:.3f} px per coordinate"
     )
-    for count, error in calibration.holdout_px.items():
-        mark = " <- chosen" if count == calibration.coefficients else ""
-        lines.append(
-            f"RMS in pictures held out, coefficients {coefficient_names(count)}: {error:.3f} px"
-            f"{mark}"
-        )
+    for lens, error in calibration.holdout_px.items():
+        mark = " <- chosen" if lens == calibration.lens else ""
+        lines.append(f"RMS in pictures held out, coefficients {lens}: {error:.3f} px{mark}")
     spread = projection_sigma(camera, calibration.adjusted.covariance)
     lines.append(
         f"standard deviation of the projection: {np.median(spread):.3f} px (median over the "
@@ -249,12 +246,16 @@ def report_text(
         "intrinsics": dict(zip(INTRINSICS, calibration.intrinsics.tolist())),
         "sigma": dict(zip(INTRINSICS, np.sqrt(np.diag(adjusted.covariance)).tolist())),
         "covariance": adjusted.covariance.tolist(),
-        "coefficients": calibration.coefficients,
+        "coefficients": calibration.lens.coefficients,
+        "tangential": calibration.lens.tangential,
         "points": len(calibration.points.board),
         "rms_px": adjusted.rms_px,
         "sigma_px": adjusted.sigma_px,
         "holdout_rms_px": {
-            str(n): e if np.isfinite(e) else None for n, e in calibration.holdout_px.items()
+            f"{lens.coefficients} tangential" if lens.tangential else str(lens.coefficients): (
+                error if np.isfinite(error) else None
+            )
+            for lens, error in calibration.holdout_px.items()
         },
         "views": [
             {

@@ -9,19 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera.board import Board
-from camera.calibration_adjustment import (
-    Adjusted,
-    Estimate,
-    Points,
-    StartError,
-    adjust,
-    project_estimate,
-)
+from camera.calibration_adjustment import Adjusted, Estimate, Points, StartError, project_estimate
 from camera.calibration_checks import demand_different_views, demand_enough, warnings_of
-from camera.calibration_model import FREE_COEFFICIENTS, free_span, is_possible, project_points
+from camera.calibration_choice import choose_lens, of_views
+from camera.calibration_fit import circle_shifts, fit_points
+from camera.calibration_settings import CalibrationSettings, FreeLens
 from camera.calibration_start import best_poses, first_estimate, normals_spread_deg
 from camera.errors import CalibrationError
-from storage.bounds import ABOVE_0, demand, whole
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -30,11 +24,6 @@ _OUTLIER_FACTOR = 3.0
 # A point is wrong when it is so many standard deviations off.
 _WRONG_POINT = 8.0
 _FEWEST_POINTS = 8
-_FOLDS = 8
-# A coefficient more has to lower the sum of the squared hold-out errors by so many variances.
-_WORTH = 4.0
-_CIRCLE_ROUNDS = 3
-_OUTLINE_POINTS = 32
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,36 +45,6 @@ class BoardView:
     pixels: FloatArray
 
 
-@dataclass(frozen=True)
-class CalibrationSettings:
-    """How to calibrate.
-
-    Attributes
-    ----------
-    aspect : float or None
-        scaleY / scaleX: 1 for square pixels, 0.5 for every second line of them; None if both scales
-        are free.
-    coefficients : int or None
-        Number of free distortion coefficients (0 to 5); None: as many as make the hold-out error
-        smaller.
-    robust : bool
-        Huber's loss; points found wrongly pull less.
-    keep_outliers : bool
-        Keep pictures whose residuals are far above the others'.
-    """
-
-    aspect: float | None = 1.0
-    coefficients: int | None = None
-    robust: bool = True
-    keep_outliers: bool = False
-
-    def __post_init__(self) -> None:
-        if self.aspect is not None:
-            demand(self, CalibrationError, aspect=ABOVE_0)
-        if self.coefficients is not None:
-            demand(self, CalibrationError, coefficients=whole(0, 5))
-
-
 @dataclass(frozen=True, eq=False)
 class Calibration:
     """A calibrated camera.
@@ -99,11 +58,11 @@ class Calibration:
         The views' names.
     outliers : tuple of (str, float)
         Views left out, with the RMS of their residuals (px).
-    coefficients : int
-        Number of free distortion coefficients.
-    holdout_px : dict of int to float
+    lens : FreeLens
+        Which coefficients of the distortion are free.
+    holdout_px : dict of FreeLens to float
         RMS reprojection error (u and v together) in views that the intrinsics were not fitted to,
-        by number of coefficients.
+        by what was free; all that was tried.
     spread_deg : float
         Largest angle between two boards' normals.
     warnings : tuple of str
@@ -113,14 +72,14 @@ class Calibration:
     points: Points
     names: tuple[str, ...]
     outliers: tuple[tuple[str, float], ...]
-    coefficients: int
-    holdout_px: dict[int, float]
+    lens: FreeLens
+    holdout_px: dict[FreeLens, float]
     spread_deg: float
     warnings: tuple[str, ...] = field(default=())
 
     @property
     def intrinsics(self) -> FloatArray:
-        """(9,) scaleX, scaleY, offsetX, offsetY, a2, a3, b1, b2, b3."""
+        """(11,) scaleX, scaleY, offsetX, offsetY, a2, a3, b1, b2, b3, p1, p2."""
         return self.adjusted.estimate.intrinsics
 
     @property
@@ -174,7 +133,13 @@ def calibrate(
     # What a model lacks is no picture's fault, so outliers are told by the fullest one.
     most = 5 if settings.coefficients is None else settings.coefficients
     for count in range(min(2, most), most + 1):
-        first = fit_points(start, measured, settings, count, radius)
+        first = fit_points(start, measured, settings, FreeLens(count), radius)
+        start = first[0].estimate
+    # Before more is asked of views that can't tell.
+    demand_different_views(first[0], normals_spread_deg(start.rotations))
+    if settings.tangential is not False:
+        full = FreeLens(most, tangential=True)
+        first = fit_points(start, measured, settings, full, radius)
         start = first[0].estimate
     rms = _view_rms(*first)
     far = rms > _OUTLIER_FACTOR * np.median(rms)
@@ -187,22 +152,15 @@ def calibrate(
         start = of_views(start, kept)
     measured, wrong = _without_wrong_points(start, measured, first[0].sigma_px, settings, radius)
 
-    counts = range(6) if settings.coefficients is None else [settings.coefficients]
-    fits: dict[int, tuple[Adjusted, Points]] = {}
-    holdout: dict[int, float] = {}
-    estimate = start
-    for count in counts:
-        fits[count] = fit_points(estimate, measured, settings, count, radius)
-        estimate = fits[count][0].estimate
-        holdout[count] = holdout_error(fits[count][0].estimate, fits[count][1], settings, count)
-    chosen = _fewest_needed(holdout, measured, fits)
-    adjusted, points = fits[chosen]
+    lens, tried = choose_lens(start, measured, settings, radius)
+    adjusted, points = tried[lens].adjusted, tried[lens].points
     spread = normals_spread_deg(adjusted.estimate.rotations)
     demand_different_views(adjusted, spread)
     warnings = warnings_of(adjusted, points, spread)
     if wrong:
         warnings.insert(0, f"{wrong} points left out: they lie far from where the others say")
-    return Calibration(adjusted, points, names, outliers, chosen, holdout, spread, tuple(warnings))
+    holdout = {free: candidate.holdout_px for free, candidate in tried.items()}
+    return Calibration(adjusted, points, names, outliers, lens, holdout, spread, tuple(warnings))
 
 
 def points_of(views: Sequence[BoardView], board: Board, size: tuple[int, int]) -> Points:
@@ -217,128 +175,14 @@ def points_of(views: Sequence[BoardView], board: Board, size: tuple[int, int]) -
     )
 
 
-def of_views(estimate: Estimate, views: IntArray) -> Estimate:
-    """An estimate with the poses of some views only."""
-    return Estimate(estimate.intrinsics, estimate.rotations[views], estimate.translations[views])
-
-
-def holdout_error(
-    estimate: Estimate,
-    points: Points,
-    settings: CalibrationSettings,
-    count: int,
-    folds: Sequence[IntArray] | None = None,
-) -> float:
-    """RMS reprojection error in views that the intrinsics were not fitted to, pixels.
-
-    Of what is held out only the poses are fitted.
-
-    Parameters
-    ----------
-    estimate : Estimate
-        Where each fit begins.
-    points : Points
-    settings : CalibrationSettings
-    count : int
-        Number of free coefficients.
-    folds : sequence of int64 arrays, optional
-        The views that are held out together; each view in one of them. Else every `_FOLDS`-th
-        (each on its own where there are few).
-    """
-    every = np.arange(len(points.starts))
-    if folds is None:
-        number = min(_FOLDS, len(every))
-        folds = [every[every % number == fold] for fold in range(number)]
-    squares = 0.0
-    span, nothing = free_span(count, settings.aspect), np.zeros((9, 0))
-    for out in folds:
-        used = np.setdiff1d(every, out)
-        fit = adjust(of_views(estimate, used), points.of(used), span, robust=settings.robust)
-        held = points.of(out)
-        there = replace(of_views(estimate, out), intrinsics=fit.estimate.intrinsics)
-        try:
-            test = adjust(there, held, nothing, robust=settings.robust, sigma_px=fit.sigma_px)
-        except StartError:  # a held-out point lies past this fit's fold
-            return float("inf")
-        squares += float(np.sum(test.residuals**2))
-    return float(np.sqrt(squares / len(points.board)))
-
-
-def circle_shifts(estimate: Estimate, points: Points, radius_m: float) -> FloatArray:
-    """Where the centroids of circles' images lie, seen from the images of their centres.
-
-    Parameters
-    ----------
-    estimate : Estimate
-    points : Points
-    radius_m : float
-        Radius of the circles.
-
-    Returns
-    -------
-    (N, 2) array
-        Pixels; area centroids of the outlines' images, distortion included.
-    """
-    angles = np.arange(_OUTLINE_POINTS) * (2.0 * np.pi / _OUTLINE_POINTS)
-    ring = radius_m * np.stack([np.cos(angles), np.sin(angles), np.zeros_like(angles)], axis=-1)
-    view = points.views
-    on_board = points.board[:, None, :] + ring
-    in_camera = np.einsum("nij,nkj->nki", estimate.rotations[view], on_board)
-    in_camera += estimate.translations[view][:, None, :]
-    outline = project_points(estimate.intrinsics, in_camera.reshape(-1, 3))[0]
-    outline = outline.reshape(len(view), _OUTLINE_POINTS, 2)
-    centre = project_estimate(estimate, points)[0]
-    relative = outline - centre[:, None, :]
-    following = np.roll(relative, -1, axis=1)
-    cross = relative[..., 0] * following[..., 1] - following[..., 0] * relative[..., 1]
-    moment = np.sum((relative + following) * cross[..., None], axis=1)
-    return np.asarray(moment / (3.0 * np.sum(cross, axis=1))[:, None])
-
-
 def _staged(
     start: Estimate, points: Points, settings: CalibrationSettings, radius_m: float
 ) -> Estimate:
     """One and then two coefficients, with the poses' second solutions tried in between."""
     for count in (1, min(2, 2 if settings.coefficients is None else settings.coefficients)):
-        estimate = fit_points(start, points, settings, count, radius_m)[0].estimate
+        estimate = fit_points(start, points, settings, FreeLens(count), radius_m)[0].estimate
         start = best_poses(estimate, points)
     return start
-
-
-def fit_points(
-    start: Estimate, points: Points, settings: CalibrationSettings, count: int, radius_m: float
-) -> tuple[Adjusted, Points]:
-    """Adjust intrinsics and poses; of circles, to their centroids.
-
-    Parameters
-    ----------
-    start : Estimate
-    points : Points
-    settings : CalibrationSettings
-    count : int
-        Number of free coefficients.
-    radius_m : float
-        Radius of the circles; 0 for points.
-
-    Returns
-    -------
-    fit : Adjusted
-    points : Points
-        With the circles' shifts taken off (`circle_shifts`).
-    """
-    span = free_span(count, settings.aspect)
-    start = replace(start, intrinsics=_within(start.intrinsics, points, span, settings.aspect))
-    fit = adjust(start, points, span, robust=settings.robust)
-    if radius_m == 0.0:
-        return fit, points
-    corrected = points
-    for _ in range(_CIRCLE_ROUNDS):
-        shifts = circle_shifts(fit.estimate, points, radius_m)
-        if not np.all(np.isfinite(shifts)):
-            break
-        corrected = replace(points, pixels=points.pixels - shifts)
-        fit = adjust(fit.estimate, corrected, span, robust=settings.robust)
-    return fit, corrected
 
 
 def _without_wrong_points(
@@ -370,30 +214,6 @@ def _without_wrong_points(
     return trimmed, int(np.sum(~right))
 
 
-def _within(
-    intrinsics: FloatArray, points: Points, span: FloatArray, aspect: float | None
-) -> FloatArray:
-    """The start with what is not free at its fixed value: no coefficient, the known aspect."""
-    free = np.any(span != 0.0, axis=1)
-    inside = np.where(free, intrinsics, 0.0)
-    if aspect is not None:
-        inside[1] = aspect * inside[0]
-    return inside if is_possible(inside, points.width, points.height) else intrinsics
-
-
 def _view_rms(fit: Adjusted, points: Points) -> FloatArray:
     squares = np.sum(fit.residuals**2, axis=1)
     return np.asarray(np.sqrt(np.add.reduceat(squares, points.starts) / points.counts))
-
-
-def _fewest_needed(
-    holdout: dict[int, float], points: Points, fits: dict[int, tuple[Adjusted, Points]]
-) -> int:
-    best = min(holdout, key=lambda count: holdout[count])
-    slack = _WORTH * fits[best][0].sigma_px ** 2 / len(points.board)
-    return min(n for n, error in holdout.items() if error**2 <= holdout[best] ** 2 + slack)
-
-
-def coefficient_names(count: int) -> str:
-    """The free coefficients, for people."""
-    return " ".join(FREE_COEFFICIENTS[count]) or "none"

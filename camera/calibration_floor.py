@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera.calibration_adjustment import Estimate, Points, adjust, project_estimate
-from camera.calibration_model import cross_matrices
+from camera.calibration_model import COUNT, cross_matrices
 from camera.calibration_projection import intrinsics_of
 from camera.calibration_start import best_poses, board_poses
 from camera.errors import CalibrationError
@@ -91,8 +91,8 @@ def place_on_floor(
         Where the points are seen.
     floor_xy : (N, 2) array
         Where they are, robot X and Y in metres.
-    intrinsics_covariance : (9, 9) array, optional
-        Of scaleX ... b3; zero if not given.
+    intrinsics_covariance : (11, 11) array, optional
+        Of scaleX ... p2; zero if not given.
 
     Returns
     -------
@@ -110,7 +110,7 @@ def place_on_floor(
     start = Estimate(intrinsics, *board_poses(intrinsics, points))
     try:
         # Without robustness at first: four points have no residuals to tell outliers by.
-        fit = adjust(best_poses(start, points), points, np.zeros((9, 0)), robust=len(floor) > 8)
+        fit = adjust(best_poses(start, points), points, np.zeros((COUNT, 0)), robust=len(floor) > 8)
     except ValueError:
         raise CalibrationError(
             "no pose of the camera sees the floor's points where they are: are they in the order "
@@ -126,7 +126,7 @@ def place_on_floor(
     covariance = fit.pose_covariances[0]
     if intrinsics_covariance is not None:
         _, by_intrinsics, by_pose = project_estimate(estimate, points)
-        gain = np.linalg.pinv(by_pose.reshape(-1, 6)) @ by_intrinsics.reshape(-1, 9)
+        gain = np.linalg.pinv(by_pose.reshape(-1, 6)) @ by_intrinsics.reshape(-1, COUNT)
         covariance = covariance + gain @ intrinsics_covariance @ gain.T
     # From (rotation from the left in the camera frame, translation) of camera_from_robot.
     # R' = R exp(-w), t' = -R exp(-w) (T + dT): dt = -R dT + R (w x T).

@@ -1,8 +1,8 @@
 """What a calibration adjusts: the projection with its derivatives, rigid poses, and the parameters.
 
-Intrinsics are always the vector ``(scaleX, scaleY, offsetX, offsetY, a2, a3, b1, b2, b3)``, the
-order of the ``.cam`` file. What is free of them is a matrix `span`, so that equal scales are one
-column and a coefficient that is left at 0 has none.
+Intrinsics are always the vector ``(scaleX, scaleY, offsetX, offsetY, a2, a3, b1, b2, b3, p1, p2)``,
+the order of the ``.cam`` file. What is free of them is a matrix `span`, so that equal scales are
+one column and a coefficient that is left at 0 has none.
 """
 
 from __future__ import annotations
@@ -10,15 +10,28 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from camera.distortion import Coef, fold_radius
+from camera.distortion import Coef, fold_radius, radial_factor
+from camera.model_checks import border_pixels
+from camera.tangential import (
+    Tangential,
+    one_to_one_radius,
+    tangential_jacobian,
+    tangential_shift,
+)
 
 FloatArray = NDArray[np.float64]
 
 #: Names of the intrinsics, in order.
-INTRINSICS = ("scaleX", "scaleY", "offsetX", "offsetY", "a2", "a3", "b1", "b2", "b3")
+INTRINSICS = ("scaleX", "scaleY", "offsetX", "offsetY", "a2", "a3", "b1", "b2", "b3", "p1", "p2")
 
-#: Power of r that each distortion coefficient goes with.
-POWERS = np.array([1.0, 2.0, 1.0, 2.0, 3.0])
+#: Their number.
+COUNT = len(INTRINSICS)
+
+#: Names of the tangential terms.
+TANGENTIAL = ("p1", "p2")
+
+#: Power of r that each distortion coefficient goes with, relative to the radius.
+POWERS = np.array([1.0, 2.0, 1.0, 2.0, 3.0, 1.0, 1.0])
 
 #: Which coefficients are free, by their number: even powers first, for a lens is smooth in its
 #: middle; then what the published camera needs.
@@ -33,6 +46,10 @@ FREE_COEFFICIENTS: tuple[tuple[str, ...], ...] = (
 
 # The image's corner must be seen at a radius that stays below the fold by this share.
 _FOLD_MARGIN = 0.01
+# Directions in which it is looked how far a decentred lens sees, and places on each of the border's
+# sides.
+_DIRECTIONS = 128
+_BORDER_PLACES = 9
 
 
 def coefficients(intrinsics: FloatArray) -> Coef:
@@ -41,7 +58,12 @@ def coefficients(intrinsics: FloatArray) -> Coef:
     return a2, a3, b1, b2, b3
 
 
-def free_span(count: int, aspect: float | None) -> FloatArray:
+def tangential_of(intrinsics: FloatArray) -> Tangential:
+    """The distortion's (p1, p2) of an intrinsics vector."""
+    return float(intrinsics[9]), float(intrinsics[10])
+
+
+def free_span(count: int, aspect: float | None, *, tangential: bool = False) -> FloatArray:
     """Directions in which intrinsics may change.
 
     Parameters
@@ -51,17 +73,19 @@ def free_span(count: int, aspect: float | None) -> FloatArray:
     aspect : float or None
         scaleY / scaleX if that is known (1 for square pixels, 0.5 for single fields); None if both
         scales are free.
+    tangential : bool
+        Whether p1 and p2 are free.
 
     Returns
     -------
-    (9, K) array
+    (11, K) array
         Its columns span the free parameters; each is a unit vector but that of tied scales.
     """
-    names = ["offsetX", "offsetY", *FREE_COEFFICIENTS[count]]
-    scales = np.zeros((9, 1 if aspect is not None else 2))
+    names = ["offsetX", "offsetY", *FREE_COEFFICIENTS[count], *(TANGENTIAL if tangential else ())]
+    scales = np.zeros((COUNT, 1 if aspect is not None else 2))
     scales[0, 0] = 1.0
     scales[1, -1] = 1.0 if aspect is None else aspect
-    return np.hstack([scales, np.eye(9)[:, [INTRINSICS.index(name) for name in names]]])
+    return np.hstack([scales, np.eye(COUNT)[:, [INTRINSICS.index(name) for name in names]]])
 
 
 def project_points(
@@ -71,7 +95,7 @@ def project_points(
 
     Parameters
     ----------
-    intrinsics : (9,) array
+    intrinsics : (11,) array
     points_camera : (N, 3) array
         Metres.
 
@@ -79,7 +103,7 @@ def project_points(
     -------
     pixels : (N, 2) array
         NaN for points that are not in front of the camera or past the distortion's fold.
-    by_intrinsics : (N, 2, 9) array
+    by_intrinsics : (N, 2, 11) array
         d(u, v) / d(intrinsics).
     by_point : (N, 2, 3) array
         d(u, v) / d(point), pixels per metre.
@@ -89,39 +113,55 @@ def project_points(
     z = np.where(points_camera[:, 2] > 0.0, points_camera[:, 2], np.nan)
     xy = points_camera[:, :2] / z[:, None]
     r = np.hypot(xy[:, 0], xy[:, 1])
-    r = np.where(r <= fold_radius((a2, a3, b1, b2, b3)), r, np.nan)
+    tangential = tangential_of(intrinsics)
+    r = np.where(r <= one_to_one_radius((a2, a3, b1, b2, b3), tangential), r, np.nan)
     numerator = r * (a2 + r * a3)
     denominator = 1.0 + r * (b1 + r * (b2 + r * b3))
     ratio = numerator / denominator
     factor = 1.0 + ratio
     slope = (a2 + 2.0 * a3 * r - ratio * (b1 + r * (2.0 * b2 + 3.0 * b3 * r))) / denominator
 
-    by_intrinsics = np.zeros((len(r), 2, 9))
     by_factor = scale * xy
-    by_intrinsics[:, 0, 0] = xy[:, 0] * factor
-    by_intrinsics[:, 1, 1] = xy[:, 1] * factor
+    by_intrinsics = np.zeros((len(r), 2, COUNT))
+    seen = xy * factor[:, None]
+    pixels = by_factor * factor[:, None] + offset
+    if any(tangential):
+        shift = tangential_shift(xy, tangential)
+        seen, pixels = seen + shift, pixels + scale * shift
+    by_intrinsics[:, 0, 0] = seen[:, 0]
+    by_intrinsics[:, 1, 1] = seen[:, 1]
     by_intrinsics[:, 0, 2] = by_intrinsics[:, 1, 3] = 1.0
     by_coefficient = np.stack(
         [r, r**2, -ratio * r, -ratio * r**2, -ratio * r**3], axis=-1
     ) / denominator[:, None]  # fmt: skip
-    by_intrinsics[:, :, 4:] = by_factor[:, :, None] * by_coefficient[:, None, :]
+    by_intrinsics[:, :, 4:9] = by_factor[:, :, None] * by_coefficient[:, None, :]
+
+    squared, product = r**2, 2.0 * xy[:, 0] * xy[:, 1]
+    by_intrinsics[:, 0, 9] = scale[0] * product
+    by_intrinsics[:, 1, 9] = scale[1] * (squared + 2.0 * xy[:, 1] ** 2)
+    by_intrinsics[:, 0, 10] = scale[0] * (squared + 2.0 * xy[:, 0] ** 2)
+    by_intrinsics[:, 1, 10] = scale[1] * product
 
     unit = xy / np.where(r > 0.0, r, 1.0)[:, None]
     by_xy = slope[:, None, None] * xy[:, :, None] * unit[:, None, :]
     by_xy[:, 0, 0] += factor
     by_xy[:, 1, 1] += factor
+    if any(tangential):
+        by_xy += tangential_jacobian(xy, tangential)
     by_xy *= scale[:, None]
     by_point = np.empty((len(r), 2, 3))
     by_point[:, :, :2] = by_xy / z[:, None, None]
     by_point[:, :, 2] = -(by_xy @ xy[:, :, None])[:, :, 0] / z[:, None]
-    return by_factor * factor[:, None] + offset, by_intrinsics, by_point
+    return pixels, by_intrinsics, by_point
 
 
 def is_possible(intrinsics: FloatArray, width: int, height: int) -> bool:
-    """Whether scales are positive and the distortion grows beyond the image's farthest corner."""
+    """Whether scales are positive and the distortion grows beyond the image's border."""
     if not np.all(np.isfinite(intrinsics)) or min(intrinsics[:2]) <= 0.0:
         return False
-    coef = coefficients(intrinsics)
+    coef, tangential = coefficients(intrinsics), tangential_of(intrinsics)
+    if any(tangential):
+        return _holds_border(intrinsics, coef, tangential, width, height)
     fold = fold_radius(coef)
     if not np.isfinite(fold):
         # r f(r) grows without end, but towards a limit where the coefficients make f fall as 1 / r.
@@ -130,6 +170,25 @@ def is_possible(intrinsics: FloatArray, width: int, height: int) -> bool:
     factor = 1.0 + fold * (a2 + fold * a3) / (1.0 + fold * (b1 + fold * (b2 + fold * b3)))
     corner = corner_radius(intrinsics, width, height)
     return bool(corner * (1.0 + _FOLD_MARGIN) < fold * factor)
+
+
+def _holds_border(
+    intrinsics: FloatArray, coef: Coef, tangential: Tangential, width: int, height: int
+) -> bool:
+    """Whether the image lies within what a decentred lens sees up to where it folds."""
+    r_max = one_to_one_radius(coef, tangential)
+    angle = np.linspace(-np.pi, np.pi, _DIRECTIONS)
+    edge = r_max * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    edge = edge * radial_factor(np.array(r_max), coef) + tangential_shift(edge, tangential)
+    border = border_pixels(width, height, _BORDER_PLACES)
+    border = (border - intrinsics[2:4]) / intrinsics[:2]
+    reach = np.interp(
+        np.arctan2(border[:, 1], border[:, 0]),
+        np.unwrap(np.arctan2(edge[:, 1], edge[:, 0])),
+        np.hypot(edge[:, 0], edge[:, 1]),
+        period=2.0 * np.pi,
+    )
+    return bool(np.all(np.hypot(border[:, 0], border[:, 1]) * (1.0 + _FOLD_MARGIN) < reach))
 
 
 def corner_radius(intrinsics: FloatArray, width: int, height: int) -> float:

@@ -6,10 +6,12 @@ it up; so what is common with a rotation is taken off, as mrcal does.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
-from camera.calibration_model import cross_matrices, project_points, rotation_of
+from camera.calibration_model import COUNT, cross_matrices, project_points, rotation_of
 from camera.model import Camera
 
 FloatArray = NDArray[np.float64]
@@ -22,10 +24,18 @@ def pixel_grid(width: int, height: int, columns: int = 49, rows: int = 37) -> Fl
 
 
 def intrinsics_of(camera: Camera) -> FloatArray:
-    """(9,) scaleX, scaleY, offsetX, offsetY, a2, a3, b1, b2, b3 of a camera."""
-    return np.array(
-        [camera.scale_x, camera.scale_y, camera.offset_x, camera.offset_y, *camera.coef]
-    )
+    """(11,) scaleX, scaleY, offsetX, offsetY, a2, a3, b1, b2, b3, p1, p2 of a camera."""
+    pinhole = (camera.scale_x, camera.scale_y, camera.offset_x, camera.offset_y)
+    return np.array([*pinhole, *camera.coef, *camera.tangential])
+
+
+def with_intrinsics(camera: Camera, intrinsics: FloatArray) -> Camera:
+    """The camera with other intrinsics, an array as of `intrinsics_of`."""
+    sx, sy, ox, oy, a2, a3, b1, b2, b3, p1, p2 = (float(value) for value in intrinsics)
+    return replace(
+        camera, scale_x=sx, scale_y=sy, offset_x=ox, offset_y=oy, coef=(a2, a3, b1, b2, b3),
+        tangential=(p1, p2),
+    )  # fmt: skip
 
 
 def projection_sigma(
@@ -36,7 +46,7 @@ def projection_sigma(
     Parameters
     ----------
     camera : Camera
-    covariance : (9, 9) array
+    covariance : (11, 11) array
         Of its intrinsics.
     columns, rows : int
         Of the grid of pixels.
@@ -48,7 +58,7 @@ def projection_sigma(
     """
     rays = camera.unproject(pixel_grid(camera.width, camera.height, columns, rows))
     _, by_intrinsics, by_point = project_points(intrinsics_of(camera), rays)
-    J = by_intrinsics.reshape(-1, 9)
+    J = by_intrinsics.reshape(-1, COUNT)
     turn = (-by_point @ cross_matrices(rays)).reshape(-1, 3)
     J = J - turn @ np.linalg.lstsq(turn, J, rcond=None)[0]
     variance = np.einsum("ni,ij,nj->n", J, covariance, J).reshape(-1, 2).sum(axis=1)

@@ -15,8 +15,9 @@ from camera.calibration_adjustment import (
     adjust,
     project_estimate,
 )
-from camera.calibration_model import free_span
+from camera.calibration_model import COUNT, coefficients, free_span, tangential_of
 from camera.distortion import undistorted_radius
+from camera.tangential import one_to_one_radius, straightened
 
 FloatArray = NDArray[np.float64]
 
@@ -48,7 +49,7 @@ def first_estimate(points: Points, aspect: float | None) -> Estimate:
     for widths in _FOCAL_WIDTHS:
         focal = widths * points.width
         intrinsics = np.array(
-            [focal, ratio * focal, 0.5 * (points.width - 1), 0.5 * (points.height - 1), *[0.0] * 5]
+            [focal, ratio * focal, 0.5 * (points.width - 1), 0.5 * (points.height - 1), *[0.0] * 7]
         )
         start = Estimate(intrinsics, *board_poses(intrinsics, few))
         try:
@@ -67,11 +68,16 @@ def board_poses(intrinsics: FloatArray, points: Points) -> tuple[FloatArray, Flo
     """`camera_from_board` of each view, (V, 3, 3) and (V, 3), by its homography."""
     normalised = (points.pixels - intrinsics[2:4]) / intrinsics[:2]
     radius = np.hypot(normalised[:, 0], normalised[:, 1])
-    a2, a3, b1, b2, b3 = (float(c) for c in intrinsics[4:])
-    straight = undistorted_radius(radius, (a2, a3, b1, b2, b3))
-    # A point past the fold stays where it is: this is but a start.
-    straight = np.where(np.isnan(straight), radius, straight)
-    normalised = normalised * (straight / np.where(radius > 0.0, radius, 1.0))[:, None]
+    coef, tangential = coefficients(intrinsics), tangential_of(intrinsics)
+    if any(tangential):
+        r_max = one_to_one_radius(coef, tangential)
+        straight_xy = straightened(normalised, coef, tangential, r_max)
+        normalised = np.where(np.isnan(straight_xy), normalised, straight_xy)
+    else:
+        straight = undistorted_radius(radius, coef)
+        # A point past the fold stays where it is: this is but a start.
+        straight = np.where(np.isnan(straight), radius, straight)
+        normalised = normalised * (straight / np.where(radius > 0.0, radius, 1.0))[:, None]
     poses = [
         _pose_from_homography(points.board[s : s + n], normalised[s : s + n])
         for s, n in zip(points.starts, points.counts)
@@ -121,7 +127,7 @@ def best_poses(estimate: Estimate, points: Points, sigma_px: float | None = None
 
 def _poses_alone(estimate: Estimate, points: Points, sigma_px: float | None) -> Estimate:
     """Refine poses, all at once or, where one has no start, one by one; that one stays as it is."""
-    nothing = np.zeros((9, 0))
+    nothing = np.zeros((COUNT, 0))
     try:
         return adjust(estimate, points, nothing, sigma_px=sigma_px, tolerance=_LOOSE).estimate
     except (StartError, np.linalg.LinAlgError):

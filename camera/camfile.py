@@ -1,7 +1,8 @@
 """Reading and writing ``.cam`` files (``SmRadialDistortedCamera``).
 
 The grammar is the data set's, read generously: any white space, commas or none, keys in any order,
-``#`` comments. Keys that mean nothing here are kept and written back.
+``#`` comments. Keys that mean nothing here are kept and written back. One key is this project's:
+``tangential: { p1 p2 }``, written only for a lens that has such terms.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from pathlib import Path
 
 from camera.errors import CameraError
 from camera.model import Camera, Pose
+from camera.tangential import NONE
 from storage import write_whole
 from storage.bounded import read_bounded
 
@@ -82,6 +84,7 @@ def parse_camera(text: str, name: str = "<text>") -> Camera:
     scale_x, scale_y = numbers("scaleX", 1)[0], numbers("scaleY", 1)[0]
     offset_x, offset_y = numbers("offsetX", 1)[0], numbers("offsetY", 1)[0]
     a2, a3, b1, b2, b3 = numbers("coef", 5)
+    p1, p2 = numbers("tangential", 2) if "tangential" in entries else NONE
     unknown = tuple((key, " ".join(token for token, _ in value)) for key, value in entries.items())
     try:
         return Camera(
@@ -96,6 +99,7 @@ def parse_camera(text: str, name: str = "<text>") -> Camera:
             sensor_to_tcp=tcp,
             mount_index=mount_index,
             unknown=unknown,
+            tangential=(p1, p2),
         )
     except CameraError as error:
         raise CameraError(f"{name}: {error}") from None
@@ -114,6 +118,8 @@ def format_camera(camera: Camera) -> str:
         f"offsetX: {_shortest(camera.offset_x)} offsetY: {_shortest(camera.offset_y)}"
     )
     lines.append(f"coef: {{ {' '.join(_shortest(c) for c in camera.coef)} }}")
+    if camera.decentred:
+        lines.append(f"tangential: {{ {' '.join(_shortest(p) for p in camera.tangential)} }}")
     lines += [f"{key}: {text}" for key, text in camera.unknown]
     return "\n".join([*lines, "}", ""])
 

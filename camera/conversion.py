@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera.calibration_model import free_span, is_possible, project_points
-from camera.conversion_models import COEFFICIENTS, ForeignCamera, Model
+from camera.conversion_models import COEFFICIENTS, P1, ForeignCamera, Model
 from camera.errors import CameraError, ConversionError
 from camera.model import Camera
+from camera.tangential import NONE, Tangential
 
 FloatArray = NDArray[np.float64]
 AnyCamera = Camera | ForeignCamera
@@ -76,8 +77,8 @@ def convert_to_foreign(
     rows : str
         `same`, `halve` or `double`.
     free : int
-        Number of the model's first coefficients that may differ from 0; -1: those that a radially
-        symmetric lens needs, and the tangential ones.
+        Number of the model's first coefficients that may differ from 0; -1: the radial and the
+        tangential ones, but not a thin prism's.
 
     Returns
     -------
@@ -108,6 +109,8 @@ def convert_to_foreign(
     rays = _rays(source, source_pixels(pixels, rows))
     fx, fy, cx, cy = _pinhole(source)
     start = np.concatenate([[fx, fy * factor, cx, cy * factor], np.zeros(COEFFICIENTS[model])])
+    if model != "fisheye":
+        start[4 + P1 : 4 + P1 + 2] = _tangential(source)
 
     def camera_of(parameters: FloatArray) -> ForeignCamera:
         fx, fy, cx, cy, *distortion = (float(value) for value in parameters)
@@ -140,7 +143,7 @@ def convert_to_foreign(
 def convert_to_camera(
     source: AnyCamera, rows: Rows = "same", pose: Camera | None = None
 ) -> Converted:
-    """Fit the project's rational radial model.
+    """Fit the project's model: the radial part, the tangential terms being taken over.
 
     Parameters
     ----------
@@ -169,13 +172,16 @@ def convert_to_camera(
     factor = {"same": 1.0, "halve": 0.5, "double": 2.0}[rows]
 
     def camera_of(p: FloatArray) -> Camera:
-        sx, sy, ox, oy, a2, a3, b1, b2, b3 = (float(value) for value in p)
-        return Camera(width, height, sx, sy, ox, oy, (a2, a3, b1, b2, b3), placed, tcp, mount)
+        sx, sy, ox, oy, a2, a3, b1, b2, b3, p1, p2 = (float(value) for value in p)
+        return Camera(
+            width, height, sx, sy, ox, oy, (a2, a3, b1, b2, b3), placed, tcp, mount,
+            tangential=(p1, p2),
+        )  # fmt: skip
 
     fx, fy, cx, cy = _pinhole(source)
-    start = np.array([fx, fy * factor, cx, cy * factor, *[0.0] * 5])
+    start = np.array([fx, fy * factor, cx, cy * factor, *[0.0] * 5, *_tangential(source)])
     if isinstance(source, Camera):
-        start[4:] = source.coef
+        start[4:9] = source.coef
         return _measured(camera_of(start), _check(source, rows))
     check = _check(source, rows)
     pixels = _grid(width, height, _FIT_GRID)
@@ -192,6 +198,9 @@ def convert_to_camera(
     if not possible(start):
         raise ConversionError("the source's focal lengths or principal point are not possible here")
     spans = [free_span(count, None) for count in range(6)]
+    if any(_tangential(source)):
+        # Last, the terms taken over may make up for what the radial part can't follow.
+        spans.append(free_span(5, None, tangential=True))
     best = _nearest(project, camera_of, start, spans, pixels, possible, check)
     if best is None:
         raise ConversionError("no camera of the project's model sees what the source sees")
@@ -251,11 +260,13 @@ def _stages(model: Model, number: int) -> list[int]:
 def _contained(source: AnyCamera, model: Model, number: int) -> ForeignCamera | None:
     """The source itself in the target's model, where that holds it."""
     if isinstance(source, Camera):
-        if any(source.coef[:2]) or model == "fisheye":
+        if any(source.coef[:2]) or model == "fisheye" or (source.decentred and number < P1 + 2):
             return None
         fx, fy, cx, cy = _pinhole(source)
-        zero = (0.0,) * COEFFICIENTS[model]
-        return ForeignCamera(model, source.width, source.height, fx, fy, cx, cy, zero)
+        distortion = np.zeros(COEFFICIENTS[model])
+        distortion[P1 : P1 + 2] = source.tangential
+        found = tuple(distortion.tolist())
+        return ForeignCamera(model, source.width, source.height, fx, fy, cx, cy, found)
     if (source.model == "fisheye") != (model == "fisheye"):
         return None
     room = COEFFICIENTS[model]
@@ -263,6 +274,15 @@ def _contained(source: AnyCamera, model: Model, number: int) -> ForeignCamera | 
     if any(source.distortion[room:]) or any(padded[number:]):
         return None
     return replace(source, model=model, distortion=padded)
+
+
+def _tangential(source: AnyCamera) -> Tangential:
+    """p1 and p2, which mean the same in all models that have them."""
+    if isinstance(source, Camera):
+        return source.tangential
+    if source.model == "fisheye":
+        return NONE
+    return source.distortion[P1], source.distortion[P1 + 1]
 
 
 def _pinhole(source: AnyCamera) -> tuple[float, float, float, float]:

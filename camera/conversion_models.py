@@ -34,6 +34,9 @@ Model = Literal["radtan", "rational", "fisheye"]
 #: Number of coefficients that `ForeignCamera.distortion` holds for each model.
 COEFFICIENTS: dict[Model, int] = {"radtan": 5, "rational": 12, "fisheye": 4}
 
+#: Place of p1, before p2, in those of `radtan` and `rational`.
+P1 = 2
+
 _LARGEST_SIDE_PX = 65536
 # An inverse is walked to from the image's centre in so many steps.
 _WALK = 24

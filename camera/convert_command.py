@@ -42,7 +42,13 @@ def perform(options: Convert) -> int:
     source = parse(text, from_format, str(options.source), options.camera_name)
     converted = convert(source, to_format, options)
     camera = converted.camera
-    label = camera.model if isinstance(camera, ForeignCamera) else "rational radial"
+    label = (
+        camera.model
+        if isinstance(camera, ForeignCamera)
+        else "rational radial, tangential"
+        if camera.decentred
+        else "rational radial"
+    )
     u, v = converted.at
     print(
         f"{options.source} ({from_format}, {source.width} x {source.height}) to {to_format} "

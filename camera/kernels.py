@@ -12,16 +12,17 @@ from numba import njit
 from numpy.typing import NDArray
 
 from camera.model import Camera
+from camera.tangential_kernels import tangential_shift_point
 
 #: Length of the vector that `camera_numbers` returns.
-NUMBERS = 22
+NUMBERS = 24
 
 
 def camera_numbers(camera: Camera) -> NDArray[np.float64]:
     """All that a projection needs, as one vector, the form in which kernels take a camera.
 
     Order: scale x, y; offset x, y; a2, a3, b1, b2, b3; r_max; the 9 entries of the rotation
-    robot -> camera row by row; the camera's centre in the robot frame.
+    robot -> camera row by row; the camera's centre in the robot frame; p1, p2.
     """
     return np.array(
         [
@@ -33,8 +34,14 @@ def camera_numbers(camera: Camera) -> NDArray[np.float64]:
             camera.r_max,
             *camera.camera_from_robot.ravel(),
             *camera.centre,
+            *camera.tangential,
         ]
     )
+
+
+def lens_numbers(camera: Camera) -> NDArray[np.float64]:
+    """The distortion alone, as `straightened_point` takes it: a2, a3, b1, b2, b3, p1, p2, r_max."""
+    return np.array([*camera.coef, *camera.tangential, camera.r_max])
 
 
 @njit(cache=True, error_model="numpy")
@@ -56,4 +63,9 @@ def project_floor_point(
     factor = 1.0 + r * (numbers[4] + r * numbers[5]) / (
         1.0 + r * (numbers[6] + r * (numbers[7] + r * numbers[8]))
     )
-    return numbers[0] * x * factor + numbers[2], numbers[1] * y * factor + numbers[3]
+    u, v = numbers[0] * x * factor, numbers[1] * y * factor
+    if numbers[22] != 0.0 or numbers[23] != 0.0:
+        x_shift, y_shift = tangential_shift_point(numbers[22], numbers[23], x, y)
+        u += numbers[0] * x_shift
+        v += numbers[1] * y_shift
+    return u + numbers[2], v + numbers[3]

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import hashlib
 import math
-import operator
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -23,15 +22,20 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from camera.distortion import (
-    LARGEST_COEFFICIENT,
     Coef,
-    fold_radius,
-    largest_distorted_radius,
     radial_factor,
     radial_factor_derivative,
     undistorted_radius,
 )
-from camera.errors import CameraError
+from camera.model_checks import check_numbers, check_one_to_one, checked_pose, checked_whole
+from camera.tangential import (
+    NONE,
+    Tangential,
+    one_to_one_radius,
+    straightened,
+    tangential_jacobian,
+    tangential_shift,
+)
 
 FloatArray = NDArray[np.float64]
 Pose = tuple[tuple[float, float, float, float], ...]
@@ -39,13 +43,10 @@ Pose = tuple[tuple[float, float, float, float], ...]
 #: The published step of the central differences by which the data set's covariances were made.
 PUBLISHED_STEP_PX = 0.1
 
-_ROTATION_TOLERANCE = 1e-3
-_LARGEST_SIDE_PX = 65536
-
 
 @dataclass(frozen=True)
 class Camera:
-    """A calibrated camera with rational radial distortion, mounted on a robot. A value.
+    """A calibrated camera with rational radial and tangential distortion, on a robot. A value.
 
     Two cameras are equal, and hash alike, when all that they were made of is equal.
 
@@ -67,6 +68,8 @@ class Camera:
         The file's ``mountIndex``.
     unknown : tuple of (key, text)
         Entries of a ``.cam`` file that mean nothing here; they survive reading and writing.
+    tangential : 2 floats
+        p1, p2 of the distortion (see `camera.tangential`); the data set's cameras have none.
 
     Raises
     ------
@@ -90,53 +93,21 @@ class Camera:
     sensor_to_tcp: Pose | None = None
     mount_index: int = 0
     unknown: tuple[tuple[str, str], ...] = field(default=())
+    tangential: Tangential = NONE
 
     def __post_init__(self) -> None:
         for name in ("width", "height", "mount_index"):
-            object.__setattr__(self, name, _whole(name, getattr(self, name)))
+            object.__setattr__(self, name, checked_whole(name, getattr(self, name)))
         object.__setattr__(self, "unknown", tuple((key, text) for key, text in self.unknown))
         object.__setattr__(self, "coef", tuple(float(c) for c in self.coef))
-        object.__setattr__(self, "robot_from_camera", _pose("sensor2World", self.robot_from_camera))
+        object.__setattr__(self, "tangential", tuple(float(p) for p in self.tangential))
+        pose = checked_pose("sensor2World", self.robot_from_camera)
+        object.__setattr__(self, "robot_from_camera", pose)
         if self.sensor_to_tcp is not None:
-            object.__setattr__(self, "sensor_to_tcp", _pose("sensor2Tcp", self.sensor_to_tcp))
-        self._check()
-
-    def _check(self) -> None:
-        for name, side in (("width", self.width), ("height", self.height)):
-            if not 1 <= side <= _LARGEST_SIDE_PX:
-                raise CameraError(f"{name} is {side}: expected 1 to {_LARGEST_SIDE_PX} pixels")
-        if len(self.coef) != 5:
-            raise CameraError(f"coef has {len(self.coef)} numbers: expected 5 (a2 a3 b1 b2 b3)")
-        for name, value in (
-            ("scaleX", self.scale_x),
-            ("scaleY", self.scale_y),
-            ("offsetX", self.offset_x),
-            ("offsetY", self.offset_y),
-            *(
-                (f"coef {symbol}", c)
-                for symbol, c in zip(["a2", "a3", "b1", "b2", "b3"], self.coef)
-            ),
-        ):
-            if not math.isfinite(value):
-                raise CameraError(f"{name} is {value}: expected a finite number")
-        if max(abs(c) for c in self.coef) > LARGEST_COEFFICIENT:
-            raise CameraError(f"coef is {self.coef}: expected at most {LARGEST_COEFFICIENT:g} each")
-        for name, value in (("scaleX", self.scale_x), ("scaleY", self.scale_y)):
-            if value <= 0.0:
-                raise CameraError(f"{name} is {value}: expected a positive number of pixels")
-        corner = self._farthest_corner()
-        seen = largest_distorted_radius(self.coef)
-        if not corner < seen:
-            raise CameraError(
-                f"the distortion folds inside the image: it grows only up to r = "
-                f"{fold_radius(self.coef):.6g}, seen at {seen:.6g}, while the image's corner lies "
-                f"at {corner:.6g}"
-            )
-
-    def _farthest_corner(self) -> float:
-        x = max(abs(self.offset_x), abs(self.width - 1 - self.offset_x)) / self.scale_x
-        y = max(abs(self.offset_y), abs(self.height - 1 - self.offset_y)) / self.scale_y
-        return math.hypot(x, y)
+            pose = checked_pose("sensor2Tcp", self.sensor_to_tcp)
+            object.__setattr__(self, "sensor_to_tcp", pose)
+        check_numbers(self)
+        check_one_to_one(self)
 
     # -- the camera as arrays ---------------------------------------------------------------
 
@@ -162,7 +133,12 @@ class Camera:
     @cached_property
     def r_max(self) -> float:
         """Undistorted radius up to which the projection is defined."""
-        return fold_radius(self.coef)
+        return one_to_one_radius(self.coef, self.tangential)
+
+    @cached_property
+    def decentred(self) -> bool:
+        """Whether there are tangential terms."""
+        return any(self.tangential)
 
     @cached_property
     def content_hash(self) -> str:
@@ -170,16 +146,19 @@ class Camera:
         numbers = (
             self.width, self.height, self.scale_x, self.scale_y, self.offset_x, self.offset_y,
             *self.coef, *(x for row in self.robot_from_camera for x in row),
+            *(self.tangential if self.decentred else ()),
         )  # fmt: skip
         # Adding 0 makes -0 the 0 that it is equal to.
         return hashlib.sha256(" ".join((n + 0.0).hex() for n in numbers).encode()).hexdigest()
 
     def __str__(self) -> str:
         pitch_deg = math.degrees(math.asin(max(-1.0, min(1.0, -float(self.rotation[2, 2])))))
+        p1, p2 = self.tangential
         return (
             f"{self.width}x{self.height} px, scale {self.scale_x:g} x {self.scale_y:g} px, "
             f"centre {self.offset_x:g} {self.offset_y:g}, "
-            f"{self.centre[2]:.3f} m above the floor, looking {pitch_deg:.1f} deg down"
+            + (f"tangential {p1:g} {p2:g}, " if self.decentred else "")
+            + f"{self.centre[2]:.3f} m above the floor, looking {pitch_deg:.1f} deg down"
         )
 
     # -- camera frame <-> pixels ------------------------------------------------------------
@@ -201,13 +180,12 @@ class Camera:
         radius = np.hypot(xy[..., 0], xy[..., 1])
         defined = (radius <= self.r_max) & np.isfinite(radius)
         factor = np.where(defined, radial_factor(np.where(defined, radius, 0.0), self.coef), np.nan)
-        return np.stack(
-            [
-                self.scale_x * xy[..., 0] * factor + self.offset_x,
-                self.scale_y * xy[..., 1] * factor + self.offset_y,
-            ],
-            axis=-1,
-        )
+        u = self.scale_x * xy[..., 0] * factor
+        v = self.scale_y * xy[..., 1] * factor
+        if self.decentred:
+            shift = tangential_shift(np.where(defined[..., None], xy, np.nan), self.tangential)
+            u, v = u + self.scale_x * shift[..., 0], v + self.scale_y * shift[..., 1]
+        return np.stack([u + self.offset_x, v + self.offset_y], axis=-1)
 
     def undistort(self, pixels: ArrayLike) -> FloatArray:
         """Undistorted normalised coordinates of pixels; the inverse of `distort`.
@@ -225,6 +203,9 @@ class Camera:
         uv = np.asarray(pixels, dtype=np.float64)
         x = (uv[..., 0] - self.offset_x) / self.scale_x
         y = (uv[..., 1] - self.offset_y) / self.scale_y
+        if self.decentred:
+            seen = np.stack([x, y], axis=-1)
+            return straightened(seen, self.coef, self.tangential, self.r_max)
         factor = radial_factor(undistorted_radius(np.hypot(x, y), self.coef), self.coef)
         return np.stack([x / factor, y / factor], axis=-1)
 
@@ -327,6 +308,8 @@ class Camera:
         unit = xy / np.where(radius > 0.0, radius, 1.0)[..., None]
         outer = slope[..., None, None] * xy[..., :, None] * unit[..., None, :]
         jacobian = factor[..., None, None] * np.eye(2) + outer
+        if self.decentred:
+            jacobian = jacobian + tangential_jacobian(xy, self.tangential)
         return np.asarray(jacobian * np.array([[self.scale_x], [self.scale_y]]))
 
     def project_jacobian(self, points_camera: ArrayLike) -> FloatArray:
@@ -383,33 +366,6 @@ class Camera:
         seen = self.floor_from_pixel(uv[..., None, :] + np.concatenate([step, -step]))
         moved = seen[..., :2, :] - seen[..., 2:, :]
         return np.asarray(moved.swapaxes(-1, -2) / (2.0 * PUBLISHED_STEP_PX))
-
-
-def _pose(name: str, rows: ArrayLike) -> Pose:
-    """Check a 3x4 rigid transform and return it as tuples."""
-    array = np.asarray(rows, dtype=np.float64)
-    if array.shape != (3, 4):
-        raise CameraError(f"{name} has shape {array.shape}: expected 3 rows of 4 numbers")
-    if not np.all(np.isfinite(array)):
-        raise CameraError(f"{name} has a number that is not finite")
-    rotation = array[:, :3]
-    with np.errstate(over="ignore", invalid="ignore"):
-        deviation = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
-    if not deviation <= _ROTATION_TOLERANCE:
-        raise CameraError(
-            f"{name} is not a rotation: R R^T differs from the identity by {deviation:.3g} "
-            f"(at most {_ROTATION_TOLERANCE:g})"
-        )
-    if np.linalg.det(rotation) < 0.0:
-        raise CameraError(f"{name} is not a rotation but a reflection: its determinant is -1")
-    return tuple((float(a), float(b), float(c), float(d)) for a, b, c, d in array)
-
-
-def _whole(name: str, value: int) -> int:
-    try:
-        return operator.index(value)
-    except TypeError:
-        raise CameraError(f"{name} is {value!r}: expected a whole number") from None
 
 
 def _read_only(array: FloatArray) -> FloatArray:

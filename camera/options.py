@@ -50,8 +50,11 @@ class Calibrate:
     free_aspect : bool
         Horizontal and vertical scale are independent of each other.
     coefficients : str
-        Number of free distortion coefficients, 0 to 5; `auto`: as many as make the error in
+        Number of free radial distortion coefficients, 0 to 5; `auto`: as many as make the error in
         pictures that were held out smaller.
+    tangential : str
+        Whether the tangential terms p1 and p2 of a decentred lens are free: `on`, `off`, or `auto`:
+        if they make that error smaller and are more than noise.
     keep_outliers : bool
         Keep pictures whose residuals are far above the others'.
     every : int
@@ -85,6 +88,7 @@ class Calibrate:
     half: bool = False
     free_aspect: bool = False
     coefficients: Literal["auto", "0", "1", "2", "3", "4", "5"] = "auto"
+    tangential: Literal["auto", "on", "off"] = "auto"
     keep_outliers: bool = False
     every: int = 15
     max_images: int = 60

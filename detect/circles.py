@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from camera import Camera
 from camera.distortion import inverse_table
-from camera.kernels import camera_numbers
+from camera.kernels import camera_numbers, lens_numbers
 from camera.model import PUBLISHED_STEP_PX
 from detect.centres import best_centres
 from detect.centres import quality_of_centres as quality_of_centres
@@ -209,10 +209,10 @@ class _KernelCamera(NamedTuple):
 
 @lru_cache(maxsize=4)
 def _kernel_camera(camera: Camera) -> _KernelCamera:
-    lens = [camera.scale_x, camera.scale_y, camera.offset_x, camera.offset_y, *camera.coef]
+    pinhole = [camera.scale_x, camera.scale_y, camera.offset_x, camera.offset_y]
     return _KernelCamera(
         camera_numbers(camera),
-        np.array(lens),
+        np.array([*pinhole, *lens_numbers(camera)]),
         np.array(camera.robot_from_camera),
         *inverse_table(camera.coef),
     )

@@ -11,6 +11,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from camera.tangential_kernels import straightened_point
+
 #: Newton's method in `camera.distortion` takes at most so many steps, and ends with one this small.
 _NEWTON_STEPS = 60
 _LAST_STEP = 1e-9
@@ -92,8 +94,8 @@ def floor_of_pixel(
     ----------
     u, v : float
         Pixel.
-    lens : (9,) float64
-        Scale x, y; offset x, y; a2, a3, b1, b2, b3.
+    lens : (12,) float64
+        Scale x, y; offset x, y; a2, a3, b1, b2, b3; p1, p2; r_max.
     pose : (3, 4) float64
         `robot_from_camera`.
     table_g, table_r : (N,) float64
@@ -106,20 +108,27 @@ def floor_of_pixel(
     x, y : float
         Metres.
     r : float
-        Undistorted radius.
+        Undistorted radius, by the radial distortion.
     """
     x = (u - lens[2]) / lens[0]
     y = (v - lens[3]) / lens[1]
     coef = lens[4:]
     last = len(table_g) - 1
     goal = math.hypot(x, y)
+    decentred = lens[9] != 0.0 or lens[10] != 0.0
+    if decentred:
+        # The radial inverse is where to begin, and where it ends as good a place as any.
+        goal = min(goal, table_g[last])
     if near >= 0.0 and goal <= table_g[last]:
         r = _newton(goal, coef, near, 0.0, table_r[last])
     else:
         r = undistorted_radius(goal, coef, table_g, table_r)
     factor = _factor(coef, r)
-    x /= factor
-    y /= factor
+    if decentred:
+        x, y = straightened_point(coef, x, y, x / factor, y / factor)
+    else:
+        x /= factor
+        y /= factor
     down = _along(pose, 2, x, y)
     if not down * pose[2, 3] < 0.0:
         return math.nan, math.nan, r

@@ -1,8 +1,9 @@
 """Where every pixel of a camera sees the floor.
 
-The lens matters only through one function of the distance from the principal point: the factor
+A radial lens matters only through one function of the distance from the principal point: the factor
 that undoes the distortion. So it is computed by the camera at some hundred distances, and between
-them by polynomials that reproduce it to the last digits.
+them by polynomials that reproduce it to the last digits. With tangential terms that is where each
+pixel's inverse is looked for.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 
 from camera import Camera
 from camera.distortion import radial_factor, undistorted_radius
+from camera.kernels import lens_numbers
 from lut.kernels import fill_floor_positions
 
 FloatArray = NDArray[np.float64]
@@ -31,9 +33,12 @@ def floor_positions(camera: Camera) -> FloatArray:
     if polynomials is None:
         v, u = np.mgrid[0 : camera.height, 0 : camera.width]
         return camera.floor_from_pixel(np.stack([u, v], axis=-1).astype(np.float64))
-    lens = np.array([camera.scale_x, camera.scale_y, camera.offset_x, camera.offset_y])
+    pinhole = np.array([camera.scale_x, camera.scale_y, camera.offset_x, camera.offset_y])
     per_radius = _INTERVALS / _farthest_corner(camera)
-    fill_floor_positions(lens, polynomials, per_radius, camera.rotation, camera.centre, floor_xy)
+    fill_floor_positions(
+        pinhole, lens_numbers(camera), polynomials, per_radius, camera.rotation, camera.centre,
+        floor_xy,
+    )  # fmt: skip
     return floor_xy
 
 

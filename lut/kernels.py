@@ -12,6 +12,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from camera.tangential_kernels import straightened_point
+
 #: Neighbouring pixels of a row that a detector works on at once; bytes of one copy.
 BLOCK = 64
 
@@ -28,6 +30,7 @@ LEAST_COPIES = 16
 
 @njit(cache=True, error_model="numpy")
 def fill_floor_positions(
+    pinhole: NDArray[np.float64],
     lens: NDArray[np.float64],
     undistortion: NDArray[np.float64],
     per_radius: float,
@@ -39,11 +42,13 @@ def fill_floor_positions(
 
     Parameters
     ----------
-    lens : (4,) float64
+    pinhole : (4,) float64
         Scale x, y and offset x, y, pixels.
+    lens : (8,) float64
+        `camera.kernels.lens_numbers`; used if there are tangential terms.
     undistortion : (N, 6) float64
-        Undistorted / distorted radius: coefficients, the lowest first, of polynomials in the
-        position within an interval of the distorted radius, from -1 to 1.
+        Undistorted / distorted radius, by the radial distortion: coefficients, the lowest first, of
+        polynomials in the position within an interval of the distorted radius, from -1 to 1.
     per_radius : float
         Intervals per unit of distorted radius.
     rotation : (3, 3) float64
@@ -61,13 +66,16 @@ def fill_floor_positions(
     cx, cy, cz = centre[0], centre[1], centre[2]
     x_seen = np.empty(width)
     for u in range(width):
-        x_seen[u] = (u - lens[2]) / lens[0]
+        x_seen[u] = (u - pinhole[2]) / pinhole[0]
+    decentred = lens[5] != 0.0 or lens[6] != 0.0
     # A loop for what is looked up, and one that the compiler can do for several pixels at once.
     ratio = np.empty(width)
+    x_normalised = np.empty(width)
+    y_normalised = np.empty(width)
     x_robot = np.empty(width)
     y_robot = np.empty(width)
     for v in range(height):
-        y_seen = (v - lens[3]) / lens[1]
+        y_seen = (v - pinhole[3]) / pinhole[1]
         for u in range(width):
             place = math.sqrt(x_seen[u] * x_seen[u] + y_seen * y_seen) * per_radius
             interval = min(int(place), last)
@@ -75,8 +83,16 @@ def fill_floor_positions(
             c = undistortion[interval]
             ratio[u] = c[0] + t * (c[1] + t * (c[2] + t * (c[3] + t * (c[4] + t * c[5]))))
         for u in range(width):
-            x = x_seen[u] * ratio[u]
-            y = y_seen * ratio[u]
+            x_normalised[u] = x_seen[u] * ratio[u]
+            y_normalised[u] = y_seen * ratio[u]
+        if decentred:
+            for u in range(width):
+                x_normalised[u], y_normalised[u] = straightened_point(
+                    lens, x_seen[u], y_seen, x_normalised[u], y_normalised[u]
+                )
+        for u in range(width):
+            x = x_normalised[u]
+            y = y_normalised[u]
             down = r20 * x + r21 * y + r22
             along = -cz / down if down * cz < 0.0 else math.nan
             x_robot[u] = cx + along * (r00 * x + r01 * y + r02)
@@ -89,6 +105,7 @@ def fill_floor_positions(
 @njit(cache=True, error_model="numpy")
 def _nearest_pixels(
     numbers: NDArray[np.float64],
+    tangential: NDArray[np.float64] | None,
     x_robot: NDArray[np.float64],
     y_robot: NDArray[np.float64],
     offset: NDArray[np.float64],
@@ -120,8 +137,15 @@ def _nearest_pixels(
         y = (r10 * dx + r11 * dy + r12 * dz) / z
         r = math.sqrt(x * x + y * y)
         factor = 1.0 + r * (a2 + r * a3) / (1.0 + r * (b1 + r * (b2 + r * b3)))
-        column = np.floor(scale_x * x * factor + offset_x + 0.5)
-        row = np.floor(scale_y * y * factor + offset_y + 0.5)
+        x_place = scale_x * x * factor
+        y_place = scale_y * y * factor
+        if tangential is not None:
+            squared = x * x + y * y
+            along = 2.0 * (tangential[1] * x + tangential[0] * y)
+            x_place += scale_x * (along * x + squared * tangential[1])
+            y_place += scale_y * (along * y + squared * tangential[0])
+        column = np.floor(x_place + offset_x + 0.5)
+        row = np.floor(y_place + offset_y + 0.5)
         # NaN fails every comparison.
         seen = (z > 0.0) & (r <= r_max)
         inside = (column >= 0.0) & (column < width) & (row >= 0.0) & (row < height)
@@ -148,7 +172,7 @@ def encode_outlines(
 
     Parameters
     ----------
-    numbers : (22,) float64
+    numbers : (24,) float64
         `camera.kernels.camera_numbers`.
     floor_xy : (H, W, 2) float64
         Floor position of each pixel, metres.
@@ -167,6 +191,7 @@ def encode_outlines(
     height, width = candidate.shape
     samples = inner.shape[0]
     padded = -(-samples // GROUP) * GROUP
+    decentred = numbers[22] != 0.0 or numbers[23] != 0.0
     nothing = height * width
     most_blocks = height * (-(-width // BLOCK))
 
@@ -197,13 +222,18 @@ def encode_outlines(
         for u in range(begin, end):
             x_robot[u] = floor_xy[v, u, 0]
             y_robot[u] = floor_xy[v, u, 1]
-        for k in range(samples):
-            _nearest_pixels(
-                numbers, x_robot, y_robot, inner[k], begin, end, height, width, nearest[k]
-            )
-            _nearest_pixels(
-                numbers, x_robot, y_robot, outer[k], begin, end, height, width, nearest[samples + k]
-            )
+        for k in range(2 * samples):
+            offset = inner[k] if k < samples else outer[k - samples]
+            if decentred:
+                _nearest_pixels(
+                    numbers, numbers[22:24], x_robot, y_robot, offset,
+                    begin, end, height, width, nearest[k],
+                )  # fmt: skip
+            else:
+                _nearest_pixels(
+                    numbers, None, x_robot, y_robot, offset,
+                    begin, end, height, width, nearest[k],
+                )  # fmt: skip
         for u in range(begin, end):
             votes[0, u] = votes[1, u] = 0
         for k in range(2 * samples):

@@ -27,7 +27,7 @@ def trace_verticals(
 
     Parameters
     ----------
-    numbers : (22,) float64
+    numbers : (24,) float64
         `camera.kernels.camera_numbers`.
     bearing : (N,) float64
         Bearings of the verticals (rad); NaN for none.
@@ -43,6 +43,8 @@ def trace_verticals(
     scale_x, scale_y, offset_x, offset_y = numbers[0], numbers[1], numbers[2], numbers[3]
     a2, a3, b1, b2, b3 = numbers[4], numbers[5], numbers[6], numbers[7], numbers[8]
     farthest = numbers[9]
+    p1, p2 = numbers[22], numbers[23]
+    decentred = p1 != 0.0 or p2 != 0.0
     for n in range(len(bearing)):
         for v in range(height):
             column[v, n] = math.nan
@@ -87,9 +89,16 @@ def trace_verticals(
                     ) / (denominator * denominator)
                     dr = (x * dx + y * dy) / r if r > 0.0 else 0.0
                     slope = scale_y * (dy * factor + y * d_factor * dr)
-                    off = v - (scale_y * y * factor + offset_y)
+                    u = scale_x * x * factor + offset_x
+                    row = scale_y * y * factor + offset_y
+                    if decentred:
+                        along = 2.0 * (p2 * x + p1 * y)
+                        d_along = 2.0 * (p2 * dx + p1 * dy)
+                        u += scale_x * (along * x + r * r * p2)
+                        row += scale_y * (along * y + r * r * p1)
+                        slope += scale_y * (d_along * y + along * dy + 2.0 * r * dr * p1)
+                    off = v - row
                     if abs(off) < _TOLERANCE_PX:
-                        u = scale_x * x * factor + offset_x
                         found = True
                         break
                     angle += off / slope

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
 import math
 
 import numpy as np
@@ -9,7 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from camera import Camera
+from camera import Camera, CameraError
 from camera.distortion import Coef, fold_radius, largest_distorted_radius
 from camera.model import Pose
 
@@ -29,8 +31,8 @@ def coefficients() -> st.SearchStrategy[Coef]:
 
 
 def _has_no_pole(coef: Coef) -> bool:
-    end = min(fold_radius(coef), 8.0)
-    denominator = np.polyval([*coef[:1:-1], 1.0], np.linspace(0.0, end, 50))
+    end = min(fold_radius(coef), 25.0)
+    denominator = np.polyval([*coef[:1:-1], 1.0], np.linspace(0.0, end, 150))
     return bool(np.all(denominator > 0.05))
 
 
@@ -60,7 +62,10 @@ def cameras(
     largest_side: int = 2000,
     down_deg: tuple[float, float] = (-180.0, 180.0),
 ) -> Camera:
-    """Valid cameras of any size, focal length, principal point, distortion and pose."""
+    """Valid cameras of any size, focal length, principal point, distortion and pose.
+
+    Every other one has tangential terms, where its image is not too near to the fold for them.
+    """
     width = draw(st.integers(8, largest_side))
     height = draw(st.integers(8, largest_side))
     offset_x = width * draw(st.floats(0.2, 0.8))
@@ -73,7 +78,7 @@ def cameras(
     # The image's corner uses up this part of what the distortion lets the camera see.
     used = draw(st.floats(0.05, 0.95))
     scale_x = farthest_px / (used * min(largest_distorted_radius(coef), WIDEST))
-    return Camera(
+    camera = Camera(
         width=width,
         height=height,
         scale_x=scale_x,
@@ -83,6 +88,11 @@ def cameras(
         coef=coef,
         robot_from_camera=draw(poses(down_deg=down_deg)),
     )
+    if draw(st.booleans()):
+        tangential = draw(st.tuples(st.floats(-0.01, 0.01), st.floats(-0.01, 0.01)))
+        with contextlib.suppress(CameraError):
+            return dataclasses.replace(camera, tangential=tangential)
+    return camera
 
 
 def pixel_grid(camera: Camera, along: int = 9) -> NDArray[np.float64]:

@@ -12,19 +12,26 @@ from camera import Camera, CameraError
 from camera.board import Board
 from camera.calibration import (
     BoardView,
-    CalibrationSettings,
     calibrate,
-    circle_shifts,
     points_of,
 )
 from camera.calibration_adjustment import Estimate, Points, adjust, project_estimate
 from camera.calibration_checks import coverage_warnings
-from camera.calibration_model import free_span, is_possible, project_points, rotation_of
+from camera.calibration_fit import circle_shifts
+from camera.calibration_model import (
+    COUNT,
+    free_span,
+    is_possible,
+    project_points,
+    rotation_of,
+)
 from camera.calibration_projection import (
     intrinsics_of,
     projection_difference,
     projection_sigma,
+    with_intrinsics,
 )
+from camera.calibration_settings import CalibrationSettings, FreeLens
 from camera.errors import CalibrationError
 from tools.camera_evaluation.covariance import monte_carlo
 from tools.camera_evaluation.rendering import board_poses
@@ -54,25 +61,29 @@ def seen_views(
     ]
 
 
-def with_intrinsics(camera: Camera, intrinsics: FloatArray) -> Camera:
-    sx, sy, ox, oy, a2, a3, b1, b2, b3 = (float(value) for value in intrinsics)
-    return replace(
-        camera, scale_x=sx, scale_y=sy, offset_x=ox, offset_y=oy, coef=(a2, a3, b1, b2, b3)
-    )
+TANGENTIAL = pytest.mark.parametrize("tangential", [(0.0, 0.0), (2e-3, -3e-3)])
 
 
-def test_points_are_projected_as_the_camera_projects_them(published_camera: Camera) -> None:
+@TANGENTIAL
+def test_points_are_projected_as_the_camera_projects_them(
+    published_camera: Camera, tangential: tuple[float, float]
+) -> None:
+    camera = replace(published_camera, tangential=tangential)
     points = np.random.default_rng(1).normal(loc=[0.0, 0.0, 1.0], size=(200, 3))
-    pixels, _, _ = project_points(intrinsics_of(published_camera), points)
-    np.testing.assert_allclose(pixels, published_camera.project(points), rtol=0.0, atol=1e-10)
+    pixels, _, _ = project_points(intrinsics_of(camera), points)
+    np.testing.assert_allclose(pixels, camera.project(points), rtol=0.0, atol=1e-10)
+    assert with_intrinsics(published_camera, intrinsics_of(camera)) == camera
 
 
-def test_derivatives_of_the_projection_are_those_of_differences(published_camera: Camera) -> None:
-    intrinsics = intrinsics_of(published_camera)
+@TANGENTIAL
+def test_derivatives_of_the_projection_are_those_of_differences(
+    published_camera: Camera, tangential: tuple[float, float]
+) -> None:
+    intrinsics = intrinsics_of(replace(published_camera, tangential=tangential))
     points = np.array([[0.1, 0.2, 0.7], [-0.3, 0.05, 0.5], [0.0, 0.0, 1.0], [0.4, -0.3, 0.6]])
     _, by_intrinsics, by_point = project_points(intrinsics, points)
-    for k in range(9):
-        step = np.zeros(9)
+    for k in range(COUNT):
+        step = np.zeros(COUNT)
         step[k] = 1e-5
         ahead = project_points(intrinsics + step, points)[0]
         behind = project_points(intrinsics - step, points)[0]
@@ -135,14 +146,55 @@ def test_noisy_points_and_wrong_ones_give_the_projection_to_its_predicted_error(
     assert away.max() < 0.1 + 3.0 * sigma.max()
     assert np.mean(away < 3.0 * sigma) > 0.95
     # Fewer coefficients than the lens has are seen through by the pictures held out.
-    assert result.holdout_px[1] > 2.0 * result.holdout_px[result.coefficients]
+    assert not result.lens.tangential
+    assert result.holdout_px[FreeLens(1)] > 2.0 * result.holdout_px[result.lens]
+
+
+def test_a_decentred_lens_is_found_and_a_radial_one_stays_radial() -> None:
+    """What was too little to tell from noise is not chosen; what is, comes back to its error."""
+    coef = (0.0, -0.2, 0.0, 0.3, 0.0)
+    radial = Camera(640, 480, 480.0, 480.0, 322.0, 238.0, coef, IDENTITY)
+    settings = CalibrationSettings(coefficients=2)
+    for tangential, found in (((0.0, 0.0), False), ((1e-3, -2e-3), True)):
+        truth = replace(radial, tangential=tangential)
+        views = seen_views(truth, 9, 0.1, seed=3)
+        result = calibrate(views, BOARD, (640, 480), settings)
+        assert result.lens == FreeLens(2, found)
+        assert set(result.holdout_px) == {FreeLens(2, False), FreeLens(2, True)}
+        camera = with_intrinsics(radial, result.intrinsics)
+        assert projection_difference(truth, camera).max() < 0.3
+        forced = replace(settings, tangential=not found)
+        other = calibrate(views, BOARD, (640, 480), forced)
+        assert other.lens == FreeLens(2, not found)
+        decentred = result if found else other
+        sigma = np.sqrt(np.diag(decentred.adjusted.covariance)[9:])
+        assert np.all(np.abs(decentred.intrinsics[9:] - tangential) < 4.0 * sigma)
+        assert np.all(sigma < 3e-4)
+        assert (result if other.lens.tangential else other).intrinsics[9:].tolist() == [0.0, 0.0]
+
+
+@pytest.mark.long
+def test_predicted_covariance_of_a_decentred_lens_is_what_repetition_shows() -> None:
+    camera = Camera(
+        640, 480, 480.0, 480.0, 322.0, 238.0, (-0.02, -0.2, 0.1, 0.5, -0.1), IDENTITY,
+        tangential=(2e-3, -3e-3),
+    )  # fmt: skip
+    trials = monte_carlo(camera, BOARD, views=15, trials=60, sigma_px=0.02, seed=4)
+    assert trials.freedom == 10
+    predicted = np.sqrt(np.diag(trials.covariances.mean(axis=0)))
+    ratio = trials.errors.std(axis=0) / predicted
+    # 60 trials know a standard deviation to 9 %.
+    assert np.all((ratio > 0.72) & (ratio < 1.33)), ratio
+    limit = 3.0 * np.sqrt(2.0 * trials.freedom / len(trials.nees))
+    assert trials.nees.mean() == pytest.approx(trials.freedom, abs=limit)
 
 
 @pytest.mark.long
 def test_predicted_covariance_is_what_repetition_shows(published_camera: Camera) -> None:
     trials = monte_carlo(published_camera, BOARD, views=15, trials=80, sigma_px=0.02, seed=4)
     predicted = np.sqrt(np.diag(trials.covariances.mean(axis=0)))
-    ratio = trials.errors.std(axis=0) / predicted
+    ratio = trials.errors.std(axis=0)[:9] / predicted[:9]
+    assert not np.any(trials.errors[:, 9:])
     # 80 trials know a standard deviation to 8 %.
     assert np.all((ratio > 0.75) & (ratio < 1.3)), ratio
     limit = 3.0 * np.sqrt(2.0 * trials.freedom / len(trials.nees))
@@ -158,7 +210,7 @@ def test_pose_covariance_is_what_repetition_shows(published_camera: Camera) -> N
     for _ in range(150):
         noisy = exact + rng.normal(scale=0.1, size=exact.shape)
         points = Points(BOARD.points, noisy, np.zeros(1, dtype=np.int64), 768, 288)
-        fit = adjust(truth, points, np.zeros((9, 0)), robust=False, sigma_px=0.1)
+        fit = adjust(truth, points, np.zeros((COUNT, 0)), robust=False, sigma_px=0.1)
         turn = fit.estimate.rotations[0] @ R.T
         vector = 0.5 * np.array(
             [turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]
@@ -188,20 +240,26 @@ def test_circles_shift_is_that_of_the_rendered_area(published_camera: Camera) ->
 
 
 def test_a_fold_inside_the_image_is_not_possible() -> None:
-    plain = np.array([460.0, 230.0, 384.0, 144.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    plain = np.array([460.0, 230.0, 384.0, 144.0, *[0.0] * 7])
     assert is_possible(plain, 768, 288)
     folded = plain.copy()
     folded[5] = -0.4
     assert not is_possible(folded, 768, 288)
+    # Without radial terms the nearest fold, at r = 1 / (6 p), is seen at 1 / (12 p).
+    for p, possible in ((0.05, True), (0.1, False)):
+        decentred = plain.copy()
+        decentred[9:] = (0.6 * p, -0.8 * p)
+        assert is_possible(decentred, 768, 288) == possible
     with pytest.raises(CameraError, match="folds inside the image"):
         Camera(768, 288, 460.0, 230.0, 384.0, 144.0, (0.0, -0.4, 0.0, 0.0, 0.0), IDENTITY)
 
 
 def test_free_span_ties_the_scales() -> None:
     span = free_span(2, 0.5)
-    assert span.shape == (9, 5)
+    assert span.shape == (11, 5)
     assert span[1, 0] == 0.5 * span[0, 0]
-    assert free_span(5, None).shape == (9, 9)
+    assert free_span(5, None).shape == (11, 9)
+    assert free_span(5, None, tangential=True).shape == (11, 11)
 
 
 def test_too_few_pictures_say_how_many_are_needed(published_camera: Camera) -> None:

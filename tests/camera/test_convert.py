@@ -153,14 +153,52 @@ def test_half_height_keeps_what_even_lines_see() -> None:
     )
 
 
-def test_tangential_distortion_shows_in_the_deviation() -> None:
-    straight = convert_to_camera(
-        ForeignCamera("radtan", 640, 480, 500.0, 500.0, 320.0, 240.0, (-0.2, 0.05, 0.0, 0.0, 0.0))
+@pytest.mark.parametrize(("p1", "p2"), [(-5e-3, 3e-3), (2e-3, 5e-3)])
+@pytest.mark.parametrize("k", [(-0.2, 0.05, -0.005)])
+def test_tangential_distortion_comes_over_and_goes_back(
+    p1: float, p2: float, k: tuple[float, float, float]
+) -> None:
+    source = ForeignCamera(
+        "radtan", 640, 480, 500.0, 505.0, 318.5, 241.0, (k[0], k[1], p1, p2, k[2])
     )
-    bent = convert_to_camera(
-        ForeignCamera("radtan", 640, 480, 500.0, 500.0, 320.0, 240.0, (-0.2, 0.05, 0.01, 0.0, 0.0))
+    there = convert_to_camera(source)
+    camera = there.camera
+    assert isinstance(camera, Camera)
+    assert there.deviation_px < 0.02
+    assert camera.tangential == pytest.approx((p1, p2), abs=1e-4)
+    # Measured apart from the conversion: OpenCV's projection of what the camera's pixels see.
+    pixels = np.random.default_rng(2).uniform([0.0, 0.0], [639.0, 479.0], size=(2000, 2))
+    away = np.linalg.norm(as_opencv_projects(source, camera.undistort(pixels)) - pixels, axis=1)
+    assert away.max() < 1.05 * there.deviation_px + 1e-3
+    back = convert_to_foreign(camera, "radtan")
+    assert back.deviation_px < 0.02
+    assert isinstance(back.camera, ForeignCamera)
+    np.testing.assert_allclose(back.camera.distort(RAYS), source.distort(RAYS), atol=0.05)
+
+
+def test_without_radial_terms_the_tangential_ones_go_and_come_exactly() -> None:
+    source = ForeignCamera(
+        "rational", 640, 480, 500.0, 505.0, 318.5, 241.0, (0.0, 0.0, 2e-3, -3e-3, *(0.0,) * 8)
     )
-    assert straight.deviation_px < 0.01
+    there = convert_to_camera(source)
+    assert isinstance(there.camera, Camera)
+    assert there.camera.tangential == (2e-3, -3e-3)
+    assert there.deviation_px < 1e-9
+    assert convert_to_foreign(there.camera, "rational").camera == source
+    half = convert_to_camera(there.camera, "halve").camera
+    assert isinstance(half, Camera)
+    assert half.tangential == (2e-3, -3e-3)
+    lines = np.array([[100.0, 20.0], [600.0, 230.0]])
+    np.testing.assert_allclose(
+        half.undistort(lines), there.camera.undistort(lines * [1.0, 2.0]), atol=1e-12
+    )
+    # What has no such terms shows it.
+    assert convert_to_foreign(there.camera, "fisheye").deviation_px > 0.1
+
+
+def test_a_thin_prism_shows_in_the_deviation() -> None:
+    prism = (-0.2, 0.05, *(0.0,) * 6, 0.01, 0.0, 0.0, 0.0)
+    bent = convert_to_camera(ForeignCamera("rational", 640, 480, 500.0, 500.0, 320.0, 240.0, prism))
     assert bent.deviation_px > 0.5
 
 

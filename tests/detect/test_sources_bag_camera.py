@@ -134,11 +134,32 @@ def test_camera_infos_that_say_nothing_or_too_little(
             open_source(path)
 
 
+def test_a_decentred_lens_is_taken_over(small_run: Path, tmp_path: Path) -> None:
+    ros = Ros()
+    (tmp_path / "bag").mkdir()
+    k = [460.0, 0, 384, 0, 230, 144, 0, 0, 1]
+    d = [-0.05, 0.01, 4e-3, -5e-3, 0.0]
+    said = [
+        Said("/tf_static", 1.0, ros.static_transforms(("base_footprint", OPTICAL, np.eye(4)[:3]))),
+        Said("/front/camera_info", 1.0, ros.camera_info(768, 288, "plumb_bob", d, k, OPTICAL)),
+    ]
+    camera = open_calibrated(
+        ros.write(tmp_path / "bag" / "s", recorded(small_run, ros, said))
+    ).camera
+    assert camera.tangential == pytest.approx((4e-3, -5e-3), abs=1e-4)
+    pixels = np.random.default_rng(1).uniform([0, 0], [767, 287], size=(200, 2))
+    rays = np.column_stack([camera.undistort(pixels), np.ones(len(pixels))])
+    K = np.reshape(np.array(k), (3, 3))
+    theirs = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), K, np.array(d))[0].reshape(-1, 2)
+    np.testing.assert_allclose(theirs, pixels, atol=0.05)
+
+
 def test_a_lens_that_the_model_cannot_follow(small_run: Path, tmp_path: Path) -> None:
-    """Tangential distortion is not radial: refused, with the deviation."""
+    """A thin prism is neither radial nor tangential: refused, with the deviation."""
     ros = Ros()
     k = [460.0, 0, 384, 0, 230, 144, 0, 0, 1]
-    bent = ros.camera_info(768, 288, "plumb_bob", [-0.05, 0.01, 0.02, -0.02, 0.0], k, OPTICAL)
+    prism = [-0.05, 0.01, *[0.0] * 6, 0.02, 0.0, 0.0, 0.0]
+    bent = ros.camera_info(768, 288, "rational_polynomial", prism, k, OPTICAL)
     said = [Said("/front/camera_info", 1.0, bent)]
     path = ros.write(tmp_path / "bent", recorded(small_run, ros, said))
     with pytest.raises(DetectError, match=r"differs from it by up to [0-9.]+ px, more than 0\.05"):

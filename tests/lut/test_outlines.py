@@ -156,6 +156,18 @@ def test_the_published_table_is_what_a_plain_computation_says(
     assert_table_is(published_table, plain_outlines(published_camera, DiscShape()))
 
 
+def test_a_decentred_table_is_what_a_plain_computation_says(
+    published_camera: Camera, published_table: DiscTable
+) -> None:
+    camera = dataclasses.replace(published_camera, tangential=(2e-3, -3e-3))
+    table = build_disc_table(camera, DiscShape())
+    assert_table_is(table, plain_outlines(camera, DiscShape()))
+    assert not np.array_equal(table.copies, published_table.copies)
+    seen = camera.floor_from_pixel([[0, 287], [767, 287], [384, 200]])
+    found = floor_positions(camera)[[287, 287, 200], [0, 767, 384]]
+    np.testing.assert_allclose(found, seen, rtol=1e-12)
+
+
 def test_the_published_limits_are_those_of_the_shipped_file(published_table: DiscTable) -> None:
     rows, columns = np.nonzero(published_table.usable)
     assert (rows.min(), rows.max()) == (116, 276)

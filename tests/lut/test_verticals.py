@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -17,6 +19,16 @@ BARREL = (0.0, -0.08, 0.0, 0.0, 0.0)
 @pytest.fixture(scope="module")
 def published_table(published_camera: Camera) -> VerticalTable:
     return build_vertical_table(published_camera)
+
+
+@pytest.fixture(scope="module")
+def decentred_camera(published_camera: Camera) -> Camera:
+    return dataclasses.replace(published_camera, tangential=(2e-3, -3e-3))
+
+
+@pytest.fixture(scope="module")
+def decentred_table(decentred_camera: Camera) -> VerticalTable:
+    return build_vertical_table(decentred_camera)
 
 
 def strip_points(table: VerticalTable, c: int) -> np.ndarray:
@@ -55,6 +67,14 @@ def test_points_on_a_vertical_project_onto_its_columns(
     assert len(rows) > 150
 
 
+@pytest.mark.parametrize("c", [5, 130, 600])
+def test_points_on_a_vertical_project_onto_its_columns_through_a_decentred_lens(
+    decentred_camera: Camera, decentred_table: VerticalTable, c: int
+) -> None:
+    test_horizon_is_where_directions_are_level(decentred_camera, decentred_table)
+    test_points_on_a_vertical_project_onto_its_columns(decentred_camera, decentred_table, c)
+
+
 def test_vertical_passes_through_its_column_on_the_horizon(
     published_table: VerticalTable,
 ) -> None:
@@ -72,12 +92,18 @@ def test_vertical_passes_through_its_column_on_the_horizon(
     roll=st.floats(-40.0, 40.0),
     aspect=st.sampled_from([1.0, 2.0]),
     coef=st.sampled_from([(0.0,) * 5, BARREL]),
+    tangential=st.sampled_from([(0.0, 0.0), (5e-3, -3e-3)]),
 )
 @settings(max_examples=25, deadline=None)
 def test_any_pose_gives_verticals_inside_the_image(
-    pitch: float, roll: float, aspect: float, coef: tuple[float, float, float, float, float]
+    pitch: float,
+    roll: float,
+    aspect: float,
+    coef: tuple[float, float, float, float, float],
+    tangential: tuple[float, float],
 ) -> None:
     camera = pinhole(90, 60, 80.0, pitch_deg=pitch, roll_deg=roll, row_aspect=aspect, coef=coef)
+    camera = dataclasses.replace(camera, tangential=tangential)
     table = build_vertical_table(camera)
     shown = np.isfinite(table.column)
     assert np.array_equal(shown, np.isfinite(table.elevation_tan))

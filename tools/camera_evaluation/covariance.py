@@ -15,10 +15,11 @@ from tyro.conf import Positional
 
 from camera import Camera, read_camera
 from camera.board import Board
-from camera.calibration import CalibrationSettings, circle_shifts, fit_points
 from camera.calibration_adjustment import Estimate, Points
-from camera.calibration_model import INTRINSICS, free_span
+from camera.calibration_fit import circle_shifts, fit_points
+from camera.calibration_model import INTRINSICS
 from camera.calibration_projection import intrinsics_of
+from camera.calibration_settings import CalibrationSettings, FreeLens
 from tools.camera_evaluation.rendered import BOARDS
 from tools.camera_evaluation.rendering import board_poses
 
@@ -31,9 +32,9 @@ class Trials:
 
     Attributes
     ----------
-    errors : (T, 9) float64
+    errors : (T, 11) float64
         Estimated less true intrinsics.
-    covariances : (T, 9, 9) float64
+    covariances : (T, 11, 11) float64
         As predicted.
     nees : (T,) float64
         Normalised squared errors of the projection, over its free directions; `freedom` on average.
@@ -63,7 +64,7 @@ def monte_carlo(
     Parameters
     ----------
     camera : Camera
-        The truth; scaleY / scaleX is taken as known.
+        The truth; scaleY / scaleX is taken as known. Tangential terms are free if it has some.
     board : Board
     views, trials : int
     sigma_px : float
@@ -95,14 +96,15 @@ def monte_carlo(
     radius_m = 0.5 * board.circle_m
     pixels = exact.pixels + (circle_shifts(truth, exact, radius_m) if radius_m > 0.0 else 0.0)
     aspect = camera.scale_y / camera.scale_x
-    span, settings = free_span(5, aspect), CalibrationSettings(aspect=aspect)
+    lens, settings = FreeLens(5, camera.decentred), CalibrationSettings(aspect=aspect)
+    span = lens.span(aspect)
     errors, covariances, nees = [], [], []
     for _ in range(trials):
         noise = rng.normal(scale=sigma_px, size=pixels.shape)
         wrong = rng.random(len(pixels)) < outliers
         noise[wrong] += 20.0 * sigma_px * rng.normal(size=(int(wrong.sum()), 2))
         points = replace(exact, pixels=pixels + noise)
-        fit, _ = fit_points(truth, points, settings, 5, radius_m)
+        fit, _ = fit_points(truth, points, settings, lens, radius_m)
         error = fit.estimate.intrinsics - truth.intrinsics
         free = np.linalg.pinv(span)
         reduced = free @ fit.covariance @ free.T
@@ -169,7 +171,8 @@ def main(arguments: list[str]) -> int:
         print(f"{name}: {options.trials} x {options.views} views, noise {options.sigma_px} px")
         print("            observed   predicted   ratio")
         for parameter, seen, said in zip(INTRINSICS, trials.errors.std(axis=0), predicted):
-            print(f"{parameter:8s} {seen:11.5g} {said:11.5g} {seen / said:7.3f}")
+            if said > 0.0:
+                print(f"{parameter:8s} {seen:11.5g} {said:11.5g} {seen / said:7.3f}")
         print(
             f"normalised squared error {trials.nees.mean():.2f} "
             f"(expected {trials.freedom}, +- {np.sqrt(2 * trials.freedom / len(trials.nees)):.2f})",

@@ -21,13 +21,10 @@ from tyro.conf import Positional
 from camera.board import Board
 from camera.board_points import circle_centroids
 from camera.calibrate_images import read_grey
-from camera.calibration import (
-    BoardView,
-    CalibrationSettings,
-    calibrate,
-    holdout_error,
-)
+from camera.calibration import BoardView, calibrate
 from camera.calibration_adjustment import Points
+from camera.calibration_choice import holdout_error
+from camera.calibration_settings import CalibrationSettings, FreeLens
 
 FloatArray = NDArray[np.float64]
 DISC_RADIUS_M = 0.1
@@ -140,8 +137,10 @@ class Comparison:
 
     Attributes
     ----------
-    views, points, coefficients : int
-        Photographs; points in all of them; coefficients that are free here.
+    views, points : int
+        Photographs; points in all of them.
+    lens : FreeLens
+        Coefficients that are free here.
     ours, rational, radial, five : dict of str to float
         By split: this project; OpenCV's rational model (k1 to k6, p1, p2), the same without p1 and
         p2, and its k1 k2 p1 p2 k3.
@@ -149,7 +148,7 @@ class Comparison:
 
     views: int
     points: int
-    coefficients: int
+    lens: FreeLens
     ours: dict[str, float]
     rational: dict[str, float]
     radial: dict[str, float]
@@ -164,16 +163,14 @@ def compare(folder: Path, group: str, *, free_aspect: bool) -> Comparison:
     )
     result = calibrate(views, board, size, settings)
     # The same corrected points for both: OpenCV knows nothing of circles.
-    points, count = result.points, result.coefficients
+    points, lens = result.points, result.lens
     estimate = result.adjusted.estimate
     ways = splits(len(points.starts))
     return Comparison(
         views=len(points.starts),
         points=len(points.board),
-        coefficients=count,
-        ours={
-            name: holdout_error(estimate, points, settings, count, w) for name, w in ways.items()
-        },
+        lens=lens,
+        ours={name: holdout_error(estimate, points, settings, lens, w) for name, w in ways.items()},
         rational={name: opencv_holdout(points, w, rational=True) for name, w in ways.items()},
         radial={
             name: opencv_holdout(points, w, rational=True, tangential=False)
@@ -187,14 +184,14 @@ def main(arguments: list[str]) -> int:
     """Run the study."""
     options = tyro.cli(Options, prog="photographs", args=arguments)
     print("RMS of what was held out, px; OpenCV: rational, the same without p1 p2, k1 k2 p1 p2 k3")
-    print("group      views points  free  held out        ours rational   radial     five")
+    print("group      views points  held out        ours rational   radial     five  free here")
     for group in options.groups:
         r = compare(options.folder, group, free_aspect=options.free_aspect)
         for name in r.ours:
             print(
-                f"{group:10s} {r.views:4d} {r.points:6d} {r.coefficients:5d}  {name:11s} "
+                f"{group:10s} {r.views:4d} {r.points:6d}  {name:11s} "
                 f"{r.ours[name]:8.4f} {r.rational[name]:8.4f} {r.radial[name]:8.4f} "
-                f"{r.five[name]:8.4f}",
+                f"{r.five[name]:8.4f}  {r.lens}",
                 flush=True,
             )
     return 0

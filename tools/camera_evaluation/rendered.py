@@ -5,7 +5,7 @@ Example: python -m tools.camera_evaluation rendered images/e/e.cam --half
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -18,17 +18,18 @@ from camera.board_points import find_board
 from camera.calibration import (
     BoardView,
     Calibration,
-    CalibrationSettings,
     calibrate,
-    circle_shifts,
     points_of,
 )
 from camera.calibration_adjustment import Estimate
+from camera.calibration_fit import circle_shifts
 from camera.calibration_projection import (
     intrinsics_of,
     projection_difference,
     projection_sigma,
+    with_intrinsics,
 )
+from camera.calibration_settings import CalibrationSettings
 from camera.errors import CalibrationError
 from tools.camera_evaluation.rendering import board_poses, rays_of, render_board
 
@@ -102,11 +103,7 @@ def calibrate_rendered(
     # Without those that the calibration leaves out as wrong, too.
     error = points.pixels - expected
     right = np.all(np.abs(error) < 8.0 * calibration.adjusted.sigma_px, axis=1)
-    sx, sy, ox, oy, *coef = (float(value) for value in calibration.intrinsics)
-    found = replace(
-        camera, scale_x=sx, scale_y=sy, offset_x=ox, offset_y=oy,
-        coef=(coef[0], coef[1], coef[2], coef[3], coef[4]),
-    )  # fmt: skip
+    found = with_intrinsics(camera, calibration.intrinsics)
     floor = float(np.sqrt(np.mean(np.sum(error[right] ** 2, axis=1))))
     return Rendered(calibration, found, floor, len(seen))
 
@@ -161,9 +158,9 @@ def main(arguments: list[str]) -> int:
         turned = projection_difference(camera, made.camera)
         sigma = projection_sigma(made.camera, result.adjusted.covariance)
         print(
-            f"{name}: found in {made.found} of {options.views}; {result.coefficients} "
-            f"coefficients; RMS {result.adjusted.rms_px:.4f} px, points' own error "
-            f"{made.floor_px:.4f} px, held out {result.holdout_px[result.coefficients]:.4f} px; "
+            f"{name}: found in {made.found} of {options.views}; free "
+            f"{result.lens}; RMS {result.adjusted.rms_px:.4f} px, points' own error "
+            f"{made.floor_px:.4f} px, held out {result.holdout_px[result.lens]:.4f} px; "
             f"projection off by at most {turned.max():.4f} px ({fixed:.4f} px with the camera's "
             f"rotation fixed), median {np.median(turned):.4f} px; predicted {sigma.max():.4f} and "
             f"{np.median(sigma):.4f} px"

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera
+from camera.kernels import lens_numbers
 from tools.simulator.poses import world_from_robot
 from tools.simulator.scene import FloatArray, Scene
 
@@ -35,10 +36,11 @@ class Optics:
     """The camera's projection as the ray caster takes it."""
 
     numbers: FloatArray
-    """scaleX, scaleY, offsetX, offsetY, nodes of `inverse` per unit of squared radius."""
+    """scaleX, scaleY, offsetX, offsetY, nodes of `inverse` per unit of squared radius, and
+    `camera.kernels.lens_numbers`."""
     inverse: FloatArray
-    """Undistorted over distorted radius at equal steps of the squared distorted radius."""
-    coef: FloatArray
+    """Undistorted over distorted radius at equal steps of the squared distorted radius, by the
+    radial distortion."""
 
 
 def optics_of(camera: Camera) -> Optics:
@@ -51,12 +53,13 @@ def optics_of(camera: Camera) -> Optics:
         [camera.offset_x + camera.scale_x * radius, np.full_like(radius, camera.offset_y)], axis=-1
     )
     ratio = np.ones_like(radius)
-    ratio[1:] = camera.undistort(pixels)[1:, 0] / radius[1:]
+    radial = replace(camera, tangential=(0.0, 0.0))
+    ratio[1:] = radial.undistort(pixels)[1:, 0] / radius[1:]
     if np.isnan(ratio).any():
         raise ValueError("the camera's image reaches past the fold of its distortion")
     numbers = (camera.scale_x, camera.scale_y, camera.offset_x, camera.offset_y)
     per_unit = (_INVERSE_NODES - 1) / (reach * reach)
-    return Optics(np.array([*numbers, per_unit]), ratio, np.array(camera.coef))
+    return Optics(np.array([*numbers, per_unit, *lens_numbers(camera)]), ratio)
 
 
 def camera_in_world(camera: Camera, pose: FloatArray) -> FloatArray:
@@ -119,7 +122,7 @@ def smeared(
     shift = later[:, :3].T @ (now[:, 3] - later[:, 3])
     return np.asarray(
         smear(
-            light.radiance, light.seen, light.depth, optics.numbers, optics.inverse, optics.coef,
+            light.radiance, light.seen, light.depth, optics.numbers, optics.inverse,
             np.ascontiguousarray(np.column_stack([rotation, shift])),
         )
     )  # fmt: skip

@@ -6,6 +6,7 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from camera.tangential_kernels import straightened_point, tangential_shift_point
 from tools.simulator.scene import Scene
 from tools.simulator.shading.kernels import SKY, first_met, radiance
 
@@ -20,16 +21,20 @@ def camera_ray(
     ----------
     u, v : float
         Pixel; need not be whole.
-    optics : (5,) float64
-        scaleX, scaleY, offsetX, offsetY, and nodes of `inverse` per unit of squared radius.
+    optics : (13,) float64
+        scaleX, scaleY, offsetX, offsetY, nodes of `inverse` per unit of squared radius, and
+        `camera.kernels.lens_numbers`.
     inverse : (N,) float64
-        Undistorted radius over distorted radius, at equal steps of the squared distorted radius.
+        Undistorted radius over distorted radius, at equal steps of the squared distorted radius, by
+        the radial distortion.
     """
     x, y = (u - optics[2]) / optics[0], (v - optics[3]) / optics[1]
     position = min((x * x + y * y) * optics[4], inverse.shape[0] - 1.001)
     node = int(position)
     share = position - node
     factor = inverse[node] * (1.0 - share) + inverse[node + 1] * share
+    if optics[10] != 0.0 or optics[11] != 0.0:
+        return straightened_point(optics[5:], x, y, x * factor, y * factor)
     return x * factor, y * factor
 
 
@@ -174,7 +179,6 @@ def smear(
     depth: NDArray[np.float32],
     optics: NDArray[np.float64],
     inverse: NDArray[np.float64],
-    coef: NDArray[np.float64],
     later_from_camera: NDArray[np.float64],
 ) -> NDArray[np.float32]:
     """Motion blur: the mean along each pixel's path during the exposure.
@@ -185,8 +189,6 @@ def smear(
         From `render_radiance`, at the middle of the exposure.
     optics, inverse
         As in `camera_ray`.
-    coef : (5,) float64
-        The distortion's a2, a3, b1, b2, b3.
     later_from_camera : (3, 4) float64
         Camera frame at the middle of the exposure -> camera frame at its end.
 
@@ -196,6 +198,7 @@ def smear(
     """
     lines, width = light.shape
     out = np.empty_like(light)
+    coef = optics[5:]
     m = later_from_camera
     for line in range(lines):
         for u in range(width):
@@ -214,6 +217,10 @@ def smear(
             )
             du = optics[0] * x * f + optics[2] - u
             dv = 2.0 * (optics[1] * y * f + optics[3]) - line
+            if coef[5] != 0.0 or coef[6] != 0.0:
+                x_shift, y_shift = tangential_shift_point(coef[5], coef[6], x, y)
+                du += optics[0] * x_shift
+                dv += 2.0 * optics[1] * y_shift
             steps = int(np.ceil(2.0 * np.sqrt(du * du + dv * dv)))
             if steps <= 0:
                 out[line, u] = light[line, u]

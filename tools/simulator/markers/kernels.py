@@ -13,6 +13,8 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from camera.tangential_kernels import tangential_shift_point
+
 #: Side of the square tiles for which the surfaces that may be seen are gathered, pixels.
 TILE = 16
 
@@ -41,7 +43,12 @@ def project_point(
     factor = 1.0 + r * (numbers[4] + r * numbers[5]) / (
         1.0 + r * (numbers[6] + r * (numbers[7] + r * numbers[8]))
     )
-    return numbers[0] * x * factor + numbers[2], numbers[1] * y * factor + numbers[3]
+    u, v = numbers[0] * x * factor, numbers[1] * y * factor
+    if numbers[22] != 0.0 or numbers[23] != 0.0:
+        x_shift, y_shift = tangential_shift_point(numbers[22], numbers[23], x, y)
+        u += numbers[0] * x_shift
+        v += numbers[1] * y_shift
+    return u + numbers[2], v + numbers[3]
 
 
 @nb.njit(cache=True, error_model="numpy")

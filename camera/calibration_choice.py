@@ -1,0 +1,175 @@
+"""Which coefficients of a lens are free: those that explain pictures that were held out."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from camera.calibration_adjustment import Adjusted, Estimate, Points, StartError, adjust
+from camera.calibration_fit import fit_points
+from camera.calibration_model import COUNT, INTRINSICS, TANGENTIAL
+from camera.calibration_settings import CalibrationSettings, FreeLens
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+_FOLDS = 8
+# A coefficient more has to lower the sum of the squared hold-out errors by so many variances.
+_WORTH = 4.0
+# The two tangential terms by so many, and they have to differ from 0 by so many variances: where a
+# board's points are found a little wrong, always in the same way, that can look like decentering.
+_TANGENTIAL_WORTH = 20.0
+_TANGENTIAL_SIGNIFICANCE = 50.0
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A fit with some coefficients free.
+
+    Attributes
+    ----------
+    adjusted : Adjusted
+    points : Points
+        What it was fitted to; circles' shifts are taken off.
+    holdout_px : float
+        `holdout_error`.
+    """
+
+    adjusted: Adjusted
+    points: Points
+    holdout_px: float
+
+
+Candidates = dict[FreeLens, Candidate]
+
+
+def choose_lens(
+    start: Estimate, points: Points, settings: CalibrationSettings, radius_m: float
+) -> tuple[FreeLens, Candidates]:
+    """Fit with more and more coefficients free, and choose.
+
+    The fewest radial coefficients whose hold-out error is not worse than the best. Tangential terms
+    if they lower it, beside those, by more than they would by chance, and are significant; then the
+    radial ones are chosen anew.
+
+    Parameters
+    ----------
+    start : Estimate
+    points : Points
+    settings : CalibrationSettings
+        `coefficients` and `tangential` may leave no choice.
+    radius_m : float
+        Radius of the circles; 0 for points.
+
+    Returns
+    -------
+    FreeLens, Candidates
+        The chosen one, and all that were tried.
+    """
+    counts = range(6) if settings.coefficients is None else [settings.coefficients]
+    radial = [FreeLens(count) for count in counts]
+    decentred = [FreeLens(count, tangential=True) for count in counts]
+    if settings.tangential is True:
+        tried = _tried(start, points, settings, radius_m, decentred)
+        return _fewest_needed(tried), tried
+    tried = _tried(start, points, settings, radius_m, radial)
+    chosen = _fewest_needed(tried)
+    if settings.tangential is False:
+        return chosen, tried
+    beside = chosen._replace(tangential=True)
+    estimate = tried[chosen].adjusted.estimate
+    tried |= _tried(estimate, points, settings, radius_m, [beside])
+    if not _is_worth_it(tried[chosen], tried[beside]):
+        return chosen, tried
+    others = [lens for lens in decentred if lens != beside]
+    more = {beside: tried[beside]} | _tried(start, points, settings, radius_m, others)
+    return _fewest_needed(more), tried | more
+
+
+def _tried(
+    start: Estimate,
+    points: Points,
+    settings: CalibrationSettings,
+    radius_m: float,
+    lenses: Iterable[FreeLens],
+) -> Candidates:
+    """Each fitted from where the last ended."""
+    tried: Candidates = {}
+    estimate = start
+    for lens in lenses:
+        adjusted, seen = fit_points(estimate, points, settings, lens, radius_m)
+        estimate = adjusted.estimate
+        tried[lens] = Candidate(adjusted, seen, holdout_error(estimate, seen, settings, lens))
+    return tried
+
+
+def _fewest_needed(tried: Candidates) -> FreeLens:
+    best = min(tried.values(), key=lambda candidate: candidate.holdout_px)
+    slack = _WORTH * best.adjusted.sigma_px**2 / len(best.points.board)
+    limit = best.holdout_px**2 + slack
+    return min(lens for lens, candidate in tried.items() if candidate.holdout_px**2 <= limit)
+
+
+def _is_worth_it(radial: Candidate, decentred: Candidate) -> bool:
+    """Whether tangential terms explain what was held out, and are more than noise."""
+    slack = _TANGENTIAL_WORTH * decentred.adjusted.sigma_px**2 / len(decentred.points.board)
+    lower = decentred.holdout_px**2 + slack <= radial.holdout_px**2
+    return lower and tangential_significance(decentred.adjusted) >= _TANGENTIAL_SIGNIFICANCE
+
+
+def tangential_significance(adjusted: Adjusted) -> float:
+    """Squared distance of (p1, p2) from 0 in standard deviations; 2 on average where they are 0."""
+    places = [INTRINSICS.index(name) for name in TANGENTIAL]
+    found = adjusted.estimate.intrinsics[places]
+    covariance = adjusted.covariance[np.ix_(places, places)]
+    return float(found @ np.linalg.pinv(covariance) @ found)
+
+
+def of_views(estimate: Estimate, views: IntArray) -> Estimate:
+    """An estimate with the poses of some views only."""
+    return Estimate(estimate.intrinsics, estimate.rotations[views], estimate.translations[views])
+
+
+def holdout_error(
+    estimate: Estimate,
+    points: Points,
+    settings: CalibrationSettings,
+    lens: FreeLens,
+    folds: Sequence[IntArray] | None = None,
+) -> float:
+    """RMS reprojection error in views that the intrinsics were not fitted to, pixels.
+
+    Of what is held out only the poses are fitted.
+
+    Parameters
+    ----------
+    estimate : Estimate
+        Where each fit begins.
+    points : Points
+    settings : CalibrationSettings
+    lens : FreeLens
+        Which coefficients are free.
+    folds : sequence of int64 arrays, optional
+        The views that are held out together; each view in one of them. Else every `_FOLDS`-th
+        (each on its own where there are few).
+    """
+    every = np.arange(len(points.starts))
+    if folds is None:
+        number = min(_FOLDS, len(every))
+        folds = [every[every % number == fold] for fold in range(number)]
+    squares = 0.0
+    span, nothing = lens.span(settings.aspect), np.zeros((COUNT, 0))
+    for out in folds:
+        used = np.setdiff1d(every, out)
+        fit = adjust(of_views(estimate, used), points.of(used), span, robust=settings.robust)
+        held = points.of(out)
+        there = replace(of_views(estimate, out), intrinsics=fit.estimate.intrinsics)
+        try:
+            test = adjust(there, held, nothing, robust=settings.robust, sigma_px=fit.sigma_px)
+        except StartError:  # a held-out point lies past this fit's fold
+            return float("inf")
+        squares += float(np.sum(test.residuals**2))
+    return float(np.sqrt(squares / len(points.board)))

@@ -1,0 +1,64 @@
+"""How a camera is calibrated, and which of its lens's coefficients are free."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from camera.calibration_model import FREE_COEFFICIENTS, TANGENTIAL, free_span
+from camera.errors import CalibrationError
+from storage.bounds import ABOVE_0, demand, whole
+
+
+class FreeLens(NamedTuple):
+    """Which of the distortion's coefficients are free."""
+
+    coefficients: int
+    """Number of the radial ones, 0 to 5 (`calibration_model.FREE_COEFFICIENTS`)."""
+    tangential: bool = False
+    """Whether p1 and p2 are."""
+
+    def span(self, aspect: float | None) -> NDArray[np.float64]:
+        """`calibration_model.free_span`."""
+        return free_span(self.coefficients, aspect, tangential=self.tangential)
+
+    def __str__(self) -> str:
+        names = (*FREE_COEFFICIENTS[self.coefficients], *(TANGENTIAL if self.tangential else ()))
+        return " ".join(names) or "none"
+
+
+@dataclass(frozen=True)
+class CalibrationSettings:
+    """How to calibrate.
+
+    Attributes
+    ----------
+    aspect : float or None
+        scaleY / scaleX: 1 for square pixels, 0.5 for every second line of them; None if both scales
+        are free.
+    coefficients : int or None
+        Number of free radial coefficients (0 to 5); None: as many as make the hold-out error
+        smaller.
+    tangential : bool or None
+        Whether the tangential terms p1 and p2 are free; None: if that makes the hold-out error
+        smaller and they are more than noise.
+    robust : bool
+        Huber's loss; points found wrongly pull less.
+    keep_outliers : bool
+        Keep pictures whose residuals are far above the others'.
+    """
+
+    aspect: float | None = 1.0
+    coefficients: int | None = None
+    tangential: bool | None = None
+    robust: bool = True
+    keep_outliers: bool = False
+
+    def __post_init__(self) -> None:
+        if self.aspect is not None:
+            demand(self, CalibrationError, aspect=ABOVE_0)
+        if self.coefficients is not None:
+            demand(self, CalibrationError, coefficients=whole(0, 5))

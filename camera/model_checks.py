@@ -1,0 +1,131 @@
+"""What cannot be a camera, refused by the names that a ``.cam`` file has for things."""
+
+from __future__ import annotations
+
+import math
+import operator
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from camera.distortion import LARGEST_COEFFICIENT, fold_radius, largest_distorted_radius
+from camera.errors import CameraError
+from camera.tangential import first_unseen, one_to_one_radius
+
+if TYPE_CHECKING:
+    from camera.model import Camera, Pose
+
+_ROTATION_TOLERANCE = 1e-3
+_LARGEST_SIDE_PX = 65536
+# Places on each side of the image's border at which it is looked whether anything is seen.
+_BORDER_PLACES = 65
+
+
+def check_numbers(camera: Camera) -> None:
+    """Refuse sizes, scales and coefficients that are impossible each for itself.
+
+    Raises
+    ------
+    CameraError
+        The message names what is wrong.
+    """
+    for name, side in (("width", camera.width), ("height", camera.height)):
+        if not 1 <= side <= _LARGEST_SIDE_PX:
+            raise CameraError(f"{name} is {side}: expected 1 to {_LARGEST_SIDE_PX} pixels")
+    if len(camera.coef) != 5:
+        raise CameraError(f"coef has {len(camera.coef)} numbers: expected 5 (a2 a3 b1 b2 b3)")
+    if len(camera.tangential) != 2:
+        raise CameraError(f"tangential has {len(camera.tangential)} numbers: expected 2 (p1 p2)")
+    for name, value in (
+        ("scaleX", camera.scale_x),
+        ("scaleY", camera.scale_y),
+        ("offsetX", camera.offset_x),
+        ("offsetY", camera.offset_y),
+        *((f"coef {symbol}", c) for symbol, c in zip(["a2", "a3", "b1", "b2", "b3"], camera.coef)),
+        *((f"tangential {symbol}", p) for symbol, p in zip(["p1", "p2"], camera.tangential)),
+    ):
+        if not math.isfinite(value):
+            raise CameraError(f"{name} is {value}: expected a finite number")
+    for name, numbers in (("coef", camera.coef), ("tangential", camera.tangential)):
+        if max(abs(c) for c in numbers) > LARGEST_COEFFICIENT:
+            raise CameraError(f"{name} is {numbers}: expected at most {LARGEST_COEFFICIENT:g} each")
+    for name, value in (("scaleX", camera.scale_x), ("scaleY", camera.scale_y)):
+        if value <= 0.0:
+            raise CameraError(f"{name} is {value}: expected a positive number of pixels")
+
+
+def check_one_to_one(camera: Camera) -> None:
+    """Refuse a distortion that folds inside the image.
+
+    Raises
+    ------
+    CameraError
+        The message says where it folds.
+    """
+    if any(camera.tangential):
+        _check_border(camera)
+        return
+    x = max(abs(camera.offset_x), abs(camera.width - 1 - camera.offset_x)) / camera.scale_x
+    y = max(abs(camera.offset_y), abs(camera.height - 1 - camera.offset_y)) / camera.scale_y
+    corner = math.hypot(x, y)
+    seen = largest_distorted_radius(camera.coef)
+    if not corner < seen:
+        raise CameraError(
+            f"the distortion folds inside the image: it grows only up to r = "
+            f"{fold_radius(camera.coef):.6g}, seen at {seen:.6g}, while the image's corner lies "
+            f"at {corner:.6g}"
+        )
+
+
+def _check_border(camera: Camera) -> None:
+    """What is one-to-one is so within a circle: its image holds the whole image, or it folds."""
+    pixels = border_pixels(camera.width, camera.height, _BORDER_PLACES)
+    with np.errstate(over="ignore"):
+        border = (pixels - [camera.offset_x, camera.offset_y]) / [camera.scale_x, camera.scale_y]
+    unseen = first_unseen(border, camera.coef, camera.tangential)
+    if unseen >= 0:
+        p1, p2 = camera.tangential
+        u, v = pixels[unseen]
+        r_max = one_to_one_radius(camera.coef, camera.tangential)
+        raise CameraError(
+            f"the distortion folds inside the image: with tangential p1 = {p1:g} and p2 = {p2:g} "
+            f"it is one-to-one only up to r = {r_max:.6g}, which pixel ({u:g}, {v:g}) lies beyond"
+        )
+
+
+def border_pixels(width: int, height: int, places: int) -> NDArray[np.float64]:
+    """(4 * places, 2) pixels along the border of an image, each side from corner to corner."""
+    along = np.linspace(0.0, 1.0, places)
+    zero, one = np.zeros(places), np.ones(places)
+    sides = [(along, zero), (along, one), (zero, along), (one, along)]
+    unit = np.concatenate([np.stack(side, axis=-1) for side in sides])
+    return np.asarray(unit * [width - 1, height - 1], dtype=np.float64)
+
+
+def checked_pose(name: str, rows: ArrayLike) -> Pose:
+    """Check a 3x4 rigid transform and return it as tuples."""
+    array = np.asarray(rows, dtype=np.float64)
+    if array.shape != (3, 4):
+        raise CameraError(f"{name} has shape {array.shape}: expected 3 rows of 4 numbers")
+    if not np.all(np.isfinite(array)):
+        raise CameraError(f"{name} has a number that is not finite")
+    rotation = array[:, :3]
+    with np.errstate(over="ignore", invalid="ignore"):
+        deviation = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+    if not deviation <= _ROTATION_TOLERANCE:
+        raise CameraError(
+            f"{name} is not a rotation: R R^T differs from the identity by {deviation:.3g} "
+            f"(at most {_ROTATION_TOLERANCE:g})"
+        )
+    if np.linalg.det(rotation) < 0.0:
+        raise CameraError(f"{name} is not a rotation but a reflection: its determinant is -1")
+    return tuple((float(a), float(b), float(c), float(d)) for a, b, c, d in array)
+
+
+def checked_whole(name: str, value: int) -> int:
+    """The whole number that a value is, of whatever type."""
+    try:
+        return operator.index(value)
+    except TypeError:
+        raise CameraError(f"{name} is {value!r}: expected a whole number") from None

@@ -1,0 +1,128 @@
+"""Compiled: single points through a lens with tangential distortion, and back.
+
+`camera.tangential` is the definition; a test holds the two together.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+_NEWTON_STEPS = 100
+_LAST_STEP = 1e-9
+_CONVERGED = 1e-12
+_SMALLEST_SHARE = 1e-6
+
+
+@njit(cache=True, error_model="numpy")
+def tangential_shift_point(p1: float, p2: float, x: float, y: float) -> tuple[float, float]:
+    """By how much decentering moves a point; all normalised."""
+    squared = x * x + y * y
+    along = 2.0 * (p2 * x + p1 * y)
+    return along * x + squared * p2, along * y + squared * p1
+
+
+@njit(cache=True, error_model="numpy")
+def straightened_point(
+    lens: NDArray[np.float64], x_seen: float, y_seen: float, x: float, y: float
+) -> tuple[float, float]:
+    """Undistorted normalised coordinates of a distorted point, of a lens with tangential terms.
+
+    Newton's method within the circle of r_max; a step that would leave it or raise the error is
+    halved. As the distortion is the gradient of a convex function there, that ends at the one
+    solution, if there is one.
+
+    Parameters
+    ----------
+    lens : (8,) float64
+        a2, a3, b1, b2, b3, p1, p2, r_max (`camera.kernels.lens_numbers`).
+    x_seen, y_seen : float
+        The distorted point, normalised.
+    x, y : float
+        Where to begin: the radial inverse, or what a neighbour sees.
+
+    Returns
+    -------
+    x, y : float
+        Both NaN where nothing is seen.
+    """
+    a2, a3, b1, b2, b3 = lens[0], lens[1], lens[2], lens[3], lens[4]
+    p1, p2, r_max = lens[5], lens[6], lens[7]
+    r = math.sqrt(x * x + y * y)
+    if r > r_max:
+        x *= 0.999 * r_max / r
+        y *= 0.999 * r_max / r
+    # The residual where the last step began; at first none is worse.
+    least = math.inf
+    x_kept, y_kept, x_step, y_step = x, y, 0.0, 0.0
+    share = 1.0
+    last = False
+    for _ in range(_NEWTON_STEPS):
+        r = math.sqrt(x * x + y * y)
+        numerator = r * (a2 + r * a3)
+        denominator = 1.0 + r * (b1 + r * (b2 + r * b3))
+        factor = 1.0 + numerator / denominator
+        squared = r * r
+        along = 2.0 * (p2 * x + p1 * y)
+        x_off = x_seen - (x * factor + along * x + squared * p2)
+        y_off = y_seen - (y * factor + along * y + squared * p1)
+        off = math.sqrt(x_off * x_off + y_off * y_off)
+        if r <= r_max and (off < least or last):
+            if last:
+                seen_radius = math.sqrt(x_seen * x_seen + y_seen * y_seen)
+                if off <= _CONVERGED * max(1.0, seen_radius):
+                    return x, y
+                return math.nan, math.nan
+            x_kept, y_kept, least, share = x, y, off, 1.0
+            slope = (
+                (a2 + 2.0 * a3 * r) * denominator - numerator * (b1 + r * (2.0 * b2 + 3.0 * b3 * r))
+            ) / (denominator * denominator)
+            per_r = slope / r if r > 0.0 else 0.0
+            xx = factor + per_r * x * x + along + 4.0 * p2 * x
+            xy = per_r * x * y + 2.0 * (p1 * x + p2 * y)
+            yy = factor + per_r * y * y + along + 4.0 * p1 * y
+            determinant = xx * yy - xy * xy
+            x_step = (yy * x_off - xy * y_off) / determinant
+            y_step = (xx * y_off - xy * x_off) / determinant
+            length = math.sqrt(x_step * x_step + y_step * y_step)
+            # Newton's error squares with each step: after one this small nothing is left to gain.
+            last = length <= _LAST_STEP * max(1.0, r)
+        else:
+            # Back, and less far.
+            share *= 0.5
+            last = False
+            if not share > _SMALLEST_SHARE:
+                break
+        x = x_kept + share * x_step
+        y = y_kept + share * y_step
+    return math.nan, math.nan
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def straighten_points(
+    lens: NDArray[np.float64],
+    seen: NDArray[np.float64],
+    start_radius: NDArray[np.float64],
+    straight: NDArray[np.float64],
+) -> None:
+    """`straightened_point` of many.
+
+    Parameters
+    ----------
+    lens : (8,) float64
+        As there.
+    seen : (N, 2) float64
+        Distorted normalised points.
+    start_radius : (N,) float64
+        About their undistorted radius.
+    straight : (N, 2) float64
+        Result.
+    """
+    for k in range(len(seen)):
+        x, y = seen[k, 0], seen[k, 1]
+        radius = math.sqrt(x * x + y * y)
+        ratio = start_radius[k] / radius if radius > 0.0 else 1.0
+        straight[k, 0], straight[k, 1] = straightened_point(lens, x, y, x * ratio, y * ratio)

@@ -1,0 +1,140 @@
+"""Discs and verticals through a lens with tangential distortion, as exactly as through another."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from camera import Camera
+from detect.circles import (
+    detect_circles,
+    disc_shape,
+    published_positions,
+    refined_covariance,
+)
+from detect.lines import detect_lines
+from detect.markers.lens import NO_LENS, lens_of
+from detect.settings import CircleSettings
+from lut import build_disc_table, build_vertical_table
+from tests.detect.line_scene import Edge, edge_columns, pinhole, render, tilted
+from tests.detect.painted_floor import PaintedFloor
+from tools.simulator.markers.kernels import project_point
+from tools.simulator.renderer import optics_of
+
+TANGENTIAL = (2e-3, -3e-3)
+PLACES = np.array([[0.0, -1.3], [1.2, -2.4], [-1.1, -1.9], [0.45, -3.6], [-0.9, -4.4]])
+EDGES = (
+    Edge(0.45, 60.0), Edge(0.30, -40.0), Edge(0.14, 70.0), Edge(-0.02, -90.0), Edge(-0.21, 50.0),
+    Edge(-0.40, -35.0),
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def decentred(published_camera: Camera) -> Camera:
+    return replace(published_camera, tangential=TANGENTIAL)
+
+
+def largest_error_m(seen_by: Camera, believed: Camera) -> float:
+    """Of the discs' places, each found once."""
+    floor = PaintedFloor(seen_by)
+    for place in PLACES:
+        floor.disc(place)
+    settings = CircleSettings(polarity="light")
+    table = build_disc_table(believed, disc_shape(settings))
+    found = detect_circles(floor.image(), believed, table, settings)
+    assert len(found) == len(PLACES)
+    distance = np.linalg.norm(found.floor_xy[:, None] - PLACES, axis=-1)
+    assert sorted(distance.argmin(axis=1)) == list(range(len(PLACES)))
+    return float(distance.min(axis=1).max())
+
+
+def test_discs_are_found_as_exactly_as_through_a_radial_lens(
+    published_camera: Camera, decentred: Camera
+) -> None:
+    radial = largest_error_m(published_camera, published_camera)
+    assert radial < 0.002
+    assert largest_error_m(decentred, decentred) < 1.5 * radial
+    # Without the terms positions are wrong: the scene does test them.
+    assert largest_error_m(decentred, published_camera) > 10.0 * radial
+
+
+def test_verticals_are_found_as_exactly_as_through_a_radial_lens() -> None:
+    radial = pinhole(240, 160, 200.0, pitch_deg=10.0, roll_deg=1.0, coef=(0.0, -0.1, 0.0, 0.0, 0.0))
+    lens = replace(radial, tangential=TANGENTIAL)
+    truth = np.array([edge.bearing_rad for edge in EDGES])
+    turn = np.radians((2.3, -1.0))
+    errors = []
+    for seen_by, believed in ((radial, radial), (lens, lens), (lens, radial)):
+        rng = np.random.default_rng(0)
+        image = render(tilted(seen_by, *turn), EDGES, noise=2.0, rng=rng)
+        found = detect_lines(image, build_vertical_table(believed))
+        assert found.tilt is not None
+        assert len(found.alpha_rad) == len(EDGES)
+        tilt = np.array([found.tilt.pitch_rad, found.tilt.roll_rad])
+        errors.append(
+            (np.abs(found.alpha_rad - truth).max(), np.degrees(np.abs(tilt - turn).max()))
+        )
+        if believed is lens:
+            # Ends are undistorted: through the lens they lie on the edges.
+            ends = np.array([[r.xtop, r.ytop, r.xbottom, r.ybottom] for r in found.landmarks()])
+            pixels = lens.distort(ends.reshape(-1, 2, 2))
+            for (top, bottom), bearing in zip(pixels, truth):
+                rows = np.array([top[1], bottom[1]])
+                columns = edge_columns(tilted(lens, *turn), bearing, rows)
+                np.testing.assert_allclose([top[0], bottom[0]], columns, atol=0.3)
+    assert errors[0][0] < 4e-4
+    assert errors[1][0] < 4e-4
+    assert errors[0][1] < 0.08
+    assert errors[1][1] < 0.08
+    assert errors[2][0] > 6e-4
+
+
+def test_published_positions_are_the_cameras(decentred: Camera) -> None:
+    rows, columns = np.mgrid[0 : decentred.height : 7, 0 : decentred.width : 5]
+    pixels = np.stack([columns.ravel(), rows.ravel()], axis=-1)
+    floor_xy, covariance = published_positions(decentred, pixels)
+    seen = decentred.floor_from_pixel(pixels)
+    jacobian = decentred.floor_jacobian_published(pixels)
+    expected = 0.04**2 * np.eye(2) + 2.0 * jacobian @ jacobian.swapaxes(-1, -2)
+    np.testing.assert_allclose(floor_xy, seen, rtol=1e-9)
+    near = np.hypot(*seen.T) < 10.0
+    assert near.sum() > 3000
+    np.testing.assert_allclose(floor_xy[near], seen[near], rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(covariance[near], expected[near], rtol=1e-8, atol=1e-11)
+
+
+def test_a_covariance_of_pixels_is_that_of_the_cameras_jacobian(decentred: Camera) -> None:
+    settings = replace(CircleSettings(), systematic_px=0.5, tilt_sigma_deg=0.0)
+    covariance = refined_covariance(decentred, PLACES, np.zeros((len(PLACES), 2, 2)), settings)
+    jacobian = decentred.floor_jacobian(decentred.project_floor(PLACES))
+    expected = 0.25 * jacobian @ jacobian.swapaxes(-1, -2)
+    np.testing.assert_allclose(covariance, expected, rtol=1e-5)
+
+
+def test_straight_pixels_of_markers(decentred: Camera) -> None:
+    image = np.zeros((decentred.height, decentred.width), np.uint8)
+    pixels = np.random.default_rng(4).uniform([1, 1], [766, 286], size=(200, 2))
+    scale = np.array([decentred.scale_x, decentred.scale_y])
+    expected = decentred.undistort(pixels) * scale + np.array([384.0, 144.0])
+    np.testing.assert_allclose(lens_of(decentred, image).straighten(pixels), expected, atol=0.005)
+    # Tangential terms alone make a lens, too.
+    alone = replace(decentred, coef=(0.0,) * 5)
+    assert lens_of(alone, image) is not NO_LENS
+    assert lens_of(replace(alone, tangential=(0.0, 0.0)), image) is NO_LENS
+
+
+def test_simulated_rays_are_the_cameras(decentred: Camera) -> None:
+    from camera.kernels import camera_numbers
+    from tools.simulator.frame.kernels import camera_ray
+
+    optics = optics_of(decentred)
+    u, v = np.meshgrid(np.linspace(-0.5, 767.5, 21), np.linspace(-0.5, 287.9, 17))
+    pixels = np.column_stack([u.ravel(), v.ravel()])
+    rays = np.array([camera_ray(a, b, optics.numbers, optics.inverse) for a, b in pixels])
+    points = np.column_stack([rays, np.ones(len(rays))])
+    np.testing.assert_allclose(decentred.project(points), pixels, atol=1e-9)
+    numbers = camera_numbers(decentred)
+    seen = np.array([project_point(numbers, *point) for point in points])
+    np.testing.assert_allclose(seen, pixels, atol=1e-9)
