@@ -212,6 +212,7 @@ def messages(reader: AnyReader, path: Path, topic: str) -> Iterator[tuple[str, f
     while True:
         try:
             connection, recorded_ns, content = next(stream)
+            recorded_s = recorded_ns / 1e9  # whatever stands in a database's column
             message = reader.deserialize(content, connection.msgtype)
         except StopIteration:
             return
@@ -221,7 +222,7 @@ def messages(reader: AnyReader, path: Path, topic: str) -> Iterator[tuple[str, f
                 f"expected a whole bag (--frames takes the first images only)"
             ) from None
         number += 1
-        yield connection.msgtype, recorded_ns / 1e9, message
+        yield connection.msgtype, recorded_s, message
 
 
 @contextmanager

@@ -76,6 +76,7 @@ def gray_of_pixels(pixels: NDArray[Any], name: object, bits: int = 16) -> NDArra
     Returns
     -------
     (H, W) uint8 array
+        Contiguous and writable; the same array if it is so already.
 
     Raises
     ------
@@ -83,7 +84,9 @@ def gray_of_pixels(pixels: NDArray[Any], name: object, bits: int = 16) -> NDArra
         If there are other numbers in it, or values that need more bits.
     """
     if pixels.ndim == 2 and pixels.dtype == np.uint8:  # of all images but a few
-        return np.ascontiguousarray(pixels)
+        # For arrays that must not be written to, as those of a message are, Numba would compile
+        # every kernel once more.
+        return np.require(pixels, requirements=["C", "W"])
     if pixels.dtype not in (np.uint8, np.uint16):
         raise FrameError(f"{name}: holds {pixels.dtype}: expected images of 8 or 16 bits")
     if pixels.ndim == 3:

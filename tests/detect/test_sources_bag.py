@@ -244,6 +244,18 @@ def test_a_bad_image_costs_its_frame(tmp_path: Path) -> None:
         read_image(second, None)
 
 
+@pytest.mark.parametrize("kind", BAG_KINDS)
+def test_images_may_be_written_to(tmp_path: Path, kind: BagKind) -> None:
+    """As those of files may: for others every kernel would be compiled once more."""
+    ros = Ros(kind)
+    path = ros.write(tmp_path / "d", [Said("/i", 1.0, ros.image(GRAY, "mono8", 1.0))])
+    (frame,) = open_source(path).frames
+    image = read_image(frame, None)
+    np.testing.assert_array_equal(image, GRAY)
+    assert image.flags.writeable
+    assert image.flags.c_contiguous
+
+
 def test_deep_images_by_the_bits_of_the_first(tmp_path: Path) -> None:
     ros = Ros()
     first = ros.image(np.full((4, 4), 4000, "<u2"), "mono16", 1.0)

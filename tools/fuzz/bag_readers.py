@@ -12,9 +12,12 @@ import numpy as np
 
 from camera import CameraError
 from detect.errors import DetectError
-from detect.sources.bag import Bag, opened_bag
+from detect.sources import bag as bag_source
+from detect.sources.bag import Bag
 from detect.sources.bag_camera import pose_in_dataset, static_transforms
 from detect.sources.steps import movement_between, step_of
+from tools.fuzz.bag_cells import bag_with_edits
+from tools.fuzz.bag_types import known_types, opened_once
 from tools.fuzz.reader import Reader
 
 _Kind = Literal["mcap", "sqlite", "ros1"]
@@ -31,8 +34,14 @@ def _bag(path: Path) -> object:
     """All that `detect` asks of a bag.
 
     The calibration that it begins with is none, so that no camera is fitted to it, which takes
-    seconds; the transforms are read all the same.
+    seconds; the transforms are read all the same. What the definitions of messages mean is worked
+    out once for each set of them.
     """
+    with known_types(), opened_once(path):
+        return _asked_of(path)
+
+
+def _asked_of(path: Path) -> object:
     bag = Bag(path)
     images = list(bag.images())
     for image in images:
@@ -41,7 +50,7 @@ def _bag(path: Path) -> object:
     odometry = bag.poses(None)
     poses = [] if odometry is None else list(odometry)
     steps = [step_of("e", movement_between(*pair)) for pair in pairwise(poses)]
-    with opened_bag(path) as reader:
+    with bag_source.opened_bag(path) as reader:
         transforms = static_transforms(reader, path)
     return images, steps, pose_in_dataset(transforms, "b", "o")
 
@@ -160,6 +169,10 @@ def _seeds(kind: _Kind) -> tuple[bytes, ...]:
     return (_recorded(kind),)
 
 
+def _bag_of_recipe(recipe: bytes) -> bytes:
+    return bag_with_edits(_recorded("sqlite"), recipe)
+
+
 _ERRORS = (DetectError, CameraError)
 
 BAG_READERS: tuple[Reader, ...] = (
@@ -173,5 +186,8 @@ BAG_READERS: tuple[Reader, ...] = (
     Reader(
         "sqlite bag", "b.db3", _bag, _ERRORS, (), _WORDS, made_seeds=partial(_seeds, "sqlite"),
         files=5,
+    ),
+    Reader(
+        "sqlite cells", "b.db3", _bag, _ERRORS, (b"",), _WORDS, files=40, content=_bag_of_recipe,
     ),
 )  # fmt: skip

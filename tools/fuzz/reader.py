@@ -39,6 +39,9 @@ class Reader:
         So many damaged files are read by the tests: fewer where each takes milliseconds.
     needed : bool
         Whether it is an error that there is no file.
+    content : callable or None
+        Makes a file's content of bytes, where damage to the file's own would not lead far; seeds
+        are then such bytes.
     """
 
     name: str
@@ -51,10 +54,15 @@ class Reader:
     made_seeds: Callable[[], tuple[bytes, ...]] | None = None
     files: int = 150
     needed: bool = True
+    content: Callable[[bytes], bytes] | None = None
 
     def all_seeds(self) -> tuple[bytes, ...]:
         """All files that it accepts."""
         return self.seeds if self.made_seeds is None else (*self.seeds, *self.made_seeds())
+
+    def content_of(self, data: bytes) -> bytes:
+        """What stands in the file: these bytes, or what they say of it."""
+        return data if self.content is None else self.content(data)
 
     def prepare(self, folder: Path) -> Path:
         """Put what stands beside its file into a folder; gives back the file's place."""

@@ -71,8 +71,9 @@ def main() -> None:
             which, data = data[0] % len(chosen) if data else 0, data[1:]
         counts[names[which]] += 1
         total += 1
+        content = chosen[which].content_of(data)
         handle = os.open(places[which], os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
-        os.write(handle, data)
+        os.write(handle, content)
         os.close(handle)
         try:
             attempt(chosen[which], places[which])
