@@ -33,8 +33,10 @@ _RESTART_VARIANCES = np.array([25.0, 25.0, math.pi**2])
 # The factors on odometry's deviations that are tried, and over how many nodes.
 _NOISE_FACTORS = (0.01, 20.0)
 _MOST_NODES_TO_LEARN_FROM = 30_000
+_LONGEST_GAP_TO_LEARN_FROM_S = 20.0
 _LEARNING_ROUNDS = 2
 _RELINEARISATIONS = 1
+_RELINEARISATIONS_WHERE_LOST = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,10 +101,13 @@ class MovementProblem:
             begins = np.array([len(self.times_s) - count], dtype=np.int64)
         held = np.searchsorted(self.nodes, begins + count) - np.searchsorted(self.nodes, begins)
         begin = int(begins[int(np.argmax(held))])
-        here = (self.nodes >= begin) & (self.nodes < begin + count)
+        return self._part(begin, begin + count)
+
+    def _part(self, begin: int, end: int) -> MovementProblem:
+        here = (self.nodes >= begin) & (self.nodes < end)
         return MovementProblem(
-            self.times_s[begin : begin + count],
-            self.controls[begin : begin + count],
+            self.times_s[begin:end],
+            self.controls[begin:end],
             self.nodes[here] - begin,
             self.measured[here],
             self.covariances[here],
@@ -110,6 +115,15 @@ class MovementProblem:
             self.repaired,
             self.settings,
         )
+
+    def split(self, longest_s: float) -> list[MovementProblem]:
+        """The parts between which nothing was measured for longer than this, without the gaps."""
+        at = self.times_s[self.nodes]
+        cuts = np.flatnonzero(np.diff(at) > longest_s) + 1
+        return [
+            self._part(int(self.nodes[own[0]]), int(self.nodes[own[-1]]) + 1)
+            for own in np.split(np.arange(len(at)), cuts)
+        ]
 
     def surprise(self, noise: FloatArray) -> float:
         """Minus twice the logarithm of the measurements' likelihood."""
@@ -126,21 +140,18 @@ class MovementProblem:
         points = np.empty((1, STATE))
         # Again, linearised along the smoothed path: where a gap was bridged, the filter alone was
         # too far off on its way for its derivatives to hold.
-        for _ in range(1 + _RELINEARISATIONS):
+        passes = 1 + _RELINEARISATIONS
+        while passes > 0:
             account = self._forward(
                 noise, points, True, predicted, spreads[0], filtered, spreads[1], spreads[2]
             )
             smooth_backward(
-                predicted,
-                spreads[0],
-                filtered,
-                spreads[1],
-                spreads[2],
-                account.restarted,
-                smoothed,
-                spreads[3],
+                predicted, spreads[0], filtered, spreads[1], spreads[2], smoothed, spreads[3]
             )
+            if len(points) == 1 and np.any(account.restarted):
+                passes += _RELINEARISATIONS_WHERE_LOST
             points = smoothed.copy()
+            passes -= 1
         return smoothed, spreads[3], account
 
     def _forward(
@@ -239,8 +250,12 @@ def noise_of(settings: FuseSettings) -> FloatArray:
 
 
 def likeliest_noise(problem: MovementProblem) -> FloatArray:
-    """Odometry's random errors that make the measurements likeliest, near those given."""
-    some = problem.shortened(_MOST_NODES_TO_LEARN_FROM)
+    """Odometry's random errors that make the measurements likeliest, near those given.
+
+    Long gaps are left out: by their ends a filter that is linearised may be lost, and then no noise
+    is likelier than another for what odometry did.
+    """
+    some = problem.shortened(_MOST_NODES_TO_LEARN_FROM).split(_LONGEST_GAP_TO_LEARN_FROM_S)
     given = noise_of(problem.settings)
     logarithms = np.zeros(3)
     bounds = tuple(math.log(factor) for factor in _NOISE_FACTORS)
@@ -254,7 +269,7 @@ def likeliest_noise(problem: MovementProblem) -> FloatArray:
             def surprise(value: float, axis: int = axis) -> float:
                 tried = logarithms.copy()
                 tried[axis] = value
-                return some.surprise(scaled(tried))
+                return sum(part.surprise(scaled(tried)) for part in some)
 
             found = minimize_scalar(
                 surprise, bounds=bounds, method="bounded", options={"xatol": 0.05}

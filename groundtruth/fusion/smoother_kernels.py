@@ -20,6 +20,9 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
+#: Of the heading (rad^2): beyond it, derivatives at the heading expected say nothing of others.
+LOST_VARIANCE = 0.5**2
+
 
 @njit(cache=True, error_model="numpy")
 def _wrap(angle: float) -> float:
@@ -41,6 +44,26 @@ def _invert_3x3(m: FloatArray, inverse: FloatArray) -> float:
     inverse[1, 2] = inverse[2, 1] = (b * c - a * e) * scale
     inverse[2, 2] = (a * d - b * b) * scale
     return float(determinant)
+
+
+@njit(cache=True, error_model="numpy")
+def _squared_innovation(
+    p: FloatArray,
+    measured_covariance: FloatArray,
+    innovation: FloatArray,
+    s: FloatArray,
+    s_inverse: FloatArray,
+) -> tuple[float, float]:
+    """Normalised square of an innovation, and its covariance's determinant; fills the last two."""
+    for i in range(POSE):
+        for j in range(POSE):
+            s[i, j] = p[i, j] + measured_covariance[i, j]
+    determinant = _invert_3x3(s, s_inverse)
+    squared = 0.0
+    for i in range(POSE):
+        for j in range(POSE):
+            squared += innovation[i] * s_inverse[i, j] * innovation[j]
+    return squared, determinant
 
 
 @njit(cache=True, error_model="numpy")
@@ -112,8 +135,10 @@ def filter_forward(
     gate : float
         Largest squared normalised innovation.
     restart_after : int
-        So many rejections in a row, and the pose's variances become `restart_variances`: the
-        measurements are believed again.
+        So many rejections in a row, and the pose becomes the measured one, with
+        `restart_variances`: the measurements are believed again, however far off the filter was.
+        The same at once where it does not know any more where the robot looks, if it is linearised
+        at its own states, which are too far off for that, or if the measurement does not fit.
     restart_variances : (3,) array
     points : (N, 6) array
         States at which each movement away from a node is linearised; of length 1: at the filter's
@@ -160,25 +185,29 @@ def filter_forward(
             for i in range(POSE):
                 innovation[i] = measured[m, i] - x[i]
             innovation[2] = _wrap(innovation[2])
-            if rejections >= restart_after:
+            lost = m > 0 and p[2, 2] > LOST_VARIANCE
+            anew = rejections >= restart_after or (lost and points.shape[0] == 1)
+            squared, determinant = _squared_innovation(
+                p, measured_covariances[m], innovation, s, s_inverse
+            )
+            if anew or (lost and squared > gate):
                 for i in range(POSE):
                     for j in range(STATE):
                         p[i, j] = 0.0
                         p[j, i] = 0.0
                 for i in range(POSE):
                     p[i, i] = restart_variances[i]
+                    x[i] += innovation[i]
+                    innovation[i] = 0.0
                 rejections = 0
                 restarted[k] = True
                 if keep:
+                    predicted[k] = x
                     predicted_covariance[k] = p
-            for i in range(POSE):
-                for j in range(POSE):
-                    s[i, j] = p[i, j] + measured_covariances[m, i, j]
-            determinant = _invert_3x3(s, s_inverse)
-            squared = 0.0
-            for i in range(POSE):
-                for j in range(POSE):
-                    squared += innovation[i] * s_inverse[i, j] * innovation[j]
+                    transitions[k, :POSE] = 0.0
+                squared, determinant = _squared_innovation(
+                    p, measured_covariances[m], innovation, s, s_inverse
+                )
             squared_innovations[m] = squared
             accepted[m] = squared <= gate
             if accepted[m]:
@@ -231,13 +260,13 @@ def smooth_backward(
     filtered: FloatArray,
     filtered_covariance: FloatArray,
     transitions: FloatArray,
-    restarted: BoolArray,
     smoothed: FloatArray,
     smoothed_covariance: FloatArray,
 ) -> None:
     """Smooth what `filter_forward` left, from the last node to the first.
 
-    Where the filter began anew, the poses before learn nothing from what came after.
+    Where the filter began anew, poses before learn from what came after only what it says of
+    odometry's systematic errors.
     """
     last = predicted.shape[0] - 1
     smoothed[last] = filtered[last]
@@ -247,19 +276,15 @@ def smooth_backward(
     gain = np.empty((STATE, STATE))
     difference = np.empty(STATE)
     for k in range(last - 1, -1, -1):
-        if restarted[k + 1]:
-            smoothed[k] = filtered[k]
-            smoothed_covariance[k] = filtered_covariance[k]
-            continue
         p, f = filtered_covariance[k], transitions[k + 1]
         _factor(predicted_covariance[k + 1], lower)
         # gain = p f' (predicted covariance)^-1, row by row.
         for i in range(STATE):
-            gain[i, 0], gain[i, 1] = p[i, 0], p[i, 1]
-            for n in range(2, STATE):
-                gain[i, 0] += p[i, n] * f[0, n]
-                gain[i, 1] += p[i, n] * f[1, n]
-            gain[i, 2] = p[i, 2] + p[i, 3] * f[2, 3] + p[i, 4] * f[2, 4]
+            for j in range(POSE):
+                total = 0.0
+                for n in range(STATE):
+                    total += p[i, n] * f[j, n]
+                gain[i, j] = total
             for j in range(POSE, STATE):
                 gain[i, j] = p[i, j]
             _solve(lower, gain[i])

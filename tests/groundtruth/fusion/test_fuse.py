@@ -14,7 +14,7 @@ from groundtruth.cli import main
 from groundtruth.errors import GroundTruthError
 from groundtruth.fusion.fuse import FuseSettings, fuse
 from groundtruth.fusion.movement import movement_problem
-from groundtruth.geometry.plane import log_motion
+from groundtruth.geometry.plane import between, log_motion
 from groundtruth.geometry.transforms import exp_se3
 from groundtruth.trajectories.interpolation import interpolate_poses
 from groundtruth.trajectories.streams import PlanarPoses, read_planar_poses, write_planar_poses
@@ -311,6 +311,41 @@ def test_a_robot_that_was_carried_away_is_found_again() -> None:
     off = np.linalg.norm(fusion.poses.poses[:, :2] - exact.poses[:, :2], axis=1)
     settled = (fusion.poses.times_s < 19.5) | (fusion.poses.times_s > fusion.restarts_s[0] + 1.0)
     assert np.max(off[settled]) < 0.15
+
+
+def test_a_gap_too_long_to_be_bridged_parts_the_path_and_no_more() -> None:
+    """A quarter of an hour of odometry that bends: poses after it are believed at once."""
+    rng = np.random.default_rng(14)
+    exact = FuseSettings(distance_sigma=0.01, lateral_sigma=0.0, turn_per_metre_sigma=0.03)
+    truth, own = drive(rng, 940.0, exact, rate_hz=10.0)
+    steps = between(own.poses[:-1], own.poses[1:])
+    steps[:, 2] += 0.02 * np.hypot(steps[:, 0], steps[:, 1])
+    odometry = PlanarPoses(own.times_s, chain(np.vstack([np.zeros((1, 3)), steps]), np.zeros(3)))
+    seen = np.concatenate([np.arange(0.0, 20.0, 0.1), np.arange(920.0, 939.8, 0.1)])
+    fusion = fuse(odometry, {"laser": measure(rng, truth, seen, LASER_COVARIANCE / 10)})
+    assert len(fusion.rejected) <= 2
+    assert all(time == pytest.approx(920.0, abs=0.2) for time in fusion.restarts_s)
+    exact_poses, _ = interpolate_poses(truth, fusion.poses.times_s)
+    off = np.linalg.norm((fusion.poses.poses - exact_poses.poses)[:, :2], axis=1)
+    near = (fusion.poses.times_s < 20.0) | (fusion.poses.times_s > 920.1)
+    assert np.max(off[near]) < 0.1
+    assert fusion.poses.covariances is not None
+    assert np.all(np.linalg.eigvalsh(fusion.poses.covariances) > 0.0)
+
+
+def test_a_robot_carried_far_away_is_found_again() -> None:
+    """Farther than a restart's own deviation lets anything pass."""
+    rng = np.random.default_rng(15)
+    truth, odometry = drive(rng, 30.0, FuseSettings())
+    moved = PlanarPoses(truth.times_s, truth.poses.copy())
+    moved.poses[truth.times_s > 15.0, :2] += [400.0, -300.0]
+    laser = measure(rng, moved, np.arange(0.0, 29.9, 0.1), LASER_COVARIANCE)
+    fusion = fuse(odometry, {"laser": laser})
+    assert len(fusion.restarts_s) == 1
+    assert len(fusion.rejected) == 40
+    exact, _ = interpolate_poses(moved, fusion.poses.times_s)
+    off = np.linalg.norm(fusion.poses.poses[:, :2] - exact.poses[:, :2], axis=1)
+    assert np.max(off[fusion.poses.times_s > fusion.restarts_s[0] + 1.0]) < 0.15
 
 
 def test_two_streams_are_better_than_each() -> None:
