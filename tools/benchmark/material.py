@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from camera import Camera, write_camera
 from detect.run import Run
+from landmarks import Frame, write_frames
 from tools.benchmark.errors import BenchmarkError
 
 _JPEG_QUALITY = 90
@@ -150,17 +151,20 @@ def repeated_run(run: Run, folder: Path, frames: int) -> Path:
     Returns
     -------
     path
-        The run folder; it has no odometry.
+        The run folder, with the odometry of those frames.
     """
-    sources = [frame.image for frame in run.frames if frame.image is not None]
+    sources = [(frame.image, frame.step) for frame in run.frames if frame.image is not None]
     if not sources:
         raise BenchmarkError(f"{run.folder}: no frame has an image: expected at least one")
     target = folder / f"frames{frames}"
     (target / "images").mkdir(parents=True)
     write_camera(run.camera, target / f"{target.name}.cam")
+    steps = []
     for number in range(frames):
-        source = sources[number % len(sources)]
+        source, step = sources[number % len(sources)]
         shutil.copyfile(source, target / "images" / f"e.{number:06d}{source.suffix}")
+        steps.append(Frame(replace(step, prefix=f"e.{number:06d}")))
+    write_frames(target / f"{target.name}.txt", steps)
     return target
 
 

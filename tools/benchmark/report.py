@@ -93,15 +93,16 @@ def format_markdown(result: Result) -> str:
         lines += _markdown_row([f"{compared.slower} / {compared.faster}", *cells])
     lines += [
         "",
-        "Whole runs, files in, files out, by the clock on the wall:",
+        "Whole runs, files in, files out, by the clock on the wall, as a share of what one core "
+        "that does nothing else reaches in the same process (quartiles):",
         "",
         *_markdown_row(
             [
-                "per job (quartiles)",
+                "per job",
                 "jobs",
                 "images/s",
-                "share of decoding from memory",
-                "share of reading and decoding files",
+                "of decoding from memory",
+                "of reading and decoding files",
             ],
             head=True,
         ),
@@ -116,6 +117,9 @@ def format_markdown(result: Result) -> str:
                 spread(passes.share_of_reading),
             ]
         )
+    for alone in result.runs[:1]:
+        lines += _markdown_row(["*decoding from memory*", "1", _per_s(alone)[0], "1", ""])
+        lines += _markdown_row(["*reading and decoding files*", "1", _per_s(alone)[1], "", "1"])
     lines += ["", "Growth, fitted to the medians:", "", *(f"- {t}" for t in growth_lines(result))]
     return "\n".join(lines) + "\n"
 
@@ -133,6 +137,11 @@ def format_headline(result: Result) -> str:
         f"{number(t.share_of_reading.median)} of reading and decoding files"
         for t in result.runs
     )
+    for alone in result.runs[:1]:
+        decoding, reading = _per_s(alone)
+        passes += (
+            f" ({alone.frames} frames; decoding alone {decoding} images/s, with reading {reading})"
+        )
     if result.by_frames:
         last = result.by_frames[-1]
         passes += (
@@ -204,6 +213,13 @@ def spread(values: Spread) -> str:
     return f"{number(values.median)} ({_quartiles(values)})"
 
 
+def _per_s(passes: RunTimes) -> tuple[str, str]:
+    """Images per second of decoding from memory, and of reading and decoding."""
+    spreads = passes.decoding_images_per_s, passes.reading_images_per_s
+    from_memory, from_files = (number(values.median) for values in spreads)
+    return from_memory, from_files
+
+
 def _kind_table(kind: KindTimes) -> Table:
     table = Table(
         title=f"{kind.kind}: {kind.pictures} images, {kind.description}", title_justify="left"
@@ -246,18 +262,28 @@ def _runs_table(title: str, runs: Iterable[RunTimes]) -> Table:
         title=title,
         title_justify="left",
         caption="* images per second and job / those of decoding the same files from memory, or of "
-        "reading and decoding them, and nothing else",
+        "reading and decoding them, and nothing else; in brackets those",
         caption_justify="left",
     )
     table.add_column("command", no_wrap=True)
-    for column in ("of decoding*", "quartiles", "of reading*", "images/s", "frames", "jobs"):
+    for column in (
+        "of decoding*",
+        "quartiles",
+        "of reading*",
+        "quartiles",
+        "images/s",
+        "frames",
+        "jobs",
+    ):
         table.add_column(column, justify="right")
     for times in runs:
+        decoding, reading = _per_s(times)
         table.add_row(
             times.command,
-            number(times.share_of_decoding.median),
+            f"{number(times.share_of_decoding.median)} ({decoding}/s)",
             _quartiles(times.share_of_decoding),
-            number(times.share_of_reading.median),
+            f"{number(times.share_of_reading.median)} ({reading}/s)",
+            _quartiles(times.share_of_reading),
             number(times.images_per_s.median),
             str(times.frames),
             str(times.jobs),

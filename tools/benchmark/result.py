@@ -88,17 +88,21 @@ class RunTimes:
         Frames of the run, processes or threads at work.
     images_per_s : Spread
         Images per second, by all jobs together.
+    decoding_images_per_s, reading_images_per_s : Spread
+        Images per second when one core decodes the same files from memory and does nothing else,
+        and when it reads each file before.
     share_of_decoding : Spread
-        Images per second and job / images per second when one core decodes the same files from
-        memory and does nothing else.
+        Images per second and job / those of decoding from memory.
     share_of_reading : Spread
-        The same, when it reads each file before.
+        Images per second and job / those of reading and decoding.
     """
 
     command: str
     frames: int
     jobs: int
     images_per_s: Spread
+    decoding_images_per_s: Spread
+    reading_images_per_s: Spread
     share_of_decoding: Spread
     share_of_reading: Spread
 
@@ -126,7 +130,7 @@ class Result:
         A sentence for each thing that was not measured.
     kinds : tuple of KindTimes
     runs : tuple of RunTimes
-        The demo run, all commands.
+        A run of the demo's images, all commands.
     by_megapixels, by_discs, by_verticals : tuple of GrowthPoint
         Growth curves.
     by_frames : tuple of RunTimes
@@ -202,6 +206,8 @@ def run_times(
         frames,
         jobs,
         spread_of(frames / seconds),
+        spread_of(frames / decoding),
+        spread_of(frames / reading),
         spread_of(paired_ratios(decoding, seconds) / jobs),
         spread_of(paired_ratios(reading, seconds) / jobs),
     )

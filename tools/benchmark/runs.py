@@ -24,7 +24,7 @@ Command = All | Circles | Lines
 Key = TypeVar("Key", bound=Hashable)
 
 #: A command that has taken this long is left out of later rounds, seconds.
-_BUDGET_S = 10.0
+_BUDGET_S = 15.0
 
 
 def commands(run: Path, output: Path, jobs: int = 1) -> dict[str, Command]:

@@ -32,7 +32,7 @@ from tools.benchmark.result import (
     function_times,
     run_times,
 )
-from tools.benchmark.runs import commands, measure_runs
+from tools.benchmark.runs import commands, measure_runs, perform
 from tools.benchmark.timing import measure_in_turn
 
 #: Peers, and what does their work here.
@@ -65,8 +65,10 @@ class Settings:
         Pictures of each kind.
     rounds : int
         How often each function gets each picture.
+    run_frames : int
+        Frames of a whole run: those of the demo run over and over.
     run_rounds : int
-        Passes over a whole run.
+        Passes over a whole run; slow commands get fewer.
     budget_s : float
         A function that has taken this long on a kind of pictures is left out of its later rounds,
         seconds.
@@ -77,7 +79,7 @@ class Settings:
     frames : tuple of int
         Lengths of the growing runs.
     jobs : tuple of int
-        Numbers of jobs, for the growing runs; the demo run, which is short, gets one.
+        Numbers of jobs, for the growing runs; the whole runs get one.
     seed : int
         Of noise and places.
     """
@@ -86,7 +88,8 @@ class Settings:
     photographs: Path | None = None
     pictures: int = 8
     rounds: int = 10
-    run_rounds: int = 3
+    run_frames: int = 1600
+    run_rounds: int = 5
     budget_s: float = 3.0
     factors: tuple[float, ...] = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0)
     landmarks: tuple[int, ...] = (0, 5, 10, 20, 30, 50)
@@ -155,8 +158,11 @@ def benchmark(settings: Settings, on_stage: Callable[[str], None] | None = None)
 
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        say("whole runs")
-        runs = _runs(settings.run, list(commands(settings.run, folder)), (1,), folder, settings)
+        say(f"whole runs: {settings.run_frames} frames")
+        for command in commands(settings.run, folder).values():
+            perform(command)  # compiles what is to be compiled
+        whole = repeated_run(run, folder / "whole", settings.run_frames)
+        runs = _runs(whole, list(commands(whole, folder)), (1,), folder, settings, warm_up=False)
         by_frames: list[RunTimes] = []
         for frames in settings.frames:
             say(f"whole runs: {frames} frames")

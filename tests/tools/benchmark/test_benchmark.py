@@ -69,7 +69,7 @@ def test_the_command_measures_everything(
     readme.write_text("<!-- benchmark begins -->\n<!-- benchmark ends -->\n")
     arguments = [
         "--run", str(short_run), "--photographs", str(short_run / "images"),
-        "--pictures", "1", "--rounds", "1", "--run-rounds", "1",
+        "--pictures", "1", "--rounds", "1", "--run-rounds", "1", "--run-frames", "3",
         "--factors", "0.5", "1", "--landmarks", "0", "3", "--frames", "1", "2", "--jobs", "1",
         "--json", str(files["json"]), "--plot", str(files["png"]), "--markdown", str(files["md"]),
         "--readme", str(readme),
@@ -92,7 +92,13 @@ def test_the_command_measures_everything(
     )
     assert [point["amount"] for point in document["by_discs"]] == [0, 3]
     assert [(times["frames"], times["jobs"]) for times in document["by_frames"]] == [(1, 1), (2, 1)]
-    assert len(document["runs"]) == len(commands(short_run, tmp_path))
+    assert [times["command"] for times in document["runs"]] == [*commands(short_run, tmp_path)]
+    for times in document["runs"]:
+        assert times["frames"] == 3
+        for kind in ("decoding", "reading"):
+            alone = times[f"{kind}_images_per_s"]["median"]
+            share = times[f"share_of_{kind}"]["median"]
+            assert times["images_per_s"]["median"] == pytest.approx(share * alone)
     assert files["png"].read_bytes().startswith(b"\x89PNG")
     assert KERNEL in files["md"].read_text()
     assert KERNEL in readme.read_text()

@@ -119,6 +119,8 @@ def test_markdown_tells_ratios_first_and_what_is_missing() -> None:
     assert (
         "| `detect all`, 10 frames | 2 | 10.0 | 0.25 (0.19 - 0.25) | 0.30 (0.22 - 0.30) |" in text
     )
+    assert "| *decoding from memory* | 1 | 20.0 | 1 |  |" in text
+    assert "| *reading and decoding files* | 1 | 16.7 |  | 1 |" in text
     assert "settings: pictures 2, rounds 7, jobs 1 2" in text
     assert "not installed: something" in text
     assert "not measured: photographs: no folder was given" in text
@@ -143,6 +145,7 @@ def test_the_headline_is_medians_alone() -> None:
     assert "| x decoding (ms) | demo |" in text
     assert "| own | 2.50 (5.00) |" in text
     assert "5.00 images/s, 0.25 of decoding from memory, 0.30 of reading and decoding" in text
+    assert "(10 frames; decoding alone 20.0 images/s, with reading 16.7)" in text
     assert "`detect all` of 10 frames with 2 jobs 10.0 images/s." in text
     assert "A processor; 2 pictures of each kind, 7 rounds." in text
 
