@@ -13,7 +13,7 @@ from camera.calibration_model import free_span, is_possible, project_points
 from camera.conversion_models import COEFFICIENTS, P1, ForeignCamera, Model
 from camera.errors import CameraError, ConversionError
 from camera.model import Camera
-from camera.tangential import NONE, Tangential
+from camera.tangential import NONE, Tangential, tangential_shift
 
 FloatArray = NDArray[np.float64]
 AnyCamera = Camera | ForeignCamera
@@ -28,6 +28,11 @@ _CHECK_GRID = (129, 97)
 _LAWSON_ROUNDS = 25
 _STEPS = 60
 _LAWSON_STEPS = 5
+_MANY_STEPS = 200
+# A largest deviation after least squares from which on another start is tried.
+_NEAR_PX = 0.02
+# b1, b2, b3 of a denominator that dips towards the image's corner, at radius 1.
+_DIP = (-2.5, 2.5, -0.85)
 # A deviation that only rounding is left of.
 _EXACT_PX = 1e-6
 
@@ -201,10 +206,35 @@ def convert_to_camera(
     if any(_tangential(source)):
         # Last, the terms taken over may make up for what the radial part can't follow.
         spans.append(free_span(5, None, tangential=True))
-    best = _nearest(project, camera_of, start, spans, pixels, possible, check)
+    radius = np.hypot(rays[:, 0], rays[:, 1])
+    away = (pixels - start[2:4]) / start[:2] - tangential_shift(rays, _tangential(source))
+    moved = np.sum((away - rays) * rays, axis=1) / np.maximum(radius, 1e-9)
+    wavy = _wavy_start(start, radius, moved)
+    best = _nearest(project, camera_of, start, spans, pixels, possible, check, wavy)
     if best is None:
         raise ConversionError("no camera of the project's model sees what the source sees")
     return best
+
+
+def _wavy_start(start: FloatArray, radius: FloatArray, moved: FloatArray) -> FloatArray:
+    """Where a fit begins to a lens whose radial distortion changes its sign within the image.
+
+    Least squares does not get there from a lens without distortion: the denominator has to dip
+    towards the border. With the dip given, a2 and a3 are linear.
+
+    Parameters
+    ----------
+    start : (11,) array
+        Intrinsics without radial distortion.
+    radius, moved : (N,) arrays
+        Undistorted radii, and how far the distortion moves rays outward there.
+    """
+    reach = float(radius.max())
+    b = np.array(_DIP) / reach ** np.array([1.0, 2.0, 3.0])
+    denominator = 1.0 + radius * (b[0] + radius * (b[1] + radius * b[2]))
+    powers = np.stack([radius**2, radius**3], axis=-1) / denominator[:, None]
+    a = np.linalg.lstsq(powers, moved, rcond=None)[0]
+    return np.concatenate([start[:4], a, b, start[9:]])
 
 
 def _nearest(
@@ -215,8 +245,12 @@ def _nearest(
     pixels: FloatArray,
     possible: Callable[[FloatArray], bool],
     check: tuple[FloatArray, FloatArray],
+    other_start: FloatArray | None = None,
 ) -> Converted | None:
-    """The fit with the smallest largest deviation, each span fitted from where the last ended."""
+    """The fit with the smallest largest deviation, each span fitted from where the last ended.
+
+    Where none is near, the last span is fitted from another start, too.
+    """
     best: Converted | None = None
     nearest = parameters = start
 
@@ -238,6 +272,14 @@ def _nearest(
             nearest, span = parameters, wider
         if best is not None and best.deviation_px < _EXACT_PX:
             return best
+    if (
+        other_start is not None
+        and possible(other_start)
+        and (best is None or best.deviation_px > _NEAR_PX)
+    ):
+        parameters = _fit(project, other_start, spans[-1], pixels, possible, steps=_MANY_STEPS)
+        if keep(parameters):
+            nearest, span = parameters, spans[-1]
     keep(_lawson(project, nearest, span, pixels, possible))
     return best
 

@@ -158,8 +158,9 @@ class Convert:
 
     Example: camera convert camchain.yaml my.cam --rows halve
 
-    The target model is fitted to the source's pixels over the whole image; the largest deviation is
-    printed, and above --limit-px nothing is written.
+    The target model is fitted to the source's pixels over the whole image; tangential terms (p1 p2)
+    are taken over where it has them. The largest deviation is printed, and above --limit-px nothing
+    is written.
 
     Parameters
     ----------

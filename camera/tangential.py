@@ -39,7 +39,9 @@ Tangential = tuple[float, float]
 NONE: Tangential = (0.0, 0.0)
 
 _NODES = 4096
-_BISECTIONS = 60
+# Rounds of looking more closely where the first fold is; the last is between neighbouring doubles.
+_REFINEMENTS = 6
+_NODES_BETWEEN = 513
 
 
 def tangential_shift(xy: FloatArray, tangential: Tangential) -> FloatArray:
@@ -95,17 +97,16 @@ def one_to_one_radius(coef: Coef, tangential: Tangential) -> float:
     limit = min(fold_radius(coef), RADIUS_LIMIT)
     radius = np.tan(np.linspace(0.0, math.atan(limit), _NODES))
     radius[-1] = limit
-    folded = np.flatnonzero(~(_least_determinant(radius, coef, amount) > 0.0))
-    if not len(folded):
-        return limit
-    low, high = float(radius[max(folded[0] - 1, 0)]), float(radius[folded[0]])
-    for _ in range(_BISECTIONS):
-        middle = 0.5 * (low + high)
-        if _least_determinant(np.array([middle]), coef, amount)[0] > 0.0:
-            low = middle
-        else:
-            high = middle
-    return low
+    for _ in range(_REFINEMENTS):
+        folded = ~(_least_determinant(radius, coef, amount) > 0.0)
+        first = int(np.argmax(folded))
+        if not folded[first]:
+            break
+        # At 0 the determinant is 1.
+        radius = np.linspace(radius[max(first - 1, 0)], radius[first], _NODES_BETWEEN)
+    else:
+        return float(radius[0])
+    return limit
 
 
 def _least_determinant(radius: FloatArray, coef: Coef, amount: float) -> FloatArray:

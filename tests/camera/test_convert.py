@@ -196,6 +196,19 @@ def test_without_radial_terms_the_tangential_ones_go_and_come_exactly() -> None:
     assert convert_to_foreign(there.camera, "fisheye").deviation_px > 0.1
 
 
+def test_a_lens_that_changes_from_barrel_to_pincushion_is_followed() -> None:
+    """From a lens without distortion least squares ends a pixel away."""
+    wavy = ForeignCamera(
+        "radtan", 640, 480, 500.0, 500.0, 319.5, 239.5, (0.1, -0.2, 5e-3, 5e-3, 0.05)
+    )
+    found = convert_to_camera(wavy)
+    assert found.deviation_px < 0.05
+    assert isinstance(found.camera, Camera)
+    pixels = np.random.default_rng(2).uniform([0.0, 0.0], [639.0, 479.0], size=(500, 2))
+    seen = as_opencv_projects(wavy, found.camera.undistort(pixels))
+    np.testing.assert_allclose(seen, pixels, atol=0.05)
+
+
 def test_a_thin_prism_shows_in_the_deviation() -> None:
     prism = (-0.2, 0.05, *(0.0,) * 6, 0.01, 0.0, 0.0, 0.0)
     bent = convert_to_camera(ForeignCamera("rational", 640, 480, 500.0, 500.0, 320.0, 240.0, prism))
