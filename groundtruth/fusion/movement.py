@@ -347,7 +347,7 @@ def _distinct(odometry: PlanarPoses, arcs: FloatArray, settings: FuseSettings) -
 
     Only there its turns tell by what share they are too long. Elsewhere, what looks like turns are
     those errors; and since they are just what measured headings contradict, the share would be
-    found to be about -1, whatever it is (regression dilution).
+    drawn towards -1, whatever it is (regression dilution).
     """
     from_s = np.maximum(odometry.times_s[:-1] - _DISTINCT_OVER_S, odometry.times_s[0])
     to_s = np.minimum(odometry.times_s[1:] + _DISTINCT_OVER_S, odometry.times_s[-1])
