@@ -39,6 +39,8 @@ PUBLISHED_PIXEL_VARIANCE = 2.0
 
 #: For the noise floor an image's noise is never less than this: one grey level, its resolution.
 _LEAST_NOISE = 1.0
+#: So many rows of an image tell its noise well enough.
+_NOISE_ROWS = 96
 
 
 @dataclass(frozen=True)
@@ -105,7 +107,7 @@ def detect_circles(
     if not (settings.verify or settings.refine):
         weakest = 0.0
         if settings.noise_floor > 0.0:
-            weakest = settings.noise_floor * max(estimate_noise(image), _LEAST_NOISE)
+            weakest = settings.noise_floor * max(estimate_noise(image, _NOISE_ROWS), _LEAST_NOISE)
         if weakest > 0.0 or settings.separation_m > 0.0:
             keep = strong_and_alone(
                 pixels, found_quality, contrast, table.floor_xy, weakest, settings.separation_m
@@ -120,7 +122,7 @@ def detect_circles(
             evidence=np.full(len(pixels), np.nan),
         )
 
-    noise = estimate_noise(image)
+    noise = estimate_noise(image, _NOISE_ROWS)
     weakest = settings.noise_floor * max(noise, _LEAST_NOISE)
     # Each disc has several best centres: of those in the middle of it one is enough.
     keep = strong_and_alone(
@@ -133,6 +135,8 @@ def detect_circles(
         found_quality[keep],
         contrast[keep],
         settings.radius_m,
+        settings.inner_radius_m,
+        settings.outer_radius_m,
         fit_settings(noise, blur_ratio_of(camera)),
         settings.verify,
         settings.refine,

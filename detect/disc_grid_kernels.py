@@ -18,6 +18,7 @@ from detect.disc_model_kernels import (
     CHORD_Y,
     F32,
     FASTMATH,
+    GEOMETRY,
     GROWTH,
     PER_LENGTH,
     PER_STEP_ACROSS,
@@ -36,9 +37,11 @@ from detect.disc_patch_kernels import (
     SADDLE_XY,
     FitSettings,
     Patch,
+    padded,
 )
 
 _SMALLEST = F32(1e-6)
+_ONE, _TWO = np.uint64(1), np.uint64(2)
 
 
 @njit(cache=True, error_model="numpy", inline="always", fastmath=FASTMATH)
@@ -75,32 +78,23 @@ def store_chord(
 
 
 @njit(cache=True, error_model="numpy", forceinline=True, fastmath=FASTMATH)
-def fill_chords(
-    floor_xy: NDArray[np.float32], radius: float, columns: bool, count: int, patch: Patch
-) -> None:
-    """The geometry for `chord_shares` of the pixels in the patch's list."""
-    index = patch.pixels
-    geometry = patch.geometry
-    terms = patch.terms
-    floor_line = floor_xy.reshape(-1)
-    next_row = 2 * floor_xy.shape[1]
-    steep, other = (2, next_row) if columns else (next_row, 2)
-    per_radius = F32(1.0 / radius)
+def finish_chords(count: int, terms: NDArray[np.float32], geometry: NDArray[np.float32]) -> None:
+    """The geometry for `chord_shares` of a list's pixels, from the floor's steps at them.
+
+    The steps (x, y) stand where later is what becomes of them: from the pixel before along the
+    steep axis in `ALONG_X` and `ALONG_Y`, to the next one in `ACROSS_X` and `ACROSS_Y`, along the
+    other axis in `PER_STEP_ACROSS` and `PER_LENGTH`.
+    """
     half = F32(0.5)
-    for i in range(count):
-        at = 2 * index[i]
-        x = floor_line[at]
-        y = floor_line[at + 1]
-        bx = (x - floor_line[at - steep]) * per_radius
-        by = (y - floor_line[at - steep + 1]) * per_radius
-        ax = (floor_line[at + steep] - x) * per_radius
-        ay = (floor_line[at + steep + 1] - y) * per_radius
-        x1 = half * (ax + bx)
-        y1 = half * (ay + by)
-        x2 = half * per_radius * (floor_line[at + other] - floor_line[at - other])
-        y2 = half * per_radius * (floor_line[at + other + 1] - floor_line[at - other + 1])
+    for i in range(np.uint64(count)):
+        bx = geometry[ALONG_X * CAPACITY + i]
+        by = geometry[ALONG_Y * CAPACITY + i]
+        ax = geometry[ACROSS_X * CAPACITY + i]
+        ay = geometry[ACROSS_Y * CAPACITY + i]
         store_chord(
-            terms[PLANE_X * CAPACITY + i], terms[PLANE_Y * CAPACITY + i], x1, y1, x2, y2,
+            terms[PLANE_X * CAPACITY + i], terms[PLANE_Y * CAPACITY + i],
+            half * (ax + bx), half * (ay + by),
+            geometry[PER_STEP_ACROSS * CAPACITY + i], geometry[PER_LENGTH * CAPACITY + i],
             math.sqrt(bx * bx + by * by), math.sqrt(ax * ax + ay * ay), i, geometry,
         )  # fmt: skip
 
@@ -147,17 +141,35 @@ def gather_grid(
     per_radius = F32(1.0 / radius)
     middle = F32(image[v0, u0])
     begin_p = first_p - margin
+    # Where the lines are in the image: from its first to its last pixel.
+    seen_begin = max(-begin_p, 0)
+    seen_end = min(length, end_p - begin_p)
+    floor_line = floor_xy.reshape(-1)
+    grey = image.reshape(-1)
     # One line more on either side, for the steps from line to line.
     for line in range(lines + 2):
         q = first_q - 1 + line
         row = line * length
-        for k in range(length):
-            p = min(max(begin_p + k, 0), end_p - 1)
-            v, u = (p, q) if columns else (q, p)
-            floor[row + k] = (floor_xy[v, u, 0] - x0) * per_radius
-            floor[CAPACITY + row + k] = (floor_xy[v, u, 1] - y0) * per_radius
-            if 0 < line <= lines:
-                terms[GREY * CAPACITY + row - length + k] = F32(image[v, u]) - middle
+        at = row + seen_begin
+        p = begin_p + seen_begin
+        first = p * width + q if columns else q * width + p
+        seen = seen_end - seen_begin
+        _copy_floor(
+            floor_line[2 * first :], 2 * width if columns else 2, x0, y0, per_radius,
+            floor[at : at + seen], floor[CAPACITY + at : CAPACITY + at + seen],
+        )  # fmt: skip
+        if 0 < line <= lines:
+            to = GREY * CAPACITY + row - length
+            _copy_grey(
+                grey[first:],
+                width if columns else 1,
+                middle,
+                terms[to + seen_begin : to + seen_end],
+            )
+            for k in range(seen_begin):
+                terms[to + k] = F32(0.0)
+            for k in range(seen_end, length):
+                terms[to + k] = F32(0.0)
         # Beyond the image the floor goes on as it ends.
         for k in range(-begin_p - 1, -1, -1):
             for axis in range(0, 2 * CAPACITY, CAPACITY):
@@ -167,11 +179,7 @@ def gather_grid(
             for axis in range(0, 2 * CAPACITY, CAPACITY):
                 at = axis + row + k
                 floor[at] = 2.0 * floor[at - 1] - floor[at - 2]
-    for i in range(0, (lines + 2) * length):
-        # No floor is far away.
-        if not abs(floor[i]) < 1e4 or not abs(floor[CAPACITY + i]) < 1e4:
-            floor[i] = 1e4
-            floor[CAPACITY + i] = 1e4
+    _far_away(floor[: (lines + 2) * length], floor[CAPACITY : CAPACITY + (lines + 2) * length])
     ratio_2 = settings.blur_ratio * settings.blur_ratio
     if columns:
         per_p, per_q = ratio_2, 1.0
@@ -182,17 +190,57 @@ def gather_grid(
         floor, n, length, settings.reach_radii, settings.reach_px, blurs_2 * per_p,
         blurs_2 * per_q, patch.geometry, terms,
     )  # fmt: skip
-    count = 0
     for line in range(lines):
         row = line * length
         for i in range(row, row + margin):
             terms[ONE * CAPACITY + i] = 0.0
         for i in range(row + length - margin, row + length):
             terms[ONE * CAPACITY + i] = 0.0
-    for i in range(n):
-        count += 1 if terms[ONE * CAPACITY + i] > F32(0.0) else 0
-    _mask_terms(n, terms)
-    return n, count
+    # Shares are computed for whole numbers of pixels.
+    for field in range(GEOMETRY):
+        for i in range(n, padded(n)):
+            patch.geometry[field * CAPACITY + i] = patch.geometry[field * CAPACITY + n - 1]
+    return n, _mask_terms(n, terms)
+
+
+@njit(cache=True, error_model="numpy", forceinline=True, fastmath=FASTMATH)
+def _copy_floor(
+    floor: NDArray[np.float32],
+    step: int,
+    x0: float,
+    y0: float,
+    per_radius: float,
+    xs: NDArray[np.float32],
+    ys: NDArray[np.float32],
+) -> None:
+    """A line of the floor x, y, x, y ..., pixels being `step` apart, in nominal radii."""
+    if step == 2:
+        for k in range(np.uint64(len(xs))):
+            xs[k] = (floor[_TWO * k] - x0) * per_radius
+            ys[k] = (floor[_TWO * k + _ONE] - y0) * per_radius
+    else:
+        for k in range(np.uint64(len(xs))):
+            xs[k] = (floor[np.uint64(step) * k] - x0) * per_radius
+            ys[k] = (floor[np.uint64(step) * k + _ONE] - y0) * per_radius
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _copy_grey(
+    grey: NDArray[np.uint8], step: int, middle: float, result: NDArray[np.float32]
+) -> None:
+    """A line of grey values, pixels being `step` apart, relative to one."""
+    for k in range(np.uint64(len(result))):
+        result[k] = F32(grey[np.uint64(step) * k]) - middle
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _far_away(xs: NDArray[np.float32], ys: NDArray[np.float32]) -> None:
+    """Where there is no floor, it is far away."""
+    most = F32(1e4)
+    for i in range(np.uint64(len(xs))):
+        seen = (abs(xs[i]) < most) & (abs(ys[i]) < most)
+        xs[i] = xs[i] if seen else most
+        ys[i] = ys[i] if seen else most
 
 
 @njit(cache=True, error_model="numpy", forceinline=True, fastmath=FASTMATH)
@@ -253,8 +301,8 @@ def _chord_geometry(
 
 
 @njit(cache=True, error_model="numpy", forceinline=True, fastmath=FASTMATH)
-def _mask_terms(n: int, terms: NDArray[np.float32]) -> None:
-    """Finish the terms of a grid: zero where a pixel is not to be fitted."""
+def _mask_terms(n: int, terms: NDArray[np.float32]) -> int:
+    """Finish the terms of a grid: zero where a pixel is not to be fitted. How many are."""
     terms[LINKED * CAPACITY] = 0.0
     for i in range(n - 1):
         terms[LINKED * CAPACITY + 1 + i] = terms[ONE * CAPACITY + i] * terms[ONE * CAPACITY + 1 + i]
@@ -268,3 +316,7 @@ def _mask_terms(n: int, terms: NDArray[np.float32]) -> None:
         terms[SADDLE_XY * CAPACITY + i] = x * y
         terms[GREY * CAPACITY + i] *= one
         terms[NEAR * CAPACITY + i] *= one
+    total = F32(0.0)
+    for i in range(n):
+        total += terms[ONE * CAPACITY + i]
+    return int(np.int64(total))

@@ -27,15 +27,62 @@ ROWS = 11
 @njit(cache=True, error_model="numpy", forceinline=True, fastmath=FASTMATH)
 def background_products(terms: NDArray[np.float32], n: int, products: NDArray[np.float64]) -> None:
     """Sums of products of the background's terms and the grey values, over n pixels."""
-    for a in range(BACKGROUND + 1):
-        row = GREYS if a == BACKGROUND else a
-        first = a * CAPACITY
-        for b in range(a + 1):
-            second = b * CAPACITY
-            total = F32(0.0)
-            for i in range(n):
-                total += terms[first + i] * terms[second + i]
-            products[row, GREYS if b == BACKGROUND else b] = total
+    # All in one loop: each pixel is read once, and no sum waits for itself.
+    s00 = F32(0.0)
+    s10 = s11 = F32(0.0)
+    s20 = s21 = s22 = F32(0.0)
+    s30 = s31 = s32 = s33 = F32(0.0)
+    s40 = s41 = s42 = s43 = s44 = F32(0.0)
+    s50 = s51 = s52 = s53 = s54 = s55 = F32(0.0)
+    for i in range(n):
+        t0 = terms[ONE * CAPACITY + i]
+        t1 = terms[PLANE_X * CAPACITY + i]
+        t2 = terms[PLANE_Y * CAPACITY + i]
+        t3 = terms[SADDLE * CAPACITY + i]
+        t4 = terms[SADDLE_XY * CAPACITY + i]
+        t5 = terms[GREY * CAPACITY + i]
+        s00 += t0 * t0
+        s10 += t1 * t0
+        s11 += t1 * t1
+        s20 += t2 * t0
+        s21 += t2 * t1
+        s22 += t2 * t2
+        s30 += t3 * t0
+        s31 += t3 * t1
+        s32 += t3 * t2
+        s33 += t3 * t3
+        s40 += t4 * t0
+        s41 += t4 * t1
+        s42 += t4 * t2
+        s43 += t4 * t3
+        s44 += t4 * t4
+        s50 += t5 * t0
+        s51 += t5 * t1
+        s52 += t5 * t2
+        s53 += t5 * t3
+        s54 += t5 * t4
+        s55 += t5 * t5
+    products[0, 0] = s00
+    products[1, 0] = s10
+    products[1, 1] = s11
+    products[2, 0] = s20
+    products[2, 1] = s21
+    products[2, 2] = s22
+    products[3, 0] = s30
+    products[3, 1] = s31
+    products[3, 2] = s32
+    products[3, 3] = s33
+    products[4, 0] = s40
+    products[4, 1] = s41
+    products[4, 2] = s42
+    products[4, 3] = s43
+    products[4, 4] = s44
+    products[GREYS, 0] = s50
+    products[GREYS, 1] = s51
+    products[GREYS, 2] = s52
+    products[GREYS, 3] = s53
+    products[GREYS, 4] = s54
+    products[GREYS, GREYS] = s55
 
 
 @njit(cache=True, error_model="numpy", forceinline=True, fastmath=FASTMATH)

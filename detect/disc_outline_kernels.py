@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -41,6 +43,11 @@ from detect.disc_patch_kernels import (
 )
 
 _SECTORS = 16
+#: Of each sector eight sums, and of what is in none.
+SECTOR_SUMS = 8 * (_SECTORS + 1)
+#: Numba knows it as the type, the type checker as a function.
+_I32: Callable[[Any], Any] = np.int32
+_U0, _U1, _U2, _U3, _U4, _U5, _U6 = (np.uint64(k) for k in range(7))
 # Where the sectors of a quadrant meet.
 _TAN_1 = math.tan(math.pi / 8.0)
 _TAN_3 = math.tan(3.0 * math.pi / 8.0)
@@ -198,6 +205,29 @@ def blur_widths(
     return width
 
 
+@njit(cache=True, error_model="numpy", forceinline=True, fastmath=FASTMATH)
+def _sectors(
+    terms: NDArray[np.float32], n: int, x0: float, y0: float, inner: float, sector: NDArray[Any]
+) -> None:
+    """Which sector pixels are in; `_SECTORS` for those in the middle, and those not fitted."""
+    cx, cy, r_2 = F32(x0), F32(y0), F32(inner)
+    tan_1, tan_3 = F32(_TAN_1), F32(_TAN_3)
+    for i in range(np.uint64(n)):
+        x = terms[PLANE_X * CAPACITY + i] - cx
+        y = terms[PLANE_Y * CAPACITY + i] - cy
+        ax = abs(x)
+        ay = abs(y)
+        k = (
+            (_I32(1) if ay > tan_1 * ax else _I32(0))
+            + (_I32(1) if ay > ax else _I32(0))
+            + (_I32(1) if ay > tan_3 * ax else _I32(0))
+        )
+        k = _I32(7) - k if x < F32(0.0) else k
+        k = _I32(15) - k if y < F32(0.0) else k
+        counts = (terms[ONE * CAPACITY + i] > F32(0.0)) & (x * x + y * y >= r_2)
+        sector[i] = k if counts else _I32(_SECTORS)
+
+
 @njit(cache=True, error_model="numpy", forceinline=True)
 def outline_statistics(
     terms: NDArray[np.float32],
@@ -208,11 +238,14 @@ def outline_statistics(
     y0: float,
     radius: float,
     contrast: float,
+    sector: NDArray[np.uint32],
+    sums: NDArray[np.float32],
 ) -> tuple[float, float, float]:
     """How evenly the edge goes round: in each sector its step and how far it is from the circle.
 
     The step is the regression of the grey values on the model's, relative to the whole disc's; the
-    distance is the Gauss-Newton step of the radius from that sector's residuals alone.
+    distance is the Gauss-Newton step of the radius from that sector's residuals alone. `sector`
+    and `sums` are working space for `n` pixels and for `SECTOR_SUMS`.
 
     Returns
     -------
@@ -220,54 +253,45 @@ def outline_statistics(
         Mean relative step, share of sectors whose step has the sign and 0.4 of the size of the
         disc's, and root mean square distance in radii.
     """
-    sums = np.zeros((_SECTORS, 7))
-    inner = 0.09 * radius * radius
-    for i in range(n):
-        if not terms[ONE * CAPACITY + i] > 0.0:
-            continue
-        x = terms[PLANE_X * CAPACITY + i] - x0
-        y = terms[PLANE_Y * CAPACITY + i] - y0
-        if x * x + y * y < inner:
-            continue
+    _sectors(terms, n, x0, y0, 0.09 * radius * radius, sector)
+    sums[:SECTOR_SUMS] = 0.0
+    c = F32(contrast)
+    for i in range(np.uint64(n)):
+        at = np.uint64(8) * np.uint64(sector[i])
         w = fields[SHARE * CAPACITY + i]
         error = errors[i]
-        by_radius = contrast * fields[BY_RADIUS * CAPACITY + i]
+        by_radius = c * fields[BY_RADIUS * CAPACITY + i]
         # What is left of the grey value when the background is taken off.
-        grey = error + contrast * w
-        ax = abs(x)
-        ay = abs(y)
-        k = (1 if ay > _TAN_1 * ax else 0) + (1 if ay > ax else 0) + (1 if ay > _TAN_3 * ax else 0)
-        if x < 0.0:
-            k = 7 - k
-        if y < 0.0:
-            k = 15 - k
-        sums[k, 0] += 1.0
-        sums[k, 1] += w
-        sums[k, 2] += w * w
-        sums[k, 3] += grey
-        sums[k, 4] += w * grey
-        sums[k, 5] += by_radius * error
-        sums[k, 6] += by_radius * by_radius
+        grey = error + c * w
+        sums[at + _U0] += F32(1.0)
+        sums[at + _U1] += w
+        sums[at + _U2] += w * w
+        sums[at + _U3] += grey
+        sums[at + _U4] += w * grey
+        sums[at + _U5] += by_radius * error
+        sums[at + _U6] += by_radius * by_radius
     seen = 0
     steps = 0.0
     good = 0
     deviation = 0.0
     strongest = 0.0
     for k in range(_SECTORS):
-        strongest = max(strongest, sums[k, 6])
+        strongest = max(strongest, sums[8 * k + 6])
     for k in range(_SECTORS):
-        if sums[k, 0] < 3.0:
+        first = 8 * k
+        pixels, shares, greys = float(sums[first]), float(sums[first + 1]), float(sums[first + 3])
+        if pixels < 3.0:
             continue
-        spread = sums[k, 2] - sums[k, 1] * sums[k, 1] / sums[k, 0]
+        spread = sums[first + 2] - shares * shares / pixels
         if spread < 0.15:
             continue
         seen += 1
-        relative = (sums[k, 4] - sums[k, 1] * sums[k, 3] / sums[k, 0]) / spread / contrast
+        relative = (sums[first + 4] - shares * greys / pixels) / spread / contrast
         steps += min(max(relative, -1.0), 1.0)
         if relative > 0.4:
             good += 1
         # Sectors with little edge in them say little about its place.
-        offset = sums[k, 5] / (sums[k, 6] + 0.1 * strongest)
+        offset = sums[first + 5] / (sums[first + 6] + 0.1 * strongest)
         deviation += min(offset * offset, 0.25)
     if seen == 0:
         return 0.0, 0.0, 0.0

@@ -28,6 +28,10 @@ from detect.disc_model_kernels import (
 ONE, PLANE_X, PLANE_Y, SADDLE, SADDLE_XY, GREY, NEAR, LINKED = range(8)
 TERMS = 8
 
+#: Loops work on this many pixels at a time, or on single ones: a list is filled up with pixels far
+#: from the disc whose terms are zero.
+WHOLE = 32
+
 #: A patch's shape: a list of pixels, lines of constant v, or lines of constant u.
 LIST, ROWS, COLUMNS = range(3)
 
@@ -70,19 +74,32 @@ class Patch(NamedTuple):
     """(TERMS * CAPACITY,)"""
     floor: NDArray[np.float32]
     """(2 * CAPACITY,): working space of the gathering."""
-    pixels: NDArray[np.int32]
-    """(2 * CAPACITY,): likewise."""
+    pixels: NDArray[np.uint32]
+    """(2 * CAPACITY,): a list's pixels, and how many each stands for."""
+    marks: NDArray[np.uint8]
+    """(CAPACITY,): working space of the gathering, for one row of the image."""
+    mark_words: NDArray[np.uint64]
+    """(CAPACITY / 8,): the same, eight at a time."""
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def new_patch() -> Patch:
     """An empty patch."""
+    marks = np.zeros(CAPACITY, np.uint8)
     return Patch(
         np.zeros(GEOMETRY * CAPACITY, np.float32),
         np.zeros(TERMS * CAPACITY, np.float32),
         np.zeros(2 * CAPACITY, np.float32),
-        np.zeros(2 * CAPACITY, np.int32),
+        np.zeros(2 * CAPACITY, np.uint32),
+        marks,
+        marks.view(np.uint64),
     )
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def padded(n: int) -> int:
+    """So many pixels, rounded up to what loops work on at once."""
+    return (n + WHOLE - 1) // WHOLE * WHOLE
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)

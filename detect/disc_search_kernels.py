@@ -10,12 +10,20 @@ from numpy.typing import NDArray
 
 from detect import disc_fit_kernels as fit
 from detect.circle_kernels import suppress_neighbours
+from detect.disc_descent_kernels import PATIENT, Hope, new_work
 from detect.disc_evidence_kernels import evidence_of
-from detect.disc_fit_kernels import PATIENT, Hope, fit_disc, new_work
+from detect.disc_fit_kernels import fit_disc
+from detect.disc_list_kernels import floor_steps
 from detect.disc_patch_kernels import FitSettings
 
 #: Candidates whose first look is this much below the required evidence are not fitted in full.
 _FIRST_LOOK_SLACK = 2.0
+#: Candidates of a lower quality than this are looked at only if the grey value steps in this share
+#: of the directions, by this share of the contrast.
+_CLEAR_QUALITY = 0.55
+_LEAST_STEPS = 0.85
+_LEAST_STEP = 0.25
+_DIRECTIONS = np.array([[math.cos(k * math.pi / 8), math.sin(k * math.pi / 8)] for k in range(16)])
 #: A look must promise to explain this share of the variance.
 _LEAST_SHARE = 0.1
 #: A look this much above the required evidence shows a disc clearly; within this share of the
@@ -92,6 +100,63 @@ def _nearest_pixel(
     return min(max(u, 1), width - 2), min(max(v, 1), height - 2)
 
 
+@njit(cache=True, error_model="numpy", nogil=True)
+def share_of_steps(
+    image: NDArray[np.uint8],
+    floor_xy: NDArray[np.float32],
+    u0: int,
+    v0: int,
+    inner: float,
+    outer: float,
+    contrast: float,
+) -> float:
+    """In what share of directions the grey value steps from a small circle to a large one.
+
+    Clutter (an edge, a corner, texture) can part the grey values of the two circles nearly as well
+    as a disc does, but it does so on some sides only.
+
+    Parameters
+    ----------
+    image : (H, W) uint8
+    floor_xy : (H, W, 2) float32
+        Floor position of each pixel, metres.
+    u0, v0 : int
+        The circles' centre.
+    inner, outer : float
+        Radii, metres: on the floor, which is taken to be seen as a plane by parallel rays.
+    contrast : float
+        Grey levels inside minus outside; a step of the same sign and a quarter of that counts.
+
+    Returns
+    -------
+    float
+        Of the directions in which both circles are in the image; 1 if there are none.
+    """
+    height, width = image.shape
+    xu, yu, xv, yv = floor_steps(floor_xy, u0, v0)
+    area = xu * yv - xv * yu
+    if not abs(area) > 0.0:
+        return 1.0
+    per_area = 1.0 / area
+    seen = 0
+    steps = 0
+    for k in range(len(_DIRECTIONS)):
+        x, y = _DIRECTIONS[k]
+        du = (yv * x - xv * y) * per_area
+        dv = (xu * y - yu * x) * per_area
+        # Half a pixel up, and rounded down: nearest pixels.
+        u1 = math.floor(u0 + inner * du + 0.5)
+        v1 = math.floor(v0 + inner * dv + 0.5)
+        u2 = math.floor(u0 + outer * du + 0.5)
+        v2 = math.floor(v0 + outer * dv + 0.5)
+        if min(u1, u2, v1, v2) < 0 or max(u1, u2) >= width or max(v1, v2) >= height:
+            continue
+        seen += 1
+        difference = float(image[v1, u1]) - float(image[v2, u2])
+        steps += 1 if difference * contrast > _LEAST_STEP * contrast * contrast else 0
+    return steps / seen if seen > 0 else 1.0
+
+
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _evidence(result: NDArray[np.float64], radius: float, optics_px: float) -> float:
     return evidence_of(
@@ -112,6 +177,8 @@ def search_discs(
     quality: NDArray[np.float64],
     contrast: NDArray[np.float32],
     radius: float,
+    inner: float,
+    outer: float,
     settings: FitSettings,
     verify: bool,
     refine: bool,
@@ -128,8 +195,8 @@ def search_discs(
         Floor position of each pixel, metres.
     pixels, quality, contrast : (N, 2) int64, (N,) float64, (N,) float32
         The candidates (see `detect.centres.best_centres`).
-    radius : float
-        Nominal radius, metres.
+    radius, inner, outer : float
+        Nominal radius, and those of the outlines, metres.
     settings : FitSettings
     verify : bool
         Drop candidates without `least_evidence`.
@@ -171,6 +238,10 @@ def search_discs(
                 break
         if seen:
             continue
+        if verify and quality[i] < _CLEAR_QUALITY:
+            steps = share_of_steps(image, floor_xy, u, v, inner, outer, float(contrast[i]))
+            if steps < _LEAST_STEPS:
+                continue
         start[0] = 0.0
         start[1] = 0.0
         start[2] = 1.0

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -33,10 +35,17 @@ def estimate_noise(image: NDArray[np.uint8], most_rows: int | None = None) -> fl
     height, width = image.shape
     if min(height, width) < 3:
         return 0.0
+    rows = _rows(height, most_rows)
+    response = np.empty(len(rows) * (width - 2), np.int16)
+    # The mask's coefficients have a sum of squares of 36; 0.6745 makes a median a deviation.
+    return median_response(image, rows, _LEAST_COUNTABLE, response) / 0.6745 / 6.0
+
+
+@lru_cache(maxsize=8)
+def _rows(height: int, most_rows: int | None) -> NDArray[np.intp]:
+    """Which rows to look at."""
     if most_rows is None:
         rows = np.arange(1, height - 1)
     else:
         rows = np.unique(np.linspace(1, height - 2, most_rows).astype(np.intp))
-    response = np.empty(len(rows) * (width - 2), np.int16)
-    # The mask's coefficients have a sum of squares of 36; 0.6745 makes a median a deviation.
-    return median_response(image, rows, _LEAST_COUNTABLE, response) / 0.6745 / 6.0
+    return rows

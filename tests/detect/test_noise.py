@@ -91,3 +91,10 @@ def test_the_widest_response_there_is() -> None:
     v, u = np.indices((50, 70))
     image = np.where((u + v) % 2 == 0, 3, 252).astype(np.uint8)
     assert estimate_noise(image) == reference(image) == 16 * 249 / 2 / 0.6745 / 6.0
+
+
+def test_some_rows_tell_nearly_as_much_as_all() -> None:
+    image = noisy(np.full((300, 400), 120.0), 6.0)
+    assert estimate_noise(image, 96) == pytest.approx(estimate_noise(image), rel=0.05)
+    # Of an image that has no more rows, all are looked at.
+    assert estimate_noise(image[:60], 96) == estimate_noise(image[:60])
