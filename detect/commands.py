@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 from detect.announcing import show_announcements
 from detect.cli import EXIT_FRAMES_FAILED, Command
 from detect.errors import DetectError, WorkerError
+from detect.kernel_loading import load_kernels_alone
 from detect.options import All, Circles, Compare, DetectorFlags, Lines, Markers
 from detect.progress import print_failures, progress_bar
 from detect.viewing_options import PERFORMED_BY
@@ -33,6 +34,8 @@ if TYPE_CHECKING:
 def carry_out(command: Command) -> int:
     """Carry out a command; returns the exit code."""
     show_announcements()
+    if isinstance(command, DetectorFlags):
+        load_kernels_alone()
     if isinstance(command, Circles):
         return _circles(command)
     if isinstance(command, Lines):

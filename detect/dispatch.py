@@ -21,7 +21,7 @@ from itertools import islice
 
 from detect.errors import WorkerError
 from detect.frame import FramePlan, tables_of
-from detect.frame_rows import FrameRows, FrameTask, rows_of_failure, rows_of_frame
+from detect.frame_rows import FrameRows, FrameTask, rows_of_failure, rows_of_frames
 
 Chunk = tuple[FrameTask, ...]
 
@@ -102,8 +102,7 @@ def detect_frames(
 
 def work_on_chunk(plan: FramePlan, chunk: Chunk) -> list[FrameRows]:
     """What a worker does with a task; all it needs, and all that it gives back, is small."""
-    tables = tables_of(plan)
-    return [rows_of_frame(task, plan, tables) for task in chunk]
+    return rows_of_frames(chunk, plan, tables_of(plan))
 
 
 class _Crew:

@@ -1,6 +1,6 @@
 """One frame of a run: its image in, its verticals, its tilt, its discs and its markers out.
 
-The way of one frame, top to bottom, is `detect_frame`.
+The way of one frame, top to bottom, is `detect_frame`, and of its image `detect_in_image`.
 """
 
 from __future__ import annotations
@@ -119,14 +119,38 @@ def detect_frame(
         If there is no such image, or none of the calibration's size.
     """
     image = read_image(frame, plan.camera, plan.working_folder)
+    return detect_in_image(image, frame.step.prefix, plan, tables, tilt)
 
+
+def detect_in_image(
+    image: NDArray[np.uint8],
+    prefix: str,
+    plan: FramePlan,
+    tables: Tables,
+    tilt: FrameTilt | None = None,
+) -> FrameDetections:
+    """Find what a plan asks for in a grey image of the calibration's size.
+
+    Parameters
+    ----------
+    image : (H, W) uint8
+        See `detect.run.read_image`.
+    prefix : str
+        What the frame's rows call it.
+    plan, tables, tilt
+        As for `detect_frame`.
+
+    Returns
+    -------
+    FrameDetections
+    """
     lines = None
     if plan.lines is not None:
         from detect.lines import detect_lines
 
         assert tables.verticals is not None
         lines = detect_lines(image, tables.verticals, plan.lines)
-        tilt = tilt_of_lines(frame.step.prefix, lines)
+        tilt = tilt_of_lines(prefix, lines)
 
     discs = None
     if plan.circles is not None:

@@ -6,8 +6,9 @@ This is all that a worker sends back, whichever process or machine it runs on: s
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from textwrap import indent
 from typing import TYPE_CHECKING
@@ -16,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from detect.errors import FrameError
-from detect.frame import FrameDetections, FramePlan, Tables, detect_frame
+from detect.frame import FrameDetections, FramePlan, Tables, detect_in_image
 from detect.row_text import unknown_rows
 from detect.row_text_kernels import circle_numbers
-from detect.run import RunFrame
+from detect.run import RunFrame, read_image
 from detect.sources.times import format_time
 from landmarks import (
     Frame,
@@ -36,6 +37,12 @@ from landmarks import (
 if TYPE_CHECKING:
     from detect.circles import CircleDetections
     from detect.lines import LineDetections
+
+#: So many pixels are decoded before any of them is looked at.
+_PIXELS_AT_ONCE = 1 << 21
+
+#: What is wrong with one frame, not with the run.
+_COSTS_THE_FRAME = (FrameError, ArithmeticError, np.linalg.LinAlgError, MemoryError)
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,16 +97,71 @@ class FrameRows:
     error: str | None = None
 
 
-def rows_of_frame(task: FrameTask, plan: FramePlan, tables: Tables) -> FrameRows:
-    """Work on a frame; an image that cannot be worked on costs its frame only."""
-    try:
-        found = detect_frame(task.frame, plan, tables, task.tilt)
-    except FrameError as error:
-        return rows_of_failure(task, str(error))
-    except (ArithmeticError, np.linalg.LinAlgError, MemoryError) as error:
-        name = task.frame.image or task.frame.step.prefix
-        return rows_of_failure(task, f"{name}: {type(error).__name__}: {error}")
+def rows_of_frames(tasks: Sequence[FrameTask], plan: FramePlan, tables: Tables) -> list[FrameRows]:
+    """Work on some frames; an image that cannot be worked on costs its frame only.
 
+    As many images are decoded, then looked at, then written about, as fit into the processor's
+    caches: a decoder, a detector and Python drive each other's instructions out of them.
+
+    Parameters
+    ----------
+    tasks : sequence of FrameTask
+        The frames.
+    plan : FramePlan
+        What is done with each.
+    tables : Tables
+        See `detect.frame.tables_of`.
+
+    Returns
+    -------
+    list of FrameRows
+        One for each.
+    """
+    camera = plan.camera
+    at_once = _PIXELS_AT_ONCE // (camera.width * camera.height) if camera is not None else 1
+    if plan.drawing is not None or plan.draw_response:
+        at_once = 1
+    rows: list[FrameRows] = []
+    source = iter(tasks)
+    while some := tuple(islice(source, max(1, at_once))):
+        images = [_image_of(task, plan) for task in some]
+        found = [_found_in(image, task, plan, tables) for image, task in zip(images, some)]
+        rows += [_rows_of(what, task, plan, tables) for what, task in zip(found, some)]
+    return rows
+
+
+def _image_of(task: FrameTask, plan: FramePlan) -> NDArray[np.uint8] | str:
+    """The image of a frame, or why there is none."""
+    try:
+        return read_image(task.frame, plan.camera, plan.working_folder)
+    except _COSTS_THE_FRAME as error:
+        return _reason(error, task)
+
+
+def _found_in(
+    image: NDArray[np.uint8] | str, task: FrameTask, plan: FramePlan, tables: Tables
+) -> FrameDetections | str:
+    """What there is in an image, or why it could not be looked for."""
+    if isinstance(image, str):
+        return image
+    try:
+        return detect_in_image(image, task.frame.step.prefix, plan, tables, task.tilt)
+    except _COSTS_THE_FRAME as error:
+        return _reason(error, task)
+
+
+def _reason(error: Exception, task: FrameTask) -> str:
+    if isinstance(error, FrameError):
+        return str(error)
+    name = task.frame.image or task.frame.step.prefix
+    return f"{name}: {type(error).__name__}: {error}"
+
+
+def _rows_of(
+    found: FrameDetections | str, task: FrameTask, plan: FramePlan, tables: Tables
+) -> FrameRows:
+    if isinstance(found, str):
+        return rows_of_failure(task, found)
     step = task.frame.step
     head = _line(format_record(step))
     circles = lines = tilt = markers = record = b""

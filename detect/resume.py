@@ -54,7 +54,7 @@ from storage.parts import PartFile, folder_locked, left_part, new_part, remove_l
 _log = logging.getLogger("redetect")
 
 #: Raised with every change of what a journal or the rows that it stands for look like.
-_JOURNAL_VERSION = 2
+_JOURNAL_VERSION = 3
 
 
 class RunOutput(Protocol):

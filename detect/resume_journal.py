@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +21,7 @@ from storage.parts import named, new_locked, old_locked, write_all
 _DIGITS = 16
 _COMPLETE = b'"complete"\n'
 _JSON = json.JSONEncoder(separators=(",", ":"))
+_STEP = struct.Struct("<9d").pack
 _LONGEST_LINE = 1 << 20
 _MOST_PARTS = 16
 
@@ -202,10 +204,10 @@ def task_digest(task: FrameTask) -> str:
             image = (image, status.st_size, status.st_mtime_ns)
         except (OSError, ValueError):
             pass  # nothing there: that counts as well
-    s = frame.step  # a record's own representation takes longer than all else here
-    step = (s.prefix, s.dx, s.dy, s.dphi, s.cxx, s.cxy, s.cyy, s.cxphi, s.cyphi, s.cphiphi)
-    beside = (step, image, frame.time_s, frame.bits, frame.failure, task.tilt, task.reference)
-    digest = hashlib.sha256(repr(beside).encode("utf-8", "surrogateescape"))
+    s = frame.step  # numbers in words, or a record's own representation, would take longer than all
+    numbers = _STEP(s.dx, s.dy, s.dphi, s.cxx, s.cxy, s.cyy, s.cxphi, s.cyphi, s.cphiphi)
+    beside = s.prefix, image, frame.time_s, frame.bits, frame.failure, task.tilt, task.reference
+    digest = hashlib.sha256(numbers + repr(beside).encode("utf-8", "surrogateescape"))
     if frame.content is not None:
         content = frame.content
         digest.update(content if isinstance(content, bytes) else content.tobytes())
@@ -213,6 +215,11 @@ def task_digest(task: FrameTask) -> str:
 
 
 def _encoded(lengths: tuple[int, ...], task: str, rows: FrameRows) -> bytes:
+    if rows.error is None and not rows.rejected:  # the same, sooner
+        return (
+            f'[[{",".join(map(str, lengths))}],"{task}",{rows.disc_count},{rows.line_count},'
+            f"{rows.marker_count},{int(rows.has_tilt)},[],null]"
+        ).encode()
     values = [
         lengths,
         task,

@@ -34,6 +34,7 @@ def unknown_rows(
         million rows. Records will tell.
     """
     head = _HEADS[keyword]
+    numbers = np.ascontiguousarray(numbers)  # for other layouts the kernel would be compiled again
     room = len(numbers) * (len(head) + LONGEST * numbers.shape[1] + len(_TAIL))
     text = np.empty(room, np.uint8)
     length = write_rows(head, numbers, _TAIL, text)

@@ -172,7 +172,8 @@ def detect_run(
         If another run is writing the same files, or a frame fails where every frame is demanded.
     """
     tables_of(plan)  # whatever is wrong with them is wrong with every frame
-    workers = local_workers(1) if workers is None else workers
+    if workers is None:
+        workers = local_workers(1, pictures=pictures is not None or run.frames.ships_images)
     summary = RunSummary()
     if run.has_times:
         outputs = [*outputs, times_file([output.path for output in outputs])]

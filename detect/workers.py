@@ -35,6 +35,7 @@ from detect.dispatch import Workers
 from detect.errors import WorkerError
 from detect.frame import FramePlan, rehearse
 from detect.interrupts import interrupts_deferred
+from detect.kernel_loading import load_kernels_alone
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -80,7 +81,7 @@ def local_workers(jobs: int, *, pictures: bool = False) -> Workers:
     if jobs < 1:
         raise WorkerError(f"jobs is {jobs}: expected 1 or more")
     if jobs == 1:
-        return Workers(_in_process, chunk=1, window=lambda: 1)
+        return Workers(_in_process, chunk=1 if pictures else _LOCAL_CHUNK, window=lambda: 1)
     window = 2 + _WINDOW_PER_WORKER * jobs
     return Workers(
         lambda plan: _processes(jobs, plan),
@@ -132,7 +133,7 @@ class _InProcess(Executor):
     """Does what it is given at once, before it gives the future back."""
 
     def submit(self, fn: Callable[P, R], /, *args: P.args, **kwargs: P.kwargs) -> Future[R]:
-        _tidy_now_and_then(_TIDY_EVERY * _LOCAL_CHUNK)
+        _tidy_now_and_then(_TIDY_EVERY)
         future: Future[R] = Future()
         future.set_result(fn(*args, **kwargs))
         return future
@@ -243,6 +244,7 @@ def _begin(plan: FramePlan, stop: Event, first: Lock, ready: Event, show: bool) 
 
     cv2.setNumThreads(1)
     announce_compiling()
+    load_kernels_alone()
     if first.acquire(block=False):
         rehearse(plan)
         ready.set()

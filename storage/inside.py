@@ -9,7 +9,9 @@ from pathlib import Path
 
 _DRIVE = re.compile(r"[A-Za-z]:")
 # What Windows takes for a device in any folder, whatever the ending.
-_DEVICE = re.compile(r"(con|prn|aux|nul|com[0-9]|lpt[0-9])( *\..*)?", re.IGNORECASE | re.DOTALL)
+_DEVICE = re.compile(
+    r"(?:\A|/)(?:con|prn|aux|nul|com[0-9]|lpt[0-9])(?: *\.[^/]*)?(?:/|\Z)", re.IGNORECASE
+)
 
 
 def leads_out(name: str, *folders: str) -> str | None:
@@ -35,7 +37,7 @@ def leads_out(name: str, *folders: str) -> str | None:
         return "is an absolute path"
     if ".." in parts and not any(_within(parts, home) for home in folders or ("/any/folder",)):
         return "leads out of the folder"
-    if any(_DEVICE.fullmatch(part) for part in parts.split("/")):
+    if _DEVICE.search(parts):
         return "is the name of a device"
     return None
 

@@ -1,10 +1,14 @@
-"""A run from the name of whatever holds its images."""
+"""A run from the name of whatever holds its images.
+
+What reads other sources than folders is imported when there is one.
+"""
 
 from __future__ import annotations
 
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from camera import Camera, read_camera
 from detect.errors import DetectError
@@ -17,16 +21,11 @@ from detect.run import (
     open_images,
     open_run,
 )
-from detect.sources.bag import BAG_SUFFIXES, Bag
-from detect.sources.bag_camera import BASE_FRAME
-from detect.sources.interface import Calibration, Source
-from detect.sources.live import LiveCamera
-from detect.sources.odometry import FirstFrames, FramesAlongPoses, FramesAlongRows, SourceFrames
 from detect.sources.options import SourceOptions
-from detect.sources.pictures import WILDCARDS, ImageFiles, home_of, matching_images, own_times
-from detect.sources.times import TimesByImage
-from detect.sources.tum import TumTrajectory
-from detect.sources.video import VideoFile
+
+if TYPE_CHECKING:
+    from detect.sources.interface import Source
+    from detect.sources.odometry import SourceFrames
 
 # How the description of a ROS 2 bag begins.
 _BAG_KEY, _LOOKED_AT = b"rosbag2_bagfile_information", 4096
@@ -118,6 +117,9 @@ def demand_recording(name: Path) -> None:
 
 def _open(name: Path, camera_path: Path | None, options: SourceOptions, *, posed: bool) -> ImageRun:
     """Open any source, with a calibration where there is one; `posed`: one with a pose."""
+    from detect.sources.interface import Calibration
+    from detect.sources.pictures import ImageFiles
+
     source = _source(name, options)
     calibration = (
         Calibration(read_camera(camera_path)) if camera_path is not None else source.calibration()
@@ -145,6 +147,13 @@ def _is_plain_folder(name: Path, options: SourceOptions) -> bool:
 
 
 def _source(name: Path, options: SourceOptions) -> Source:
+    from detect.sources.bag import BAG_SUFFIXES, Bag
+    from detect.sources.bag_camera import BASE_FRAME
+    from detect.sources.live import LiveCamera
+    from detect.sources.pictures import WILDCARDS, ImageFiles, home_of, matching_images, own_times
+    from detect.sources.times import TimesByImage
+    from detect.sources.video import VideoFile
+
     live = _LIVE.fullmatch(str(name))
     is_bag = _is_ros2_bag(name) or name.suffix.lower() in BAG_SUFFIXES
     if options.image_topic and not is_bag:
@@ -177,6 +186,10 @@ def _source(name: Path, options: SourceOptions) -> Source:
 
 def _frames(source: Source, options: SourceOptions) -> tuple[SourceFrames, Path | None]:
     """The frames of a source with the odometry that is wanted, and the file of that."""
+    from detect.sources.odometry import FramesAlongPoses, FramesAlongRows, SourceFrames
+    from detect.sources.pictures import ImageFiles
+    from detect.sources.tum import TumTrajectory
+
     wanted = options.odometry
     if options.times and not isinstance(source, ImageFiles):
         raise DetectError(f"{source.name}: --times {options.times}: its images have their own")
@@ -203,12 +216,16 @@ def _frames(source: Source, options: SourceOptions) -> tuple[SourceFrames, Path 
 def _shortened(run: ImageRun, count: int) -> ImageRun:
     if not count:
         return run
+    from detect.sources.odometry import FirstFrames
+
     frames: Frames = FirstFrames(run.frames, count)
     return replace(run, frames=frames)
 
 
 def _demand_size(source: Source, camera: Camera) -> None:
     """Refuse a video of another size at once: none of its frames could be worked on."""
+    from detect.sources.video import VideoFile
+
     if isinstance(source, VideoFile) and source.size != (camera.width, camera.height):
         raise DetectError(
             f"{source.name}: is {source.size[0]}x{source.size[1]} px: expected "

@@ -1,0 +1,79 @@
+"""Compiled kernels loaded from Numba's cache without what only a compiler needs.
+
+Before it looks into its cache, Numba gets ready to compile: it imports what it can compile of
+Python, NumPy and SciPy, and registers all of it, which takes a third of the time that a command
+has before its first landmark. Machine code needs none of that. So the cache is looked into first,
+and Numba gets ready where there is something to compile.
+
+Attributes of Numba that are not public are used for it; where they have changed, everything is done
+as Numba does it.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cache
+from importlib import import_module
+from typing import Any
+
+
+@cache
+def load_kernels_alone() -> None:
+    """Have this process load cached kernels without getting ready to compile."""
+    try:
+        cache_class: Any = import_module("numba.core.caching").Cache
+        environment: Any = import_module("numba.core.environment")
+        runtime: Any = import_module("numba.core.runtime").rtsys
+        numbas_own = cache_class.load_overload
+        for holder, name in (
+            (cache_class, "_load_overload"),
+            (cache_class, "_guard_against_spurious_io_errors"),
+            (environment, "_rebuild_env"),
+            (environment, "lookup_environment"),
+            (environment.Environment, "_memo"),
+            (runtime, "initialize"),
+        ):
+            getattr(holder, name)
+    except (ImportError, AttributeError):
+        return
+
+    def load_overload(self: Any, signature: Any, target_context: Any) -> Any:
+        loaded = None
+        try:
+            runtime.initialize(target_context)  # what allocates arrays
+            with _environments_alone(environment), self._guard_against_spurious_io_errors():
+                loaded = self._load_overload(signature, target_context)
+        except Exception:
+            loaded = None  # whatever it is: Numba itself will tell
+        return numbas_own(self, signature, target_context) if loaded is None else loaded
+
+    cache_class.load_overload = load_overload
+
+
+@contextmanager
+def _environments_alone(environment: Any) -> Iterator[None]:
+    """Have the environments of Numba's own functions made without their modules, during a block.
+
+    A kernel brings an environment of each function that was compiled into it: its constants, which
+    compiled code uses, and the names of its module, for code that is interpreted.
+    """
+    numbas_own = environment._rebuild_env
+
+    def rebuilt(module: str, constants: list[Any], name: str) -> Any:
+        if module in sys.modules or not module.startswith("numba."):
+            return numbas_own(module, constants, name)
+        found = environment.lookup_environment(name)
+        if found is None:
+            found = environment.Environment({"__name__": module})
+            found.consts[:] = constants
+            found.env_name = name
+            environment.Environment._memo[name] = found
+        return found
+
+    environment._rebuild_env = rebuilt
+    try:
+        yield
+    finally:
+        environment._rebuild_env = numbas_own

@@ -1,0 +1,85 @@
+"""Kernels loaded from the cache: what they compute, and what is not imported for that."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+KERNELS = '''
+import numpy as np
+from numba import njit
+
+@njit(cache=True, error_model="numpy")
+def spread(values):
+    """Allocates, sums up, and raises: what is loaded has constants and parts of Numba's own."""
+    if len(values) < 2:
+        raise ValueError("expected two values or more")
+    off = np.empty(len(values))
+    off[:] = values - values.mean()
+    return np.sqrt((off * off).sum() / np.sum(np.ones(len(values))))
+
+@njit(cache=True, error_model="numpy")
+def spread_of_two(values):
+    return spread(values) + spread(2.0 * values)
+'''
+
+PROGRAM = """
+import sys
+from detect.kernel_loading import load_kernels_alone
+load_kernels_alone()
+import numpy as np
+from kernels import spread, spread_of_two
+print(spread(np.array([1.0, 2.0, 3.0, 4.0])))
+print("numba.np.arraymath" in sys.modules or "scipy.linalg" in sys.modules)
+try:
+    spread(np.array([1.0]))
+except ValueError as error:
+    print(error)
+if "more" in sys.argv:
+    print(spread_of_two(np.array([1.0, 2.0, 3.0, 4.0])))  # compiled round one that was loaded
+    print(spread(np.array([1, 2, 3, 4])))  # another signature
+"""
+
+
+def said(folder: Path, *arguments: str) -> list[str]:
+    root = Path(__file__).resolve().parents[2]
+    process = subprocess.run(
+        [sys.executable, "-c", PROGRAM, *arguments],
+        env={
+            **os.environ,
+            "PYTHONPATH": os.pathsep.join([str(root), str(folder)]),
+            "NUMBA_CACHE_DIR": str(folder / "cache"),
+        },
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert process.stderr == ""
+    return process.stdout.splitlines()
+
+
+@pytest.mark.long
+def test_loaded_kernels_need_no_compiler_and_are_the_same(tmp_path: Path) -> None:
+    (tmp_path / "kernels.py").write_text(KERNELS)
+    deviation, refused = str(1.25**0.5), "expected two values or more"
+    assert said(tmp_path) == [deviation, "True", refused]  # compiled
+    assert said(tmp_path) == [deviation, "False", refused]  # loaded
+    both = [str(3.0 * 1.25**0.5), deviation]
+    assert said(tmp_path, "more") == [deviation, "False", refused, *both]  # compiled round it
+
+
+def test_a_numba_without_the_attributes_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    from numba.core import environment
+    from numba.core.caching import Cache
+
+    from detect.kernel_loading import load_kernels_alone
+
+    own = Cache.load_overload
+    monkeypatch.setattr(Cache, "load_overload", own)  # put back afterwards
+    monkeypatch.delattr(environment, "lookup_environment")
+    load_kernels_alone.__wrapped__()
+    assert Cache.load_overload is own
