@@ -14,6 +14,9 @@ from lut.verticals import VerticalTable
 
 FloatArray = NDArray[np.float64]
 
+#: So many rows of the band are crossed by each line if starts need company on them.
+_CROSSED = 3
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LineFilter:
@@ -69,6 +72,9 @@ class StartBand:
         on the horizon only.
     spacing : int
         See above.
+    supported : bool
+        Whether there are so many of these rows that each line crosses several of them: a start that
+        has no company on them is none of a line.
     """
 
     row: NDArray[np.int32]
@@ -79,6 +85,7 @@ class StartBand:
     visible: NDArray[np.bool_]
     weights: NDArray[np.float32]
     spacing: int
+    supported: bool
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -195,6 +202,8 @@ def start_band(table: VerticalTable, settings: LineSettings) -> StartBand:
         visible=visible,
         weights=np.array(weights, np.float32),
         spacing=settings.start_spacing_rows,
+        supported=steps > 0
+        and settings.least_points(table.row_aspect) >= _CROSSED * settings.start_spacing_rows,
     )
 
 

@@ -91,7 +91,9 @@ def find_lines(
         band_weights, along, regulariser, response,
     )  # fmt: skip
     threshold = following[2]
-    start_row, start_column, start_sign, _ = find_starts(response, band_row, threshold)
+    start_row, start_column, start_sign, _ = find_starts(
+        response, band_row, threshold, following[13] != 0.0
+    )
 
     groups = len(ends)
     responses = np.empty(len(strip), np.float32)

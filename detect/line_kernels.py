@@ -16,13 +16,16 @@ from detect.line_group_kernels import MARGIN, STEP, respond, uncounted
 from detect.line_order_kernels import descending
 from detect.line_vector_code import LANES
 
+#: A line's starts on neighbouring rows of the band are no more columns apart.
+_SUPPORT = 2
+
 #: Rows that are filtered ahead of a track.
 _AHEAD = 12
 
 
 @njit(cache=True, error_model="numpy")
 def find_starts(
-    response: NDArray[np.float32], band_row: NDArray[np.int32], threshold: float
+    response: NDArray[np.float32], band_row: NDArray[np.int32], threshold: float, supported: bool
 ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float32], NDArray[np.float32]]:
     """Maxima of the response along rows parallel to the horizon, the highest first.
 
@@ -34,6 +37,8 @@ def find_starts(
         Image rows of these; -1 where tracks may not start.
     threshold : float
         Least absolute response.
+    supported : bool
+        Leave out maxima beside which there is none of the same sign on either neighbouring row.
 
     Returns
     -------
@@ -54,6 +59,8 @@ def find_starts(
     inner = max(width - 2, 0)
     highest = np.zeros(-(-inner // 8) * 8, np.uint8)
     eight = highest.view(np.uint64)
+    sign_at = np.zeros((steps, width), np.int8)
+    at = np.empty(len(row), np.int32)
     n = 0
     for k in range(steps if inner > 0 else 0):
         lefts = response[k, : width - 2]
@@ -72,11 +79,28 @@ def find_starts(
                 continue
             for i in range(8 * word, 8 * word + 8):
                 if highest[i]:
-                    row[n] = allowed[i]
+                    at[n] = k
                     column[n] = i + 1
-                    signs[n] = np.float32(1.0 if heres[i] > 0.0 else -1.0)
-                    score[n] = abs(heres[i])
+                    sign_at[k, i + 1] = 1 if heres[i] > 0.0 else -1
                     n += 1
+    found = n
+    n = 0
+    for each in range(found):
+        k = at[each]
+        c = column[each]
+        sign = sign_at[k, c]
+        if supported:
+            beside = False
+            for other in range(max(k - 1, 0), min(k + 2, steps)):
+                for near in range(max(c - _SUPPORT, 0), min(c + _SUPPORT + 1, width)):
+                    beside |= (other != k) & (sign_at[other, near] == sign)
+            if not beside:
+                continue
+        row[n] = band_row[k, c]
+        column[n] = c
+        signs[n] = sign
+        score[n] = abs(response[k, c])
+        n += 1
     order = descending(score[:n])
     row_of = np.empty(n, np.int32)
     column_of = np.empty(n, np.int32)

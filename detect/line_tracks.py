@@ -158,7 +158,7 @@ def line_starts(
     from detect.line_kernels import find_starts
 
     response, band = start_response(image, table, settings)
-    return LineStarts(*find_starts(response, band.row, settings.threshold))
+    return LineStarts(*find_starts(response, band.row, settings.threshold, band.supported))
 
 
 def start_response(

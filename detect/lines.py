@@ -112,6 +112,7 @@ def _told_beforehand(table: VerticalTable, settings: LineSettings) -> tuple[Any,
         settings.first_edges,
         1.0 if level else -1.0,
         settings.consensus.building_rad if level else math.inf,
+        band.supported,
     )
     return (
         table.column, table.elevation_tan, table.bearing_rad, table.horizon_row, table.first_row,

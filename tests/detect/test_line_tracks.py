@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from detect.line_filter import FilteredColumns, gaussian_window, start_band
+from detect.line_kernels import find_starts
 from detect.line_settings import DEFAULT, PUBLISHED, LineSettings
 from detect.line_tracks import (
     line_response,
@@ -95,6 +96,36 @@ def test_starts_lie_on_the_horizon_band_highest_first() -> None:
     assert set(np.unique(band.row - np.rint(TABLE.horizon_row[band.column]))) == {-8, -4, 0, 4, 8}
     assert np.all(np.diff(band.score) <= 0.0)
     assert np.all(band.score >= DEFAULT.threshold)
+
+
+def test_starts_have_company_on_a_neighbouring_row_of_the_band() -> None:
+    """What is left out is as the definition says, and the columns of an edge are not."""
+    rng = np.random.default_rng(6)
+    image = render(CAMERA, [Edge(0.2, 40.0), Edge(-0.1, 90.0)], grey=60.0, noise=12.0, rng=rng)
+    response, band = start_response(image, TABLE, DEFAULT)
+    assert band.supported
+    row, column, sign, score = find_starts(response, band.row, DEFAULT.threshold, False)
+    level = {(int(band.row[k, c]), c): k for k in range(len(band.row)) for c in range(96)}
+    k = np.array([level[v, c] for v, c in zip(row.tolist(), column.tolist())])
+    beside = np.abs(k[:, None] - k) == 1
+    beside &= np.abs(column[:, None] - column) <= 2
+    kept = (beside & (sign[:, None] == sign)).any(axis=1)
+    assert 10 < kept.sum() <= len(row) - 4
+    found = line_starts(image, TABLE, DEFAULT)
+    for own, all_of_them in zip(
+        (found.row, found.column, found.polarity, found.score), (row, column, sign, score)
+    ):
+        np.testing.assert_array_equal(own, all_of_them[kept])
+    for edge in (0.2, -0.1):
+        at = 47.5 - 110.0 * np.tan(edge)
+        assert np.sum(np.abs(found.column - at) < 1.6) >= 3
+
+
+@pytest.mark.parametrize("spacing", [1, 4, 8])
+def test_starts_need_company_only_where_lines_cross_several_rows(spacing: int) -> None:
+    settings = replace(DEFAULT, start_spacing_rows=spacing, least_length_px=0.0, least_rows=14)
+    assert start_band(TABLE, settings).supported == (spacing < 8)
+    assert not start_band(TABLE, PUBLISHED).supported
 
 
 @pytest.mark.parametrize("gap", [5, 25])
