@@ -179,12 +179,12 @@ def test_predicted_covariance_of_a_decentred_lens_is_what_repetition_shows() -> 
         640, 480, 480.0, 480.0, 322.0, 238.0, (-0.02, -0.2, 0.1, 0.5, -0.1), IDENTITY,
         tangential=(2e-3, -3e-3),
     )  # fmt: skip
-    trials = monte_carlo(camera, BOARD, views=15, trials=60, sigma_px=0.02, seed=4)
+    trials = monte_carlo(camera, BOARD, views=15, trials=40, sigma_px=0.02, seed=4)
     assert trials.freedom == 10
     predicted = np.sqrt(np.diag(trials.covariances.mean(axis=0)))
     ratio = trials.errors.std(axis=0) / predicted
-    # 60 trials know a standard deviation to 9 %.
-    assert np.all((ratio > 0.72) & (ratio < 1.33)), ratio
+    # 40 trials know a standard deviation to 11 %.
+    assert np.all((ratio > 0.67) & (ratio < 1.4)), ratio
     limit = 3.0 * np.sqrt(2.0 * trials.freedom / len(trials.nees))
     assert trials.nees.mean() == pytest.approx(trials.freedom, abs=limit)
 
