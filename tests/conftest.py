@@ -40,6 +40,35 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     )
 
 
+#: Files whose tests take longest, so that they are begun first: at the end no worker is left alone
+#: with one of them. The first two compile most kernels, different ones, so that none is compiled
+#: twice at the same time.
+LONGEST_FILES = (
+    "tests/detect/test_killed.py",
+    "tests/detect/markers/test_detect.py",
+    "tests/tools/reenactment/test_prepare.py",
+    "tests/camera/test_calibrate_command.py",
+    "tests/groundtruth/markers/test_rig.py",
+    "tests/groundtruth/markers/test_network.py",
+    "tests/tools/simulator/test_simulated_run.py",
+    "tests/detect/test_line_step.py",
+    "tests/detect/test_centres.py",
+    "tests/detect/test_concurrent.py",
+    "tests/docs/test_examples.py",
+    "tests/camera/test_calibration.py",
+    "tests/groundtruth/clocks/test_sync.py",
+    "tests/groundtruth/markers/test_refinement.py",
+    "tests/detect/test_workers.py",
+    "tests/detect/test_full_disks.py",
+)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Order files by how long they take, where that is known; their tests stay as they are."""
+    places = {name: place for place, name in enumerate(LONGEST_FILES)}
+    items.sort(key=lambda item: places.get(item.nodeid.partition("::")[0], len(places)))
+
+
 @pytest.fixture(scope="session")
 def published_cam_text() -> str:
     """The calibration of run e as the report prints it."""

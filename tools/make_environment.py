@@ -57,8 +57,12 @@ def _installed(environment: Path) -> bool:
         )
         return _installed_unlocked(environment)
     pip = _new_environment(environment)
+    # Modules are compiled when they are first imported: most never are.
     locked = subprocess.run(
-        [*pip, "install", "--quiet", "--require-hashes", "--no-deps", "--requirement", str(LOCK)],
+        [
+            *pip, "install", "--quiet", "--no-compile", "--require-hashes", "--no-deps",
+            "--requirement", str(LOCK),
+        ],
         check=False, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
     if locked.returncode == 0:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -17,12 +18,24 @@ from tools.reenactment.recording import Recording, read_map, read_path, recordin
 from tools.reenactment.world import read_world
 
 
+def laid_run(folder: Path, camera: Camera) -> Path:
+    run = make_run(camera, 11, tilt_deg=0.3)
+    write_frames(folder / "map.circles", run.frames)
+    write_camera(camera, folder / "ring.cam")
+    return folder
+
+
 @pytest.fixture
 def run_folder(tmp_path: Path, published_camera: Camera) -> Path:
-    run = make_run(published_camera, 11, tilt_deg=0.3)
-    write_frames(tmp_path / "map.circles", run.frames)
-    write_camera(published_camera, tmp_path / "ring.cam")
-    return tmp_path
+    return laid_run(tmp_path, published_camera)
+
+
+@pytest.fixture(scope="module")
+def prepared(tmp_path_factory: pytest.TempPathFactory, published_camera: Camera) -> Path:
+    """A folder with a run and its world, not to be changed."""
+    folder = laid_run(tmp_path_factory.mktemp("prepared"), published_camera)
+    assert main(arguments(folder)) == 0
+    return folder
 
 
 def arguments(folder: Path, *more: str) -> list[str]:
@@ -32,9 +45,8 @@ def arguments(folder: Path, *more: str) -> list[str]:
     return ["prepare", landmarks, "--camera", camera, "-o", world, *more]
 
 
-def test_world_shows_the_rows_again(run_folder: Path, published_camera: Camera) -> None:
-    assert main(arguments(run_folder)) == 0
-    world = read_world(run_folder / "world.npz")
+def test_world_shows_the_rows_again(prepared: Path, published_camera: Camera) -> None:
+    world = read_world(prepared / "world.npz")
     geometry = Geometry(
         poses=world.poses,
         disc_xy=world.disc_xy,
@@ -43,7 +55,7 @@ def test_world_shows_the_rows_again(run_folder: Path, published_camera: Camera) 
         tilt=world.tilt,
     )
     found = rows = 0
-    for i, frame in enumerate(read_frames(run_folder / "map.circles")):
+    for i, frame in enumerate(read_frames(prepared / "map.circles")):
         assert world.prefixes[i] == frame.step.prefix
         shown, _, seen = rows_of_frame(published_camera, geometry, i)
         ids = world.disc_ids[seen].tolist()
@@ -56,8 +68,10 @@ def test_world_shows_the_rows_again(run_folder: Path, published_camera: Camera) 
     assert found >= 0.98 * rows > 300
 
 
-def test_same_bytes_again(run_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(arguments(run_folder)) == 0
+def test_same_bytes_again(
+    prepared: Path, run_folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copy(prepared / "world.npz", run_folder)
     first = (run_folder / "world.npz").read_bytes()
     assert main(arguments(run_folder)) == 1
     assert "world.npz: exists already" in capsys.readouterr().err
