@@ -26,10 +26,15 @@ from camera import Camera, read_camera
 from detect.errors import DetectError, FrameError
 from detect.image_bounds import bounded_content
 from detect.image_names import IMAGE_SUFFIXES, ImageNames
+from detect.run_images import (
+    demand_no_link_out,
+    homes_of,
+    image_of,
+    images_of_folder,
+    place_of,
+)
 from detect.sources.gray import decode_gray
 from landmarks import Step, read_rows
-from storage.inside import leads_out, link_out
-from storage.messages import excerpt
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,13 +126,13 @@ class RunFrames:
         return self._count
 
     def __iter__(self) -> Generator[RunFrame, None, None]:
-        homes = _homes(self._images)
+        homes = homes_of(self._images)
         if self._odometry is None:
             for place in range(len(self._images)):
                 path = self._images.path(place)
                 step = _standing_still(path.stem)
                 try:
-                    _demand_no_link_out(path, homes)
+                    demand_no_link_out(path, homes)
                 except FrameError as error:
                     yield RunFrame(step, None, failure=str(error))
                     continue
@@ -135,7 +140,7 @@ class RunFrames:
             return
         for step in _steps(self._odometry):
             try:
-                image = _image_of(step, self._images, homes)
+                image = image_of(step, self._images, homes)
             except FrameError as error:
                 yield RunFrame(step, None, failure=str(error))
                 continue
@@ -265,23 +270,6 @@ def _demand_folder(folder: Path) -> None:
         raise DetectError(f"{folder}: no such folder: expected a run folder or a folder of images")
 
 
-def images_of_folder(folder: Path) -> ImageNames:
-    """The images in ``images/`` or, failing that, in the folder itself.
-
-    Raises
-    ------
-    DetectError
-        If there are none.
-    """
-    for place in (folder / "images", folder):
-        if place.is_dir():
-            found = ImageNames(place)
-            if len(found):
-                return found
-    kinds = " ".join(sorted(IMAGE_SUFFIXES))
-    raise DetectError(f"{folder}: no images: expected {kinds} in it or in {folder / 'images'}")
-
-
 def _image_run(folder: Path, bits: int | None) -> ImageRun:
     from detect.sources.pictures import bits_of_images
 
@@ -293,14 +281,14 @@ def _image_run(folder: Path, bits: int | None) -> ImageRun:
     else:
         named = np.zeros(len(images), bool)
         count = 0
-        homes = _homes(images)
+        homes = homes_of(images)
         for step in _steps(odometry):
             count += 1
             with suppress(FrameError):  # told when it is the frame's turn
-                found = _place_of(step, images, homes)
+                found = place_of(step, images, homes)
                 if found is not None:
                     if images.has_links:
-                        _demand_no_link_out(images.path(found), homes)
+                        demand_no_link_out(images.path(found), homes)
                     named[found] = True
         frames = RunFrames(images, odometry, count, int(np.count_nonzero(~named)), bits)
     return ImageRun(folder, frames, odometry, folder / "detected")
@@ -385,46 +373,6 @@ def _odometry(folder: Path) -> Path | None:
         if candidate.is_file():
             return candidate
     return None
-
-
-def _image_of(step: Step, images: ImageNames, homes: tuple[str, ...]) -> Path | None:
-    """A step's image; None if there is none.
-
-    Raises
-    ------
-    FrameError
-        If the step's prefix, or a link of that name, leads out of the run: whoever made the file of
-        steps does not decide which other files are read.
-    """
-    found = _place_of(step, images, homes)
-    if found is None:
-        return None
-    path = images.path(found)
-    _demand_no_link_out(path, homes)
-    return path
-
-
-def _place_of(step: Step, images: ImageNames, homes: tuple[str, ...]) -> int | None:
-    """The place of a step's image, by its name alone."""
-    name = step.prefix.strip('"')
-    why = leads_out(name, *homes)
-    if why is not None:
-        raise FrameError(f"{excerpt(step.prefix)}: the prefix {why}: expected an image of the run")
-    return images.find(name.replace("\\", "/").rsplit("/", 1)[-1])
-
-
-def _demand_no_link_out(path: Path, homes: tuple[str, ...]) -> None:
-    if os.path.islink(path) and link_out(path, *map(Path, homes)):  # noqa: PTH114 - much sooner
-        raise FrameError(
-            f"{path}: cannot be read: is a link that leads out of the run: expected an image in it"
-        )
-
-
-def _homes(images: ImageNames) -> tuple[str, ...]:
-    """Where a run's images may be: their folder, and that of the run."""
-    folder = os.path.abspath(images.folder)  # noqa: PTH100 - links are not followed yet
-    above, name = os.path.split(folder)
-    return (folder, above) if name == "images" else (folder,)
 
 
 def _standing_still(prefix: str) -> Step:

@@ -17,10 +17,10 @@ from detect.run import (
     Frames,
     ImageRun,
     Run,
-    images_of_folder,
     open_images,
     open_run,
 )
+from detect.run_images import images_of_folder
 from detect.sources.options import SourceOptions
 
 if TYPE_CHECKING:
