@@ -51,13 +51,15 @@ def progress(label: str) -> Iterator[tuple[Callable[[int], None], Callable[[], N
     )
 
     console = Console(stderr=True)
+    if not console.is_terminal:  # of a disabled bar, older versions of rich print the line's end
+        yield lambda total: None, lambda: None
+        return
     bar = Progress(
         TextColumn("{task.description}"),
         BarColumn(),
         MofNCompleteColumn(),
         TimeRemainingColumn(),
         console=console,
-        disable=not console.is_terminal,
     )
     with bar:
         task = bar.add_task(label, total=None)

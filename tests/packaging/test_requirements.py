@@ -11,9 +11,6 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 from packaging.version import Version
 
-#: Withdrawn by their makers: the next version is the lowest that can be had.
-WITHDRAWN = {"scipy": "1.11.0"}
-
 
 def declared(root: Path, extras: tuple[str, ...]) -> dict[str, Requirement]:
     """What the project needs, by itself and with extras."""
@@ -51,13 +48,9 @@ def test_the_lowest_versions_are_those_that_are_allowed(project_root: Path) -> N
     tools = declared(project_root, ("dev",))
     for name in set(found) & (set(wanted) | set(tools)):
         end, version = lower_end((wanted | tools)[name]), found[name]
-        if name in WITHDRAWN:
-            assert end == Version(WITHDRAWN[name])
-            assert version == Version(f"{end.major}.{end.minor}.{end.micro + 1}")
-        else:
-            assert version.release[: len(end.release)] == end.release, name
-            assert all(part == 0 for part in version.release[len(end.release) : 3]), name
-            assert version.pre == end.pre, name
+        assert version.release[: len(end.release)] == end.release, name
+        assert all(part == 0 for part in version.release[len(end.release) : 3]), name
+        assert version.pre == end.pre, name
 
 
 def test_the_lowest_versions_are_what_is_installed(project_root: Path) -> None:
