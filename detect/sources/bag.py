@@ -260,15 +260,16 @@ def chosen_topic(
         If there is no such topic, or there are several and none was named.
     """
     topics = sorted({c.topic for c in reader.connections if c.msgtype in kinds})
-    listed = ", ".join(topics[:6]) or "none"
+    listed = ", ".join(topic[:60] for topic in topics[:6]) or "none"
     expected = " or ".join(kind.replace("/msg", "") for kind in kinds)
     if named is not None:
         if named in topics:
             return named
         raise DetectError(f"{path}: no {what} in {named!r}: expected {expected}, of {listed}")
     if not topics:
-        there = ", ".join(sorted({str(c.msgtype) for c in reader.connections})[:6]) or "no messages"
-        raise DetectError(f"{path}: no {what} in it, but {there}: expected {expected}")
+        there = sorted({str(c.msgtype) for c in reader.connections})[:6]
+        held = ", ".join(kind[:60] for kind in there) or "no messages"
+        raise DetectError(f"{path}: no {what} in it, but {held}: expected {expected}")
     if len(topics) > 1:
         raise DetectError(f"{path}: several topics of {what} ({listed}): name one by {flag}")
     return topics[0]
