@@ -24,7 +24,7 @@ from detect.centres import best_centres
 from detect.centres import quality_of_centres as quality_of_centres
 from detect.disc_covariance_kernels import refined_covariances
 from detect.disc_fit import blur_ratio_of, fit_settings, fitted_positions
-from detect.disc_search_kernels import search_discs, strong_and_alone
+from detect.disc_search_kernels import middles, search_discs, strong_and_alone
 from detect.errors import FrameError
 from detect.noise import estimate_noise
 from detect.pixel_floor_kernels import published_positions as pixel_positions
@@ -125,13 +125,13 @@ def detect_circles(
     noise = estimate_noise(image, _NOISE_ROWS)
     weakest = settings.noise_floor * max(noise, _LEAST_NOISE)
     # Each disc has several best centres: of those in the middle of it one is enough.
-    keep = strong_and_alone(
-        pixels, found_quality, contrast, table.floor_xy, weakest, 0.5 * settings.separation_m
-    )
+    near = 0.5 * settings.separation_m
+    keep = strong_and_alone(pixels, found_quality, contrast, table.floor_xy, weakest, near)
+    starts = middles(pixels, found_quality, contrast, table.floor_xy, weakest, near, keep)
     results, evidence, index = search_discs(
         image,
         table.floor_xy,
-        pixels[keep],
+        starts,
         found_quality[keep],
         contrast[keep],
         settings.radius_m,

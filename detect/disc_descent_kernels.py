@@ -250,7 +250,7 @@ def descend(
             width = width_per_px * sigma_of(math.exp(p[3]))
             if hope.least_evidence > -math.inf:
                 slack = _FIRST_STEP_SLACK if evaluations == 1 else 0.0
-                promise = evidence_of(share, p[2], 0.0, 1.0, width / p[2], hope.optics_px)
+                promise = evidence_of(share, p[2], 0.0, 1.0, 1.0, width / p[2], hope.optics_px)
                 if promise < hope.least_evidence - slack:
                     return Descent(False, contrast, variance, evaluations)
             longest = max(math.hypot(p[0] - best[0], p[1] - best[1]), abs(p[2] - best[2]))

@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 RADIUS_RANGE = (0.75, 1.28)
 LEAST_EXPLAINED = 0.35
 LEAST_SECTORS = 0.75
+#: A ring has no disc in its middle: the step of the middle, relative to the disc's.
+LEAST_MIDDLE_STEP = 0.4
 #: An outline may be this uneven where the disc explains more than the given share: with nothing
 #: else there to disturb it, it is the shape that is wrong (a square of the same size, say).
 MOST_UNEVEN = 1.2
@@ -25,6 +27,7 @@ def evidence_of(
     relative_radius: float,
     outline_deviation: float,
     sectors_good: float,
+    middle_step: float,
     relative_blur: float,
     optics_px: float,
 ) -> float:
@@ -36,6 +39,7 @@ def evidence_of(
         RADIUS_RANGE[0] < relative_radius < RADIUS_RANGE[1]
         and explained >= LEAST_EXPLAINED
         and sectors_good > LEAST_SECTORS
+        and middle_step > LEAST_MIDDLE_STEP
         and (uneven < MOST_UNEVEN or explained < UNDISTURBED)
     )
     if not possible:
@@ -58,6 +62,7 @@ def evidence_of_all(
     relative_radius: NDArray[np.float64],
     outline_deviation: NDArray[np.float64],
     sectors_good: NDArray[np.float64],
+    middle_step: NDArray[np.float64],
     relative_blur: NDArray[np.float64],
     optics_px: float,
 ) -> NDArray[np.float64]:
@@ -67,6 +72,6 @@ def evidence_of_all(
         if fitted[k]:
             score[k] = evidence_of(
                 explained[k], relative_radius[k], outline_deviation[k], sectors_good[k],
-                relative_blur[k], optics_px,
+                middle_step[k], relative_blur[k], optics_px,
             )  # fmt: skip
     return score

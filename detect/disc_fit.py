@@ -52,6 +52,9 @@ class DiscFits:
         Share of the variance about the background that the disc explains.
     sectors_good : (N,) float64
         Share of 16 sectors whose step at the edge has the sign, and 0.4 of the size, of the disc's.
+    middle_step : (N,) float64
+        Step of the disc's middle from the background, relative to the contrast; 1 where the middle
+        is less than two pixels.
     outline_deviation : (N,) float64
         Root mean square over the sectors of how far the edge is from the circle, in radii.
     relative_blur : (N,) float64
@@ -66,6 +69,7 @@ class DiscFits:
     contrast: FloatArray
     explained: FloatArray
     sectors_good: FloatArray
+    middle_step: FloatArray
     outline_deviation: FloatArray
     relative_blur: FloatArray
 
@@ -130,6 +134,7 @@ def fit_discs(
         contrast=results[:, kernels.CONTRAST],
         explained=results[:, kernels.EXPLAINED],
         sectors_good=results[:, kernels.SECTORS_GOOD],
+        middle_step=results[:, kernels.MIDDLE_STEP],
         outline_deviation=results[:, kernels.OUTLINE_DEVIATION],
         relative_blur=results[:, kernels.RELATIVE_BLUR],
     )
@@ -198,6 +203,7 @@ def disc_evidence(fits: DiscFits, radius_m: float, blur_px: float = 1.0) -> Floa
             fits.radius_m / radius_m,
             fits.outline_deviation,
             fits.sectors_good,
+            fits.middle_step,
             fits.relative_blur,
             blur_px,
         )

@@ -42,8 +42,8 @@ X, Y, RADIUS, BLUR, CONTRAST = range(5)
 EXPLAINED, RESIDUAL_VARIANCE, PIXELS = range(5, 8)
 COV_XX, COV_XY, COV_YY = range(8, 11)
 SECTORS_STEP, SECTORS_GOOD, OUTLINE_DEVIATION, RELATIVE_BLUR = range(11, 15)
-ITERATIONS, BLUR_BOUND, COMPLETE = range(15, 18)
-RESULT_SIZE = 18
+ITERATIONS, BLUR_BOUND, COMPLETE, MIDDLE_STEP = range(15, 19)
+RESULT_SIZE = 19
 
 _MAX_EVALUATIONS = 15
 _LOOK_EVALUATIONS = 3
@@ -147,6 +147,7 @@ def _conclude(
     out[RELATIVE_BLUR] = blur_width(patch, p, settings.blur_ratio, work) / p[2]
     if detail == LOOK:
         out[SECTORS_GOOD] = 1.0
+        out[MIDDLE_STEP] = 1.0
         return
     variance = max(variance, settings.noise**2) * correlated_area(terms, errors, patch.n)
     # x and y come last: their covariance is the inverse of the last two rows' own products.
@@ -157,10 +158,14 @@ def _conclude(
     out[COV_XX] = scale * per_xx * per_xx * (1.0 + (xy * per_yy) ** 2)
     out[COV_XY] = -scale * per_xx * per_yy * per_yy * xy
     out[COV_YY] = scale * per_yy * per_yy
-    out[SECTORS_STEP], out[SECTORS_GOOD], out[OUTLINE_DEVIATION] = outline_statistics(
+    step, good, deviation, middle = outline_statistics(
         terms, work.fields, errors, patch.n, p[0], p[1], p[2], contrast, work.patch.pixels,
         work.sums,
     )  # fmt: skip
+    out[SECTORS_STEP] = step
+    out[SECTORS_GOOD] = good
+    out[OUTLINE_DEVIATION] = deviation
+    out[MIDDLE_STEP] = middle
 
 
 @njit(cache=True, error_model="numpy")

@@ -43,6 +43,8 @@ from detect.disc_patch_kernels import (
 )
 
 _SECTORS = 16
+#: Pixels that the middle of a disc must have to be looked at.
+_LEAST_MIDDLE = 2.0
 #: Of each sector eight sums, and of what is in none.
 SECTOR_SUMS = 8 * (_SECTORS + 1)
 #: Numba knows it as the type, the type checker as a function.
@@ -240,7 +242,7 @@ def outline_statistics(
     contrast: float,
     sector: NDArray[np.uint32],
     sums: NDArray[np.float32],
-) -> tuple[float, float, float]:
+) -> tuple[float, float, float, float]:
     """How evenly the edge goes round: in each sector its step and how far it is from the circle.
 
     The step is the regression of the grey values on the model's, relative to the whole disc's; the
@@ -249,9 +251,10 @@ def outline_statistics(
 
     Returns
     -------
-    step, good, deviation : float
+    step, good, deviation, middle : float
         Mean relative step, share of sectors whose step has the sign and 0.4 of the size of the
-        disc's, and root mean square distance in radii.
+        disc's, root mean square distance in radii, and the step of the middle (the inner 0.3 of the
+        radius) from the background, relative to the disc's: 1 where it has not two pixels.
     """
     _sectors(terms, n, x0, y0, 0.09 * radius * radius, sector)
     sums[:SECTOR_SUMS] = 0.0
@@ -293,6 +296,10 @@ def outline_statistics(
         # Sectors with little edge in them say little about its place.
         offset = sums[first + 5] / (sums[first + 6] + 0.1 * strongest)
         deviation += min(offset * offset, 0.25)
+    # Pixels that are not fitted are in there, too, with shares and grey values of nothing.
+    middle = 1.0
+    if sums[8 * _SECTORS + 1] >= _LEAST_MIDDLE:
+        middle = float(sums[8 * _SECTORS + 3]) / float(sums[8 * _SECTORS + 1]) / contrast
     if seen == 0:
-        return 0.0, 0.0, 0.0
-    return steps / seen, good / seen, math.sqrt(deviation / seen)
+        return 0.0, 0.0, 0.0, middle
+    return steps / seen, good / seen, math.sqrt(deviation / seen), middle

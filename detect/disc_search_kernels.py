@@ -73,6 +73,56 @@ def strong_and_alone(
     return index[suppress_neighbours(place, quality[index], separation)]
 
 
+@njit(cache=True, error_model="numpy", nogil=True)
+def middles(
+    pixels: NDArray[np.int64],
+    quality: NDArray[np.float64],
+    contrast: NDArray[np.float32],
+    floor_xy: NDArray[np.float32],
+    weakest: float,
+    separation: float,
+    keep: NDArray[np.int64],
+) -> NDArray[np.int64]:
+    """In the middle of which pixels of the same disc each best centre lies.
+
+    A large disc has many best centres, and which of them is the very best is up to the noise: a fit
+    that starts beside the disc's middle may be given up.
+
+    Parameters
+    ----------
+    pixels, quality, contrast, floor_xy, weakest, separation
+        As in `strong_and_alone`.
+    keep : (M,) int64
+        What that returned.
+
+    Returns
+    -------
+    (M, 2) int64
+        Pixels (u, v): the means of the centres of at least the contrast `weakest`, and of the same
+        sign, within the separation, weighed by quality squared and contrast.
+    """
+    middle = np.empty((len(keep), 2), np.int64)
+    for k in range(len(keep)):
+        u0, v0 = pixels[keep[k]]
+        total = 0.0
+        sum_u = 0.0
+        sum_v = 0.0
+        for i in range(len(pixels)):
+            if abs(contrast[i]) < weakest or contrast[i] * contrast[keep[k]] < 0.0:
+                continue
+            u, v = pixels[i]
+            dx = floor_xy[v, u, 0] - floor_xy[v0, u0, 0]
+            dy = floor_xy[v, u, 1] - floor_xy[v0, u0, 1]
+            if dx * dx + dy * dy < separation * separation or i == keep[k]:
+                weight = quality[i] * quality[i] * abs(contrast[i])
+                total += weight
+                sum_u += weight * (u - u0)
+                sum_v += weight * (v - v0)
+        middle[k, 0] = u0 + round(sum_u / total)
+        middle[k, 1] = v0 + round(sum_v / total)
+    return middle
+
+
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _nearest_pixel(
     floor_xy: NDArray[np.float32], u: int, v: int, x: float, y: float
@@ -164,6 +214,7 @@ def _evidence(result: NDArray[np.float64], radius: float, optics_px: float) -> f
         result[fit.RADIUS] / radius,
         result[fit.OUTLINE_DEVIATION],
         result[fit.SECTORS_GOOD],
+        result[fit.MIDDLE_STEP],
         result[fit.RELATIVE_BLUR],
         optics_px,
     )

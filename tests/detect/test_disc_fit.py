@@ -10,7 +10,7 @@ from camera import Camera
 from detect import disc_fit_kernels as kernels
 from detect.circles import disc_shape, refined_covariance, tilt_jacobian
 from detect.disc_fit import disc_evidence, fit_discs
-from detect.disc_search_kernels import _nearest_pixel, strong_and_alone
+from detect.disc_search_kernels import _nearest_pixel, middles, strong_and_alone
 from detect.settings import CircleSettings
 from lut import DiscTable, build_disc_table
 from tests.detect.painted_floor import PaintedFloor
@@ -153,5 +153,36 @@ def test_results_have_their_columns() -> None:
         kernels.RESIDUAL_VARIANCE, kernels.PIXELS, kernels.COV_XX, kernels.COV_XY, kernels.COV_YY,
         kernels.SECTORS_STEP, kernels.SECTORS_GOOD, kernels.OUTLINE_DEVIATION,
         kernels.RELATIVE_BLUR, kernels.ITERATIONS, kernels.BLUR_BOUND, kernels.COMPLETE,
+        kernels.MIDDLE_STEP,
     )  # fmt: skip
     assert sorted(names) == list(range(kernels.RESULT_SIZE))
+
+
+def test_the_middle_of_a_discs_best_centres(table: DiscTable) -> None:
+    """Weighed by what speaks for each; neither weak ones nor those of the other sign count."""
+    pixels = np.array([[298, 200], [304, 200], [306, 200], [301, 201], [500, 200]])
+    quality = np.array([1.0, 0.5, 0.9, 0.9, 0.8])
+    contrast = np.array([30.0, 60.0, -40.0, 5.0, 30.0])
+    keep = np.array([0, 4])
+    found = middles(pixels, quality, contrast, table.floor_xy, 10.0, 0.07, keep)
+    # (30 * 298 + 0.25 * 60 * 304) / 45
+    np.testing.assert_array_equal(found, [[300, 200], [500, 200]])
+    alone = middles(pixels, quality, contrast, table.floor_xy, 10.0, 0.0, keep)
+    np.testing.assert_array_equal(alone, pixels[keep])
+
+
+@pytest.mark.parametrize("forward_m", [1.2, 1.8, 2.5, 3.2])
+@pytest.mark.parametrize("hole_m", [0.05, 0.06, 0.07])
+def test_a_ring_is_no_disc(
+    published_camera: Camera, table: DiscTable, forward_m: float, hole_m: float
+) -> None:
+    """Its outer edge is a disc's; what it has in the middle is not."""
+    place = (0.1, -forward_m)
+    ring = PaintedFloor(published_camera, 60.0).shape(
+        place, lambda x, y: (np.hypot(x, y) < 0.10) & (np.hypot(x, y) > hole_m), 190.0
+    )
+    disc = PaintedFloor(published_camera, 60.0).disc(place, 190.0, 0.10, 0.7)
+    pixel = nearest(published_camera, place)[None]
+    for painted, is_disc in ((ring, False), (disc, True)):
+        fit = fit_discs(painted.image(), table.floor_xy, pixel, 0.10, 1.5, blur_ratio=PAINTED_RATIO)
+        assert (disc_evidence(fit, 0.10)[0] > 1.1) == is_disc
