@@ -18,7 +18,8 @@ from scipy.optimize import minimize
 
 from groundtruth.clocks.clock import ClockModel, ClockSegment
 from groundtruth.errors import GroundTruthError
-from groundtruth.fusion.movement import likeliest_noise, movement_problem, noise_of
+from groundtruth.fusion.learning import likeliest_noise, noise_of
+from groundtruth.fusion.movement import movement_problem
 from groundtruth.fusion.settings import FuseSettings
 from groundtruth.trajectories.streams import PlanarPoses
 

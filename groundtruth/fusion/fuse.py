@@ -14,7 +14,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from groundtruth.fusion.movement import likeliest_noise, movement_problem, noise_of
+from groundtruth.fusion.learning import likeliest_noise, looser_over_seconds, noise_of
+from groundtruth.fusion.movement import movement_problem
 from groundtruth.fusion.settings import FuseSettings
 from groundtruth.trajectories.streams import PlanarPoses
 from landmarks import wrap_angle
@@ -53,6 +54,9 @@ class OdometryErrors:
         Their standard deviations.
     distance_sigma, lateral_sigma, turn_sigma, turn_per_metre_sigma : float
         Its random errors, as in `FuseSettings`.
+    looser_in_gaps : float
+        By what factor their variances were raised where nothing was measured for more than a
+        second, since odometry erred more over seconds than from sample to sample; 1 if it did not.
     """
 
     turn_scale: float
@@ -65,6 +69,7 @@ class OdometryErrors:
     lateral_sigma: float
     turn_sigma: float
     turn_per_metre_sigma: float
+    looser_in_gaps: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,7 +130,8 @@ def fuse(
     chosen = settings or FuseSettings()
     problem = movement_problem(odometry, streams, chosen)
     noise = likeliest_noise(problem) if chosen.learn_noise else noise_of(chosen)
-    smoothed, spread, account = problem.smooth(noise)
+    looser = looser_over_seconds(problem, noise) if chosen.learn_noise else 1.0
+    smoothed, spread, account = problem.smooth(noise, looser)
 
     first, last = problem.times_s[0], problem.times_s[-1]
     inside = odometry.times_s[(odometry.times_s >= first) & (odometry.times_s <= last)]
@@ -144,15 +150,13 @@ def fuse(
             )
             for i in np.flatnonzero(~account.accepted)
         ),
-        restarts_s=tuple(float(time) for time in problem.times_s[account.restarted]),
+        restarts_s=tuple(float(time) for time in problem.times_s[account.restarted > 0]),
         used={
             name: int(np.count_nonzero(account.accepted & (np.array(problem.streams) == name)))
             for name in streams
         },
         odometry=OdometryErrors(
-            *(float(value) for value in smoothed[-1, 3:]),
-            *(float(value) for value in last_spread[3:]),
-            *(float(value) for value in noise),
+            *np.concatenate([smoothed[-1, 3:], last_spread[3:], noise, [looser]]).tolist()
         ),
         repaired=problem.repaired,
     )

@@ -4,19 +4,26 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize_scalar
 from scipy.stats import chi2
 
-from groundtruth.errors import GroundTruthError
-from groundtruth.fusion.motion_kernels import STATE
+from groundtruth.fusion.gaps import (
+    UNMEASURED_S,
+    Bridge,
+    back_from,
+    bridge,
+    ends_that_did_not_fit,
+    gaps_where_lost,
+)
+from groundtruth.fusion.measurements import gather
+from groundtruth.fusion.motion_kernels import POSE, STATE
 from groundtruth.fusion.settings import FuseSettings
 from groundtruth.fusion.smoother_kernels import filter_forward, smooth_backward
 from groundtruth.geometry.plane import between, log_motion
-from groundtruth.trajectories.streams import RAWSEEDS_ROUNDING, PlanarPoses
+from groundtruth.trajectories.streams import PlanarPoses
 
 FloatArray = NDArray[np.float64]
 
@@ -30,11 +37,8 @@ _DISTINCT_OVER_S = 1.0
 _DISTINCT_SIGMAS = 4.0
 _RESTART_AFTER = 40
 _RESTART_VARIANCES = np.array([25.0, 25.0, math.pi**2])
-# The factors on odometry's deviations that are tried, and over how many nodes.
-_NOISE_FACTORS = (0.01, 20.0)
-_MOST_NODES_TO_LEARN_FROM = 30_000
-_LONGEST_GAP_TO_LEARN_FROM_S = 20.0
-_LEARNING_ROUNDS = 2
+# Of the heading (rad^2): beyond it, derivatives at the heading expected say nothing of others.
+_LOST_VARIANCE = 0.5**2
 _RELINEARISATIONS = 1
 _RELINEARISATIONS_WHERE_LOST = 3
 
@@ -48,15 +52,15 @@ class MeasurementAccount:
     squared : (M,) float64
         Squared normalised innovations.
     accepted : (M,) bool
-    restarted : (N,) bool
-        Nodes at which the filter began anew.
+    restarted : (N,) int8
+        Whether the filter began anew at a node, and why (see `smoother_kernels`).
     surprise : float
         Minus twice the logarithm of their likelihood.
     """
 
     squared: FloatArray
     accepted: NDArray[np.bool_]
-    restarted: NDArray[np.bool_]
+    restarted: NDArray[np.int8]
     surprise: float
 
 
@@ -127,43 +131,139 @@ class MovementProblem:
 
     def surprise(self, noise: FloatArray) -> float:
         """Minus twice the logarithm of the measurements' likelihood."""
-        empty = np.empty((1, STATE)), np.empty((1, STATE, STATE))
-        return self._forward(
-            noise, empty[0], False, empty[0], empty[1], empty[0], empty[1], empty[1]
-        ).surprise
+        return self.account(noise).surprise
 
-    def smooth(self, noise: FloatArray) -> tuple[FloatArray, FloatArray, MeasurementAccount]:
-        """Smoothed states, their covariances, and what became of the measurements."""
-        count = len(self.times_s)
-        predicted, filtered, smoothed = (np.empty((count, STATE)) for _ in range(3))
-        spreads = [np.empty((count, STATE, STATE)) for _ in range(4)]
+    def account(self, noise: FloatArray) -> MeasurementAccount:
+        """What becomes of the measurements in a filter that goes forward only."""
+        return self._forward(
+            _variances(self.times_s, self.controls, noise),
+            np.empty((1, STATE)),
+            np.zeros(len(self.times_s), dtype=np.bool_),
+            None,
+        )
+
+    def thinned(self, spacing_s: float) -> MovementProblem:
+        """With no measurement sooner than this after the one before."""
+        at = self.times_s[self.nodes]
+        kept = np.zeros(len(at), dtype=np.bool_)
+        last = -np.inf
+        for i, time in enumerate(at):
+            if time - last >= spacing_s:
+                kept[i] = True
+                last = time
+        return self.with_only(kept)
+
+    def with_only(self, kept: NDArray[np.bool_]) -> MovementProblem:
+        """With some of its measurements."""
+        return replace(
+            self,
+            nodes=self.nodes[kept],
+            measured=self.measured[kept],
+            covariances=self.covariances[kept],
+            streams=tuple(self.streams[i] for i in np.flatnonzero(kept)),
+        )
+
+    def smooth(
+        self, noise: FloatArray, looser_in_gaps: float = 1.0
+    ) -> tuple[FloatArray, FloatArray, MeasurementAccount]:
+        """Smoothed states, their covariances, and what became of the measurements.
+
+        Parameters
+        ----------
+        noise : (4,) array
+            Odometry's random errors, see `groundtruth.fusion.learning.noise_of`.
+        looser_in_gaps : float
+            Factor on the variances they make where nothing is measured.
+
+        Returns
+        -------
+        states, covariances : (N, 6), (N, 6, 6) arrays
+        account : MeasurementAccount
+        """
+        variances = _variances(self.times_s, self.controls, noise)
+        as_sampled = variances.copy()
+        after = np.flatnonzero(np.diff(self.times_s[self.nodes]) > UNMEASURED_S)
+        for begin, end in zip(self.nodes[after], self.nodes[after + 1]):
+            variances[begin + 1 : end + 1] *= looser_in_gaps
+        work = _Work(len(self.times_s))
         points = np.empty((1, STATE))
+        cuts = np.zeros(len(self.times_s), dtype=np.bool_)
+        while True:
+            account = self._forward(variances, points, cuts, work)
+            unfit = ends_that_did_not_fit(
+                self.times_s, self.nodes, account.accepted, account.restarted
+            )
+            if not unfit:
+                break
+            cuts[unfit] = True
+        work.smooth_backward()
+        gaps = gaps_where_lost(self.nodes, account.accepted, account.restarted)
+        points = work.smoothed.copy()
+        cuts[:] = False
+        for begin, end in gaps:
+            found = self._bridge(begin, end, as_sampled, points, work)
+            cuts[end] = found.path is None
+            variances[begin + 1 : end + 1] *= max(1.0, found.looser / looser_in_gaps)
         # Again, linearised along the smoothed path: where a gap was bridged, the filter alone was
         # too far off on its way for its derivatives to hold.
-        passes = 1 + _RELINEARISATIONS
-        while passes > 0:
-            account = self._forward(
-                noise, points, True, predicted, spreads[0], filtered, spreads[1], spreads[2]
-            )
-            smooth_backward(
-                predicted, spreads[0], filtered, spreads[1], spreads[2], smoothed, spreads[3]
-            )
-            if len(points) == 1 and np.any(account.restarted):
-                passes += _RELINEARISATIONS_WHERE_LOST
-            points = smoothed.copy()
-            passes -= 1
-        return smoothed, spreads[3], account
+        for _ in range(_RELINEARISATIONS + (_RELINEARISATIONS_WHERE_LOST if gaps else 0)):
+            account = self._forward(variances, points, cuts, work)
+            work.smooth_backward()
+            points = work.smoothed.copy()
+        for begin, end in gaps:
+            if cuts[end]:
+                self._anchor(begin, end, variances, work)
+        return work.smoothed, work.smoothed_covariance, account
+
+    def _bridge(
+        self, begin: int, end: int, variances: FloatArray, points: FloatArray, work: _Work
+    ) -> Bridge:
+        """Lay points over a gap that was cut, if it can be bridged.
+
+        The least noise that explains the other end tells by how many whole turns headings differ.
+        """
+        gap = slice(begin, end + 1)
+        found = bridge(
+            self.controls[gap],
+            variances[gap],
+            points[begin:end],
+            work.smoothed_covariance[begin],
+            points[end, :POSE],
+            work.smoothed_covariance[end, :POSE, :POSE],
+            self.gate(),
+        )
+        if found.path is None:
+            return found
+        points[begin:end] = found.path[:-1]
+        # Whole turns, so that headings go on without a jump.
+        turns = np.round((found.path[-1, 2] - points[end, 2]) / (2.0 * math.pi))
+        points[end:, 2] += 2.0 * math.pi * turns
+        return found
+
+    def _anchor(self, begin: int, end: int, variances: FloatArray, work: _Work) -> None:
+        """Let the second half of a gap that was cut be told by what comes after it."""
+        gap = slice(begin, end + 1)
+        states, spreads = back_from(
+            self.controls[gap],
+            variances[gap],
+            work.smoothed[end],
+            work.smoothed_covariance[end],
+        )
+        way = np.cumsum(np.hypot(self.controls[gap, 0], self.controls[gap, 1]))
+        half = int(np.searchsorted(way, 0.5 * (way[0] + way[-1]))) + 1
+        work.smoothed[begin + half : end] = states[half:-1]
+        work.smoothed_covariance[begin + half : end] = spreads[half:-1]
+
+    def gate(self) -> float:
+        """Largest squared normalised innovation."""
+        return float(chi2.ppf(self.settings.gate_probability, POSE))
 
     def _forward(
         self,
-        noise: FloatArray,
+        variances: FloatArray,
         points: FloatArray,
-        keep: bool,
-        predicted: FloatArray,
-        predicted_covariance: FloatArray,
-        filtered: FloatArray,
-        filtered_covariance: FloatArray,
-        transitions: FloatArray,
+        cuts: NDArray[np.bool_],
+        work: _Work | None,
     ) -> MeasurementAccount:
         systematic = (
             self.settings.turn_scale_sigma,
@@ -172,30 +272,57 @@ class MovementProblem:
         )
         squared = np.empty(len(self.nodes))
         accepted = np.empty(len(self.nodes), dtype=np.bool_)
-        restarted = np.empty(len(self.times_s), dtype=np.bool_)
+        restarted = np.empty(len(self.times_s), dtype=np.int8)
+        kept = work or _Work(1)
         surprise = filter_forward(
             self.controls,
-            _variances(self.times_s, self.controls, noise),
+            variances,
             np.concatenate([self.measured[0], np.zeros(3)]),
             np.diag(np.concatenate([_RESTART_VARIANCES, np.square(systematic)])),
             self.nodes,
             self.measured,
             self.covariances,
-            float(chi2.ppf(self.settings.gate_probability, 3)),
+            self.gate(),
             _RESTART_AFTER,
             _RESTART_VARIANCES,
+            _LOST_VARIANCE if len(points) == 1 else math.inf,
+            cuts,
             points,
-            keep,
-            predicted,
-            predicted_covariance,
-            filtered,
-            filtered_covariance,
-            transitions,
+            work is not None,
+            kept.predicted,
+            kept.predicted_covariance,
+            kept.filtered,
+            kept.filtered_covariance,
+            kept.transitions,
             squared,
             accepted,
             restarted,
         )
         return MeasurementAccount(squared, accepted, restarted, float(surprise))
+
+
+class _Work:
+    """Arrays that the filter and the smoother fill, for N nodes."""
+
+    def __init__(self, count: int) -> None:
+        self.predicted, self.filtered, self.smoothed = (np.empty((count, STATE)) for _ in range(3))
+        (
+            self.predicted_covariance,
+            self.filtered_covariance,
+            self.smoothed_covariance,
+            self.transitions,
+        ) = (np.empty((count, STATE, STATE)) for _ in range(4))
+
+    def smooth_backward(self) -> None:
+        smooth_backward(
+            self.predicted,
+            self.predicted_covariance,
+            self.filtered,
+            self.filtered_covariance,
+            self.transitions,
+            self.smoothed,
+            self.smoothed_covariance,
+        )
 
 
 def movement_problem(
@@ -222,7 +349,7 @@ def movement_problem(
         If there is no measurement within the odometry's time, a stream has no covariances, or one
         of them cannot be repaired.
     """
-    names, times, measured, covariances, repaired = _gather(odometry, streams, settings)
+    names, times, measured, covariances, repaired = gather(odometry, streams, settings)
     inside = odometry.times_s[(odometry.times_s >= times[0]) & (odometry.times_s <= times[-1])]
     node_times = np.union1d(inside, times)
     return MovementProblem(
@@ -235,99 +362,6 @@ def movement_problem(
         repaired=repaired,
         settings=settings,
     )
-
-
-def noise_of(settings: FuseSettings) -> FloatArray:
-    """Odometry's random errors: along a metre, across it (m), of a radian, of a metre (rad)."""
-    return np.array(
-        [
-            settings.distance_sigma,
-            settings.lateral_sigma,
-            settings.turn_sigma,
-            settings.turn_per_metre_sigma,
-        ]
-    )
-
-
-def likeliest_noise(problem: MovementProblem) -> FloatArray:
-    """Odometry's random errors that make the measurements likeliest, near those given.
-
-    Long gaps are left out: by their ends a filter that is linearised may be lost, and then no noise
-    is likelier than another for what odometry did.
-    """
-    some = problem.shortened(_MOST_NODES_TO_LEARN_FROM).split(_LONGEST_GAP_TO_LEARN_FROM_S)
-    given = noise_of(problem.settings)
-    logarithms = np.zeros(3)
-    bounds = tuple(math.log(factor) for factor in _NOISE_FACTORS)
-
-    def scaled(values: FloatArray) -> FloatArray:
-        return np.asarray(given * np.exp(values[[0, 1, 2, 2]]))
-
-    for _ in range(_LEARNING_ROUNDS):
-        for axis in (2, 0, 1):
-
-            def surprise(value: float, axis: int = axis) -> float:
-                tried = logarithms.copy()
-                tried[axis] = value
-                return sum(part.surprise(scaled(tried)) for part in some)
-
-            found = minimize_scalar(
-                surprise, bounds=bounds, method="bounded", options={"xatol": 0.05}
-            )
-            logarithms[axis] = float(found.x)
-    return scaled(logarithms)
-
-
-def _gather(
-    odometry: PlanarPoses, streams: Mapping[str, PlanarPoses], settings: FuseSettings
-) -> tuple[list[str], FloatArray, FloatArray, FloatArray, dict[str, int]]:
-    """All measurements within the odometry's time, in order, with covariances that can be used."""
-    names: list[str] = []
-    times, poses, covariances = [], [], []
-    repaired = {}
-    for name, stream in streams.items():
-        if stream.covariances is None:
-            raise GroundTruthError(f"{name}: no covariances: expected t, x, y, theta and 9 more")
-        inside = (stream.times_s >= odometry.times_s[0]) & (stream.times_s <= odometry.times_s[-1])
-        usable, repaired[name] = _usable(name, stream.covariances[inside])
-        scale = (settings.covariance_scale or {}).get(name, 1.0)
-        names += [name] * int(np.count_nonzero(inside))
-        times.append(stream.times_s[inside])
-        poses.append(stream.poses[inside])
-        covariances.append(usable * scale)
-    if not names:
-        raise GroundTruthError(
-            "no measured pose within the odometry's time "
-            f"({odometry.times_s[0]:.3f} s to {odometry.times_s[-1]:.3f} s)"
-        )
-    all_times = np.concatenate(times)
-    order = np.argsort(all_times, kind="stable")
-    return (
-        [names[i] for i in order],
-        all_times[order],
-        np.concatenate(poses)[order],
-        np.concatenate(covariances)[order],
-        repaired,
-    )
-
-
-def _usable(name: str, covariances: FloatArray) -> tuple[FloatArray, int]:
-    """Covariances made symmetric, and raised where a file's rounding made them singular."""
-    symmetric = 0.5 * (covariances + np.swapaxes(covariances, 1, 2))
-    smallest = np.linalg.eigvalsh(symmetric)[:, 0]
-    worst = float(smallest.min(initial=0.0))
-    # Three entries of a row may each be off by the rounding.
-    if worst < -3.0 * RAWSEEDS_ROUNDING:
-        at = int(np.argmin(smallest))
-        raise GroundTruthError(
-            f"{name}: pose {at + 1} has a covariance with eigenvalue {worst:.3g}: expected none "
-            "below what rounding to six decimals makes of 0"
-        )
-    weak = smallest <= RAWSEEDS_ROUNDING * 0.1
-    symmetric[weak] += np.eye(3) * (
-        RAWSEEDS_ROUNDING + np.maximum(0.0, -smallest[weak])[:, None, None]
-    )
-    return symmetric, int(np.count_nonzero(weak))
 
 
 def _controls(

@@ -19,9 +19,10 @@ from groundtruth.fusion.motion_kernels import POSE, STATE, move
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
+KindArray = NDArray[np.int8]
 
-#: Of the heading (rad^2): beyond it, derivatives at the heading expected say nothing of others.
-LOST_VARIANCE = 0.5**2
+#: How the filter began anew at a node: not at all, after many rejections, where it was lost.
+NOT_ANEW, AFTER_REJECTIONS, WHERE_LOST = 0, 1, 2
 
 
 @njit(cache=True, error_model="numpy")
@@ -108,6 +109,8 @@ def filter_forward(
     gate: float,
     restart_after: int,
     restart_variances: FloatArray,
+    lost_variance: float,
+    cuts: BoolArray,
     points: FloatArray,
     keep: bool,
     predicted: FloatArray,
@@ -117,7 +120,7 @@ def filter_forward(
     transitions: FloatArray,
     squared_innovations: FloatArray,
     accepted: BoolArray,
-    restarted: BoolArray,
+    restarted: KindArray,
 ) -> float:
     """Filter N nodes forward, with M measured poses at some of them.
 
@@ -137,12 +140,15 @@ def filter_forward(
     restart_after : int
         So many rejections in a row, and the pose becomes the measured one, with
         `restart_variances`: the measurements are believed again, however far off the filter was.
-        The same at once where it does not know any more where the robot looks, if it is linearised
-        at its own states, which are too far off for that, or if the measurement does not fit.
     restart_variances : (3,) array
+    lost_variance : float
+        The same at once where the heading's variance (rad^2) is greater.
+    cuts : (N,) bool array
+        The same at these nodes, at their first measurement.
     points : (N, 6) array
-        States at which each movement away from a node is linearised; of length 1: at the filter's
-        own.
+        States at which each movement away from a node is linearised, with headings that go on
+        without jumps; measured headings are taken to lie within half a turn of them. Of length 1:
+        at the filter's own.
     keep : bool
         Whether the next five arrays are filled; they may be of length 1 where they are not.
     predicted, predicted_covariance, filtered, filtered_covariance : (N, 6), (N, 6, 6) arrays
@@ -150,8 +156,8 @@ def filter_forward(
         Derivatives of each node's prediction by the node before.
     squared_innovations, accepted : (M,) arrays
         Filled.
-    restarted : (N,) array
-        Filled: whether the filter began anew at a node.
+    restarted : (N,) int8 array
+        Filled: whether the filter began anew at a node, and why.
 
     Returns
     -------
@@ -170,7 +176,8 @@ def filter_forward(
     rejections = 0
     surprise = 0.0
     for k in range(controls.shape[0]):
-        restarted[k] = False
+        restarted[k] = NOT_ANEW
+        cut = cuts[k]
         if k > 0:
             if points.shape[0] > 1:
                 move(x, p, f, controls[k], control_variances[k], points[k - 1])
@@ -184,13 +191,13 @@ def filter_forward(
         while m < nodes.shape[0] and nodes[m] == k:
             for i in range(POSE):
                 innovation[i] = measured[m, i] - x[i]
-            innovation[2] = _wrap(innovation[2])
-            lost = m > 0 and p[2, 2] > LOST_VARIANCE
-            anew = rejections >= restart_after or (lost and points.shape[0] == 1)
-            squared, determinant = _squared_innovation(
-                p, measured_covariances[m], innovation, s, s_inverse
-            )
-            if anew or (lost and squared > gate):
+            if points.shape[0] > 1:
+                ahead = points[k, 2] - x[2]
+                innovation[2] = ahead + _wrap(innovation[2] - ahead)
+            else:
+                innovation[2] = _wrap(innovation[2])
+            lost = m > 0 and (cut or p[2, 2] > lost_variance)
+            if lost or rejections >= restart_after:
                 for i in range(POSE):
                     for j in range(STATE):
                         p[i, j] = 0.0
@@ -200,14 +207,15 @@ def filter_forward(
                     x[i] += innovation[i]
                     innovation[i] = 0.0
                 rejections = 0
-                restarted[k] = True
+                cut = False
+                restarted[k] = WHERE_LOST if lost else AFTER_REJECTIONS
                 if keep:
                     predicted[k] = x
                     predicted_covariance[k] = p
                     transitions[k, :POSE] = 0.0
-                squared, determinant = _squared_innovation(
-                    p, measured_covariances[m], innovation, s, s_inverse
-                )
+            squared, determinant = _squared_innovation(
+                p, measured_covariances[m], innovation, s, s_inverse
+            )
             squared_innovations[m] = squared
             accepted[m] = squared <= gate
             if accepted[m]:
@@ -290,7 +298,6 @@ def smooth_backward(
             _solve(lower, gain[i])
         for i in range(STATE):
             difference[i] = smoothed[k + 1, i] - predicted[k + 1, i]
-        difference[2] = _wrap(difference[2])
         for i in range(STATE):
             total = filtered[k, i]
             for j in range(STATE):

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
+from scipy.signal import lfilter
 
 from groundtruth.cli import main
 from groundtruth.errors import GroundTruthError
@@ -447,3 +448,103 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert "give --force" in capsys.readouterr().err
     assert main(["fuse", str(tmp_path / "odometry.csv")]) == 1
     assert "expected at least one ground truth" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_odometry_that_errs_smoothly_bridges_long_gaps_and_holes_beside_them(seed: int) -> None:
+    """A localisation as odometry: never far off, and wrong for seconds, not from row to row."""
+    rng = np.random.default_rng(30 + seed)
+    times = np.arange(0.0, 1700.0, 0.1)
+    # It turns left more than right: what is learnt of turns counts at the long gaps' ends.
+    turning = 0.01 + 0.4 * np.sin(0.3 * times)
+    steps = 0.1 * np.column_stack([0.7 + 0.0 * times, 0.0 * times, turning])
+    truth = PlanarPoses(times, chain(steps, np.zeros(3)))
+    # 50 mm and 1.5 degrees, smooth within a second and forgotten after a few.
+    kept = math.exp(-0.1 / 1.5)
+    off = lfilter([1.0], [1.0, -2.0 * kept, kept**2], rng.normal(size=(len(times), 3)), axis=0)
+    off *= [0.05, 0.05, math.radians(1.5)] / np.std(off, axis=0)
+    off += rng.normal(size=off.shape) * [0.001, 0.001, 0.004]
+    odometry = PlanarPoses(times, truth.poses + off)
+    times = times[:-10]
+    long_gap = ((times > 40.0) & (times < 260.0)) | ((times > 300.0) & (times < 1450.0))
+    begins = [20.0, 35.0, 260.0, 280.0, 290.0, 1450.0, 1480.0, 1520.0, 1560.0, 1620.0, 1670.0]
+    lengths = [5.0, 5.0, 2.0, 5.0, 10.0, 5.0, 20.0, 20.0, 5.0, 20.0, 5.0]
+    holes = [(begin, begin + length) for begin, length in zip(begins, lengths)]
+
+    def in_hole(at: FloatArray) -> NDArray[np.bool_]:
+        return np.asarray(np.any([(at >= begin) & (at < end) for begin, end in holes], axis=0))
+
+    spread = np.diag(np.square([2e-3, 2e-3, 3e-3]))
+    laser = measure(rng, truth, times[~(long_gap | in_hole(times))], spread)
+    fusion = fuse(odometry, {"laser": laser})
+    assert fusion.restarts_s == ()
+    assert fusion.odometry.looser_in_gaps > 1.0
+    assert abs(fusion.odometry.turn_bias_per_metre) < 0.005
+    found = fusion.poses
+    within = in_hole(found.times_s)
+    exact, _ = interpolate_poses(truth, found.times_s)
+    distance = np.linalg.norm((found.poses - exact.poses)[:, :2], axis=1)
+    squared = normalised_error(found, truth) / 3.0
+    assert np.mean(distance[within]) < 0.1
+    assert 0.3 < np.mean(squared[within]) < 2.0
+    assert np.mean(squared) < 2.0
+
+
+@pytest.mark.parametrize("bend", [-0.02, 0.0, 0.02])
+def test_beside_a_long_gap_the_path_is_told_by_its_own_side(bend: float) -> None:
+    """Twenty minutes without a pose: for seconds from either end, odometry leads on from there."""
+    rng = np.random.default_rng(40)
+    exact = FuseSettings(distance_sigma=0.01, lateral_sigma=0.0, turn_per_metre_sigma=0.02)
+    truth, own = drive(rng, 1240.0, exact, rate_hz=10.0)
+    steps = between(own.poses[:-1], own.poses[1:])
+    steps[:, 2] += bend * np.hypot(steps[:, 0], steps[:, 1])
+    odometry = PlanarPoses(own.times_s, chain(np.vstack([np.zeros((1, 3)), steps]), np.zeros(3)))
+    seen = np.concatenate([np.arange(0.0, 20.0, 0.1), np.arange(1220.0, 1239.8, 0.1)])
+    found = fuse(odometry, {"laser": measure(rng, truth, seen, LASER_COVARIANCE / 10)}).poses
+    at = found.times_s
+    beside = ((at > 20.0) & (at < 25.0)) | ((at > 1215.0) & (at < 1220.0))
+    exact_poses, _ = interpolate_poses(truth, at)
+    off = np.linalg.norm((found.poses - exact_poses.poses)[:, :2], axis=1)
+    assert np.max(off[beside]) < 0.5
+    assert np.mean(normalised_error(found, truth)[beside]) < 3.0 * 2.0
+    assert np.mean(normalised_error(found, truth)) < 3.0 * 2.0
+
+
+@pytest.mark.parametrize("turned_rad", [0.0, 2.0])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_robot_carried_away_in_a_gap_keeps_the_covariance_honest(
+    seed: int, turned_rad: float
+) -> None:
+    """What odometry did not see in a gap is laid to the gap; poses after it are believed."""
+    rng = np.random.default_rng(seed)
+    truth, odometry = drive(rng, 60.0, FuseSettings())
+    moved = PlanarPoses(truth.times_s, truth.poses.copy())
+    late = truth.times_s > 30.0
+    carried = moved.poses[late, 0] + 1j * moved.poses[late, 1] + (4.0 - 3.0j)
+    carried *= np.exp(1j * turned_rad)
+    moved.poses[late, 0], moved.poses[late, 1] = carried.real, carried.imag
+    moved.poses[late, 2] = wrap_angle(moved.poses[late, 2] + turned_rad)
+    seen = np.concatenate([np.arange(0.0, 20.0, 0.1), np.arange(40.0, 59.8, 0.1)])
+    fusion = fuse(odometry, {"laser": measure(rng, moved, seen, LASER_COVARIANCE)})
+    assert len(fusion.rejected) <= 1
+    found = fusion.poses
+    at = found.times_s
+    exact, _ = interpolate_poses(moved, at)
+    off = np.linalg.norm((found.poses - exact.poses)[:, :2], axis=1)
+    measured = (at < 20.0) | (at > 40.0)
+    assert np.max(off[measured]) < 0.1
+    squared = normalised_error(found, moved) / 3.0
+    assert np.mean(squared[measured]) < 2.0
+    assert np.mean(squared) < 10.0
+
+
+def test_a_wrong_pose_after_a_gap_is_kept_out() -> None:
+    rng = np.random.default_rng(0)
+    truth, odometry = drive(rng, 60.0, FuseSettings())
+    seen = np.concatenate([np.arange(0.0, 20.0, 0.1), np.arange(40.0, 59.8, 0.1)])
+    laser = measure(rng, truth, seen, LASER_COVARIANCE)
+    laser.poses[200] += [10.0, 10.0, 1.0]
+    fusion = fuse(odometry, {"laser": laser})
+    assert [rejected.time_s for rejected in fusion.rejected] == [pytest.approx(40.0)]
+    assert fusion.restarts_s == ()
+    assert fusion.odometry.looser_in_gaps == 1.0

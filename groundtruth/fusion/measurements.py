@@ -1,0 +1,88 @@
+"""Measured poses of all streams, in one order, with covariances that can be inverted."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from groundtruth.errors import GroundTruthError
+from groundtruth.fusion.settings import FuseSettings
+from groundtruth.trajectories.streams import RAWSEEDS_ROUNDING, PlanarPoses
+
+FloatArray = NDArray[np.float64]
+
+
+def gather(
+    odometry: PlanarPoses, streams: Mapping[str, PlanarPoses], settings: FuseSettings
+) -> tuple[list[str], FloatArray, FloatArray, FloatArray, dict[str, int]]:
+    """All measurements within the odometry's time, in order, with covariances that can be used.
+
+    Parameters
+    ----------
+    odometry : PlanarPoses
+    streams : mapping of str to PlanarPoses
+        Measured poses, by name.
+    settings : FuseSettings
+
+    Returns
+    -------
+    names : list of M str
+        Whose each measurement is.
+    times_s, poses, covariances : (M,), (M, 3), (M, 3, 3) arrays
+    repaired : dict of str to int
+        Covariances that had to be raised, by stream.
+
+    Raises
+    ------
+    GroundTruthError
+        If there is no measurement within the odometry's time, a stream has no covariances, or one
+        of them cannot be repaired.
+    """
+    names: list[str] = []
+    times, poses, covariances = [], [], []
+    repaired = {}
+    for name, stream in streams.items():
+        if stream.covariances is None:
+            raise GroundTruthError(f"{name}: no covariances: expected t, x, y, theta and 9 more")
+        inside = (stream.times_s >= odometry.times_s[0]) & (stream.times_s <= odometry.times_s[-1])
+        usable, repaired[name] = _usable(name, stream.covariances[inside])
+        scale = (settings.covariance_scale or {}).get(name, 1.0)
+        names += [name] * int(np.count_nonzero(inside))
+        times.append(stream.times_s[inside])
+        poses.append(stream.poses[inside])
+        covariances.append(usable * scale)
+    if not names:
+        raise GroundTruthError(
+            "no measured pose within the odometry's time "
+            f"({odometry.times_s[0]:.3f} s to {odometry.times_s[-1]:.3f} s)"
+        )
+    all_times = np.concatenate(times)
+    order = np.argsort(all_times, kind="stable")
+    return (
+        [names[i] for i in order],
+        all_times[order],
+        np.concatenate(poses)[order],
+        np.concatenate(covariances)[order],
+        repaired,
+    )
+
+
+def _usable(name: str, covariances: FloatArray) -> tuple[FloatArray, int]:
+    """Covariances made symmetric, and raised where a file's rounding made them singular."""
+    symmetric = 0.5 * (covariances + np.swapaxes(covariances, 1, 2))
+    smallest = np.linalg.eigvalsh(symmetric)[:, 0]
+    worst = float(smallest.min(initial=0.0))
+    # Three entries of a row may each be off by the rounding.
+    if worst < -3.0 * RAWSEEDS_ROUNDING:
+        at = int(np.argmin(smallest))
+        raise GroundTruthError(
+            f"{name}: pose {at + 1} has a covariance with eigenvalue {worst:.3g}: expected none "
+            "below what rounding to six decimals makes of 0"
+        )
+    weak = smallest <= RAWSEEDS_ROUNDING * 0.1
+    symmetric[weak] += np.eye(3) * (
+        RAWSEEDS_ROUNDING + np.maximum(0.0, -smallest[weak])[:, None, None]
+    )
+    return symmetric, int(np.count_nonzero(weak))
