@@ -139,13 +139,14 @@ def find_views(
 
 def camera_of(calibration: Calibration) -> Camera:
     """The calibrated camera, without a pose."""
-    sx, sy, ox, oy, a2, a3, b1, b2, b3, p1, p2 = (float(x) for x in calibration.intrinsics)
+    sx, sy, ox, oy, a2, a3, b1, b2, b3, p1, p2, *k = (float(x) for x in calibration.intrinsics)
     points = calibration.points
     try:
         return Camera(
             width=points.width, height=points.height,
             scale_x=sx, scale_y=sy, offset_x=ox, offset_y=oy, coef=(a2, a3, b1, b2, b3),
             robot_from_camera=_IDENTITY, sensor_to_tcp=_IDENTITY, tangential=(p1, p2),
+            polynomial=(k[0], k[1], k[2]),
         )  # fmt: skip
     except CameraError as error:
         raise CalibrationError(

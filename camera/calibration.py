@@ -79,7 +79,7 @@ class Calibration:
 
     @property
     def intrinsics(self) -> FloatArray:
-        """(11,) scaleX, scaleY, offsetX, offsetY, a2, a3, b1, b2, b3, p1, p2."""
+        """(14,) `calibration_model.INTRINSICS`."""
         return self.adjusted.estimate.intrinsics
 
     @property

@@ -86,7 +86,7 @@ class Estimate:
 
     Attributes
     ----------
-    intrinsics : (11,) float64
+    intrinsics : (14,) float64
     rotations, translations : (V, 3, 3) and (V, 3) float64
         `camera_from_board` of each view, metres.
     """
@@ -109,7 +109,7 @@ class Adjusted:
         Seen less projected, pixels.
     weights : (N, 2) float64
         Robust weights, 1 where a residual counts in full.
-    covariance : (11, 11) float64
+    covariance : (14, 14) float64
         Of the intrinsics; zero for what was held fixed.
     pose_covariances : (V, 6, 6) float64
         Of each view's rotation (perturbed from the left, in the camera frame, rad) and translation
@@ -148,7 +148,7 @@ def project_estimate(
     Returns
     -------
     pixels : (N, 2) array
-    by_intrinsics : (N, 2, 11) array
+    by_intrinsics : (N, 2, 14) array
     by_pose : (N, 2, 6) array
         By the rotation (from the left, about the board's origin) and the translation of the
         point's own view.

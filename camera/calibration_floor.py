@@ -91,7 +91,7 @@ def place_on_floor(
         Where the points are seen.
     floor_xy : (N, 2) array
         Where they are, robot X and Y in metres.
-    intrinsics_covariance : (11, 11) array, optional
+    intrinsics_covariance : (14, 14) array, optional
         Of scaleX ... p2; zero if not given.
 
     Returns

@@ -1,8 +1,8 @@
 """What a calibration adjusts: the projection with its derivatives, rigid poses, and the parameters.
 
-Intrinsics are always the vector ``(scaleX, scaleY, offsetX, offsetY, a2, a3, b1, b2, b3, p1, p2)``,
-the order of the ``.cam`` file. What is free of them is a matrix `span`, so that equal scales are
-one column and a coefficient that is left at 0 has none.
+Intrinsics are always the vector ``(scaleX, scaleY, offsetX, offsetY, a2, a3, b1, b2, b3, p1, p2,
+k1, k2, k3)``, the order of the ``.cam`` file. What is free of them is a matrix `span`, so that
+equal scales are one column and a coefficient that is left at 0 has none.
 """
 
 from __future__ import annotations
@@ -10,19 +10,17 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from camera.brown import Brown, brown_jacobian, brown_shift, one_to_one_radius
 from camera.distortion import Coef, fold_radius, radial_factor
 from camera.model_checks import border_pixels
-from camera.tangential import (
-    Tangential,
-    one_to_one_radius,
-    tangential_jacobian,
-    tangential_shift,
-)
 
 FloatArray = NDArray[np.float64]
 
 #: Names of the intrinsics, in order.
-INTRINSICS = ("scaleX", "scaleY", "offsetX", "offsetY", "a2", "a3", "b1", "b2", "b3", "p1", "p2")
+INTRINSICS = (
+    "scaleX", "scaleY", "offsetX", "offsetY", "a2", "a3", "b1", "b2", "b3", "p1", "p2", "k1", "k2",
+    "k3",
+)  # fmt: skip
 
 #: Their number.
 COUNT = len(INTRINSICS)
@@ -30,8 +28,11 @@ COUNT = len(INTRINSICS)
 #: Names of the tangential terms.
 TANGENTIAL = ("p1", "p2")
 
+#: Names of the even polynomial's coefficients.
+POLYNOMIAL = ("k1", "k2", "k3")
+
 #: Power of r that each distortion coefficient goes with, relative to the radius.
-POWERS = np.array([1.0, 2.0, 1.0, 2.0, 3.0, 1.0, 1.0])
+POWERS = np.array([1.0, 2.0, 1.0, 2.0, 3.0, 1.0, 1.0, 2.0, 4.0, 6.0])
 
 #: Which coefficients are free, by their number: even powers first, for a lens is smooth in its
 #: middle; then what the published camera needs.
@@ -46,7 +47,7 @@ FREE_COEFFICIENTS: tuple[tuple[str, ...], ...] = (
 
 # The image's corner must be seen at a radius that stays below the fold by this share.
 _FOLD_MARGIN = 0.01
-# Directions in which it is looked how far a decentred lens sees, and places on each of the border's
+# Directions in which it is looked how far such a lens sees, and places on each of the border's
 # sides.
 _DIRECTIONS = 128
 _BORDER_PLACES = 9
@@ -58,30 +59,36 @@ def coefficients(intrinsics: FloatArray) -> Coef:
     return a2, a3, b1, b2, b3
 
 
-def tangential_of(intrinsics: FloatArray) -> Tangential:
-    """The distortion's (p1, p2) of an intrinsics vector."""
-    return float(intrinsics[9]), float(intrinsics[10])
+def brown_terms(intrinsics: FloatArray) -> Brown:
+    """The distortion's (k1, k2, p1, p2, k3) of an intrinsics vector."""
+    p1, p2, k1, k2, k3 = (float(c) for c in intrinsics[9:14])
+    return k1, k2, p1, p2, k3
 
 
-def free_span(count: int, aspect: float | None, *, tangential: bool = False) -> FloatArray:
+def free_span(
+    count: int, aspect: float | None, *, tangential: bool = False, polynomial: int = 0
+) -> FloatArray:
     """Directions in which intrinsics may change.
 
     Parameters
     ----------
     count : int
-        Number of free distortion coefficients, 0 to 5 (`FREE_COEFFICIENTS`).
+        Number of free coefficients of the rational distortion, 0 to 5 (`FREE_COEFFICIENTS`).
     aspect : float or None
         scaleY / scaleX if that is known (1 for square pixels, 0.5 for single fields); None if both
         scales are free.
     tangential : bool
         Whether p1 and p2 are free.
+    polynomial : int
+        Number of free ones of k1, k2, k3.
 
     Returns
     -------
-    (11, K) array
+    (14, K) array
         Its columns span the free parameters; each is a unit vector but that of tied scales.
     """
     names = ["offsetX", "offsetY", *FREE_COEFFICIENTS[count], *(TANGENTIAL if tangential else ())]
+    names += POLYNOMIAL[:polynomial]
     scales = np.zeros((COUNT, 1 if aspect is not None else 2))
     scales[0, 0] = 1.0
     scales[1, -1] = 1.0 if aspect is None else aspect
@@ -95,7 +102,7 @@ def project_points(
 
     Parameters
     ----------
-    intrinsics : (11,) array
+    intrinsics : (14,) array
     points_camera : (N, 3) array
         Metres.
 
@@ -103,7 +110,7 @@ def project_points(
     -------
     pixels : (N, 2) array
         NaN for points that are not in front of the camera or past the distortion's fold.
-    by_intrinsics : (N, 2, 11) array
+    by_intrinsics : (N, 2, 14) array
         d(u, v) / d(intrinsics).
     by_point : (N, 2, 3) array
         d(u, v) / d(point), pixels per metre.
@@ -113,8 +120,8 @@ def project_points(
     z = np.where(points_camera[:, 2] > 0.0, points_camera[:, 2], np.nan)
     xy = points_camera[:, :2] / z[:, None]
     r = np.hypot(xy[:, 0], xy[:, 1])
-    tangential = tangential_of(intrinsics)
-    r = np.where(r <= one_to_one_radius((a2, a3, b1, b2, b3), tangential), r, np.nan)
+    brown = brown_terms(intrinsics)
+    r = np.where(r <= one_to_one_radius((a2, a3, b1, b2, b3), brown), r, np.nan)
     numerator = r * (a2 + r * a3)
     denominator = 1.0 + r * (b1 + r * (b2 + r * b3))
     ratio = numerator / denominator
@@ -125,8 +132,8 @@ def project_points(
     by_intrinsics = np.zeros((len(r), 2, COUNT))
     seen = xy * factor[:, None]
     pixels = by_factor * factor[:, None] + offset
-    if any(tangential):
-        shift = tangential_shift(xy, tangential)
+    if any(brown):
+        shift = brown_shift(xy, brown)
         seen, pixels = seen + shift, pixels + scale * shift
     by_intrinsics[:, 0, 0] = seen[:, 0]
     by_intrinsics[:, 1, 1] = seen[:, 1]
@@ -141,13 +148,15 @@ def project_points(
     by_intrinsics[:, 1, 9] = scale[1] * (squared + 2.0 * xy[:, 1] ** 2)
     by_intrinsics[:, 0, 10] = scale[0] * (squared + 2.0 * xy[:, 0] ** 2)
     by_intrinsics[:, 1, 10] = scale[1] * product
+    powers = np.stack([squared, squared**2, squared**3], axis=-1)
+    by_intrinsics[:, :, 11:14] = by_factor[:, :, None] * powers[:, None, :]
 
     unit = xy / np.where(r > 0.0, r, 1.0)[:, None]
     by_xy = slope[:, None, None] * xy[:, :, None] * unit[:, None, :]
     by_xy[:, 0, 0] += factor
     by_xy[:, 1, 1] += factor
-    if any(tangential):
-        by_xy += tangential_jacobian(xy, tangential)
+    if any(brown):
+        by_xy += brown_jacobian(xy, brown)
     by_xy *= scale[:, None]
     by_point = np.empty((len(r), 2, 3))
     by_point[:, :, :2] = by_xy / z[:, None, None]
@@ -159,9 +168,9 @@ def is_possible(intrinsics: FloatArray, width: int, height: int) -> bool:
     """Whether scales are positive and the distortion grows beyond the image's border."""
     if not np.all(np.isfinite(intrinsics)) or min(intrinsics[:2]) <= 0.0:
         return False
-    coef, tangential = coefficients(intrinsics), tangential_of(intrinsics)
-    if any(tangential):
-        return _holds_border(intrinsics, coef, tangential, width, height)
+    coef, brown = coefficients(intrinsics), brown_terms(intrinsics)
+    if any(brown):
+        return _holds_border(intrinsics, coef, brown, width, height)
     fold = fold_radius(coef)
     if not np.isfinite(fold):
         # r f(r) grows without end, but towards a limit where the coefficients make f fall as 1 / r.
@@ -173,13 +182,13 @@ def is_possible(intrinsics: FloatArray, width: int, height: int) -> bool:
 
 
 def _holds_border(
-    intrinsics: FloatArray, coef: Coef, tangential: Tangential, width: int, height: int
+    intrinsics: FloatArray, coef: Coef, brown: Brown, width: int, height: int
 ) -> bool:
-    """Whether the image lies within what a decentred lens sees up to where it folds."""
-    r_max = one_to_one_radius(coef, tangential)
+    """Whether the image lies within what a lens with Brown's terms sees up to where it folds."""
+    r_max = one_to_one_radius(coef, brown)
     angle = np.linspace(-np.pi, np.pi, _DIRECTIONS)
     edge = r_max * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    edge = edge * radial_factor(np.array(r_max), coef) + tangential_shift(edge, tangential)
+    edge = edge * radial_factor(np.array(r_max), coef) + brown_shift(edge, brown)
     border = border_pixels(width, height, _BORDER_PLACES)
     border = (border - intrinsics[2:4]) / intrinsics[:2]
     reach = np.interp(

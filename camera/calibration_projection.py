@@ -24,17 +24,17 @@ def pixel_grid(width: int, height: int, columns: int = 49, rows: int = 37) -> Fl
 
 
 def intrinsics_of(camera: Camera) -> FloatArray:
-    """(11,) scaleX, scaleY, offsetX, offsetY, a2, a3, b1, b2, b3, p1, p2 of a camera."""
+    """(14,) numbers of a camera (`calibration_model.INTRINSICS`)."""
     pinhole = (camera.scale_x, camera.scale_y, camera.offset_x, camera.offset_y)
-    return np.array([*pinhole, *camera.coef, *camera.tangential])
+    return np.array([*pinhole, *camera.coef, *camera.tangential, *camera.polynomial])
 
 
 def with_intrinsics(camera: Camera, intrinsics: FloatArray) -> Camera:
     """The camera with other intrinsics, an array as of `intrinsics_of`."""
-    sx, sy, ox, oy, a2, a3, b1, b2, b3, p1, p2 = (float(value) for value in intrinsics)
+    sx, sy, ox, oy, a2, a3, b1, b2, b3, p1, p2, *k = (float(x) for x in intrinsics)
     return replace(
         camera, scale_x=sx, scale_y=sy, offset_x=ox, offset_y=oy, coef=(a2, a3, b1, b2, b3),
-        tangential=(p1, p2),
+        tangential=(p1, p2), polynomial=(k[0], k[1], k[2]),
     )  # fmt: skip
 
 
@@ -46,7 +46,7 @@ def projection_sigma(
     Parameters
     ----------
     camera : Camera
-    covariance : (11, 11) array
+    covariance : (14, 14) array
         Of its intrinsics.
     columns, rows : int
         Of the grid of pixels.

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from camera.brown import one_to_one_radius, straightened
 from camera.calibration_adjustment import (
     Adjusted,
     Estimate,
@@ -15,9 +16,8 @@ from camera.calibration_adjustment import (
     adjust,
     project_estimate,
 )
-from camera.calibration_model import COUNT, coefficients, free_span, tangential_of
+from camera.calibration_model import COUNT, brown_terms, coefficients, free_span
 from camera.distortion import undistorted_radius
-from camera.tangential import one_to_one_radius, straightened
 
 FloatArray = NDArray[np.float64]
 
@@ -49,7 +49,7 @@ def first_estimate(points: Points, aspect: float | None) -> Estimate:
     for widths in _FOCAL_WIDTHS:
         focal = widths * points.width
         intrinsics = np.array(
-            [focal, ratio * focal, 0.5 * (points.width - 1), 0.5 * (points.height - 1), *[0.0] * 7]
+            [focal, ratio * focal, 0.5 * (points.width - 1), 0.5 * (points.height - 1), *[0.0] * 10]
         )
         start = Estimate(intrinsics, *board_poses(intrinsics, few))
         try:
@@ -68,10 +68,10 @@ def board_poses(intrinsics: FloatArray, points: Points) -> tuple[FloatArray, Flo
     """`camera_from_board` of each view, (V, 3, 3) and (V, 3), by its homography."""
     normalised = (points.pixels - intrinsics[2:4]) / intrinsics[:2]
     radius = np.hypot(normalised[:, 0], normalised[:, 1])
-    coef, tangential = coefficients(intrinsics), tangential_of(intrinsics)
-    if any(tangential):
-        r_max = one_to_one_radius(coef, tangential)
-        straight_xy = straightened(normalised, coef, tangential, r_max)
+    coef, brown = coefficients(intrinsics), brown_terms(intrinsics)
+    if any(brown):
+        r_max = one_to_one_radius(coef, brown)
+        straight_xy = straightened(normalised, coef, brown, r_max)
         normalised = np.where(np.isnan(straight_xy), normalised, straight_xy)
     else:
         straight = undistorted_radius(radius, coef)

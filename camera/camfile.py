@@ -1,8 +1,9 @@
 """Reading and writing ``.cam`` files (``SmRadialDistortedCamera``).
 
 The grammar is the data set's, read generously: any white space, commas or none, keys in any order,
-``#`` comments. Keys that mean nothing here are kept and written back. One key is this project's:
-``tangential: { p1 p2 }``, written only for a lens that has such terms.
+``#`` comments. Keys that mean nothing here are kept and written back. Two keys are this project's:
+``tangential: { p1 p2 }`` and ``polynomial: { k1 k2 k3 }``, each written only for a lens that has
+such terms.
 """
 
 from __future__ import annotations
@@ -11,9 +12,10 @@ import os
 import re
 from pathlib import Path
 
+from camera.brown import NOT_TANGENTIAL
+from camera.distortion import NO_POLYNOMIAL
 from camera.errors import CameraError
 from camera.model import Camera, Pose
-from camera.tangential import NONE
 from storage import write_whole
 from storage.bounded import read_bounded
 
@@ -84,7 +86,8 @@ def parse_camera(text: str, name: str = "<text>") -> Camera:
     scale_x, scale_y = numbers("scaleX", 1)[0], numbers("scaleY", 1)[0]
     offset_x, offset_y = numbers("offsetX", 1)[0], numbers("offsetY", 1)[0]
     a2, a3, b1, b2, b3 = numbers("coef", 5)
-    p1, p2 = numbers("tangential", 2) if "tangential" in entries else NONE
+    p1, p2 = numbers("tangential", 2) if "tangential" in entries else NOT_TANGENTIAL
+    k1, k2, k3 = numbers("polynomial", 3) if "polynomial" in entries else NO_POLYNOMIAL
     unknown = tuple((key, " ".join(token for token, _ in value)) for key, value in entries.items())
     try:
         return Camera(
@@ -100,6 +103,7 @@ def parse_camera(text: str, name: str = "<text>") -> Camera:
             mount_index=mount_index,
             unknown=unknown,
             tangential=(p1, p2),
+            polynomial=(k1, k2, k3),
         )
     except CameraError as error:
         raise CameraError(f"{name}: {error}") from None
@@ -120,6 +124,8 @@ def format_camera(camera: Camera) -> str:
     lines.append(f"coef: {{ {' '.join(_shortest(c) for c in camera.coef)} }}")
     if camera.decentred:
         lines.append(f"tangential: {{ {' '.join(_shortest(p) for p in camera.tangential)} }}")
+    if any(camera.polynomial):
+        lines.append(f"polynomial: {{ {' '.join(_shortest(k) for k in camera.polynomial)} }}")
     lines += [f"{key}: {text}" for key, text in camera.unknown]
     return "\n".join([*lines, "}", ""])
 

@@ -1,4 +1,4 @@
-"""Converting a camera from one model to another: the target is fitted to the source's pixels."""
+"""Converting a camera to another model: taken over where that contains it, else fitted."""
 
 from __future__ import annotations
 
@@ -9,11 +9,13 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from camera.brown import NOT_TANGENTIAL, Tangential, brown_of, brown_shift
 from camera.calibration_model import free_span, is_possible, project_points
+from camera.calibration_projection import intrinsics_of
 from camera.conversion_models import COEFFICIENTS, P1, ForeignCamera, Model
+from camera.distortion import NO_POLYNOMIAL
 from camera.errors import CameraError, ConversionError
 from camera.model import Camera
-from camera.tangential import NONE, Tangential, tangential_shift
 
 FloatArray = NDArray[np.float64]
 AnyCamera = Camera | ForeignCamera
@@ -148,7 +150,11 @@ def convert_to_foreign(
 def convert_to_camera(
     source: AnyCamera, rows: Rows = "same", pose: Camera | None = None
 ) -> Converted:
-    """Fit the project's model: the radial part, the tangential terms being taken over.
+    """Take over, or fit, the project's model.
+
+    A polynomial and tangential terms without a denominator are taken over as they are. Else the
+    rational part is fitted beside the source's tangential terms and, where it comes not near, all
+    of them and a polynomial together.
 
     Parameters
     ----------
@@ -177,18 +183,28 @@ def convert_to_camera(
     factor = {"same": 1.0, "halve": 0.5, "double": 2.0}[rows]
 
     def camera_of(p: FloatArray) -> Camera:
-        sx, sy, ox, oy, a2, a3, b1, b2, b3, p1, p2 = (float(value) for value in p)
+        sx, sy, ox, oy, a2, a3, b1, b2, b3, p1, p2, k1, k2, k3 = (float(x) for x in p)
         return Camera(
             width, height, sx, sy, ox, oy, (a2, a3, b1, b2, b3), placed, tcp, mount,
-            tangential=(p1, p2),
+            tangential=(p1, p2), polynomial=(k1, k2, k3),
         )  # fmt: skip
 
     fx, fy, cx, cy = _pinhole(source)
-    start = np.array([fx, fy * factor, cx, cy * factor, *[0.0] * 5, *_tangential(source)])
-    if isinstance(source, Camera):
-        start[4:9] = source.coef
-        return _measured(camera_of(start), _check(source, rows))
+    start = np.array(
+        [fx, fy * factor, cx, cy * factor, *[0.0] * 5, *_tangential(source), *[0.0] * 3]
+    )
     check = _check(source, rows)
+    if isinstance(source, Camera):
+        start[4:9], start[11:14] = source.coef, source.polynomial
+        return _measured(camera_of(start), check)
+    plumb_bob = _contained(source, "radtan", COEFFICIENTS["radtan"])
+    if plumb_bob is not None:
+        k1, k2, _, _, k3 = plumb_bob.distortion
+        try:
+            return _measured(camera_of(np.array([*start[:11], k1, k2, k3])), check)
+        except CameraError:
+            # One-to-one over its image, but not over a circle around it, as cameras here are.
+            pass
     pixels = _grid(width, height, _FIT_GRID)
     rays = _rays(source, source_pixels(pixels, rows))
     points = np.column_stack([rays, np.ones(len(rays))])
@@ -206,14 +222,27 @@ def convert_to_camera(
     if any(_tangential(source)):
         # Last, the terms taken over may make up for what the radial part can't follow.
         spans.append(free_span(5, None, tangential=True))
+    together = free_span(5, None, tangential=any(_tangential(source)), polynomial=3)
     radius = np.hypot(rays[:, 0], rays[:, 1])
-    away = (pixels - start[2:4]) / start[:2] - tangential_shift(rays, _tangential(source))
+    away = (pixels - start[2:4]) / start[:2] - brown_shift(
+        rays, brown_of(NO_POLYNOMIAL, _tangential(source))
+    )
     moved = np.sum((away - rays) * rays, axis=1) / np.maximum(radius, 1e-9)
     wavy = _wavy_start(start, radius, moved)
     best = _nearest(project, camera_of, start, spans, pixels, possible, check, wavy)
+    if best is None or best.deviation_px > _NEAR_PX:
+        nearest = start if best is None else _intrinsics(best)
+        fuller = _nearest(project, camera_of, nearest, [together], pixels, possible, check)
+        if best is None or (fuller is not None and fuller.deviation_px < best.deviation_px):
+            best = fuller
     if best is None:
         raise ConversionError("no camera of the project's model sees what the source sees")
     return best
+
+
+def _intrinsics(found: Converted) -> FloatArray:
+    assert isinstance(found.camera, Camera)
+    return intrinsics_of(found.camera)
 
 
 def _wavy_start(start: FloatArray, radius: FloatArray, moved: FloatArray) -> FloatArray:
@@ -224,7 +253,7 @@ def _wavy_start(start: FloatArray, radius: FloatArray, moved: FloatArray) -> Flo
 
     Parameters
     ----------
-    start : (11,) array
+    start : (14,) array
         Intrinsics without radial distortion.
     radius, moved : (N,) arrays
         Undistorted radii, and how far the distortion moves rays outward there.
@@ -302,11 +331,11 @@ def _stages(model: Model, number: int) -> list[int]:
 def _contained(source: AnyCamera, model: Model, number: int) -> ForeignCamera | None:
     """The source itself in the target's model, where that holds it."""
     if isinstance(source, Camera):
-        if any(source.coef[:2]) or model == "fisheye" or (source.decentred and number < P1 + 2):
+        if any(source.coef[:2]) or model == "fisheye" or any(source.brown[number:]):
             return None
         fx, fy, cx, cy = _pinhole(source)
         distortion = np.zeros(COEFFICIENTS[model])
-        distortion[P1 : P1 + 2] = source.tangential
+        distortion[: len(source.brown)] = source.brown
         found = tuple(distortion.tolist())
         return ForeignCamera(model, source.width, source.height, fx, fy, cx, cy, found)
     if (source.model == "fisheye") != (model == "fisheye"):
@@ -323,7 +352,7 @@ def _tangential(source: AnyCamera) -> Tangential:
     if isinstance(source, Camera):
         return source.tangential
     if source.model == "fisheye":
-        return NONE
+        return NOT_TANGENTIAL
     return source.distortion[P1], source.distortion[P1 + 1]
 
 

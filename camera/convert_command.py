@@ -42,13 +42,7 @@ def perform(options: Convert) -> int:
     source = parse(text, from_format, str(options.source), options.camera_name)
     converted = convert(source, to_format, options)
     camera = converted.camera
-    label = (
-        camera.model
-        if isinstance(camera, ForeignCamera)
-        else "rational radial, tangential"
-        if camera.decentred
-        else "rational radial"
-    )
+    label = camera.model if isinstance(camera, ForeignCamera) else _label(camera)
     u, v = converted.at
     print(
         f"{options.source} ({from_format}, {source.width} x {source.height}) to {to_format} "
@@ -71,6 +65,18 @@ def perform(options: Convert) -> int:
         stream.write(written.encode())
     print(f"written: {options.target}")
     return 0
+
+
+def _label(camera: Camera) -> str:
+    """What a camera's distortion is made of."""
+    if not any(camera.brown):
+        return "rational radial"
+    parts = {
+        "rational radial": any(camera.coef[:2]),
+        "polynomial": any(camera.polynomial),
+        "tangential": camera.decentred,
+    }
+    return ", ".join(name for name, there in parts.items() if there)
 
 
 def format_of_name(path: Path) -> Format:

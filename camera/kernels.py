@@ -11,18 +11,18 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from camera.brown_kernels import brown_shift_point
 from camera.model import Camera
-from camera.tangential_kernels import tangential_shift_point
 
 #: Length of the vector that `camera_numbers` returns.
-NUMBERS = 24
+NUMBERS = 27
 
 
 def camera_numbers(camera: Camera) -> NDArray[np.float64]:
     """All that a projection needs, as one vector, the form in which kernels take a camera.
 
     Order: scale x, y; offset x, y; a2, a3, b1, b2, b3; r_max; the 9 entries of the rotation
-    robot -> camera row by row; the camera's centre in the robot frame; p1, p2.
+    robot -> camera row by row; the camera's centre in the robot frame; k1, k2, p1, p2, k3.
     """
     return np.array(
         [
@@ -34,14 +34,24 @@ def camera_numbers(camera: Camera) -> NDArray[np.float64]:
             camera.r_max,
             *camera.camera_from_robot.ravel(),
             *camera.centre,
-            *camera.tangential,
+            *camera.brown,
         ]
     )
 
 
 def lens_numbers(camera: Camera) -> NDArray[np.float64]:
-    """The distortion alone, as `straightened_point` takes it: a2, a3, b1, b2, b3, p1, p2, r_max."""
-    return np.array([*camera.coef, *camera.tangential, camera.r_max])
+    """The distortion alone, as `straightened_point` takes it.
+
+    Order: a2, a3, b1, b2, b3; k1, k2, p1, p2, k3; r_max.
+    """
+    return np.array([*camera.coef, *camera.brown, camera.r_max])
+
+
+@njit(cache=True, error_model="numpy")
+def has_brown(terms: NDArray[np.float64]) -> bool:
+    """Whether any of k1, k2, p1, p2, k3 is not 0."""
+    k1, k2, p1, p2, k3 = terms[0], terms[1], terms[2], terms[3], terms[4]
+    return bool(k1 != 0.0 or k2 != 0.0 or p1 != 0.0 or p2 != 0.0 or k3 != 0.0)
 
 
 @njit(cache=True, error_model="numpy")
@@ -64,8 +74,10 @@ def project_floor_point(
         1.0 + r * (numbers[6] + r * (numbers[7] + r * numbers[8]))
     )
     u, v = numbers[0] * x * factor, numbers[1] * y * factor
-    if numbers[22] != 0.0 or numbers[23] != 0.0:
-        x_shift, y_shift = tangential_shift_point(numbers[22], numbers[23], x, y)
+    if has_brown(numbers[22:27]):
+        x_shift, y_shift = brown_shift_point(
+            numbers[22], numbers[23], numbers[24], numbers[25], numbers[26], x, y
+        )
         u += numbers[0] * x_shift
         v += numbers[1] * y_shift
     return u + numbers[2], v + numbers[3]

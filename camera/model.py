@@ -21,21 +21,25 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from camera.brown import (
+    NOT_TANGENTIAL,
+    Brown,
+    Tangential,
+    brown_jacobian,
+    brown_of,
+    brown_shift,
+    one_to_one_radius,
+    straightened,
+)
 from camera.distortion import (
+    NO_POLYNOMIAL,
     Coef,
+    Polynomial,
     radial_factor,
     radial_factor_derivative,
     undistorted_radius,
 )
 from camera.model_checks import check_numbers, check_one_to_one, checked_pose, checked_whole
-from camera.tangential import (
-    NONE,
-    Tangential,
-    one_to_one_radius,
-    straightened,
-    tangential_jacobian,
-    tangential_shift,
-)
 
 FloatArray = NDArray[np.float64]
 Pose = tuple[tuple[float, float, float, float], ...]
@@ -46,7 +50,7 @@ PUBLISHED_STEP_PX = 0.1
 
 @dataclass(frozen=True)
 class Camera:
-    """A calibrated camera with rational radial and tangential distortion, on a robot. A value.
+    """A calibrated camera on a robot, with its distortion. A value.
 
     Two cameras are equal, and hash alike, when all that they were made of is equal.
 
@@ -69,7 +73,9 @@ class Camera:
     unknown : tuple of (key, text)
         Entries of a ``.cam`` file that mean nothing here; they survive reading and writing.
     tangential : 2 floats
-        p1, p2 of the distortion (see `camera.tangential`); the data set's cameras have none.
+        p1, p2 of the distortion (see `camera.brown`); the data set's cameras have none.
+    polynomial : 3 floats
+        k1, k2, k3 of the distortion (see `camera.brown`); the data set's cameras have none.
 
     Raises
     ------
@@ -93,7 +99,8 @@ class Camera:
     sensor_to_tcp: Pose | None = None
     mount_index: int = 0
     unknown: tuple[tuple[str, str], ...] = field(default=())
-    tangential: Tangential = NONE
+    tangential: Tangential = NOT_TANGENTIAL
+    polynomial: Polynomial = NO_POLYNOMIAL
 
     def __post_init__(self) -> None:
         for name in ("width", "height", "mount_index"):
@@ -101,6 +108,7 @@ class Camera:
         object.__setattr__(self, "unknown", tuple((key, text) for key, text in self.unknown))
         object.__setattr__(self, "coef", tuple(float(c) for c in self.coef))
         object.__setattr__(self, "tangential", tuple(float(p) for p in self.tangential))
+        object.__setattr__(self, "polynomial", tuple(float(k) for k in self.polynomial))
         pose = checked_pose("sensor2World", self.robot_from_camera)
         object.__setattr__(self, "robot_from_camera", pose)
         if self.sensor_to_tcp is not None:
@@ -133,12 +141,17 @@ class Camera:
     @cached_property
     def r_max(self) -> float:
         """Undistorted radius up to which the projection is defined."""
-        return one_to_one_radius(self.coef, self.tangential)
+        return one_to_one_radius(self.coef, self.brown)
 
     @cached_property
     def decentred(self) -> bool:
         """Whether there are tangential terms."""
         return any(self.tangential)
+
+    @cached_property
+    def brown(self) -> Brown:
+        """k1, k2, p1, p2, k3 of the distortion, in OpenCV's order."""
+        return brown_of(self.polynomial, self.tangential)
 
     @cached_property
     def content_hash(self) -> str:
@@ -147,6 +160,7 @@ class Camera:
             self.width, self.height, self.scale_x, self.scale_y, self.offset_x, self.offset_y,
             *self.coef, *(x for row in self.robot_from_camera for x in row),
             *(self.tangential if self.decentred else ()),
+            *(self.polynomial if any(self.polynomial) else ()),
         )  # fmt: skip
         # Adding 0 makes -0 the 0 that it is equal to.
         return hashlib.sha256(" ".join((n + 0.0).hex() for n in numbers).encode()).hexdigest()
@@ -154,10 +168,12 @@ class Camera:
     def __str__(self) -> str:
         pitch_deg = math.degrees(math.asin(max(-1.0, min(1.0, -float(self.rotation[2, 2])))))
         p1, p2 = self.tangential
+        k1, k2, k3 = self.polynomial
         return (
             f"{self.width}x{self.height} px, scale {self.scale_x:g} x {self.scale_y:g} px, "
             f"centre {self.offset_x:g} {self.offset_y:g}, "
             + (f"tangential {p1:g} {p2:g}, " if self.decentred else "")
+            + (f"polynomial {k1:g} {k2:g} {k3:g}, " if any(self.polynomial) else "")
             + f"{self.centre[2]:.3f} m above the floor, looking {pitch_deg:.1f} deg down"
         )
 
@@ -182,8 +198,8 @@ class Camera:
         factor = np.where(defined, radial_factor(np.where(defined, radius, 0.0), self.coef), np.nan)
         u = self.scale_x * xy[..., 0] * factor
         v = self.scale_y * xy[..., 1] * factor
-        if self.decentred:
-            shift = tangential_shift(np.where(defined[..., None], xy, np.nan), self.tangential)
+        if any(self.brown):
+            shift = brown_shift(np.where(defined[..., None], xy, np.nan), self.brown)
             u, v = u + self.scale_x * shift[..., 0], v + self.scale_y * shift[..., 1]
         return np.stack([u + self.offset_x, v + self.offset_y], axis=-1)
 
@@ -205,8 +221,9 @@ class Camera:
         y = (uv[..., 1] - self.offset_y) / self.scale_y
         if self.decentred:
             seen = np.stack([x, y], axis=-1)
-            return straightened(seen, self.coef, self.tangential, self.r_max)
-        factor = radial_factor(undistorted_radius(np.hypot(x, y), self.coef), self.coef)
+            return straightened(seen, self.coef, self.brown, self.r_max)
+        radius = undistorted_radius(np.hypot(x, y), self.coef, self.polynomial)
+        factor = radial_factor(radius, self.coef, self.polynomial)
         return np.stack([x / factor, y / factor], axis=-1)
 
     def project(self, points_camera: ArrayLike) -> FloatArray:
@@ -308,8 +325,8 @@ class Camera:
         unit = xy / np.where(radius > 0.0, radius, 1.0)[..., None]
         outer = slope[..., None, None] * xy[..., :, None] * unit[..., None, :]
         jacobian = factor[..., None, None] * np.eye(2) + outer
-        if self.decentred:
-            jacobian = jacobian + tangential_jacobian(xy, self.tangential)
+        if any(self.brown):
+            jacobian = jacobian + brown_jacobian(xy, self.brown)
         return np.asarray(jacobian * np.array([[self.scale_x], [self.scale_y]]))
 
     def project_jacobian(self, points_camera: ArrayLike) -> FloatArray:

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from camera.brown import first_unseen, one_to_one_radius
 from camera.distortion import LARGEST_COEFFICIENT, fold_radius, largest_distorted_radius
 from camera.errors import CameraError
-from camera.tangential import first_unseen, one_to_one_radius
 
 if TYPE_CHECKING:
     from camera.model import Camera, Pose
@@ -37,6 +37,8 @@ def check_numbers(camera: Camera) -> None:
         raise CameraError(f"coef has {len(camera.coef)} numbers: expected 5 (a2 a3 b1 b2 b3)")
     if len(camera.tangential) != 2:
         raise CameraError(f"tangential has {len(camera.tangential)} numbers: expected 2 (p1 p2)")
+    if len(camera.polynomial) != 3:
+        raise CameraError(f"polynomial has {len(camera.polynomial)} numbers: expected 3 (k1 k2 k3)")
     for name, value in (
         ("scaleX", camera.scale_x),
         ("scaleY", camera.scale_y),
@@ -44,10 +46,13 @@ def check_numbers(camera: Camera) -> None:
         ("offsetY", camera.offset_y),
         *((f"coef {symbol}", c) for symbol, c in zip(["a2", "a3", "b1", "b2", "b3"], camera.coef)),
         *((f"tangential {symbol}", p) for symbol, p in zip(["p1", "p2"], camera.tangential)),
+        *((f"polynomial {symbol}", k) for symbol, k in zip(["k1", "k2", "k3"], camera.polynomial)),
     ):
         if not math.isfinite(value):
             raise CameraError(f"{name} is {value}: expected a finite number")
-    for name, numbers in (("coef", camera.coef), ("tangential", camera.tangential)):
+    for name, numbers in (
+        ("coef", camera.coef), ("tangential", camera.tangential), ("polynomial", camera.polynomial),
+    ):  # fmt: skip
         if max(abs(c) for c in numbers) > LARGEST_COEFFICIENT:
             raise CameraError(f"{name} is {numbers}: expected at most {LARGEST_COEFFICIENT:g} each")
     for name, value in (("scaleX", camera.scale_x), ("scaleY", camera.scale_y)):
@@ -69,11 +74,14 @@ def check_one_to_one(camera: Camera) -> None:
     x = max(abs(camera.offset_x), abs(camera.width - 1 - camera.offset_x)) / camera.scale_x
     y = max(abs(camera.offset_y), abs(camera.height - 1 - camera.offset_y)) / camera.scale_y
     corner = math.hypot(x, y)
-    seen = largest_distorted_radius(camera.coef)
+    seen = largest_distorted_radius(camera.coef, camera.polynomial)
     if not corner < seen:
+        fold = fold_radius(camera.coef, camera.polynomial)
+        k1, k2, k3 = camera.polynomial
+        values = f"with polynomial k1 = {k1:g}, k2 = {k2:g} and k3 = {k3:g} "
         raise CameraError(
-            f"the distortion folds inside the image: it grows only up to r = "
-            f"{fold_radius(camera.coef):.6g}, seen at {seen:.6g}, while the image's corner lies "
+            f"the distortion folds inside the image: {values if any(camera.polynomial) else ''}it "
+            f"grows only up to r = {fold:.6g}, seen at {seen:.6g}, while the image's corner lies "
             f"at {corner:.6g}"
         )
 
@@ -83,14 +91,17 @@ def _check_border(camera: Camera) -> None:
     pixels = border_pixels(camera.width, camera.height, _BORDER_PLACES)
     with np.errstate(over="ignore"):
         border = (pixels - [camera.offset_x, camera.offset_y]) / [camera.scale_x, camera.scale_y]
-    unseen = first_unseen(border, camera.coef, camera.tangential)
+    unseen = first_unseen(border, camera.coef, camera.brown)
     if unseen >= 0:
-        p1, p2 = camera.tangential
+        k1, k2, p1, p2, k3 = camera.brown
+        more = f", polynomial k1 = {k1:g}, k2 = {k2:g} and k3 = {k3:g}"
+        more = more if any(camera.polynomial) else ""
         u, v = pixels[unseen]
-        r_max = one_to_one_radius(camera.coef, camera.tangential)
+        r_max = one_to_one_radius(camera.coef, camera.brown)
         raise CameraError(
-            f"the distortion folds inside the image: with tangential p1 = {p1:g} and p2 = {p2:g} "
-            f"it is one-to-one only up to r = {r_max:.6g}, which pixel ({u:g}, {v:g}) lies beyond"
+            f"the distortion folds inside the image: with tangential p1 = {p1:g} and p2 = {p2:g}"
+            f"{more} it is one-to-one only up to r = {r_max:.6g}, which pixel ({u:g}, {v:g}) lies "
+            "beyond"
         )
 
 

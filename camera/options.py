@@ -158,9 +158,9 @@ class Convert:
 
     Example: camera convert camchain.yaml my.cam --rows halve
 
-    The target model is fitted to the source's pixels over the whole image; tangential terms (p1 p2)
-    are taken over where it has them. The largest deviation is printed, and above --limit-px nothing
-    is written.
+    Where the target model contains the source's, its numbers are taken over; else it is fitted to
+    the source's pixels over the whole image. The largest deviation is printed, and above
+    --limit-px nothing is written.
 
     Parameters
     ----------

@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from camera.tangential_kernels import straightened_point
+from camera.brown_kernels import straightened_point
 
 #: Newton's method in `camera.distortion` takes at most so many steps, and ends with one this small.
 _NEWTON_STEPS = 60
@@ -22,6 +22,8 @@ _LAST_STEP = 1e-9
 def _factor(coef: NDArray[np.float64], r: float) -> float:
     numerator = r * (coef[0] + r * coef[1])
     factor: float = 1.0 + numerator / (1.0 + r * (coef[2] + r * (coef[3] + r * coef[4])))
+    squared = r * r
+    factor += squared * (coef[5] + squared * (coef[6] + squared * coef[9]))
     return factor
 
 
@@ -33,6 +35,8 @@ def _factor_derivative(coef: NDArray[np.float64], r: float) -> float:
     d_denominator = coef[2] + r * (2.0 * coef[3] + 3.0 * coef[4] * r)
     slope: float = d_numerator * denominator - numerator * d_denominator
     slope /= denominator * denominator
+    squared = r * r
+    slope += r * (2.0 * coef[5] + squared * (4.0 * coef[6] + squared * (6.0 * coef[9])))
     return slope
 
 
@@ -94,8 +98,8 @@ def floor_of_pixel(
     ----------
     u, v : float
         Pixel.
-    lens : (12,) float64
-        Scale x, y; offset x, y; a2, a3, b1, b2, b3; p1, p2; r_max.
+    lens : (15,) float64
+        Scale x, y; offset x, y; a2, a3, b1, b2, b3; k1, k2, p1, p2, k3; r_max.
     pose : (3, 4) float64
         `robot_from_camera`.
     table_g, table_r : (N,) float64
@@ -115,7 +119,7 @@ def floor_of_pixel(
     coef = lens[4:]
     last = len(table_g) - 1
     goal = math.hypot(x, y)
-    decentred = lens[9] != 0.0 or lens[10] != 0.0
+    decentred = lens[11] != 0.0 or lens[12] != 0.0
     if decentred:
         # The radial inverse is where to begin, and where it ends as good a place as any.
         goal = min(goal, table_g[last])

@@ -60,8 +60,9 @@ def _undistortion(camera: Camera) -> FloatArray | None:
     def ratio(position: FloatArray) -> FloatArray:
         interval = np.arange(_INTERVALS)[:, None]
         distorted = (interval + 0.5 * (position + 1.0)) * (farthest / _INTERVALS)
-        radius = undistorted_radius(np.minimum(distorted, farthest), camera.coef)
-        return 1.0 / radial_factor(radius, camera.coef)
+        distorted = np.minimum(distorted, farthest)
+        radius = undistorted_radius(distorted, camera.coef, camera.polynomial)
+        return 1.0 / radial_factor(radius, camera.coef, camera.polynomial)
 
     solve = np.linalg.inv(np.vander(nodes, increasing=True))
     polynomials = ratio(nodes) @ solve.T

@@ -12,7 +12,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from camera.tangential_kernels import straightened_point
+from camera.brown_kernels import straightened_point
+from camera.kernels import has_brown
 
 #: Neighbouring pixels of a row that a detector works on at once; bytes of one copy.
 BLOCK = 64
@@ -44,7 +45,7 @@ def fill_floor_positions(
     ----------
     pinhole : (4,) float64
         Scale x, y and offset x, y, pixels.
-    lens : (8,) float64
+    lens : (11,) float64
         `camera.kernels.lens_numbers`; used if there are tangential terms.
     undistortion : (N, 6) float64
         Undistorted / distorted radius, by the radial distortion: coefficients, the lowest first, of
@@ -67,7 +68,7 @@ def fill_floor_positions(
     x_seen = np.empty(width)
     for u in range(width):
         x_seen[u] = (u - pinhole[2]) / pinhole[0]
-    decentred = lens[5] != 0.0 or lens[6] != 0.0
+    decentred = lens[7] != 0.0 or lens[8] != 0.0
     # A loop for what is looked up, and one that the compiler can do for several pixels at once.
     ratio = np.empty(width)
     x_normalised = np.empty(width)
@@ -105,7 +106,7 @@ def fill_floor_positions(
 @njit(cache=True, error_model="numpy")
 def _nearest_pixels(
     numbers: NDArray[np.float64],
-    tangential: NDArray[np.float64] | None,
+    brown: NDArray[np.float64] | None,
     x_robot: NDArray[np.float64],
     y_robot: NDArray[np.float64],
     offset: NDArray[np.float64],
@@ -139,11 +140,12 @@ def _nearest_pixels(
         factor = 1.0 + r * (a2 + r * a3) / (1.0 + r * (b1 + r * (b2 + r * b3)))
         x_place = scale_x * x * factor
         y_place = scale_y * y * factor
-        if tangential is not None:
+        if brown is not None:
             squared = x * x + y * y
-            along = 2.0 * (tangential[1] * x + tangential[0] * y)
-            x_place += scale_x * (along * x + squared * tangential[1])
-            y_place += scale_y * (along * y + squared * tangential[0])
+            along = 2.0 * (brown[3] * x + brown[2] * y)
+            along += squared * (brown[0] + squared * (brown[1] + squared * brown[4]))
+            x_place += scale_x * (along * x + squared * brown[3])
+            y_place += scale_y * (along * y + squared * brown[2])
         column = np.floor(x_place + offset_x + 0.5)
         row = np.floor(y_place + offset_y + 0.5)
         # NaN fails every comparison.
@@ -172,7 +174,7 @@ def encode_outlines(
 
     Parameters
     ----------
-    numbers : (24,) float64
+    numbers : (27,) float64
         `camera.kernels.camera_numbers`.
     floor_xy : (H, W, 2) float64
         Floor position of each pixel, metres.
@@ -191,7 +193,7 @@ def encode_outlines(
     height, width = candidate.shape
     samples = inner.shape[0]
     padded = -(-samples // GROUP) * GROUP
-    decentred = numbers[22] != 0.0 or numbers[23] != 0.0
+    shifted = has_brown(numbers[22:27])
     nothing = height * width
     most_blocks = height * (-(-width // BLOCK))
 
@@ -224,9 +226,9 @@ def encode_outlines(
             y_robot[u] = floor_xy[v, u, 1]
         for k in range(2 * samples):
             offset = inner[k] if k < samples else outer[k - samples]
-            if decentred:
+            if shifted:
                 _nearest_pixels(
-                    numbers, numbers[22:24], x_robot, y_robot, offset,
+                    numbers, numbers[22:27], x_robot, y_robot, offset,
                     begin, end, height, width, nearest[k],
                 )  # fmt: skip
             else:

@@ -8,6 +8,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from camera.kernels import has_brown
+
 _NEWTON_STEPS = 12
 _TOLERANCE_PX = 1e-9
 
@@ -27,7 +29,7 @@ def trace_verticals(
 
     Parameters
     ----------
-    numbers : (24,) float64
+    numbers : (27,) float64
         `camera.kernels.camera_numbers`.
     bearing : (N,) float64
         Bearings of the verticals (rad); NaN for none.
@@ -43,8 +45,8 @@ def trace_verticals(
     scale_x, scale_y, offset_x, offset_y = numbers[0], numbers[1], numbers[2], numbers[3]
     a2, a3, b1, b2, b3 = numbers[4], numbers[5], numbers[6], numbers[7], numbers[8]
     farthest = numbers[9]
-    p1, p2 = numbers[22], numbers[23]
-    decentred = p1 != 0.0 or p2 != 0.0
+    k1, k2, p1, p2, k3 = numbers[22], numbers[23], numbers[24], numbers[25], numbers[26]
+    shifted = has_brown(numbers[22:27])
     for n in range(len(bearing)):
         for v in range(height):
             column[v, n] = math.nan
@@ -91,9 +93,12 @@ def trace_verticals(
                     slope = scale_y * (dy * factor + y * d_factor * dr)
                     u = scale_x * x * factor + offset_x
                     row = scale_y * y * factor + offset_y
-                    if decentred:
-                        along = 2.0 * (p2 * x + p1 * y)
-                        d_along = 2.0 * (p2 * dx + p1 * dy)
+                    if shifted:
+                        squared = r * r
+                        by_squared = k1 + squared * (k2 + squared * k3)
+                        d_by_r = 2.0 * k1 + squared * (4.0 * k2 + squared * (6.0 * k3))
+                        along = 2.0 * (p2 * x + p1 * y) + squared * by_squared
+                        d_along = 2.0 * (p2 * dx + p1 * dy) + r * dr * d_by_r
                         u += scale_x * (along * x + r * r * p2)
                         row += scale_y * (along * y + r * r * p1)
                         slope += scale_y * (d_along * y + along * dy + 2.0 * r * dr * p1)

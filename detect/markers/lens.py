@@ -89,7 +89,7 @@ def lens_of(camera: Camera | None, image: NDArray[np.uint8]) -> Lens:
 
 @functools.lru_cache(maxsize=8)
 def _cached_lens(camera: Camera) -> Lens:
-    if not (any(camera.coef[:2]) or camera.decentred):
+    if not (any(camera.coef[:2]) or any(camera.brown)):
         return NO_LENS
     # The last cell may reach past the border, where the distortion need not be defined.
     u = np.minimum(np.arange(0, camera.width - 1 + _STEP_PX, _STEP_PX), camera.width - 1.0)

@@ -64,7 +64,8 @@ def cameras(
 ) -> Camera:
     """Valid cameras of any size, focal length, principal point, distortion and pose.
 
-    Every other one has tangential terms, where its image is not too near to the fold for them.
+    Every other one has tangential terms, and every other one a polynomial, where its image is not
+    too near to the fold for them.
     """
     width = draw(st.integers(8, largest_side))
     height = draw(st.integers(8, largest_side))
@@ -91,7 +92,14 @@ def cameras(
     if draw(st.booleans()):
         tangential = draw(st.tuples(st.floats(-0.01, 0.01), st.floats(-0.01, 0.01)))
         with contextlib.suppress(CameraError):
-            return dataclasses.replace(camera, tangential=tangential)
+            camera = dataclasses.replace(camera, tangential=tangential)
+    if draw(st.booleans()):
+        # Of an image that reaches to 80 degrees only a small share would still be one-to-one.
+        reach = min(farthest_px / scale_x, 3.0)
+        k1, k2, k3 = draw(st.tuples(*[st.floats(-0.1, 0.2)] * 3))
+        polynomial = (k1 / reach**2, k2 / reach**4, k3 / reach**6)
+        with contextlib.suppress(CameraError):
+            camera = dataclasses.replace(camera, polynomial=polynomial)
     return camera
 
 

@@ -61,25 +61,38 @@ def seen_views(
     ]
 
 
-TANGENTIAL = pytest.mark.parametrize("tangential", [(0.0, 0.0), (2e-3, -3e-3)])
+BROWN = pytest.mark.parametrize(
+    ("tangential", "polynomial"),
+    [
+        ((0.0, 0.0), (0.0, 0.0, 0.0)),
+        ((2e-3, -3e-3), (0.0, 0.0, 0.0)),
+        ((2e-3, 0.0), (-0.1, 0.05, 0.02)),
+    ],
+)
 
 
-@TANGENTIAL
+@BROWN
 def test_points_are_projected_as_the_camera_projects_them(
-    published_camera: Camera, tangential: tuple[float, float]
+    published_camera: Camera,
+    tangential: tuple[float, float],
+    polynomial: tuple[float, float, float],
 ) -> None:
-    camera = replace(published_camera, tangential=tangential)
+    camera = replace(published_camera, tangential=tangential, polynomial=polynomial)
     points = np.random.default_rng(1).normal(loc=[0.0, 0.0, 1.0], size=(200, 3))
     pixels, _, _ = project_points(intrinsics_of(camera), points)
     np.testing.assert_allclose(pixels, camera.project(points), rtol=0.0, atol=1e-10)
     assert with_intrinsics(published_camera, intrinsics_of(camera)) == camera
 
 
-@TANGENTIAL
+@BROWN
 def test_derivatives_of_the_projection_are_those_of_differences(
-    published_camera: Camera, tangential: tuple[float, float]
+    published_camera: Camera,
+    tangential: tuple[float, float],
+    polynomial: tuple[float, float, float],
 ) -> None:
-    intrinsics = intrinsics_of(replace(published_camera, tangential=tangential))
+    intrinsics = intrinsics_of(
+        replace(published_camera, tangential=tangential, polynomial=polynomial)
+    )
     points = np.array([[0.1, 0.2, 0.7], [-0.3, 0.05, 0.5], [0.0, 0.0, 1.0], [0.4, -0.3, 0.6]])
     _, by_intrinsics, by_point = project_points(intrinsics, points)
     for k in range(COUNT):
@@ -167,10 +180,10 @@ def test_a_decentred_lens_is_found_and_a_radial_one_stays_radial() -> None:
         other = calibrate(views, BOARD, (640, 480), forced)
         assert other.lens == FreeLens(2, not found)
         decentred = result if found else other
-        sigma = np.sqrt(np.diag(decentred.adjusted.covariance)[9:])
-        assert np.all(np.abs(decentred.intrinsics[9:] - tangential) < 4.0 * sigma)
+        sigma = np.sqrt(np.diag(decentred.adjusted.covariance)[9:11])
+        assert np.all(np.abs(decentred.intrinsics[9:11] - tangential) < 4.0 * sigma)
         assert np.all(sigma < 3e-4)
-        assert (result if other.lens.tangential else other).intrinsics[9:].tolist() == [0.0, 0.0]
+        assert (result if other.lens.tangential else other).intrinsics[9:].tolist() == [0.0] * 5
 
 
 @pytest.mark.long
@@ -240,7 +253,7 @@ def test_circles_shift_is_that_of_the_rendered_area(published_camera: Camera) ->
 
 
 def test_a_fold_inside_the_image_is_not_possible() -> None:
-    plain = np.array([460.0, 230.0, 384.0, 144.0, *[0.0] * 7])
+    plain = np.array([460.0, 230.0, 384.0, 144.0, *[0.0] * 10])
     assert is_possible(plain, 768, 288)
     folded = plain.copy()
     folded[5] = -0.4
@@ -248,7 +261,7 @@ def test_a_fold_inside_the_image_is_not_possible() -> None:
     # Without radial terms the nearest fold, at r = 1 / (6 p), is seen at 1 / (12 p).
     for p, possible in ((0.05, True), (0.1, False)):
         decentred = plain.copy()
-        decentred[9:] = (0.6 * p, -0.8 * p)
+        decentred[9:11] = (0.6 * p, -0.8 * p)
         assert is_possible(decentred, 768, 288) == possible
     with pytest.raises(CameraError, match="folds inside the image"):
         Camera(768, 288, 460.0, 230.0, 384.0, 144.0, (0.0, -0.4, 0.0, 0.0, 0.0), IDENTITY)
@@ -256,10 +269,11 @@ def test_a_fold_inside_the_image_is_not_possible() -> None:
 
 def test_free_span_ties_the_scales() -> None:
     span = free_span(2, 0.5)
-    assert span.shape == (11, 5)
+    assert span.shape == (14, 5)
     assert span[1, 0] == 0.5 * span[0, 0]
-    assert free_span(5, None).shape == (11, 9)
-    assert free_span(5, None, tangential=True).shape == (11, 11)
+    assert free_span(5, None).shape == (14, 9)
+    assert free_span(5, None, tangential=True).shape == (14, 11)
+    assert free_span(0, 1.0, tangential=True, polynomial=3).shape == (14, 8)
 
 
 def test_too_few_pictures_say_how_many_are_needed(published_camera: Camera) -> None:

@@ -11,15 +11,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from camera import Camera, CameraError, format_camera, parse_camera
-from camera.distortion import Coef, fold_radius
+from camera.brown import brown_jacobian, brown_of, brown_shift, one_to_one_radius
+from camera.brown_kernels import brown_shift_point
+from camera.distortion import NO_POLYNOMIAL, Coef, fold_radius
 from camera.kernels import lens_numbers
 from camera.model_checks import border_pixels
-from camera.tangential import one_to_one_radius, tangential_jacobian, tangential_shift
-from camera.tangential_kernels import tangential_shift_point
 from tests.camera.strategies import coefficients
 
 AMOUNT = st.floats(-0.05, 0.05)
 TANGENTIAL = (2e-3, -3e-3)
+BROWN = brown_of(NO_POLYNOMIAL, TANGENTIAL)
 
 
 @pytest.fixture
@@ -42,8 +43,8 @@ def test_the_terms_are_opencvs() -> None:
 def test_the_compiled_terms_are_the_same() -> None:
     rng = np.random.default_rng(2)
     for x, y in rng.normal(size=(20, 2)):
-        shift = tangential_shift(np.array([x, y]), TANGENTIAL)
-        assert tangential_shift_point(*TANGENTIAL, x, y) == pytest.approx(tuple(shift), rel=1e-14)
+        shift = brown_shift(np.array([x, y]), BROWN)
+        assert brown_shift_point(*BROWN, x, y) == pytest.approx(tuple(shift), rel=1e-14)
 
 
 def test_without_the_terms_nothing_changes(published_camera: Camera, decentred: Camera) -> None:
@@ -58,7 +59,7 @@ def test_without_the_terms_nothing_changes(published_camera: Camera, decentred: 
     assert len(hashes) == 4
     assert "tangential" not in str(published_camera)
     assert "tangential 0.002 -0.003" in str(decentred)
-    assert lens_numbers(published_camera)[5:7].tolist() == [0.0, 0.0]
+    assert lens_numbers(published_camera)[5:10].tolist() == [0.0] * 5
 
 
 # -- where it is one-to-one -----------------------------------------------------------------------
@@ -81,7 +82,7 @@ def circle(radius: float, places: int = 720) -> np.ndarray:
 def test_up_to_r_max_the_jacobian_is_positive_in_all_directions(
     coef: Coef, p1: float, p2: float, share: float
 ) -> None:
-    r_max = one_to_one_radius(coef, (p1, p2))
+    r_max = one_to_one_radius(coef, (0.0, 0.0, p1, p2, 0.0))
     assert 0.0 < r_max <= fold_radius(coef)
     assert np.all(determinant(coef, (p1, p2), circle(share * min(r_max, 573.0))) > 0.0)
 
@@ -91,7 +92,7 @@ def test_up_to_r_max_the_jacobian_is_positive_in_all_directions(
 )
 @pytest.mark.parametrize("tangential", [TANGENTIAL, (0.04, 0.01), (0.0, -0.02)])
 def test_at_r_max_it_vanishes_in_one(coef: Coef, tangential: tuple[float, float]) -> None:
-    r_max = one_to_one_radius(coef, tangential)
+    r_max = one_to_one_radius(coef, brown_of(NO_POLYNOMIAL, tangential))
     edge = determinant(coef, tangential, circle(r_max * (1.0 - 1e-9)))
     assert edge.min() == pytest.approx(0.0, abs=1e-4 * edge.max())
     if not any(coef):
@@ -103,7 +104,7 @@ def test_at_r_max_it_vanishes_in_one(coef: Coef, tangential: tuple[float, float]
 def test_what_is_seen_comes_back_out_to_the_fold(
     coef: Coef, p1: float, p2: float, seed: int
 ) -> None:
-    r_max = min(one_to_one_radius(coef, (p1, p2)), 20.0)
+    r_max = min(one_to_one_radius(coef, (0.0, 0.0, p1, p2, 0.0)), 20.0)
     camera = Camera(
         3, 3, 1e6, 1e6, 1.0, 1.0, coef, np.eye(4)[:3],  # type: ignore[arg-type]
         tangential=(p1, p2),
@@ -133,7 +134,7 @@ def test_past_the_fold_all_is_nan(decentred: Camera) -> None:
 
 def test_a_derivative_of_the_terms_is_symmetric() -> None:
     xy = np.random.default_rng(5).normal(size=(50, 2))
-    derivative = tangential_jacobian(xy, TANGENTIAL)
+    derivative = brown_jacobian(xy, BROWN)
     np.testing.assert_array_equal(derivative, derivative.swapaxes(-1, -2))
 
 
@@ -170,7 +171,7 @@ def test_refused_exactly_where_the_border_is_not_seen(amount: float, angle: floa
     except CameraError:
         # Somewhere on the way from the middle to the border the determinant is no more positive,
         # or just is: the border lies outside of what is seen from within r_max.
-        reach = circle(one_to_one_radius(plain.coef, tangential))
+        reach = circle(one_to_one_radius(plain.coef, brown_of(NO_POLYNOMIAL, tangential)))
         larger = dataclasses.replace(plain, scale_x=5e3, scale_y=5e3, tangential=tangential)
         edge = (larger.distort(reach * (1.0 - 1e-9)) - [31.5, 23.5]) / 5e3 * 50.0
         hull = cv2.convexHull(edge.astype(np.float32))

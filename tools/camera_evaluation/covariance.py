@@ -32,9 +32,9 @@ class Trials:
 
     Attributes
     ----------
-    errors : (T, 11) float64
+    errors : (T, 14) float64
         Estimated less true intrinsics.
-    covariances : (T, 11, 11) float64
+    covariances : (T, 14, 14) float64
         As predicted.
     nees : (T,) float64
         Normalised squared errors of the projection, over its free directions; `freedom` on average.

@@ -49,6 +49,7 @@ def _guessed(path: Path) -> object:
 
 
 _DECENTRED_TEXT = CAMERA_TEXT.removesuffix(b"}\n") + b"tangential: { 0.002 -0.003 }\n}\n"
+_POLYNOMIAL_TEXT = _DECENTRED_TEXT.removesuffix(b"}\n") + b"polynomial: { -0.02 0.01 0 }\n}\n"
 _OPENCV = ForeignCamera("radtan", 64, 48, 50.0, 51.0, 31.5, 23.5, (-0.1, 0.01, 0.001, 0.002, 0.0))
 _RATIONAL = ForeignCamera("rational", 64, 48, 50.0, 51.0, 31.5, 23.5, (0.1,) * 8 + (0.0,) * 4)
 _FISHEYE = ForeignCamera("fisheye", 64, 48, 50.0, 51.0, 31.5, 23.5, (0.1, 0.01, 0.0, 0.0))
@@ -69,11 +70,12 @@ CAMERA_READERS: tuple[Reader, ...] = (
         "e.cam",
         _camera,
         (CameraError,),
-        (CAMERA_TEXT, _DECENTRED_TEXT),
+        (CAMERA_TEXT, _DECENTRED_TEXT, _POLYNOMIAL_TEXT),
         (
             b"sensor2World:",
             b"coef:",
             b"tangential: { 1e-3 -2e-3 }",
+            b"polynomial: { -0.01 1e-3 1e-4 }",
             b"width:",
             b"{",
             b"}",

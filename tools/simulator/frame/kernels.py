@@ -6,7 +6,8 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from camera.tangential_kernels import straightened_point, tangential_shift_point
+from camera.brown_kernels import brown_shift_point, straightened_point
+from camera.kernels import has_brown
 from tools.simulator.scene import Scene
 from tools.simulator.shading.kernels import SKY, first_met, radiance
 
@@ -21,7 +22,7 @@ def camera_ray(
     ----------
     u, v : float
         Pixel; need not be whole.
-    optics : (13,) float64
+    optics : (16,) float64
         scaleX, scaleY, offsetX, offsetY, nodes of `inverse` per unit of squared radius, and
         `camera.kernels.lens_numbers`.
     inverse : (N,) float64
@@ -33,7 +34,7 @@ def camera_ray(
     node = int(position)
     share = position - node
     factor = inverse[node] * (1.0 - share) + inverse[node + 1] * share
-    if optics[10] != 0.0 or optics[11] != 0.0:
+    if optics[12] != 0.0 or optics[13] != 0.0:
         return straightened_point(optics[5:], x, y, x * factor, y * factor)
     return x * factor, y * factor
 
@@ -217,8 +218,10 @@ def smear(
             )
             du = optics[0] * x * f + optics[2] - u
             dv = 2.0 * (optics[1] * y * f + optics[3]) - line
-            if coef[5] != 0.0 or coef[6] != 0.0:
-                x_shift, y_shift = tangential_shift_point(coef[5], coef[6], x, y)
+            if has_brown(coef[5:10]):
+                x_shift, y_shift = brown_shift_point(
+                    coef[5], coef[6], coef[7], coef[8], coef[9], x, y
+                )
                 du += optics[0] * x_shift
                 dv += 2.0 * optics[1] * y_shift
             steps = int(np.ceil(2.0 * np.sqrt(du * du + dv * dv)))

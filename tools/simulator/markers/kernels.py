@@ -13,7 +13,8 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from camera.tangential_kernels import tangential_shift_point
+from camera.brown_kernels import brown_shift_point
+from camera.kernels import has_brown
 
 #: Side of the square tiles for which the surfaces that may be seen are gathered, pixels.
 TILE = 16
@@ -44,8 +45,10 @@ def project_point(
         1.0 + r * (numbers[6] + r * (numbers[7] + r * numbers[8]))
     )
     u, v = numbers[0] * x * factor, numbers[1] * y * factor
-    if numbers[22] != 0.0 or numbers[23] != 0.0:
-        x_shift, y_shift = tangential_shift_point(numbers[22], numbers[23], x, y)
+    if has_brown(numbers[22:27]):
+        x_shift, y_shift = brown_shift_point(
+            numbers[22], numbers[23], numbers[24], numbers[25], numbers[26], x, y
+        )
         u += numbers[0] * x_shift
         v += numbers[1] * y_shift
     return u + numbers[2], v + numbers[3]

@@ -1,6 +1,6 @@
-"""Compiled: single points through a lens with tangential distortion, and back.
+"""Compiled: single points through a lens with Brown's distortion, and back.
 
-`camera.tangential` is the definition; a test holds the two together.
+`camera.brown` is the definition; a test holds the two together.
 """
 
 from __future__ import annotations
@@ -18,10 +18,12 @@ _SMALLEST_SHARE = 1e-6
 
 
 @njit(cache=True, error_model="numpy")
-def tangential_shift_point(p1: float, p2: float, x: float, y: float) -> tuple[float, float]:
-    """By how much decentering moves a point; all normalised."""
+def brown_shift_point(
+    k1: float, k2: float, p1: float, p2: float, k3: float, x: float, y: float
+) -> tuple[float, float]:
+    """By how much Brown's terms move a point; all normalised."""
     squared = x * x + y * y
-    along = 2.0 * (p2 * x + p1 * y)
+    along = 2.0 * (p2 * x + p1 * y) + squared * (k1 + squared * (k2 + squared * k3))
     return along * x + squared * p2, along * y + squared * p1
 
 
@@ -29,7 +31,7 @@ def tangential_shift_point(p1: float, p2: float, x: float, y: float) -> tuple[fl
 def straightened_point(
     lens: NDArray[np.float64], x_seen: float, y_seen: float, x: float, y: float
 ) -> tuple[float, float]:
-    """Undistorted normalised coordinates of a distorted point, of a lens with tangential terms.
+    """Undistorted normalised coordinates of a distorted point, of a lens with Brown's terms.
 
     Newton's method within the circle of r_max; a step that would leave it or raise the error is
     halved. As the distortion is the gradient of a convex function there, that ends at the one
@@ -37,8 +39,8 @@ def straightened_point(
 
     Parameters
     ----------
-    lens : (8,) float64
-        a2, a3, b1, b2, b3, p1, p2, r_max (`camera.kernels.lens_numbers`).
+    lens : (11,) float64
+        a2, a3, b1, b2, b3, k1, k2, p1, p2, k3, r_max (`camera.kernels.lens_numbers`).
     x_seen, y_seen : float
         The distorted point, normalised.
     x, y : float
@@ -50,7 +52,7 @@ def straightened_point(
         Both NaN where nothing is seen.
     """
     a2, a3, b1, b2, b3 = lens[0], lens[1], lens[2], lens[3], lens[4]
-    p1, p2, r_max = lens[5], lens[6], lens[7]
+    k1, k2, p1, p2, k3, r_max = lens[5], lens[6], lens[7], lens[8], lens[9], lens[10]
     r = math.sqrt(x * x + y * y)
     if r > r_max:
         x *= 0.999 * r_max / r
@@ -64,8 +66,8 @@ def straightened_point(
         r = math.sqrt(x * x + y * y)
         numerator = r * (a2 + r * a3)
         denominator = 1.0 + r * (b1 + r * (b2 + r * b3))
-        factor = 1.0 + numerator / denominator
         squared = r * r
+        factor = 1.0 + numerator / denominator + squared * (k1 + squared * (k2 + squared * k3))
         along = 2.0 * (p2 * x + p1 * y)
         x_off = x_seen - (x * factor + along * x + squared * p2)
         y_off = y_seen - (y * factor + along * y + squared * p1)
@@ -81,6 +83,7 @@ def straightened_point(
                 (a2 + 2.0 * a3 * r) * denominator - numerator * (b1 + r * (2.0 * b2 + 3.0 * b3 * r))
             ) / (denominator * denominator)
             per_r = slope / r if r > 0.0 else 0.0
+            per_r += 2.0 * k1 + squared * (4.0 * k2 + squared * (6.0 * k3))
             xx = factor + per_r * x * x + along + 4.0 * p2 * x
             xy = per_r * x * y + 2.0 * (p1 * x + p2 * y)
             yy = factor + per_r * y * y + along + 4.0 * p1 * y
@@ -112,7 +115,7 @@ def straighten_points(
 
     Parameters
     ----------
-    lens : (8,) float64
+    lens : (11,) float64
         As there.
     seen : (N, 2) float64
         Distorted normalised points.
