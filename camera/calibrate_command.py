@@ -63,6 +63,7 @@ def perform(options: Calibrate) -> int:
         aspect=None if options.free_aspect else 0.5 if options.half else 1.0,
         coefficients=None if options.coefficients == "auto" else int(options.coefficients),
         tangential={"auto": None, "on": True, "off": False}[options.tangential],
+        polynomial=options.polynomial,
         keep_outliers=options.keep_outliers,
     )
     images = calibration_images(options.images, options.every, options.max_images)
@@ -249,13 +250,12 @@ def report_text(
         "covariance": adjusted.covariance.tolist(),
         "coefficients": calibration.lens.coefficients,
         "tangential": calibration.lens.tangential,
+        "polynomial": calibration.lens.polynomial,
         "points": len(calibration.points.board),
         "rms_px": adjusted.rms_px,
         "sigma_px": adjusted.sigma_px,
         "holdout_rms_px": {
-            f"{lens.coefficients} tangential" if lens.tangential else str(lens.coefficients): (
-                error if np.isfinite(error) else None
-            )
+            lens.label: error if np.isfinite(error) else None
             for lens, error in calibration.holdout_px.items()
         },
         "views": [

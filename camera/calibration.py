@@ -131,14 +131,14 @@ def calibrate(
 
     outliers: tuple[tuple[str, float], ...] = ()
     # What a model lacks is no picture's fault, so outliers are told by the fullest one.
-    most = 5 if settings.coefficients is None else settings.coefficients
+    most = settings.most
     for count in range(min(2, most), most + 1):
-        first = fit_points(start, measured, settings, FreeLens(count), radius)
+        first = fit_points(start, measured, settings, settings.lens(count), radius)
         start = first[0].estimate
     # Before more is asked of views that can't tell.
     demand_different_views(first[0], normals_spread_deg(start.rotations))
     if settings.tangential is not False:
-        full = FreeLens(most, tangential=True)
+        full = settings.lens(most, tangential=True)
         first = fit_points(start, measured, settings, full, radius)
         start = first[0].estimate
     rms = _view_rms(*first)
@@ -179,8 +179,9 @@ def _staged(
     start: Estimate, points: Points, settings: CalibrationSettings, radius_m: float
 ) -> Estimate:
     """One and then two coefficients, with the poses' second solutions tried in between."""
-    for count in (1, min(2, 2 if settings.coefficients is None else settings.coefficients)):
-        estimate = fit_points(start, points, settings, FreeLens(count), radius_m)[0].estimate
+    for count in (1, min(2, settings.most)):
+        lens = settings.lens(count)
+        estimate = fit_points(start, points, settings, lens, radius_m)[0].estimate
         start = best_poses(estimate, points)
     return start
 

@@ -60,7 +60,7 @@ def choose_lens(
     start : Estimate
     points : Points
     settings : CalibrationSettings
-        `coefficients` and `tangential` may leave no choice.
+        `coefficients` and `tangential` may leave no choice; `polynomial` says which radial ones.
     radius_m : float
         Radius of the circles; 0 for points.
 
@@ -69,9 +69,9 @@ def choose_lens(
     FreeLens, Candidates
         The chosen one, and all that were tried.
     """
-    counts = range(6) if settings.coefficients is None else [settings.coefficients]
-    radial = [FreeLens(count) for count in counts]
-    decentred = [FreeLens(count, tangential=True) for count in counts]
+    counts = range(settings.most + 1) if settings.coefficients is None else [settings.most]
+    radial = [settings.lens(count) for count in counts]
+    decentred = [settings.lens(count, tangential=True) for count in counts]
     if settings.tangential is True:
         tried = _tried(start, points, settings, radius_m, decentred)
         return _fewest_needed(tried), tried

@@ -14,8 +14,6 @@ from hypothesis import strategies as st
 from camera import Camera, CameraError, format_camera, parse_camera
 from camera.brown import brown_jacobian, brown_of, brown_shift, one_to_one_radius
 from camera.brown_kernels import brown_shift_point
-from camera.calibration_model import is_possible
-from camera.calibration_projection import intrinsics_of
 from camera.conversion import convert_to_camera, convert_to_foreign
 from camera.conversion_models import ForeignCamera
 from camera.distortion import (
@@ -181,7 +179,6 @@ def test_pixels_go_out_and_come_back(camera: Camera) -> None:
     pixels = pixel_grid(camera)
     np.testing.assert_allclose(camera.distort(camera.undistort(pixels)), pixels, atol=1e-6)
     assert parse_camera(format_camera(camera)) == camera
-    assert is_possible(intrinsics_of(camera), 1, 1) or camera.r_max < 1.0
 
 
 def test_jacobians_are_those_of_differences(published_camera: Camera) -> None:
@@ -219,7 +216,7 @@ def test_kernels_project_as_the_camera(published_camera: Camera) -> None:
         (
             (-0.6, 0.0, 0.0),
             r"folds inside the image: with polynomial k1 = -0.6, k2 = 0 and k3 = 0 it grows only "
-            r"up to r = 0.\d+, seen at 0.\d+, while the image's corner lies at 0.\d+",
+            r"up to r = 0.\d+, seen at 0.\d+, while the image's corner lies at 1.\d+",
         ),
         ((float("nan"), 0.0, 0.0), "polynomial k1 is nan: expected a finite number"),
         ((0.0, 0.0, float("inf")), "polynomial k3 is inf: expected a finite number"),

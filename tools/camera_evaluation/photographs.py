@@ -124,11 +124,14 @@ class Options:
         Cameras: beginnings of the photographs' names.
     free_aspect : bool
         Both scales free, as OpenCV has them; else equal.
+    polynomial : bool
+        Here the radial distortion is the polynomial k1 k2 k3.
     """
 
     folder: Positional[Path]
     groups: tuple[str, ...] = ("asym", "sym", "rct", "robvis")
     free_aspect: bool = True
+    polynomial: bool = False
 
 
 @dataclass(frozen=True)
@@ -155,11 +158,14 @@ class Comparison:
     five: dict[str, float]
 
 
-def compare(folder: Path, group: str, *, free_aspect: bool) -> Comparison:
+def compare(folder: Path, group: str, *, free_aspect: bool, polynomial: bool = False) -> Comparison:
     """Hold out photographs of a camera, by each of `splits`."""
     views, board, size = read_group(folder, group)
     settings = CalibrationSettings(
-        aspect=None if free_aspect else 1.0, robust=False, keep_outliers=True
+        aspect=None if free_aspect else 1.0,
+        polynomial=polynomial,
+        robust=False,
+        keep_outliers=True,
     )
     result = calibrate(views, board, size, settings)
     # The same corrected points for both: OpenCV knows nothing of circles.
@@ -186,7 +192,9 @@ def main(arguments: list[str]) -> int:
     print("RMS of what was held out, px; OpenCV: rational, the same without p1 p2, k1 k2 p1 p2 k3")
     print("group      views points  held out        ours rational   radial     five  free here")
     for group in options.groups:
-        r = compare(options.folder, group, free_aspect=options.free_aspect)
+        r = compare(
+            options.folder, group, free_aspect=options.free_aspect, polynomial=options.polynomial
+        )
         for name in r.ours:
             print(
                 f"{group:10s} {r.views:4d} {r.points:6d}  {name:11s} "
