@@ -1,4 +1,4 @@
-"""Discs and verticals through a lens with tangential distortion, as exactly as through another."""
+"""Discs and verticals through lenses with Brown's terms, as exactly as through another."""
 
 from __future__ import annotations
 
@@ -24,6 +24,8 @@ from tools.simulator.markers.kernels import project_point
 from tools.simulator.renderer import optics_of
 
 TANGENTIAL = (2e-3, -3e-3)
+#: EuRoC's cam0: its lens alone, and a decentred one like it.
+EUROC = (-0.28340811, 0.07395907, 0.0)
 PLACES = np.array([[0.0, -1.3], [1.2, -2.4], [-1.1, -1.9], [0.45, -3.6], [-0.9, -4.4]])
 EDGES = (
     Edge(0.45, 60.0), Edge(0.30, -40.0), Edge(0.14, 70.0), Edge(-0.02, -90.0), Edge(-0.21, 50.0),
@@ -60,9 +62,30 @@ def test_discs_are_found_as_exactly_as_through_a_radial_lens(
     assert largest_error_m(decentred, published_camera) > 10.0 * radial
 
 
+@pytest.fixture(scope="module", params=[(0.0, 0.0), TANGENTIAL], ids=["centred", "decentred"])
+def plumb_bob(request: pytest.FixtureRequest, published_camera: Camera) -> Camera:
+    return replace(published_camera, coef=(0.0,) * 5, polynomial=EUROC, tangential=request.param)
+
+
+def test_discs_are_found_as_exactly_through_a_plumb_bob(
+    published_camera: Camera, plumb_bob: Camera
+) -> None:
+    assert largest_error_m(plumb_bob, plumb_bob) < 0.002
+    assert largest_error_m(plumb_bob, published_camera) > 0.01
+
+
 def test_verticals_are_found_as_exactly_as_through_a_radial_lens() -> None:
     radial = pinhole(240, 160, 200.0, pitch_deg=10.0, roll_deg=1.0, coef=(0.0, -0.1, 0.0, 0.0, 0.0))
-    lens = replace(radial, tangential=TANGENTIAL)
+    look_through(radial, replace(radial, tangential=TANGENTIAL))
+
+
+def test_verticals_are_found_as_exactly_through_a_plumb_bob() -> None:
+    radial = pinhole(240, 160, 200.0, pitch_deg=10.0, roll_deg=1.0, coef=(0.0, -0.1, 0.0, 0.0, 0.0))
+    look_through(radial, replace(radial, coef=(0.0,) * 5, polynomial=EUROC))
+
+
+def look_through(radial: Camera, lens: Camera) -> None:
+    """Verticals through a lens are found as exactly as through a radial one."""
     truth = np.array([edge.bearing_rad for edge in EDGES])
     turn = np.radians((2.3, -1.0))
     errors = []
@@ -91,7 +114,14 @@ def test_verticals_are_found_as_exactly_as_through_a_radial_lens() -> None:
     assert errors[2][0] > 6e-4
 
 
-def test_published_positions_are_the_cameras(decentred: Camera) -> None:
+@pytest.mark.parametrize("polynomial", [(0.0, 0.0, 0.0), (-0.05, 0.02, -0.004)])
+@pytest.mark.parametrize("tangential", [(0.0, 0.0), TANGENTIAL])
+def test_published_positions_are_the_cameras(
+    published_camera: Camera,
+    tangential: tuple[float, float],
+    polynomial: tuple[float, float, float],
+) -> None:
+    decentred = replace(published_camera, tangential=tangential, polynomial=polynomial)
     rows, columns = np.mgrid[0 : decentred.height : 7, 0 : decentred.width : 5]
     pixels = np.stack([columns.ravel(), rows.ravel()], axis=-1)
     floor_xy, covariance = published_positions(decentred, pixels)
@@ -123,12 +153,21 @@ def test_straight_pixels_of_markers(decentred: Camera) -> None:
     alone = replace(decentred, coef=(0.0,) * 5)
     assert lens_of(alone, image) is not NO_LENS
     assert lens_of(replace(alone, tangential=(0.0, 0.0)), image) is NO_LENS
+    # And so does a polynomial.
+    plumb_bob = replace(alone, tangential=(0.0, 0.0), polynomial=EUROC)
+    expected = plumb_bob.undistort(pixels) * scale + np.array([384.0, 144.0])
+    np.testing.assert_allclose(lens_of(plumb_bob, image).straighten(pixels), expected, atol=0.01)
 
 
-def test_simulated_rays_are_the_cameras(decentred: Camera) -> None:
+@pytest.mark.parametrize("polynomial", [(0.0, 0.0, 0.0), EUROC])
+def test_simulated_rays_are_the_cameras(
+    decentred: Camera, polynomial: tuple[float, float, float]
+) -> None:
     from camera.kernels import camera_numbers
     from tools.simulator.frame.kernels import camera_ray
 
+    if any(polynomial):
+        decentred = replace(decentred, coef=(0.0,) * 5, polynomial=polynomial)
     optics = optics_of(decentred)
     u, v = np.meshgrid(np.linspace(-0.5, 767.5, 21), np.linspace(-0.5, 287.9, 17))
     pixels = np.column_stack([u.ravel(), v.ravel()])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -156,10 +157,18 @@ def test_the_published_table_is_what_a_plain_computation_says(
     assert_table_is(published_table, plain_outlines(published_camera, DiscShape()))
 
 
-def test_a_decentred_table_is_what_a_plain_computation_says(
-    published_camera: Camera, published_table: DiscTable
+@pytest.mark.parametrize(
+    "lens",
+    [
+        {"tangential": (2e-3, -3e-3)},
+        {"coef": (0.0,) * 5, "polynomial": (-0.28, 0.074, 0.0)},
+        {"tangential": (2e-3, -3e-3), "polynomial": (-0.05, 0.02, -0.004)},
+    ],
+)
+def test_a_table_with_browns_terms_is_what_a_plain_computation_says(
+    published_camera: Camera, published_table: DiscTable, lens: dict[str, Any]
 ) -> None:
-    camera = dataclasses.replace(published_camera, tangential=(2e-3, -3e-3))
+    camera = dataclasses.replace(published_camera, **lens)
     table = build_disc_table(camera, DiscShape())
     assert_table_is(table, plain_outlines(camera, DiscShape()))
     assert not np.array_equal(table.copies, published_table.copies)

@@ -23,7 +23,9 @@ def published_table(published_camera: Camera) -> VerticalTable:
 
 @pytest.fixture(scope="module")
 def decentred_camera(published_camera: Camera) -> Camera:
-    return dataclasses.replace(published_camera, tangential=(2e-3, -3e-3))
+    return dataclasses.replace(
+        published_camera, tangential=(2e-3, -3e-3), polynomial=(-0.05, 0.02, -0.004)
+    )
 
 
 @pytest.fixture(scope="module")
