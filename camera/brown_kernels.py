@@ -53,6 +53,7 @@ def straightened_point(
     """
     a2, a3, b1, b2, b3 = lens[0], lens[1], lens[2], lens[3], lens[4]
     k1, k2, p1, p2, k3, r_max = lens[5], lens[6], lens[7], lens[8], lens[9], lens[10]
+    polynomial = k1 != 0.0 or k2 != 0.0 or k3 != 0.0
     r = math.sqrt(x * x + y * y)
     if r > r_max:
         x *= 0.999 * r_max / r
@@ -67,7 +68,9 @@ def straightened_point(
         numerator = r * (a2 + r * a3)
         denominator = 1.0 + r * (b1 + r * (b2 + r * b3))
         squared = r * r
-        factor = 1.0 + numerator / denominator + squared * (k1 + squared * (k2 + squared * k3))
+        factor = 1.0 + numerator / denominator
+        if polynomial:
+            factor += squared * (k1 + squared * (k2 + squared * k3))
         along = 2.0 * (p2 * x + p1 * y)
         x_off = x_seen - (x * factor + along * x + squared * p2)
         y_off = y_seen - (y * factor + along * y + squared * p1)
@@ -83,7 +86,8 @@ def straightened_point(
                 (a2 + 2.0 * a3 * r) * denominator - numerator * (b1 + r * (2.0 * b2 + 3.0 * b3 * r))
             ) / (denominator * denominator)
             per_r = slope / r if r > 0.0 else 0.0
-            per_r += 2.0 * k1 + squared * (4.0 * k2 + squared * (6.0 * k3))
+            if polynomial:
+                per_r += 2.0 * k1 + squared * (4.0 * k2 + squared * (6.0 * k3))
             xx = factor + per_r * x * x + along + 4.0 * p2 * x
             xy = per_r * x * y + 2.0 * (p1 * x + p2 * y)
             yy = factor + per_r * y * y + along + 4.0 * p1 * y

@@ -218,7 +218,7 @@ def _kernel_camera(camera: Camera) -> _KernelCamera:
         camera_numbers(camera),
         np.array([*pinhole, *lens_numbers(camera)]),
         np.array(camera.robot_from_camera),
-        *inverse_table(camera.coef, camera.polynomial),
+        *inverse_table(camera.coef),
     )
 
 

@@ -22,8 +22,6 @@ _LAST_STEP = 1e-9
 def _factor(coef: NDArray[np.float64], r: float) -> float:
     numerator = r * (coef[0] + r * coef[1])
     factor: float = 1.0 + numerator / (1.0 + r * (coef[2] + r * (coef[3] + r * coef[4])))
-    squared = r * r
-    factor += squared * (coef[5] + squared * (coef[6] + squared * coef[9]))
     return factor
 
 
@@ -35,8 +33,6 @@ def _factor_derivative(coef: NDArray[np.float64], r: float) -> float:
     d_denominator = coef[2] + r * (2.0 * coef[3] + 3.0 * coef[4] * r)
     slope: float = d_numerator * denominator - numerator * d_denominator
     slope /= denominator * denominator
-    squared = r * r
-    slope += r * (2.0 * coef[5] + squared * (4.0 * coef[6] + squared * (6.0 * coef[9])))
     return slope
 
 
@@ -112,23 +108,24 @@ def floor_of_pixel(
     x, y : float
         Metres.
     r : float
-        Undistorted radius, by the radial distortion.
+        Undistorted radius, by the rational distortion.
     """
     x = (u - lens[2]) / lens[0]
     y = (v - lens[3]) / lens[1]
     coef = lens[4:]
     last = len(table_g) - 1
     goal = math.hypot(x, y)
-    decentred = lens[11] != 0.0 or lens[12] != 0.0
-    if decentred:
-        # The radial inverse is where to begin, and where it ends as good a place as any.
+    shifted = lens[9] != 0.0 or lens[10] != 0.0 or lens[11] != 0.0 or lens[12] != 0.0
+    shifted = shifted or lens[13] != 0.0
+    if shifted:
+        # The rational inverse is where to begin, and where it ends as good a place as any.
         goal = min(goal, table_g[last])
     if near >= 0.0 and goal <= table_g[last]:
         r = _newton(goal, coef, near, 0.0, table_r[last])
     else:
         r = undistorted_radius(goal, coef, table_g, table_r)
     factor = _factor(coef, r)
-    if decentred:
+    if shifted:
         x, y = straightened_point(coef, x, y, x / factor, y / factor)
     else:
         x /= factor
