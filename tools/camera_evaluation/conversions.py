@@ -1,4 +1,4 @@
-"""Converting a camera to the other programs' models and back, and cameras with tangential terms.
+"""Converting a camera to the other programs' models and back, and cameras with Brown's terms.
 
 Example: python -m tools.camera_evaluation conversions images/e/e.cam
 """
@@ -53,7 +53,7 @@ PLUMB_BOBS: dict[str, ForeignCamera] = {
 
 @dataclass(frozen=True)
 class Options:
-    """Convert a camera to each model and back; then OpenCV's plumb bob with tangential terms.
+    """Convert a camera to each model and back; then OpenCV's plumb bob.
 
     Example: python -m tools.camera_evaluation conversions images/e/e.cam
 
