@@ -40,6 +40,7 @@ from storage import OutputExistsError, write_whole
 
 FloatArray = NDArray[np.float64]
 
+_WHETHER = {"auto": None, "on": True, "off": False}
 _IDENTITY = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
 
 
@@ -62,8 +63,8 @@ def perform(options: Calibrate) -> int:
     settings = CalibrationSettings(
         aspect=None if options.free_aspect else 0.5 if options.half else 1.0,
         coefficients=None if options.coefficients == "auto" else int(options.coefficients),
-        tangential={"auto": None, "on": True, "off": False}[options.tangential],
-        polynomial=options.polynomial,
+        tangential=_WHETHER[options.tangential],
+        polynomial=_WHETHER[options.polynomial],
         keep_outliers=options.keep_outliers,
     )
     images = calibration_images(options.images, options.every, options.max_images)

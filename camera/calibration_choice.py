@@ -23,6 +23,8 @@ _WORTH = 4.0
 # board's points are found a little wrong, always in the same way, that can look like decentering.
 _TANGENTIAL_WORTH = 20.0
 _TANGENTIAL_SIGNIFICANCE = 50.0
+# The polynomial instead of the rational function, by so many.
+_POLYNOMIAL_WORTH = 20.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,14 +55,15 @@ def choose_lens(
 
     The fewest radial coefficients whose hold-out error is not worse than the best. Tangential terms
     if they lower it, beside those, by more than they would by chance, and are significant; then the
-    radial ones are chosen anew.
+    radial ones are chosen anew. The polynomial instead of the rational function if, beside the same
+    tangential terms, it lowers the error by more than it would by chance.
 
     Parameters
     ----------
     start : Estimate
     points : Points
     settings : CalibrationSettings
-        `coefficients` and `tangential` may leave no choice; `polynomial` says which radial ones.
+        `coefficients`, `tangential` and `polynomial` may leave no choice.
     radius_m : float
         Radius of the circles; 0 for points.
 
@@ -69,6 +72,23 @@ def choose_lens(
     FreeLens, Candidates
         The chosen one, and all that were tried.
     """
+    chosen, tried = _chosen_of_a_kind(start, points, settings, radius_m)
+    free = settings.polynomial is None and settings.coefficients is None
+    # One coefficient, a3, is k1; where it is enough no polynomial is better.
+    if not free or chosen.coefficients < 2:
+        return chosen, tried
+    others = [FreeLens(0, chosen.tangential, count) for count in (2, 3)]
+    polynomials = _tried(start, points, settings, radius_m, others)
+    other = _fewest_needed(polynomials)
+    if _is_lower(polynomials[other], tried[chosen], _POLYNOMIAL_WORTH):
+        chosen = other
+    return chosen, tried | polynomials
+
+
+def _chosen_of_a_kind(
+    start: Estimate, points: Points, settings: CalibrationSettings, radius_m: float
+) -> tuple[FreeLens, Candidates]:
+    """`choose_lens` among rational functions, or polynomials."""
     counts = range(settings.most + 1) if settings.coefficients is None else [settings.most]
     radial = [settings.lens(count) for count in counts]
     decentred = [settings.lens(count, tangential=True) for count in counts]
@@ -115,9 +135,14 @@ def _fewest_needed(tried: Candidates) -> FreeLens:
 
 def _is_worth_it(radial: Candidate, decentred: Candidate) -> bool:
     """Whether tangential terms explain what was held out, and are more than noise."""
-    slack = _TANGENTIAL_WORTH * decentred.adjusted.sigma_px**2 / len(decentred.points.board)
-    lower = decentred.holdout_px**2 + slack <= radial.holdout_px**2
+    lower = _is_lower(decentred, radial, _TANGENTIAL_WORTH)
     return lower and tangential_significance(decentred.adjusted) >= _TANGENTIAL_SIGNIFICANCE
+
+
+def _is_lower(candidate: Candidate, other: Candidate, variances: float) -> bool:
+    """Whether a candidate's sum of squared hold-out errors is lower by so many variances."""
+    slack = variances * candidate.adjusted.sigma_px**2 / len(candidate.points.board)
+    return candidate.holdout_px**2 + slack <= other.holdout_px**2
 
 
 def tangential_significance(adjusted: Adjusted) -> float:

@@ -55,12 +55,13 @@ class CalibrationSettings:
         are free.
     coefficients : int or None
         Number of free radial coefficients (0 to 5, of the polynomial 0 to 3); None: as many as make
-        the hold-out error smaller.
+        the hold-out error smaller. Of the rational function, unless `polynomial` is true.
     tangential : bool or None
         Whether the tangential terms p1 and p2 are free; None: if that makes the hold-out error
         smaller and they are more than noise.
-    polynomial : bool
-        The radial distortion is the polynomial k1, k2, k3, not the rational one.
+    polynomial : bool or None
+        Whether the radial distortion is the polynomial k1, k2, k3, not the rational one; None: if
+        that makes the hold-out error much smaller.
     robust : bool
         Huber's loss; points found wrongly pull less.
     keep_outliers : bool
@@ -70,7 +71,7 @@ class CalibrationSettings:
     aspect: float | None = 1.0
     coefficients: int | None = None
     tangential: bool | None = None
-    polynomial: bool = False
+    polynomial: bool | None = None
     robust: bool = True
     keep_outliers: bool = False
 

@@ -55,9 +55,10 @@ class Calibrate:
     tangential : str
         Whether the tangential terms p1 and p2 of a decentred lens are free: `on`, `off`, or `auto`:
         if they make that error smaller and are more than noise.
-    polynomial : bool
-        The radial distortion is OpenCV's polynomial k1 k2 k3 instead of the rational function, so
-        --coefficients are 0 to 3.
+    polynomial : str
+        Whether the radial distortion is OpenCV's polynomial k1 k2 k3 instead of the rational
+        function: `on` (then --coefficients are 0 to 3), `off`, or `auto`: if that makes the error
+        in pictures that were held out much smaller.
     keep_outliers : bool
         Keep pictures whose residuals are far above the others'.
     every : int
@@ -92,7 +93,7 @@ class Calibrate:
     free_aspect: bool = False
     coefficients: Literal["auto", "0", "1", "2", "3", "4", "5"] = "auto"
     tangential: Literal["auto", "on", "off"] = "auto"
-    polynomial: bool = False
+    polynomial: Literal["auto", "on", "off"] = "auto"
     keep_outliers: bool = False
     every: int = 15
     max_images: int = 60

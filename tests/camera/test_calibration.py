@@ -210,6 +210,20 @@ def test_a_polynomial_instead_of_the_rational_function_comes_back() -> None:
 
 
 @pytest.mark.long
+def test_the_polynomial_is_chosen_where_the_rational_function_cannot_follow() -> None:
+    """A lens of k1 k2 k3 as of a common depth camera."""
+    wavy = Camera(
+        640, 480, 517.0, 517.0, 318.6, 255.3, (0.0,) * 5, IDENTITY,
+        polynomial=(0.2624, -0.9531, 1.1633),
+    )  # fmt: skip
+    views = seen_views(wavy, 9, 0.05, seed=7)
+    result = calibrate(views, BOARD, (640, 480), CalibrationSettings(tangential=False))
+    assert result.lens == FreeLens(0, False, 3)
+    found = with_intrinsics(wavy, result.intrinsics)
+    assert projection_difference(wavy, found).max() < 0.3
+
+
+@pytest.mark.long
 def test_predicted_covariance_of_a_decentred_lens_is_what_repetition_shows() -> None:
     camera = Camera(
         640, 480, 480.0, 480.0, 322.0, 238.0, (-0.02, -0.2, 0.1, 0.5, -0.1), IDENTITY,

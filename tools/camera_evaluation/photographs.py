@@ -125,7 +125,7 @@ class Options:
     free_aspect : bool
         Both scales free, as OpenCV has them; else equal.
     polynomial : bool
-        Here the radial distortion is the polynomial k1 k2 k3.
+        Here the radial distortion is the polynomial k1 k2 k3; else that is chosen as by default.
     """
 
     folder: Positional[Path]
@@ -163,7 +163,7 @@ def compare(folder: Path, group: str, *, free_aspect: bool, polynomial: bool = F
     views, board, size = read_group(folder, group)
     settings = CalibrationSettings(
         aspect=None if free_aspect else 1.0,
-        polynomial=polynomial,
+        polynomial=True if polynomial else None,
         robust=False,
         keep_outliers=True,
     )
