@@ -1,4 +1,4 @@
-"""The ends of what `pyproject.toml` allows are what CI tries: the lowest versions, and the lock."""
+"""The ends of what `pyproject.toml` allows are what is tried: the lowest versions, and the lock."""
 
 from __future__ import annotations
 
