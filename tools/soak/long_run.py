@@ -18,7 +18,9 @@ from tools.soak.processes import ProcessState, family
 #: Throughput is compared between these shares of the run: before and after them, processes start
 #: and files take their places.
 _FIRST, _LAST = (0.01, 0.11), (0.89, 0.99)
-_LOOK_EVERY_S = 0.5
+#: The processes are looked at when another such share of the run is done, however fast that goes.
+_LOOK_EVERY = 0.004
+_POLL_EVERY_S = 0.02
 _DECODINGS = 5
 _MIB = 1 << 20
 
@@ -171,7 +173,8 @@ def soak(run: Path, output: Path, frames: int, jobs: int) -> SoakResult:
     ) as process:
         try:
             image = min((run / "images").iterdir()).read_bytes()
-            looks = _looks_at(process, output / ".detected.journal", image)
+            least = int(_LOOK_EVERY * frames)
+            looks = _looks_at(process, output / ".detected.journal", image, least)
             _, said = process.communicate()
         except BaseException:
             process.kill()
@@ -181,10 +184,13 @@ def soak(run: Path, output: Path, frames: int, jobs: int) -> SoakResult:
     return _result(looks, frames, jobs, time.monotonic() - begin_s)
 
 
-def _looks_at(process: subprocess.Popen[str], journal: Path, image: bytes) -> list[_Look]:
-    """Look at the processes again and again while frames are noted in the journal."""
+def _looks_at(
+    process: subprocess.Popen[str], journal: Path, image: bytes, least: int
+) -> list[_Look]:
+    """Look at the processes whenever more than so many further frames are noted in the journal."""
     looks: list[_Look] = []
     lines, place = -1, 0  # the first line is no frame
+    looked_at = 0
     while process.poll() is None:
         try:
             with journal.open("rb") as stream:
@@ -195,10 +201,11 @@ def _looks_at(process: subprocess.Popen[str], journal: Path, image: bytes) -> li
         if content:
             lines += content.count(b"\n")
             place += len(content)
-            states = family(process.pid)
-            if states and lines > 0:
+            states = family(process.pid) if lines - looked_at > least else []
+            if states:
                 looks.append(_Look(time.monotonic(), lines, tuple(states), _decoding_s(image)))
-        time.sleep(_LOOK_EVERY_S)
+                looked_at = lines
+        time.sleep(_POLL_EVERY_S)
     return looks
 
 
