@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from camera.brown import NOT_TANGENTIAL, Tangential, brown_of, brown_shift
 from camera.calibration_model import free_span, is_possible, project_points
 from camera.calibration_projection import intrinsics_of
+from camera.conversion_fit import EXACT_PX, least_squares, smallest_largest
 from camera.conversion_models import COEFFICIENTS, P1, ForeignCamera, Model
 from camera.distortion import NO_POLYNOMIAL
 from camera.errors import CameraError, ConversionError
@@ -26,17 +27,11 @@ _IDENTITY = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
 # Grids of pixels: to fit on, and to look for the largest deviation on.
 _FIT_GRID = (41, 31)
 _CHECK_GRID = (129, 97)
-# Lawson's reweighting: so many rounds towards the smallest largest deviation.
-_LAWSON_ROUNDS = 25
-_STEPS = 60
-_LAWSON_STEPS = 5
 _MANY_STEPS = 200
 # A largest deviation after least squares from which on another start is tried.
 _NEAR_PX = 0.02
 # b1, b2, b3 of a denominator that dips towards the image's corner, at radius 1.
 _DIP = (-2.5, 2.5, -0.85)
-# A deviation that only rounding is left of.
-_EXACT_PX = 1e-6
 
 
 @dataclass(frozen=True)
@@ -296,20 +291,22 @@ def _nearest(
 
     span = spans[0]
     for wider in spans:
-        parameters = _fit(project, parameters, wider, pixels, possible)
+        parameters = least_squares(project, parameters, wider, pixels, possible)
         if keep(parameters):
             nearest, span = parameters, wider
-        if best is not None and best.deviation_px < _EXACT_PX:
+        if best is not None and best.deviation_px < EXACT_PX:
             return best
     if (
         other_start is not None
         and possible(other_start)
         and (best is None or best.deviation_px > _NEAR_PX)
     ):
-        parameters = _fit(project, other_start, spans[-1], pixels, possible, steps=_MANY_STEPS)
+        parameters = least_squares(
+            project, other_start, spans[-1], pixels, possible, steps=_MANY_STEPS
+        )
         if keep(parameters):
             nearest, span = parameters, spans[-1]
-    keep(_lawson(project, nearest, span, pixels, possible))
+    keep(smallest_largest(project, nearest, span, pixels, possible))
     return best
 
 
@@ -391,70 +388,3 @@ def _measured(camera: AnyCamera, check: tuple[FloatArray, FloatArray]) -> Conver
     away = np.where(np.isfinite(away), away, np.inf)
     worst = int(np.argmax(away))
     return Converted(camera, float(away[worst]), (float(pixels[worst, 0]), float(pixels[worst, 1])))
-
-
-def _fit(
-    project: Callable[[FloatArray], tuple[FloatArray, FloatArray]],
-    start: FloatArray,
-    span: FloatArray,
-    pixels: FloatArray,
-    possible: Callable[[FloatArray], bool],
-    weights: FloatArray | None = None,
-    steps: int = _STEPS,
-) -> FloatArray:
-    """Least squares over the grid (Levenberg-Marquardt)."""
-    root = np.ones(len(pixels)) if weights is None else np.sqrt(weights)
-    parameters, damping = start, 1e-4
-    found, jacobian = project(parameters)
-    error = root[:, None] * (pixels - found)
-    cost = float(np.sum(error**2))
-    for _ in range(steps):
-        J = (root[:, None, None] * (jacobian @ span)).reshape(-1, span.shape[1])
-        scale = np.maximum(np.linalg.norm(J, axis=0), 1e-300)
-        J = J / scale
-        while damping < 1e10:
-            stacked = np.vstack([J, np.sqrt(damping) * np.eye(J.shape[1])])
-            right = np.concatenate([error.ravel(), np.zeros(J.shape[1])])
-            step = span @ (np.linalg.lstsq(stacked, right, rcond=None)[0] / scale)
-            trial = parameters + step
-            if possible(trial):
-                found, trial_jacobian = project(trial)
-                trial_error = root[:, None] * (pixels - found)
-                trial_cost = float(np.sum(trial_error**2))
-                if trial_cost < cost:
-                    break
-            damping *= 8.0
-        else:
-            return parameters
-        done = cost - trial_cost <= 1e-9 * cost + 1e-24
-        parameters, error, cost, jacobian = trial, trial_error, trial_cost, trial_jacobian
-        damping = max(damping / 8.0, 1e-14)
-        if done:
-            return np.asarray(parameters)
-    return parameters
-
-
-def _lawson(
-    project: Callable[[FloatArray], tuple[FloatArray, FloatArray]],
-    start: FloatArray,
-    span: FloatArray,
-    pixels: FloatArray,
-    possible: Callable[[FloatArray], bool],
-) -> FloatArray:
-    """Towards the smallest largest deviation (Lawson 1961): weights grow where it is large."""
-    weights = np.full(len(pixels), 1.0)
-    parameters = best = start
-    smallest = float("inf")
-    for _ in range(_LAWSON_ROUNDS):
-        away = np.linalg.norm(project(parameters)[0] - pixels, axis=1)
-        worst = float(away.max())
-        if not np.isfinite(worst):
-            break
-        if worst < smallest:
-            smallest, best = worst, parameters
-        if worst < _EXACT_PX:
-            break
-        weights = weights * (0.05 + away / worst)
-        weights /= weights.mean()
-        parameters = _fit(project, parameters, span, pixels, possible, weights, _LAWSON_STEPS)
-    return best

@@ -11,9 +11,10 @@ from numba import njit
 from numpy.typing import NDArray
 
 from detect.line_detections import COUNTS
-from detect.line_kernels import find_starts, follow_edges
+from detect.line_kernels import follow_edges
 from detect.line_pass_kernels import fit_and_judge, lines_of_tracks
 from detect.line_response_kernels import band_response
+from detect.line_start_kernels import find_starts
 
 
 @njit(cache=True, error_model="numpy")

@@ -155,7 +155,7 @@ def line_starts(
     LineStarts
         The highest first.
     """
-    from detect.line_kernels import find_starts
+    from detect.line_start_kernels import find_starts
 
     response, band = start_response(image, table, settings)
     return LineStarts(*find_starts(response, band.row, settings.threshold, band.supported))

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from detect.line_filter import FilteredColumns, gaussian_window, start_band
-from detect.line_kernels import find_starts
 from detect.line_settings import DEFAULT, PUBLISHED, LineSettings
+from detect.line_start_kernels import find_starts
 from detect.line_tracks import (
     line_response,
     line_starts,

@@ -1,0 +1,116 @@
+"""Fitting a camera to where another sees rays: least squares, the smallest largest error."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+#: A deviation that only rounding is left of.
+EXACT_PX = 1e-6
+
+# Lawson's reweighting: so many rounds towards the smallest largest deviation.
+_LAWSON_ROUNDS = 25
+_STEPS = 60
+_LAWSON_STEPS = 5
+
+
+def least_squares(
+    project: Callable[[FloatArray], tuple[FloatArray, FloatArray]],
+    start: FloatArray,
+    span: FloatArray,
+    pixels: FloatArray,
+    possible: Callable[[FloatArray], bool],
+    weights: FloatArray | None = None,
+    steps: int = _STEPS,
+) -> FloatArray:
+    """Parameters of a camera that sees rays nearest to given pixels (Levenberg-Marquardt).
+
+    Parameters
+    ----------
+    project : callable
+        From (P,) parameters to the (N, 2) pixels of the rays, and their (N, 2, P) derivatives.
+    start : (P,) float64
+        Parameters to begin with.
+    span : (P, F) float64
+        Directions in which they are free.
+    pixels : (N, 2) float64
+        Where the rays are to be seen.
+    possible : callable
+        Whether parameters are those of a camera: a step to others is not taken.
+    weights : (N,) float64, optional
+        Of the squared distances.
+    steps : int
+        The most that are taken.
+
+    Returns
+    -------
+    (P,) float64
+    """
+    root = np.ones(len(pixels)) if weights is None else np.sqrt(weights)
+    parameters, damping = start, 1e-4
+    found, jacobian = project(parameters)
+    error = root[:, None] * (pixels - found)
+    cost = float(np.sum(error**2))
+    for _ in range(steps):
+        J = (root[:, None, None] * (jacobian @ span)).reshape(-1, span.shape[1])
+        scale = np.maximum(np.linalg.norm(J, axis=0), 1e-300)
+        J = J / scale
+        while damping < 1e10:
+            stacked = np.vstack([J, np.sqrt(damping) * np.eye(J.shape[1])])
+            right = np.concatenate([error.ravel(), np.zeros(J.shape[1])])
+            step = span @ (np.linalg.lstsq(stacked, right, rcond=None)[0] / scale)
+            trial = parameters + step
+            if possible(trial):
+                found, trial_jacobian = project(trial)
+                trial_error = root[:, None] * (pixels - found)
+                trial_cost = float(np.sum(trial_error**2))
+                if trial_cost < cost:
+                    break
+            damping *= 8.0
+        else:
+            return parameters
+        done = cost - trial_cost <= 1e-9 * cost + 1e-24
+        parameters, error, cost, jacobian = trial, trial_error, trial_cost, trial_jacobian
+        damping = max(damping / 8.0, 1e-14)
+        if done:
+            return np.asarray(parameters)
+    return parameters
+
+
+def smallest_largest(
+    project: Callable[[FloatArray], tuple[FloatArray, FloatArray]],
+    start: FloatArray,
+    span: FloatArray,
+    pixels: FloatArray,
+    possible: Callable[[FloatArray], bool],
+) -> FloatArray:
+    """Parameters towards the smallest largest distance: weights grow where it is large.
+
+    Parameters as in `least_squares`.
+
+    References
+    ----------
+    Lawson, Contributions to the theory of linear least maximum approximation, 1961.
+    """
+    weights = np.full(len(pixels), 1.0)
+    parameters = best = start
+    smallest = float("inf")
+    for _ in range(_LAWSON_ROUNDS):
+        away = np.linalg.norm(project(parameters)[0] - pixels, axis=1)
+        worst = float(away.max())
+        if not np.isfinite(worst):
+            break
+        if worst < smallest:
+            smallest, best = worst, parameters
+        if worst < EXACT_PX:
+            break
+        weights = weights * (0.05 + away / worst)
+        weights /= weights.mean()
+        parameters = least_squares(
+            project, parameters, span, pixels, possible, weights, _LAWSON_STEPS
+        )
+    return best
