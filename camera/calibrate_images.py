@@ -65,7 +65,10 @@ def calibration_images(
 
 
 def read_grey(path: Path) -> GreyImage:
-    """Read an image as grey values of 8 bits.
+    """Read an image as grey values of 8 bits, as the sensor saw it.
+
+    How a camera was held, which telephones write beside a picture (Exif), turns nothing: a
+    calibration is of the sensor's pixels, whichever way up they are shown.
 
     Raises
     ------
@@ -87,7 +90,10 @@ def read_grey(path: Path) -> GreyImage:
     if size is not None:
         data = np.frombuffer(content, np.uint8)
         with suppress(cv2.error):
-            image = cv2.imdecode(data, cv2.IMREAD_ANYDEPTH | cv2.IMREAD_GRAYSCALE)
+            image = cv2.imdecode(
+                data,
+                cv2.IMREAD_ANYDEPTH | cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION,
+            )
     if image is None:
         raise CalibrationError(
             f"{path}: not an image that can be read: expected JPEG, PNG, PNM, BMP or TIFF"

@@ -131,7 +131,9 @@ def _decoded(content: bytes, *, deep: bool) -> NDArray[Any] | None:
 
     if not content:
         return None
-    flags = cv2.IMREAD_GRAYSCALE | (cv2.IMREAD_ANYDEPTH if deep else 0)
+    # A calibration is of the sensor's pixels, whichever way up a telephone would show them (Exif).
+    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+    flags |= cv2.IMREAD_ANYDEPTH if deep else 0
     try:
         image = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
     except cv2.error:  # sizes beyond OpenCV's bounds are no None

@@ -154,8 +154,10 @@ def find_boards(image: BoardImage, board: Checkerboard, camera: Camera) -> Board
     # What claims more is not decoded: memory is taken only for what there should be.
     if size is not None and sorted(size) != sorted((camera.width, camera.height)):
         raise _other_size(image.image, size, camera)
+    # A calibration is of the sensor's pixels, whichever way up a telephone would show them (Exif).
+    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
     try:
-        grey = None if size is None else cv2.imdecode(content, cv2.IMREAD_GRAYSCALE)
+        grey = None if size is None else cv2.imdecode(content, flags)
     except cv2.error:
         grey = None
     if grey is None:
