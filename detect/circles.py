@@ -246,7 +246,7 @@ def refined_covariance(
     return np.asarray(
         refined_covariances(
             _kernel_camera(camera).numbers,
-            camera.centre,
+            np.array(camera.centre),
             np.ascontiguousarray(floor_xy, np.float64),
             np.ascontiguousarray(fitted, np.float64),
             settings.systematic_px**2,

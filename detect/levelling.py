@@ -56,7 +56,10 @@ def level_positions(
     """
     return np.asarray(
         level_floor(
-            np.ascontiguousarray(floor_xy, dtype=np.float64), camera.centre, pitch_rad, roll_rad
+            np.ascontiguousarray(floor_xy, dtype=np.float64),
+            np.array(camera.centre),
+            pitch_rad,
+            roll_rad,
         )
     )
 
@@ -90,7 +93,7 @@ def level_covariances(
         level_floor_covariances(
             np.ascontiguousarray(floor_xy, dtype=np.float64),
             np.ascontiguousarray(covariance, dtype=np.float64),
-            camera.centre,
+            np.array(camera.centre),
             pitch_rad,
             roll_rad,
             np.ascontiguousarray(tilt_covariance, dtype=np.float64),

@@ -36,8 +36,9 @@ def floor_positions(camera: Camera) -> FloatArray:
     pinhole = np.array([camera.scale_x, camera.scale_y, camera.offset_x, camera.offset_y])
     per_radius = _INTERVALS / _farthest_corner(camera)
     fill_floor_positions(
-        pinhole, lens_numbers(camera), polynomials, per_radius, camera.rotation, camera.centre,
-        floor_xy,
+        pinhole, lens_numbers(camera), polynomials, per_radius,
+        # A camera that came from another process has arrays of another kind.
+        np.array(camera.rotation), np.array(camera.centre), floor_xy,
     )  # fmt: skip
     return floor_xy
 

@@ -108,7 +108,8 @@ def build_vertical_table(camera: Camera) -> VerticalTable:
         elevation_tan=np.asfortranarray(
             np.where(seen, np.tan(elevation), np.nan), dtype=np.float32
         ),
-        robot_from_camera=camera.rotation,
+        # Like those of a table that is read: kernels are compiled for one kind of array only.
+        robot_from_camera=np.array(camera.rotation),
         row_aspect=camera.scale_x / camera.scale_y,
     )
 

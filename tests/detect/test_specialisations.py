@@ -1,0 +1,77 @@
+"""A kernel is compiled for one kind of array, wherever cameras and tables come from.
+
+Built, read from a file, or handed over by another process, arrays differ in whether they may be
+written to and in how they lie in memory; for each kind Numba would compile again, for seconds, in a
+user's second run.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import pickle
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numba import typeof
+
+from camera import Camera, parse_camera
+from detect.circles import refined_covariance
+from detect.disc_covariance_kernels import refined_covariances
+from detect.levelling import level_covariances, level_positions
+from detect.levelling_kernels import level_floor, level_floor_covariances
+from detect.settings import CircleSettings
+from lut import DiscShape, cached_disc_table, cached_vertical_table, floor_positions
+from lut.kernels import fill_floor_positions
+from tests.conftest import PUBLISHED_CAM
+
+FLOOR_XY = np.array([[0.0, -1.0], [1.1, -2.0]])
+COVARIANCE = np.stack([1e-4 * np.eye(2)] * 2)
+
+
+def small(camera: Camera) -> Camera:
+    """At an eighth of its size: tables in milliseconds."""
+    return dataclasses.replace(
+        camera, width=96, height=36, scale_x=464.762 / 8, scale_y=232.381 / 8, offset_x=48.0,
+        offset_y=18.0,
+    )  # fmt: skip
+
+
+def kinds_of(table: Any) -> dict[str, str]:
+    return {
+        field.name: str(typeof(getattr(table, field.name))) for field in dataclasses.fields(table)
+    }
+
+
+@pytest.mark.parametrize("kind", ["discs", "verticals"])
+def test_tables_that_are_built_and_read_are_of_one_kind(
+    published_camera: Camera, tmp_path: Path, kind: str
+) -> None:
+    def table() -> Any:
+        camera = small(published_camera)
+        if kind == "verticals":
+            return cached_vertical_table(camera, folder=tmp_path)
+        return cached_disc_table(
+            camera, DiscShape(samples=5, border_px=3, far_limit_m_per_px=0.2), folder=tmp_path
+        )
+
+    built = kinds_of(table())
+    assert len(list(tmp_path.iterdir())) == 1
+    assert kinds_of(table()) == built
+
+
+def test_cameras_that_are_read_and_handed_over_are_of_one_kind() -> None:
+    read = parse_camera(PUBLISHED_CAM)
+    assert read.centre[2] > 0.0  # kept by the camera, and handed over with it
+    assert read.rotation.shape == (3, 3)
+    handed_over = pickle.loads(pickle.dumps(read))
+    kernels = (level_floor, level_floor_covariances, refined_covariances, fill_floor_positions)
+    compiled = []
+    for camera in (read, handed_over):
+        level_positions(camera, FLOOR_XY, 0.01, 0.02)
+        level_covariances(camera, FLOOR_XY, COVARIANCE, 0.01, 0.02, np.eye(2))
+        refined_covariance(camera, FLOOR_XY, COVARIANCE, CircleSettings())
+        floor_positions(camera)
+        compiled.append([set(kernel.signatures) for kernel in kernels])
+    assert compiled[0] == compiled[1]
