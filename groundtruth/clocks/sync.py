@@ -26,7 +26,7 @@ from groundtruth.clocks.line import on_one_line
 from groundtruth.clocks.refinement import refine_by_movement
 from groundtruth.clocks.wandering import Wandering, estimate_wandering
 from groundtruth.errors import GroundTruthError
-from groundtruth.trajectories.streams import PlanarPoses
+from groundtruth.trajectories.streams import PlanarPoses, last_of_each_time
 from landmarks import wrap_angle
 
 FloatArray = NDArray[np.float64]
@@ -89,7 +89,7 @@ def synchronise(
     odometry : PlanarPoses
         The robot's own poses on its own clock; only headings and times are used.
     groundtruth : PlanarPoses
-        Poses on the ground truth's clock.
+        Poses on the ground truth's clock. Of several of one time, in either, the last counts.
     settings : SyncSettings, optional
 
     Returns
@@ -106,6 +106,7 @@ def synchronise(
         If a stream has fewer than 20 poses, or they do not overlap.
     """
     bounds = settings or SyncSettings()
+    odometry, groundtruth = last_of_each_time(odometry), last_of_each_time(groundtruth)
     for name, poses in (("odometry", odometry), ("ground truth", groundtruth)):
         if len(poses) < _FEWEST_SAMPLES:
             raise GroundTruthError(

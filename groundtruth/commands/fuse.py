@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import asdict
 from pathlib import Path
 
@@ -47,7 +48,9 @@ def perform(options: Fuse) -> int:
         "used": fusion.used,
         "odometry": asdict(fusion.odometry),
         "covariances_repaired": fusion.repaired,
+        "measurements_repeated": fusion.repeated,
         "restarts_s": fusion.restarts_s,
+        "odometry_pauses_s": fusion.pauses_s,
         "rejected": [asdict(rejected) for rejected in fusion.rejected],
     }
     write_planar_poses(options.output, fusion.poses, overwrite=options.force)
@@ -62,4 +65,12 @@ def perform(options: Fuse) -> int:
         f"{len(fusion.rejected)} rejected, {len(fusion.restarts_s)} restarts; "
         f"median sigma {sigma:.1f} mm"
     )
+    if fusion.pauses_s:
+        begin, end = max(fusion.pauses_s, key=lambda pause: pause[1] - pause[0])
+        print(
+            f"warning: {options.odometry}: {len(fusion.pauses_s)} pauses, the longest from "
+            f"{begin:.3f} s to {end:.3f} s on the ground truth's clock: which way the robot went "
+            "is not known there, and covariances are raised",
+            file=sys.stderr,
+        )
     return 0

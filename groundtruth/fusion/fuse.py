@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from groundtruth.fusion.controls import pauses_of
 from groundtruth.fusion.learning import likeliest_noise, looser_over_seconds, noise_of
 from groundtruth.fusion.movement import movement_problem
 from groundtruth.fusion.settings import FuseSettings
@@ -92,6 +93,11 @@ class Fusion:
     repaired : dict of str to int
         Covariances that were not positive definite as written, by stream; they were raised by their
         file's rounding.
+    repeated : dict of str to int
+        Rows that were the row before once more, by stream; they counted once.
+    pauses_s : tuple of (float, float)
+        Between which times odometry was not written, within the poses' time. What may have been
+        driven there besides, at the rates at which the robot usually goes, makes it less certain.
     """
 
     poses: PlanarPoses
@@ -100,6 +106,8 @@ class Fusion:
     used: dict[str, int]
     odometry: OdometryErrors
     repaired: dict[str, int]
+    repeated: dict[str, int]
+    pauses_s: tuple[tuple[float, float], ...]
 
 
 def fuse(
@@ -159,4 +167,8 @@ def fuse(
             *np.concatenate([smoothed[-1, 3:], last_spread[3:], noise, [looser]]).tolist()
         ),
         repaired=problem.repaired,
+        repeated=problem.repeated,
+        pauses_s=tuple(
+            (begin, end) for begin, end in pauses_of(odometry) if end > first and begin < last
+        ),
     )

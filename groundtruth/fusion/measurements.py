@@ -16,7 +16,7 @@ FloatArray = NDArray[np.float64]
 
 def gather(
     odometry: PlanarPoses, streams: Mapping[str, PlanarPoses], settings: FuseSettings
-) -> tuple[list[str], FloatArray, FloatArray, FloatArray, dict[str, int]]:
+) -> tuple[list[str], FloatArray, FloatArray, FloatArray, dict[str, int], dict[str, int]]:
     """All measurements within the odometry's time, in order, with covariances that can be used.
 
     Parameters
@@ -33,6 +33,9 @@ def gather(
     times_s, poses, covariances : (M,), (M, 3), (M, 3, 3) arrays
     repaired : dict of str to int
         Covariances that had to be raised, by stream.
+    repeated : dict of str to int
+        Rows that are the row before once more, to the last digit, by stream: left out, since one
+        measurement must not count twice.
 
     Raises
     ------
@@ -42,11 +45,14 @@ def gather(
     """
     names: list[str] = []
     times, poses, covariances = [], [], []
-    repaired = {}
+    repaired, repeated = {}, {}
     for name, stream in streams.items():
         if stream.covariances is None:
             raise GroundTruthError(f"{name}: no covariances: expected t, x, y, theta and 9 more")
         inside = (stream.times_s >= odometry.times_s[0]) & (stream.times_s <= odometry.times_s[-1])
+        again = inside & _repeats(stream, stream.covariances)
+        repeated[name] = int(np.count_nonzero(again))
+        inside &= ~again
         usable, repaired[name] = _usable(name, stream.covariances[inside])
         scale = (settings.covariance_scale or {}).get(name, 1.0)
         names += [name] * int(np.count_nonzero(inside))
@@ -66,7 +72,15 @@ def gather(
         np.concatenate(poses)[order],
         np.concatenate(covariances)[order],
         repaired,
+        repeated,
     )
+
+
+def _repeats(stream: PlanarPoses, covariances: FloatArray) -> NDArray[np.bool_]:
+    """(N,) which rows are those before them."""
+    rows = np.column_stack([stream.times_s, stream.poses, covariances.reshape(len(stream), 9)])
+    same = np.all(rows[1:] == rows[:-1], axis=1)
+    return np.concatenate([np.zeros(min(len(rows), 1), dtype=np.bool_), same])
 
 
 def _usable(name: str, covariances: FloatArray) -> tuple[FloatArray, int]:

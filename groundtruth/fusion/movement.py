@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from groundtruth.fusion.controls import movements, variances_of
 from groundtruth.fusion.gaps import (
     UNMEASURED_S,
     Bridge,
@@ -22,19 +23,10 @@ from groundtruth.fusion.measurements import gather
 from groundtruth.fusion.motion_kernels import POSE, STATE
 from groundtruth.fusion.settings import FuseSettings
 from groundtruth.fusion.smoother_kernels import filter_forward, smooth_backward
-from groundtruth.geometry.plane import between, log_motion
-from groundtruth.trajectories.streams import PlanarPoses
+from groundtruth.trajectories.streams import PlanarPoses, last_of_each_time
 
 FloatArray = NDArray[np.float64]
 
-# A robot that stands still may yet be moved a little; without it, standing would make covariances
-# that cannot be inverted.
-_CREEP_M2_PER_S = (1e-4) ** 2
-_CREEP_RAD2_PER_S = (1e-4) ** 2
-# A turn is distinct if, from a second before to a second after, odometry turned by more than so
-# many of its standard deviations.
-_DISTINCT_OVER_S = 1.0
-_DISTINCT_SIGMAS = 4.0
 _RESTART_AFTER = 40
 _RESTART_VARIANCES = np.array([25.0, 25.0, math.pi**2])
 # Of the heading (rad^2): beyond it, derivatives at the heading expected say nothing of others.
@@ -76,6 +68,8 @@ class MovementProblem:
         Odometry's movement to each node: way forward, way to the left (m) and turn (rad), each
         summed up in the robot's turning frame; and the turn again where it is a distinct one, else
         0.
+    unseen : (N, 2) float64
+        Way (m) and turn (rad) that it may have made besides, where odometry pauses.
     nodes : (M,) int64
         At which node each measurement was made, ascending.
     measured, covariances : (M, 3), (M, 3, 3) float64
@@ -84,16 +78,20 @@ class MovementProblem:
         Whose they are.
     repaired : dict of str to int
         Covariances that had to be raised, by stream.
+    repeated : dict of str to int
+        Rows that repeated the row before and were left out, by stream.
     settings : FuseSettings
     """
 
     times_s: FloatArray
     controls: FloatArray
+    unseen: FloatArray
     nodes: NDArray[np.int64]
     measured: FloatArray
     covariances: FloatArray
     streams: tuple[str, ...]
     repaired: dict[str, int]
+    repeated: dict[str, int]
     settings: FuseSettings
 
     def shortened(self, count: int) -> MovementProblem:
@@ -112,11 +110,13 @@ class MovementProblem:
         return MovementProblem(
             self.times_s[begin:end],
             self.controls[begin:end],
+            self.unseen[begin:end],
             self.nodes[here] - begin,
             self.measured[here],
             self.covariances[here],
             tuple(self.streams[i] for i in np.flatnonzero(here)),
             self.repaired,
+            self.repeated,
             self.settings,
         )
 
@@ -136,7 +136,7 @@ class MovementProblem:
     def account(self, noise: FloatArray) -> MeasurementAccount:
         """What becomes of the measurements in a filter that goes forward only."""
         return self._forward(
-            _variances(self.times_s, self.controls, noise),
+            self._variances(noise),
             np.empty((1, STATE)),
             np.zeros(len(self.times_s), dtype=np.bool_),
             None,
@@ -180,7 +180,7 @@ class MovementProblem:
         states, covariances : (N, 6), (N, 6, 6) arrays
         account : MeasurementAccount
         """
-        variances = _variances(self.times_s, self.controls, noise)
+        variances = self._variances(noise)
         as_sampled = variances.copy()
         after = np.flatnonzero(np.diff(self.times_s[self.nodes]) > UNMEASURED_S)
         for begin, end in zip(self.nodes[after], self.nodes[after + 1]):
@@ -257,6 +257,10 @@ class MovementProblem:
     def gate(self) -> float:
         """Largest squared normalised innovation."""
         return float(chi2.ppf(self.settings.gate_probability, POSE))
+
+    def _variances(self, noise: FloatArray) -> FloatArray:
+        """(N, 3) what odometry's random errors sum up to."""
+        return variances_of(self.times_s, self.controls, self.unseen, noise, self.settings)
 
     def _forward(
         self,
@@ -349,69 +353,20 @@ def movement_problem(
         If there is no measurement within the odometry's time, a stream has no covariances, or one
         of them cannot be repaired.
     """
-    names, times, measured, covariances, repaired = gather(odometry, streams, settings)
+    names, times, measured, covariances, repaired, repeated = gather(odometry, streams, settings)
+    odometry = last_of_each_time(odometry)
     inside = odometry.times_s[(odometry.times_s >= times[0]) & (odometry.times_s <= times[-1])]
     node_times = np.union1d(inside, times)
+    controls, unseen = movements(odometry, node_times, settings)
     return MovementProblem(
         times_s=node_times,
-        controls=_controls(odometry, node_times, settings),
+        controls=controls,
+        unseen=unseen,
         nodes=np.searchsorted(node_times, times).astype(np.int64),
         measured=measured,
         covariances=covariances,
         streams=tuple(names),
         repaired=repaired,
+        repeated=repeated,
         settings=settings,
-    )
-
-
-def _controls(
-    odometry: PlanarPoses, node_times_s: FloatArray, settings: FuseSettings
-) -> FloatArray:
-    """(N, 4) movements between nodes: each a share of an arc between two samples of odometry."""
-    arcs = log_motion(between(odometry.poses[:-1], odometry.poses[1:]))
-    arcs = np.column_stack([arcs, np.where(_distinct(odometry, arcs, settings), arcs[:, 2], 0.0)])
-    last = len(odometry) - 2
-    at = np.clip(np.searchsorted(odometry.times_s, node_times_s[:-1], side="right") - 1, 0, last)
-    share = np.diff(node_times_s) / (odometry.times_s[at + 1] - odometry.times_s[at])
-    return np.concatenate([np.zeros((1, 4)), share[:, None] * arcs[at]])
-
-
-def _distinct(odometry: PlanarPoses, arcs: FloatArray, settings: FuseSettings) -> NDArray[np.bool_]:
-    """Between which samples the robot turned by more than odometry's random errors explain.
-
-    Only there its turns tell by what share they are too long. Elsewhere, what looks like turns are
-    those errors; and since they are just what measured headings contradict, the share would be
-    drawn towards -1, whatever it is (regression dilution).
-    """
-    from_s = np.maximum(odometry.times_s[:-1] - _DISTINCT_OVER_S, odometry.times_s[0])
-    to_s = np.minimum(odometry.times_s[1:] + _DISTINCT_OVER_S, odometry.times_s[-1])
-
-    def within(steps: FloatArray) -> FloatArray:
-        total = np.concatenate([[0.0], np.cumsum(steps)])
-        ends = (np.interp(at, odometry.times_s, total) for at in (to_s, from_s))
-        return np.asarray(np.subtract(*ends))
-
-    turn = within(arcs[:, 2])
-    variance = (
-        settings.turn_sigma**2 * np.abs(turn)
-        + settings.turn_per_metre_sigma**2 * within(np.hypot(arcs[:, 0], arcs[:, 1]))
-        + _CREEP_RAD2_PER_S * (to_s - from_s)
-    )
-    return np.asarray(turn**2 > _DISTINCT_SIGMAS**2 * variance)
-
-
-def _variances(times_s: FloatArray, controls: FloatArray, noise: FloatArray) -> FloatArray:
-    """(N, 3) noise of movements, summed up: along the way, across it (m^2), of the turn (rad^2).
-
-    All of it is proportional to way, turn and time, so that it adds up over parts of a movement.
-    """
-    along, across, by_turn, by_way = np.square(noise)
-    way = np.hypot(controls[:, 0], controls[:, 1])
-    passed = np.concatenate([[0.0], np.diff(times_s)])
-    return np.column_stack(
-        [
-            along * way + _CREEP_M2_PER_S * passed,
-            across * way + _CREEP_M2_PER_S * passed,
-            by_turn * np.abs(controls[:, 2]) + by_way * way + _CREEP_RAD2_PER_S * passed,
-        ]
     )

@@ -84,6 +84,22 @@ class PlanarPoses:
         return len(self.times_s)
 
 
+def last_of_each_time(poses: PlanarPoses) -> PlanarPoses:
+    """The last of all poses of one time, which is where those before it lead to.
+
+    Where stamps are coarser than samples, as those of buffers that are read now and then, several
+    poses have one time. No speed can be told between them, yet the robot moved on.
+    """
+    last = np.append(np.diff(poses.times_s) > 0.0, True)[: len(poses)]
+    if np.all(last):
+        return poses
+    return PlanarPoses(
+        poses.times_s[last],
+        poses.poses[last],
+        None if poses.covariances is None else poses.covariances[last],
+    )
+
+
 def is_positive_definite(covariances: FloatArray, rounding: float = 0.0) -> NDArray[np.bool_]:
     """Which of (..., d, d) covariances can be inverted in earnest.
 
