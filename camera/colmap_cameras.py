@@ -1,4 +1,4 @@
-"""COLMAP's cameras.txt and ``pycolmap.Camera``.
+"""COLMAP's cameras.txt and cameras.bin, and ``pycolmap.Camera``.
 
 COLMAP counts pixels from the image's corner: the top left pixel's centre is (0.5, 0.5). So the
 principal point is moved by half a pixel on the way in and out.
@@ -6,6 +6,7 @@ principal point is moved by half a pixel on the way in and out.
 
 from __future__ import annotations
 
+import struct
 from typing import TYPE_CHECKING
 
 from camera.conversion_models import COEFFICIENTS, ForeignCamera, Model
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 
 _HALF_PIXEL = 0.5
 _LONGEST_LIST = 100
+_DIGITS = frozenset("0123456789")
 
 #: COLMAP's models: ours, number of focal lengths, and where its distortion goes in our order.
 _MODELS: dict[str, tuple[Model, int, tuple[int, ...]]] = {
@@ -31,6 +33,24 @@ _MODELS: dict[str, tuple[Model, int, tuple[int, ...]]] = {
     "SIMPLE_RADIAL_FISHEYE": ("fisheye", 1, (0,)),
     "RADIAL_FISHEYE": ("fisheye", 1, (0, 1)),
     "OPENCV_FISHEYE": ("fisheye", 2, (0, 1, 2, 3)),
+}
+#: COLMAP's numbers of them, in cameras.bin.
+_NUMBERED = {
+    0: "SIMPLE_PINHOLE",
+    1: "PINHOLE",
+    2: "SIMPLE_RADIAL",
+    3: "RADIAL",
+    4: "OPENCV",
+    5: "OPENCV_FISHEYE",
+    6: "FULL_OPENCV",
+    8: "SIMPLE_RADIAL_FISHEYE",
+    9: "RADIAL_FISHEYE",
+}
+#: Those that can't be converted have to be passed over: names and numbers of parameters.
+_PASSED_OVER = {
+    7: ("FOV", 5),
+    10: ("THIN_PRISM_FISHEYE", 12),
+    11: ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
 }
 _WRITTEN: dict[Model, str] = {
     "radtan": "OPENCV",
@@ -70,6 +90,50 @@ def parse_colmap(text: str, name: str = "<text>", camera_name: str = "") -> Fore
     except ValueError:
         raise ConversionError(f"{where}: a size or parameter that is no number") from None
     return _from_parameters(where, fields[1], width, height, parameters)
+
+
+def text_of_binary(content: bytes, name: str = "<bytes>") -> str:
+    """The lines of a cameras.txt of the content of a cameras.bin.
+
+    Raises
+    ------
+    ConversionError
+        If it ends early, goes on behind its last camera, or has a model of unknown length.
+
+    References
+    ----------
+    COLMAP, src/colmap/scene/reconstruction_io_binary.cc.
+    """
+    lines = []
+    try:
+        (count,) = struct.unpack_from("<Q", content)
+        place = 8
+        for camera in range(1, count + 1):
+            number, model, width, height = struct.unpack_from("<IiQQ", content, place)
+            if model in _NUMBERED:
+                label = _NUMBERED[model]
+                _, focals, order = _MODELS[label]
+                length = focals + 2 + len(order)
+            elif model in _PASSED_OVER:
+                label, length = _PASSED_OVER[model]
+            else:
+                raise ConversionError(
+                    f"{name}: camera {camera} has COLMAP's model {model}, which is unknown here: "
+                    "expected one of 0 to 11; write it as text (colmap model_converter "
+                    "--output_type TXT)"
+                )
+            parameters = struct.unpack_from(f"<{length}d", content, place + 24)
+            place += 24 + 8 * length
+            values = " ".join(repr(value) for value in parameters)
+            lines.append(f"{number} {label} {width} {height} {values}")
+    except struct.error:
+        raise ConversionError(f"{name}: ends early: expected COLMAP's cameras.bin") from None
+    if place != len(content):
+        raise ConversionError(
+            f"{name}: {len(content) - place} bytes behind its {count} cameras: expected COLMAP's "
+            "cameras.bin"
+        )
+    return "\n".join([*lines, ""])
 
 
 def camera_from_pycolmap(camera: pycolmap.Camera) -> ForeignCamera:
@@ -126,9 +190,9 @@ def colmap_parameters(camera: ForeignCamera) -> tuple[str, list[float]]:
 
 
 def format_colmap(camera: ForeignCamera, camera_name: str = "1") -> str:
-    """The text of a cameras.txt of one camera."""
+    """The text of a cameras.txt of one camera; its number is 1 unless `camera_name` is one."""
     name, parameters = colmap_parameters(camera)
-    number = camera_name or "1"
+    number = camera_name if camera_name and _DIGITS.issuperset(camera_name) else "1"
     values = " ".join(shortest(value) for value in parameters)
     return (
         "# Camera list with one line of data per camera:\n"

@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from camera.camfile import format_camera, parse_camera, read_camera
-from camera.colmap_cameras import format_colmap, parse_colmap
+from camera.colmap_cameras import format_colmap, parse_colmap, text_of_binary
 from camera.conversion import AnyCamera, Converted, convert_to_camera, convert_to_foreign
 from camera.conversion_models import ForeignCamera, Model
-from camera.convert_yaml import parse_yaml, read_text
+from camera.convert_yaml import parse_yaml, read_content, text_of
 from camera.errors import ConversionError
 from camera.kalibr_camchain import format_kalibr, parse_kalibr
 from camera.model import Camera
@@ -40,7 +40,10 @@ def perform(options: Convert) -> int:
     if to_format == "auto":
         to_format = format_of_name(options.target)
     source = parse(text, from_format, str(options.source), options.camera_name)
-    converted = convert(source, to_format, options)
+    try:
+        converted = convert(source, to_format, options)
+    except ConversionError as error:
+        raise ConversionError(f"{options.source}: {error}") from None
     camera = converted.camera
     label = camera.model if isinstance(camera, ForeignCamera) else _label(camera)
     u, v = converted.at
@@ -65,6 +68,20 @@ def perform(options: Convert) -> int:
         stream.write(written.encode())
     print(f"written: {options.target}")
     return 0
+
+
+def read_text(path: Path) -> str:
+    """The text of a calibration file; of COLMAP's cameras.bin, that of its cameras.txt.
+
+    Raises
+    ------
+    ConversionError
+        If it cannot be read, is larger than any calibration, or no text.
+    """
+    content = read_content(path)
+    if path.suffix.lower() == ".bin":
+        return text_of_binary(content, str(path))
+    return text_of(content, str(path))
 
 
 def _label(camera: Camera) -> str:
@@ -121,8 +138,12 @@ def format_of_text(path: Path, text: str) -> Format:
     """
     if text.lstrip().startswith("{ SmRadial") or path.suffix.lower() == ".cam":
         return "cam"
-    if path.suffix.lower() == ".txt":
+    if path.suffix.lower() in (".txt", ".bin"):
         return "colmap"
+    if text.lstrip().startswith("<"):
+        raise ConversionError(
+            f"{path}: is XML: expected YAML; OpenCV writes it where the file's name ends in .yml"
+        )
     if text.startswith("%YAML:") or "!!opencv-matrix" in text:
         return "opencv"
     content = parse_yaml(text, str(path))
@@ -134,7 +155,8 @@ def format_of_text(path: Path, text: str) -> Format:
         return "opencv"
     raise ConversionError(
         f"{path}: neither a .cam file nor a camera in OpenCV's, ROS's, Kalibr's or COLMAP's format "
-        "that is recognised: give --from-format"
+        "that is recognised (they have image_width, distortion_model, cam0 with intrinsics, or are "
+        "a cameras.txt): give --from-format"
     )
 
 

@@ -18,8 +18,8 @@ _LARGEST_FILE_BYTES = 1 << 20
 _MOST_CAMERAS = 1000
 
 
-def read_text(path: Path) -> str:
-    """The text of a calibration file.
+def read_content(path: Path) -> bytes:
+    """The content of a calibration file.
 
     Raises
     ------
@@ -27,15 +27,27 @@ def read_text(path: Path) -> str:
         If it cannot be read or is larger than any calibration.
     """
     try:
-        return read_bounded(path, _LARGEST_FILE_BYTES).decode("utf-8-sig")
+        return read_bounded(path, _LARGEST_FILE_BYTES)
     except FileNotFoundError:
         raise ConversionError(f"{path}: no such calibration file") from None
-    except UnicodeDecodeError:
-        raise ConversionError(f"{path}: is no text: expected a calibration") from None
     except OSError as error:
         raise ConversionError(
             f"{path}: cannot be read as a calibration: {error.strerror}"
         ) from None
+
+
+def text_of(content: bytes, name: str) -> str:
+    """The content of a calibration file as text.
+
+    Raises
+    ------
+    ConversionError
+        If it is none.
+    """
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise ConversionError(f"{name}: is no text: expected a calibration") from None
 
 
 def parse_yaml(text: str, name: str) -> dict[str, Any]:

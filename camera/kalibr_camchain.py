@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 from camera.conversion_models import ForeignCamera, Model
@@ -13,6 +14,7 @@ from storage.messages import excerpt, one_line
 _MODELS: dict[str, Model] = {"radtan": "radtan", "equi": "fisheye", "equidistant": "fisheye"}
 _COEFFICIENTS = 4
 _LONGEST_LIST = 100
+_NAME = re.compile(r"cam\d+", re.ASCII)
 
 
 def parse_kalibr(text: str, name: str = "<text>", camera_name: str = "") -> ForeignCamera:
@@ -65,7 +67,7 @@ def parse_kalibr(text: str, name: str = "<text>", camera_name: str = "") -> Fore
 
 
 def format_kalibr(camera: ForeignCamera, camera_name: str = "cam0") -> str:
-    """The text of a camchain of one camera.
+    """The text of a camchain of one camera: ``cam0``, unless `camera_name` is such a name.
 
     Raises
     ------
@@ -77,7 +79,7 @@ def format_kalibr(camera: ForeignCamera, camera_name: str = "cam0") -> str:
     d = ", ".join(shortest(value) for value in camera.distortion[:_COEFFICIENTS])
     pinhole = ", ".join(shortest(v) for v in (camera.fx, camera.fy, camera.cx, camera.cy))
     lines = [
-        f"{camera_name or 'cam0'}:",
+        f"{camera_name if _NAME.fullmatch(camera_name) else 'cam0'}:",
         "  camera_model: pinhole",
         f"  intrinsics: [{pinhole}]",
         f"  distortion_model: {'equi' if camera.model == 'fisheye' else 'radtan'}",

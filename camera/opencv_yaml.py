@@ -32,8 +32,15 @@ def parse_opencv(text: str, name: str = "<text>") -> ForeignCamera:
         If it lacks something or cannot be read.
     """
     content = parse_yaml(text, name)
-    width = whole(first_of(content, ("image_width", "image_Width"), name), "image_width", name)
-    height = whole(first_of(content, ("image_height", "image_Height"), name), "image_height", name)
+    sides = []
+    for key, other in (("image_width", "image_Width"), ("image_height", "image_Height")):
+        if key not in content and other not in content:
+            # OpenCV itself does not ask for the size; its stereo sample writes none.
+            raise ConversionError(
+                f"{name}: lacks {key}: add the images' size, a line such as '{key}: 640'"
+            )
+        sides.append(whole(first_of(content, (key, other), name), key, name))
+    width, height = sides
     fx, fy, cx, cy = pinhole_matrix(first_of(content, _MATRIX, name), "camera_matrix", name)
     d = numbers(first_of(content, _DISTORTION, name), "distortion_coefficients", name)
     kind = content.get("fisheye_model", content.get("distortion_model", 0))

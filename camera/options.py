@@ -188,7 +188,8 @@ class Convert:
     limit_px : float
         Largest deviation that is accepted, pixels.
     camera_name : str
-        Which camera of a file that holds several, such as cam0 (Kalibr) or its number (COLMAP).
+        Which camera of a file that holds several, such as cam0 (Kalibr) or its number (COLMAP); the
+        target's camera is called so, too, where its format can have such a name.
     pose_from : Path
         A .cam file whose pose the .cam file gets; other formats have none, and without this it is
         the identity, until `camera floor` finds it.

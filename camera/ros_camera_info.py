@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 
 from camera.conversion_models import ForeignCamera, Model
@@ -20,6 +21,7 @@ _MODELS: dict[str, Model] = {name: model for model, name in ROS_NAMES.items()} |
     "fisheye": "fisheye"
 }
 _RATIONAL_PRINTED = 8
+_NAME = re.compile(r"[A-Za-z_]\w*", re.ASCII)
 
 
 def camera_from_message(
@@ -78,18 +80,18 @@ def parse_ros(text: str, name: str = "<text>") -> ForeignCamera:
         If it lacks something or cannot be read.
     """
     content = parse_yaml(text, name)
-    for key in ("roi", "binning_x", "binning_y"):
-        value = content.get(key)
-        part = value.get("width", 0) if isinstance(value, dict) else value
-        if isinstance(part, int) and part > (0 if key == "roi" else 1):
-            raise ConversionError(
-                f"{name}: {key} is set: only whole, unbinned images are converted"
-            )
+    width = whole(first_of(content, ("image_width", "width"), name), "image_width", name)
+    height = whole(first_of(content, ("image_height", "height"), name), "image_height", name)
+    for key in ("binning_x", "binning_y"):
+        binning = content.get(key)
+        if isinstance(binning, int) and binning > 1:
+            raise ConversionError(f"{name}: {key} is {binning}: only unbinned images are converted")
+    _demand_whole_image(content.get("roi"), width, height, name)
     matrix = first_of(content, ("camera_matrix", "k", "K"), name)
     coefficients = first_of(content, ("distortion_coefficients", "d", "D"), name)
     return camera_from_message(
-        whole(first_of(content, ("image_width", "width"), name), "image_width", name),
-        whole(first_of(content, ("image_height", "height"), name), "image_height", name),
+        width,
+        height,
         _word(content.get("distortion_model", "plumb_bob")),
         numbers(coefficients, "distortion_coefficients", name),
         numbers(matrix, "camera_matrix", name),
@@ -97,12 +99,27 @@ def parse_ros(text: str, name: str = "<text>") -> ForeignCamera:
     )
 
 
+def _demand_whole_image(roi: object, width: int, height: int, name: str) -> None:
+    """Refuse a region of interest other than none (all 0) or the whole image."""
+    if not isinstance(roi, dict):
+        return
+    found = tuple(roi.get(key, 0) for key in ("x_offset", "y_offset", "width", "height"))
+    if found not in ((0, 0, 0, 0), (0, 0, width, height)):
+        raise ConversionError(
+            f"{name}: roi is {excerpt(found)} (x_offset, y_offset, width, height): only whole "
+            f"images, here {width} x {height}, are converted"
+        )
+
+
 def _word(value: object) -> str:
     return value if isinstance(value, str) else excerpt(value)
 
 
 def format_ros(camera: ForeignCamera, camera_name: str = "camera") -> str:
-    """The text of a camera_info YAML file, as camera_calibration writes it."""
+    """The text of a camera_info YAML file, as camera_calibration writes it.
+
+    A name that is no word, such as a number, is left out for ``camera``.
+    """
     d = list(camera.distortion)
     if camera.model == "rational" and not any(d[_RATIONAL_PRINTED:]):
         d = d[:_RATIONAL_PRINTED]
@@ -112,7 +129,7 @@ def format_ros(camera: ForeignCamera, camera_name: str = "camera") -> str:
     lines = [
         f"image_width: {camera.width}",
         f"image_height: {camera.height}",
-        f"camera_name: {camera_name}",
+        f"camera_name: {camera_name if _NAME.fullmatch(camera_name) else 'camera'}",
         *_matrix("camera_matrix", 3, 3, matrix),
         f"distortion_model: {ROS_NAMES[camera.model]}",
         *_matrix("distortion_coefficients", 1, len(d), d),
