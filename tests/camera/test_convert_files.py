@@ -99,8 +99,8 @@ def test_a_region_that_is_the_whole_image_is_none() -> None:
     ("name", "text", "message"),
     [
         ("a.xml", "<?xml version='1.0'?>", "is XML: expected YAML"),
-        ("a.yml", "%YAML:1.0\n---\nM1: 3\n", "lacks image_width: add a line"),
-        ("a.yml", "%YAML:1.0\n---\nimage_Width: 3\n", "lacks image_height: add a line"),
+        ("a.yml", "%YAML:1.0\n---\nM1: 3\n", "lacks image_width: add the images' size"),
+        ("a.yml", "%YAML:1.0\n---\nimage_Width: 3\n", "lacks image_height: add the images' size"),
         ("a.yml", "intrinsics: [1, 1, 1, 1]\n", "cam0 with intrinsics"),
     ],
 )
