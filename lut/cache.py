@@ -34,7 +34,7 @@ from storage import write_whole
 #: Raised with every change of what tables hold or how they are computed.
 TABLE_VERSION = 7
 
-Table = TypeVar("Table", DiscTable, VerticalTable)
+Made = TypeVar("Made")
 
 _log = logging.getLogger("redetect")
 
@@ -77,13 +77,17 @@ def cached_disc_table(camera: Camera, shape: DiscShape, folder: Path | None = No
     """
     folder = cache_folder() if folder is None else folder
     path = folder / f"discs-{_key(camera, shape)}.table"
+    table: DiscTable | None = None
+    if (fields := _read(path)) is not None:
+        # Apart from what follows: whatever goes wrong here is not the file's fault.
+        floor_xy = floor_positions(camera).astype(np.float32)
 
-    def complete(**fields: Any) -> DiscTable:
-        table = DiscTable(**fields, floor_xy=floor_positions(camera).astype(np.float32))
-        check_disc_table(table, camera, shape)
-        return table
+        def complete() -> DiscTable:
+            table = DiscTable(**fields, floor_xy=floor_xy)
+            check_disc_table(table, camera, shape)
+            return table
 
-    table = _read(path, complete)
+        table = _sound(path, complete)
     if table is None:
         _log.info("computing the table of discs, once for this calibration")
         table = build_disc_table(camera, shape)
@@ -108,13 +112,15 @@ def cached_vertical_table(camera: Camera, folder: Path | None = None) -> Vertica
         Equal to that of `lut.build_vertical_table`.
     """
     path = (cache_folder() if folder is None else folder) / f"verticals-{_key(camera)}.table"
+    table: VerticalTable | None = None
+    if (fields := _read(path)) is not None:
 
-    def complete(**fields: Any) -> VerticalTable:
-        table = VerticalTable(**fields)
-        check_vertical_table(table, camera)
-        return table
+        def complete() -> VerticalTable:
+            table = VerticalTable(**fields)
+            check_vertical_table(table, camera)
+            return table
 
-    table = _read(path, complete)
+        table = _sound(path, complete)
     if table is None:
         _log.info("computing the table of verticals, once for this calibration")
         table = build_vertical_table(camera)
@@ -129,19 +135,28 @@ def _key(camera: Camera, shape: DiscShape | None = None) -> str:
     return hashlib.sha256(" ".join(parts).encode()).hexdigest()[:32]
 
 
-def _read(path: Path, make: Callable[..., Table]) -> Table | None:
-    """The table made of a file's fields; None if there is no file or it must not be used."""
+def _read(path: Path) -> dict[str, Any] | None:
+    """The fields that a file holds; None if there is no file or it must not be used."""
     content = _own_content(path)
     if content is None:
         return None
     digest, payload = content[:_DIGEST_BYTES], content[_DIGEST_BYTES:]
-    try:
+
+    def fields() -> dict[str, Any]:
         if _digest(path, payload) != digest:
             raise ValueError("damaged")
         with np.load(io.BytesIO(payload), allow_pickle=False) as arrays:
-            # Numbers were stored as arrays without dimensions.
-            fields = {name: arrays[name] for name in arrays.files}
-        return make(**{name: a if a.ndim else a.item() for name, a in fields.items()})
+            found = {name: arrays[name] for name in arrays.files}
+        # Numbers were stored as arrays without dimensions.
+        return {name: a if a.ndim else a.item() for name, a in found.items()}
+
+    return _sound(path, fields)
+
+
+def _sound(path: Path, make: Callable[[], Made]) -> Made | None:
+    """What is made of a file's content alone; None, and said, where that cannot be."""
+    try:
+        return make()
     except Exception:  # what a hostile archive raises is as manifold as its bytes
         _log.info("%s: is damaged: it is computed again", path)
         return None

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import errno
 import hashlib
 import io
 import logging
+import os
 import pickle
 import subprocess
 import sys
@@ -134,6 +136,24 @@ def test_every_camera_has_a_table_of_its_own(
     cached_disc_table(camera, SHAPE, tmp_path)
     assert_same(cached_disc_table(other, SHAPE, tmp_path), build_disc_table(other, SHAPE))
     assert computed == [SHAPE, SHAPE]
+
+
+def test_what_is_no_fault_of_the_file_is_not_called_damage(
+    tmp_path: Path,
+    camera: Camera,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """A kernel that cannot be kept, say: the disk is full."""
+    cached_disc_table(camera, SHAPE, tmp_path)
+
+    def full(_: Camera) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "kernel.nbc")
+
+    monkeypatch.setattr(lut.cache, "floor_positions", full)
+    with caplog.at_level(logging.INFO, logger="redetect"), pytest.raises(OSError, match="kernel"):
+        cached_disc_table(camera, SHAPE, tmp_path)
+    assert caplog.messages == []
 
 
 def test_another_version_of_the_tables_does_not_read_old_ones(
