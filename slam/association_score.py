@@ -75,12 +75,7 @@ def score_association(labels: IntArray, ids: Sequence[tuple[int, ...]]) -> Assoc
 
     listed = csr_array((np.ones(len(row)), (row, column)), shape=(count, len(names)))
     labelled = csr_array((np.ones(count), (np.arange(count), label)), shape=(count, found))
-    one_landmark = (listed @ listed.T) > 0
-    one_label = (labelled @ labelled.T) > 0
-    both = one_landmark.multiply(one_label)
-    of_landmark, of_label, right = (
-        (matrix.nnz - count) // 2 for matrix in (one_landmark, one_label, both)
-    )
+    of_landmark, of_label, right = _pairs(ids, known, label, found)
 
     # What each row counts as: the ID of its own that most rows of its label have.
     votes = np.asarray((labelled.T @ listed).todense()).reshape(found, len(names))
@@ -100,4 +95,42 @@ def score_association(labels: IntArray, ids: Sequence[tuple[int, ...]]) -> Assoc
         right_rows=float(cells[matched].sum() / count) if count else 1.0,
         wrong_merges=int(np.sum(np.count_nonzero(cells, axis=1) - 1)),
         splits=int(np.sum(np.maximum(np.count_nonzero(cells, axis=0) - 1, 0))),
+    )
+
+
+def _pairs(
+    ids: Sequence[tuple[int, ...]], known: list[int], label: IntArray, found: int
+) -> tuple[int, int, int]:
+    """Pairs of rows that show one landmark, that have one label, and both.
+
+    Rows with the same IDs are counted together: pairs of rows themselves are too many in long runs.
+    """
+    from scipy.sparse import csr_array
+
+    kinds: dict[frozenset[int], int] = {}
+    kind = np.array(
+        [kinds.setdefault(frozenset(ids[k]), len(kinds)) for k in known], dtype=np.int64
+    )
+    names = {name: k for k, name in enumerate(sorted({i for some in kinds for i in some}))}
+    row = np.array([n for n, some in enumerate(kinds) for _ in some], dtype=np.int64)
+    column = np.array([names[i] for some in kinds for i in some], dtype=np.int64)
+    listed = csr_array(
+        (np.ones(len(row), dtype=np.int64), (row, column)), shape=(len(kinds), len(names))
+    )
+    alike = ((listed @ listed.T) > 0).astype(np.int64)
+    cells = csr_array(
+        (np.ones(len(kind), dtype=np.int64), (kind, label)), shape=(len(kinds), found)
+    )
+    rows = np.bincount(kind, minlength=len(kinds))
+    of_label = np.bincount(label, minlength=found)
+    totals = (
+        int(rows @ (alike @ rows)),
+        int(of_label @ of_label),
+        int((alike @ cells).multiply(cells).sum()),
+    )
+    # Each pair was counted twice, and each row with itself.
+    return (
+        (totals[0] - len(known)) // 2,
+        (totals[1] - len(known)) // 2,
+        (totals[2] - len(known)) // 2,
     )

@@ -36,7 +36,7 @@ def graph_of_frames(frames: Sequence[Frame], name: str, solution: Path | None = 
     Parameters
     ----------
     frames : sequence of Frame
-        The run. Of a row with several identifiers the first counts.
+        The run. Of a row with several identifiers the first that is known counts.
     name : str
         What stands for its file in messages.
     solution : Path, optional

@@ -134,8 +134,7 @@ def triangulate(
     course = theta + bearing_rad
     ray = np.stack([np.sin(course), -np.cos(course)], axis=1)
     normal = np.stack([-ray[:, 1], ray[:, 0]], axis=1)
-    crossing = np.abs(ray[:, :1] * ray[None, :, 1] - ray[:, 1:] * ray[None, :, 0])
-    if np.max(crossing) < np.sin(least_parallax_rad):
+    if _widest_crossing(course) < least_parallax_rad:
         return None
     # Nearest point to all rays, then again with each ray's miss counted as an angle.
     distance = np.ones(len(ray))
@@ -149,3 +148,15 @@ def triangulate(
     if np.mean(ahead) <= 0.5 or np.median(miss) > MOST_MEDIAN_MISS:
         return None
     return np.asarray(xy)
+
+
+def _widest_crossing(course_rad: FloatArray) -> float:
+    """The largest angle under which two of (n,) directions cross as lines, 0 to a right angle."""
+    ordered = np.sort(course_rad % np.pi)
+    # Of each line, the one nearest to its perpendicular: the next or the last one around it.
+    after = np.searchsorted(ordered, (ordered + 0.5 * np.pi) % np.pi)
+    widest = 0.0
+    for place in (after, after - 1):
+        apart = np.abs(ordered[place % len(ordered)] - ordered)
+        widest = max(widest, float(np.max(np.minimum(apart, np.pi - apart))))
+    return widest

@@ -10,14 +10,18 @@ J.-M. Morel, "Meaningful alignments", International Journal of Computer Vision 4
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slam.errors import SlamError
 from storage.bounds import ABOVE_0, LIMIT, NOT_NEGATIVE, demand, whole
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -26,8 +30,8 @@ BoolArray = NDArray[np.bool_]
 # The area that a constellation covers: what is within this distance of one of its landmarks.
 _COVER_M = 0.6
 _GRID_M = 0.15
-# Stretches that share so many landmarks are one place already.
-_ATTACHED = 3
+#: Stretches that share so many landmarks are one place already.
+SHARED_BY_ONE_PLACE = 3
 
 
 @dataclass(frozen=True)
@@ -167,6 +171,28 @@ def stretches_of(
     return found
 
 
+def shared_landmarks(stretches: Sequence[Stretch]) -> csr_array:
+    """How many landmarks stretches have in common.
+
+    Parameters
+    ----------
+    stretches : sequence of S Stretch
+
+    Returns
+    -------
+    (S, S) sparse int64
+        Of each two; rows and columns as in the sequence.
+    """
+    from scipy.sparse import csr_array
+
+    sizes = np.array([len(s.labels) for s in stretches], dtype=np.int64)
+    labels = np.concatenate([np.zeros(0, dtype=np.int64), *(s.labels for s in stretches)])
+    starts = np.concatenate([[0], np.cumsum(sizes)])
+    shape = (len(sizes), int(labels.max(initial=-1)) + 1)
+    seen = csr_array((np.ones(len(labels), dtype=np.int64), labels, starts), shape=shape)
+    return csr_array(seen @ seen.T)
+
+
 def find_matches(
     stretches: list[Stretch], settings: LoopSettings, progress: Callable[[str], None] | None = None
 ) -> list[Match]:
@@ -194,14 +220,15 @@ def find_matches(
     tried = 0
     centres = np.array([s.xy.mean(axis=0) for s in stretches]).reshape(-1, 2)
     extents = np.array([np.linalg.norm(s.xy - s.xy.mean(axis=0), axis=1).max() for s in stretches])
+    together = shared_landmarks(stretches)
     for k, later in enumerate(stretches):
         if k % settings.later_step:
             continue
         if progress:
             progress(f"stretch {k + 1} of {len(stretches)}")
-        shared = [int(np.isin(s.labels, later.labels).sum()) for s in stretches[:k]]
+        shared = together[[k], :k].toarray()[0]
         gap = np.array([later.middle_frame - s.middle_frame for s in stretches[:k]], dtype=np.int64)
-        apart = (gap >= settings.stretch_frames) & (np.array(shared, dtype=np.int64) < _ATTACHED)
+        apart = (gap >= settings.stretch_frames) & (shared < SHARED_BY_ONE_PLACE)
         if settings.attached_frames and np.any(~apart & (gap >= settings.attached_frames)):
             continue
         near = np.linalg.norm(centres[:k] - centres[k], axis=1) < (

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.loops import Match, Stretch, mutual_pairs
+from slam.loops import SHARED_BY_ONE_PLACE, Match, Stretch, mutual_pairs, shared_landmarks
 from slam.motion import relative_pose, rotation
 
 FloatArray = NDArray[np.float64]
@@ -138,10 +138,10 @@ def pairs_in_place(stretches: Sequence[Stretch], reach_m: float) -> list[tuple[i
         Nearest first.
     """
     distances: dict[tuple[int, int], float] = {}
+    together = shared_landmarks(stretches)
     for k, later in enumerate(stretches):
-        for earlier in stretches[: k + 1]:
-            if len(np.intersect1d(earlier.labels, later.labels, assume_unique=True)) < 3:
-                continue
+        others = together[[k], :k].tocoo()
+        for earlier in (stretches[i] for i in others.col[others.data >= SHARED_BY_ONE_PLACE]):
             offset = np.abs(earlier.xy.mean(axis=0) - later.xy.mean(axis=0))
             if offset.max() > 40.0:
                 continue

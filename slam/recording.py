@@ -43,7 +43,8 @@ class CircleRows:
     covariance : (n, 2, 2) float64
         Of `xy` (m^2), positive definite.
     ids : (n,) int64
-        Identifiers; -1 where unknown. Of a row with several the first counts.
+        Identifiers; -1 where unknown, as are all below 0. Of a row with several the first that is
+        known counts.
     """
 
     frame: IntArray
@@ -287,7 +288,9 @@ def _circle_rows(frames: Sequence[Frame], name: str) -> CircleRows:
         frame=np.array([k for k, _ in rows], dtype=np.int64),
         xy=numbers[:, :2].copy(),
         covariance=covariance,
-        ids=np.array([r.ids[0] if r.ids else UNKNOWN_ID for _, r in rows], dtype=np.int64),
+        ids=np.array(
+            [next((i for i in r.ids if i >= 0), UNKNOWN_ID) for _, r in rows], dtype=np.int64
+        ),
     )
 
 
@@ -308,7 +311,7 @@ def _line_rows(frames: Sequence[Frame], name: str) -> LineRows:
         frame=np.array([k for k, _ in rows], dtype=np.int64),
         bearing_rad=np.array([r.alpha for _, r in rows], dtype=np.float64),
         sigma_rad=np.array([r.sigma for _, r in rows], dtype=np.float64),
-        ids=tuple(tuple(i for i in r.ids if i != UNKNOWN_ID) for _, r in rows),
+        ids=tuple(tuple(i for i in r.ids if i >= 0) for _, r in rows),
     )
 
 

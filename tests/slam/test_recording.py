@@ -40,6 +40,18 @@ def test_rows_of_both_files_become_arrays(tmp_path: Path) -> None:
     assert recording.lines.ids == ((4, 7),)
 
 
+@pytest.mark.parametrize(
+    ("listed", "expected"), [("-1", -1), ("-2", -1), ("-1 5", 5), ("-7 5 6", 5), ("0", 0)]
+)
+def test_all_ids_below_0_are_unknown(tmp_path: Path, listed: str, expected: int) -> None:
+    """An estimator must not take all rows of -2 for sights of one disc."""
+    disc = write(tmp_path / "x.circles", STEP.format(k=0) + DISC.format(id=listed))
+    assert read_recording(disc).circles.ids.tolist() == [expected]
+    line = write(tmp_path / "x.lines", STEP.format(k=0) + LINE.replace("4 7", f"{listed} -3 8"))
+    known = tuple(int(word) for word in f"{listed} 8".split() if int(word) >= 0)
+    assert read_recording(line).lines.ids == (known,)
+
+
 def test_a_landmark_before_any_step_is_refused(tmp_path: Path) -> None:
     path = write(tmp_path / "x.circles", DISC.format(id=1) + STEP.format(k=0))
     with pytest.raises(LandmarkFileError, match=r"x\.circles:1: landmark before any STEP"):
