@@ -23,7 +23,7 @@ _WORTH = 4.0
 # board's points are found a little wrong, always in the same way, that can look like decentering.
 _TANGENTIAL_WORTH = 20.0
 _TANGENTIAL_SIGNIFICANCE = 50.0
-# The polynomial instead of the rational function, by so many.
+# The polynomial instead of a rational function of as few coefficients, by so many.
 _POLYNOMIAL_WORTH = 20.0
 
 
@@ -56,7 +56,9 @@ def choose_lens(
     The fewest radial coefficients whose hold-out error is not worse than the best. Tangential terms
     if they lower it, beside those, by more than they would by chance, and are significant; then the
     radial ones are chosen anew. The polynomial instead of the rational function if, beside the same
-    tangential terms, it lowers the error by more than it would by chance.
+    tangential terms, it needs fewer coefficients for an error that is not worse, or lowers the
+    error by more than it would by chance; what it has then not been asked yet is whether it needs
+    tangential terms.
 
     Parameters
     ----------
@@ -73,15 +75,18 @@ def choose_lens(
         The chosen one, and all that were tried.
     """
     chosen, tried = _chosen_of_a_kind(start, points, settings, radius_m)
-    free = settings.polynomial is None and settings.coefficients is None
-    # One coefficient, a3, is k1; where it is enough no polynomial is better.
-    if not free or chosen.coefficients < 2:
+    if settings.polynomial is not None or settings.coefficients is not None:
         return chosen, tried
-    others = [FreeLens(0, chosen.tangential, count) for count in (2, 3)]
+    counts = (2, 3)  # one coefficient, a3, is k1
+    others = [FreeLens(0, chosen.tangential, count) for count in counts]
     polynomials = _tried(start, points, settings, radius_m, others)
     other = _fewest_needed(polynomials)
-    if _is_lower(polynomials[other], tried[chosen], _POLYNOMIAL_WORTH):
+    # Coefficients that the pictures do not need make the projection unsure where nothing was seen.
+    worth = -_WORTH if other.polynomial < chosen.coefficients else _POLYNOMIAL_WORTH
+    if _is_lower(polynomials[other], tried[chosen], worth):
         chosen = other
+        if not chosen.tangential:
+            chosen, polynomials = _with_tangential(start, points, settings, radius_m, polynomials)
     return chosen, tried | polynomials
 
 
@@ -90,21 +95,31 @@ def _chosen_of_a_kind(
 ) -> tuple[FreeLens, Candidates]:
     """`choose_lens` among rational functions, or polynomials."""
     counts = range(settings.most + 1) if settings.coefficients is None else [settings.most]
-    radial = [settings.lens(count) for count in counts]
-    decentred = [settings.lens(count, tangential=True) for count in counts]
     if settings.tangential is True:
+        decentred = [settings.lens(count, tangential=True) for count in counts]
         tried = _tried(start, points, settings, radius_m, decentred)
         return _fewest_needed(tried), tried
-    tried = _tried(start, points, settings, radius_m, radial)
-    chosen = _fewest_needed(tried)
+    tried = _tried(start, points, settings, radius_m, [settings.lens(count) for count in counts])
+    return _with_tangential(start, points, settings, radius_m, tried)
+
+
+def _with_tangential(
+    start: Estimate,
+    points: Points,
+    settings: CalibrationSettings,
+    radius_m: float,
+    radial: Candidates,
+) -> tuple[FreeLens, Candidates]:
+    """Choose among radial lenses, and tangential terms where they are worth it."""
+    chosen = _fewest_needed(radial)
     if settings.tangential is False:
-        return chosen, tried
+        return chosen, radial
     beside = chosen._replace(tangential=True)
-    estimate = tried[chosen].adjusted.estimate
-    tried |= _tried(estimate, points, settings, radius_m, [beside])
+    estimate = radial[chosen].adjusted.estimate
+    tried = radial | _tried(estimate, points, settings, radius_m, [beside])
     if not _is_worth_it(tried[chosen], tried[beside]):
         return chosen, tried
-    others = [lens for lens in decentred if lens != beside]
+    others = [lens._replace(tangential=True) for lens in radial if lens != chosen]
     more = {beside: tried[beside]} | _tried(start, points, settings, radius_m, others)
     return _fewest_needed(more), tried | more
 

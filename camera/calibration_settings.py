@@ -61,7 +61,7 @@ class CalibrationSettings:
         smaller and they are more than noise.
     polynomial : bool or None
         Whether the radial distortion is the polynomial k1, k2, k3, not the rational one; None: if
-        that makes the hold-out error much smaller.
+        that needs fewer coefficients, or makes the hold-out error much smaller.
     robust : bool
         Huber's loss; points found wrongly pull less.
     keep_outliers : bool

@@ -57,8 +57,8 @@ class Calibrate:
         if they make that error smaller and are more than noise.
     polynomial : str
         Whether the radial distortion is OpenCV's polynomial k1 k2 k3 instead of the rational
-        function: `on` (then --coefficients are 0 to 3), `off`, or `auto`: if that makes the error
-        in pictures that were held out much smaller.
+        function: `on` (then --coefficients are 0 to 3), `off`, or `auto`: if fewer coefficients do
+        as well then in pictures that were held out, or their error is much smaller.
     keep_outliers : bool
         Keep pictures whose residuals are far above the others'.
     every : int
