@@ -26,6 +26,10 @@ from storage import OutputExistsError, write_whole
 MAP_NAME, PATH_NAME, TABLE_NAME, PICTURE_NAME = "map.csv", "path.csv", "table.json", "map.png"
 
 
+#: The joint covariance of more landmarks than this is not written: it would be gigabytes.
+MOST_LANDMARKS_TOGETHER = 5000
+
+
 def perform(command: Map) -> int:
     """Carry the command out; 0 if all went well."""
     _check(command)
@@ -61,13 +65,23 @@ def perform(command: Map) -> int:
     final = landmark_map(mapped.graph, mapped.estimate, mapped.covariance)
     path = path_of(recording, mapped.estimate, mapped.covariance)
     write_map(output / MAP_NAME, final, head, overwrite=command.force)
-    joint = joint_covariance(mapped.graph, mapped.estimate, weighting)
-    write_joint_covariance(output / MAP_NAME, joint, overwrite=command.force)
+    few = len(final.discs) + len(final.lines) <= MOST_LANDMARKS_TOGETHER
+    if few:
+        joint = joint_covariance(mapped.graph, mapped.estimate, weighting)
+        write_joint_covariance(output / MAP_NAME, joint, overwrite=command.force)
+    else:
+        # One of another map must not stay beside this one.
+        (output / joint_name).unlink(missing_ok=True)
     write_path(output / PATH_NAME, path, head, overwrite=command.force)
     with write_whole(output / TABLE_NAME, overwrite=command.force) as stream:
         stream.write((json.dumps(_results(mapped, command), indent=1) + "\n").encode())
     for line in _report(mapped, seconds):
         print(line)
+    if not few:
+        print(
+            f"more than {MOST_LANDMARKS_TOGETHER} landmarks: no {joint_name}, so that `slam "
+            "localize` takes their errors to be independent"
+        )
     _draw(mapped, final, path, recording, output, command)
     print(f"{output}: {MAP_NAME}, {PATH_NAME}, {TABLE_NAME}, {PICTURE_NAME}")
     return 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -285,8 +286,10 @@ def test_damaged_files_are_read_or_refused(
 def test_identifiers_that_have_no_vertex_are_refused(tmp_path: Path) -> None:
     frames = list(read_frames(DEMO))[:1]
     for number in (-5, 2**31 - 10):
-        disc = CircleLandmark(1.0, -2.0, 0.5, 0.003, 0.0, 0.007, (number,))
+        disc = CircleLandmark(1.0, -2.0, 0.5, 0.003, 0.0, 0.007, (7,))
         graph = graph_of_frames([Frame(frames[0].step, (disc,))], "a")
+        ids = np.array([number])
+        graph = replace(graph, disc_ids=ids, circles=replace(graph.circles, ids=ids))
         with pytest.raises(SlamError, match=f"disc {number}: expected an identifier of 0 to"):
             write_g2o(tmp_path / "a.g2o", graph)
     assert not (tmp_path / "a.g2o").exists()

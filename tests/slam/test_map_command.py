@@ -53,6 +53,20 @@ def test_landmarks_stand_where_they_truly_are(demo_run: Path, both_kinds: Path) 
     assert np.all(np.linalg.eigvalsh(path.covariance[1:])[:, 0] > 0.0)
 
 
+def test_the_joint_covariance_of_too_many_landmarks_is_not_written(
+    demo_run: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    output = demo_run.parent / "many"
+    assert main(["map", str(demo_run), "-o", str(output)]) == 0
+    assert (output / "map_covariance.npy").is_file()
+    monkeypatch.setattr("slam.map_command.MOST_LANDMARKS_TOGETHER", 30)
+    assert main(["map", str(demo_run), "-o", str(output), "--force"]) == 0
+    assert "more than 30 landmarks: no map_covariance.npy" in capsys.readouterr().out
+    assert not (output / "map_covariance.npy").exists()
+    found = [str(demo_run), "--map", str(output / "map.csv"), "-o", str(demo_run.parent / "loc")]
+    assert main(["localize", *found]) == 0
+
+
 def test_table_says_what_was_done(both_kinds: Path) -> None:
     results = json.loads((both_kinds / "table.json").read_text(encoding="utf-8"))
     table = results["table"]
