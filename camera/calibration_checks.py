@@ -16,6 +16,9 @@ FEWEST_VIEWS = 3
 # Below this the focal length hangs on the perspective of single views alone.
 _SMALLEST_SPREAD_DEG = 3.0
 _LARGEST_SCALE_SIGMA = 0.03
+# Points are found to some tenths of a pixel; in large images, which are softer, less well.
+_LARGEST_RMS_PX = 1.0
+_LARGEST_RMS_WIDTHS = 1.0 / 2000.0
 
 
 def demand_enough(count: int, without: str = "") -> None:
@@ -45,6 +48,12 @@ def demand_different_views(fit: Adjusted, spread_deg: float) -> None:
 def warnings_of(fit: Adjusted, points: Points, spread_deg: float) -> list[str]:
     """What would make a calibration firmer."""
     warnings = []
+    if fit.rms_px > max(_LARGEST_RMS_PX, _LARGEST_RMS_WIDTHS * points.width):
+        warnings.append(
+            f"an RMS residual of {fit.rms_px:.2f} px says that the points are not explained: is the "
+            "board flat, are --board, --columns and --rows right, and does the lens see less than "
+            "90 deg off its axis in the image's corners?"
+        )
     views = len(points.starts)
     if views < 10:
         warnings.append(f"only {views} pictures: 15 to 40 make the result firmer")

@@ -16,7 +16,7 @@ from camera.calibration import (
     points_of,
 )
 from camera.calibration_adjustment import Estimate, Points, adjust, project_estimate
-from camera.calibration_checks import coverage_warnings
+from camera.calibration_checks import coverage_warnings, warnings_of
 from camera.calibration_fit import circle_shifts
 from camera.calibration_model import (
     COUNT,
@@ -351,6 +351,17 @@ def test_what_of_the_image_was_not_covered_is_told(published_camera: Camera) -> 
     assert "bottom left" in told
     assert "top right" in told
     assert "top left" not in told
+
+
+def test_residuals_that_no_board_leaves_are_told(published_camera: Camera) -> None:
+    """A fisheye lens that sees more than the model can is fitted as well as it can be."""
+    R, t = board_poses(published_camera, BOARD, 1, 8, distances_m=DISTANCES_M)[0]
+    truth = Estimate(intrinsics_of(published_camera), R[None], t[None])
+    points = points_of(seen_views(published_camera, 1, 0.1, seed=8), BOARD, (768, 288))
+    fit = adjust(truth, points, np.zeros((COUNT, 0)))
+    for times, told in ((1.0, False), (20.0, True)):
+        worse = replace(fit, residuals=times * fit.residuals)
+        assert any("not explained" in text for text in warnings_of(worse, points, 40.0)) == told
 
 
 @pytest.mark.parametrize(
