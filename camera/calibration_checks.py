@@ -50,9 +50,9 @@ def warnings_of(fit: Adjusted, points: Points, spread_deg: float) -> list[str]:
     warnings = []
     if fit.rms_px > max(_LARGEST_RMS_PX, _LARGEST_RMS_WIDTHS * points.width):
         warnings.append(
-            f"an RMS residual of {fit.rms_px:.2f} px says that the points are not explained: is the "
-            "board flat, are --board, --columns and --rows right, and does the lens see less than "
-            "90 deg off its axis in the image's corners?"
+            f"an RMS residual of {fit.rms_px:.2f} px says that the points are not explained: is "
+            "the board flat, are --board, --columns and --rows right, and does the lens see less "
+            "than 90 deg off its axis in the image's corners?"
         )
     views = len(points.starts)
     if views < 10:
