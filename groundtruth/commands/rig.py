@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -136,11 +137,21 @@ def _markers(
             number, metres = int(marker), float(width)
         except ValueError:
             number, metres = -1, float("nan")
-        if number < 0 or not metres > 0.0:
+        if number < 0 or not (np.isfinite(metres) and metres > 0.0):
             raise GroundTruthError(f"widths: {word!r}: expected a marker and metres, as 31=0.15")
         if number in widths:
             widths[number] = metres
+        else:
+            print(
+                f"warning: widths: marker {number} is not among those found ({_listed(ids)}): its "
+                "width counts for none",
+                file=sys.stderr,
+            )
     return dictionary, widths
+
+
+def _listed(ids: Sequence[int], most: int = 10) -> str:
+    return ", ".join(map(str, ids[:most])) + (", ..." if len(ids) > most else "")
 
 
 def _views_of(estimate: RigEstimate, index: int) -> list[int]:

@@ -214,9 +214,10 @@ def test_a_rig_from_a_session(tmp_path: Path, capsys: Captured) -> None:
     together = [
         "rig", *runs, *options, "--force", "--network", str(session / "network.json"),
         "--reference-poses", str(reference), "--ids", *map(str, rig.ids[:4]),
-        "--widths", "31=0.24",
+        "--widths", "31=0.24", "13=0.24",
     ]  # fmt: skip
     assert main(together) == 0
+    assert "widths: marker 13 is not among those found" in capsys.readouterr().err
     found = read_rig(output)
     assert found.ids == rig.ids[:4]
     error = log_se3(inverse(rig.robot_from_marker[:4]) @ found.robot_from_marker)
@@ -228,6 +229,7 @@ def test_a_rig_from_a_session(tmp_path: Path, capsys: Captured) -> None:
     [
         (["--width-m", "0"], "width_m is 0"),
         (["--width-m", "0.2", "--widths", "31:0.2"], "'31:0.2': expected a marker and metres"),
+        (["--width-m", "0.2", "--widths", "31=inf"], "'31=inf': expected a marker and metres"),
         (["--width-m", "0.2", "--ids", "99"], "no markers of the dictionary"),
         (["--width-m", "0.2", "--dictionary", "aruco"], "no markers of the dictionary aruco"),
         (["--width-m", "0.2", "--reference-poses", "x.csv"], "needs --network"),
