@@ -37,9 +37,13 @@ def perform(options: Fuse) -> int:
     if options.clock is not None:
         times = read_clock(options.clock).groundtruth_times(odometry.times_s)
         odometry = PlanarPoses(times, odometry.poses)
-    fusion = fuse(
-        odometry, {name: read_planar_poses(path) for name, path in files.items()}, settings
-    )
+    streams = {name: read_planar_poses(path) for name, path in files.items()}
+    for name, stream in streams.items():
+        if stream.covariances is None:
+            raise GroundTruthError(
+                f"{files[name]}: no covariances: expected t, x, y, theta and 9 more, as of {name}"
+            )
+    fusion = fuse(odometry, streams, settings)
     document = {
         **provenance(
             settings,

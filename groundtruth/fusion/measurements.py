@@ -53,7 +53,7 @@ def gather(
         again = inside & _repeats(stream, stream.covariances)
         repeated[name] = int(np.count_nonzero(again))
         inside &= ~again
-        usable, repaired[name] = _usable(name, stream.covariances[inside])
+        usable, repaired[name] = _usable(name, stream.covariances, np.flatnonzero(inside))
         scale = (settings.covariance_scale or {}).get(name, 1.0)
         names += [name] * int(np.count_nonzero(inside))
         times.append(stream.times_s[inside])
@@ -83,17 +83,17 @@ def _repeats(stream: PlanarPoses, covariances: FloatArray) -> NDArray[np.bool_]:
     return np.concatenate([np.zeros(min(len(rows), 1), dtype=np.bool_), same])
 
 
-def _usable(name: str, covariances: FloatArray) -> tuple[FloatArray, int]:
-    """Covariances made symmetric, and raised where a file's rounding made them singular."""
-    symmetric = 0.5 * (covariances + np.swapaxes(covariances, 1, 2))
+def _usable(name: str, covariances: FloatArray, rows: NDArray[np.int64]) -> tuple[FloatArray, int]:
+    """Covariances of rows made symmetric, and raised where rounding made them singular."""
+    symmetric = 0.5 * (covariances[rows] + np.swapaxes(covariances[rows], 1, 2))
     smallest = np.linalg.eigvalsh(symmetric)[:, 0]
     worst = float(smallest.min(initial=0.0))
     # Three entries of a row may each be off by the rounding.
     if worst < -3.0 * RAWSEEDS_ROUNDING:
         at = int(np.argmin(smallest))
         raise GroundTruthError(
-            f"{name}: pose {at + 1} has a covariance with eigenvalue {worst:.3g}: expected none "
-            "below what rounding to six decimals makes of 0"
+            f"{name}: pose {rows[at] + 1} has a covariance with eigenvalue {worst:.3g}: expected "
+            "none below what rounding to six decimals makes of 0"
         )
     weak = smallest <= RAWSEEDS_ROUNDING * 0.1
     symmetric[weak] += np.eye(3) * (

@@ -226,6 +226,10 @@ def test_a_covariance_that_no_rounding_explains_is_refused() -> None:
     laser.covariances[3] = -np.eye(3)
     with pytest.raises(GroundTruthError, match="laser: pose 4 has a covariance with eigenvalue -1"):
         fuse(odometry, {"laser": laser})
+    # It is counted in its own stream, wherever odometry begins.
+    late = PlanarPoses(odometry.times_s[10:], odometry.poses[10:])
+    with pytest.raises(GroundTruthError, match="laser: pose 4 has"):
+        fuse(late, {"laser": laser})
 
 
 def test_what_cannot_be_fused_is_refused() -> None:
