@@ -85,11 +85,6 @@ def test_from_pictures_to_a_placed_camera(
     assert len(report["views"]) >= 12
     for name in ("residuals", "views", "coverage"):
         assert cv2.imread(str(tmp_path / f"my.{name}.png")) is not None
-    before = output.read_bytes()
-    assert main(command) == 1
-    assert "--force" in capsys.readouterr().err
-    assert main([*command, "--force"]) == 0
-    assert output.read_bytes() == before
     # The same from known places: a table instead of a picture.
     places = on_floor(BOARD.points, (0.03, -0.75), math.pi)
     rows = [
@@ -124,13 +119,21 @@ def test_a_video_gives_what_its_frames_give(
     found = read_camera(output)
     # The video's compression costs some of the points' accuracy.
     assert projection_difference(rays.camera, found).max() < 1.0
+    # The same bytes again, and not unasked.
+    again = ["calibrate", str(path), *FLAGS, "--every", "2", "--coefficients", "1"]
+    assert main([*again, "-o", str(tmp_path / "first.cam")]) == 0
+    capsys.readouterr()
+    assert main([*again, "-o", str(output)]) == 1
+    assert "--force" in capsys.readouterr().err
+    assert main([*again, "-o", str(output), "--force"]) == 0
+    assert output.read_bytes() == (tmp_path / "first.cam").read_bytes()
 
 
 @pytest.mark.long
 def test_rendered_boards_through_the_published_camera(published_camera: Camera) -> None:
     board, distances = BOARDS["checkerboard"]
-    made = calibrate_rendered(published_camera, board, distances, views=24, seed=7)
-    assert made.found == 24
+    made = calibrate_rendered(published_camera, board, distances, views=14, seed=7)
+    assert made.found == 14
     # At the points' own noise, less what the fit takes up.
     assert made.calibration.adjusted.rms_px < 1.02 * made.floor_px
     assert projection_difference(published_camera, made.camera).max() < 0.1
@@ -175,7 +178,7 @@ def test_pose_on_the_floor_and_its_covariance(published_camera: Camera) -> None:
     still = place_on_floor(published_camera, exact, floor_xy)
     np.testing.assert_allclose(still.robot_from_camera[:, 3], published_camera.centre, atol=1e-3)
     nees = []
-    for _ in range(150):
+    for _ in range(60):
         noisy = exact + rng.normal(scale=0.2, size=exact.shape)
         found = place_on_floor(published_camera, noisy, floor_xy)
         turn = found.robot_from_camera[:, :3] @ still.robot_from_camera[:, :3].T
@@ -187,6 +190,7 @@ def test_pose_on_the_floor_and_its_covariance(published_camera: Camera) -> None:
         # The scale is found from 50 residuals, so compare at the true one.
         covariance = found.covariance * (0.2 / found.sigma_px) ** 2
         nees.append(error @ np.linalg.solve(covariance, error))
+    # 60 trials know the mean to 7 %.
     assert np.mean(nees) == pytest.approx(6.0, rel=0.2)
 
 

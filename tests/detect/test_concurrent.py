@@ -20,8 +20,8 @@ from tools.soak.long_run import link_run
 from tools.soak.short_runs import repeat_short_runs
 
 PATIENCE_S = 400.0
-FRAMES = 40
-LONG_FRAMES = 200
+FRAMES = 16
+LONG_FRAMES = 80
 
 pytestmark = [
     pytest.mark.long,
@@ -187,6 +187,6 @@ def test_cold_kernels_compiled_by_two_at_once(run_folder: Path, tmp_path: Path) 
 
 @pytest.mark.skipif(not Path("/dev/shm").is_dir(), reason="looks for shared memory in /dev/shm")
 def test_short_runs_leave_nothing_behind(project_root: Path, tmp_path: Path) -> None:
-    left = repeat_short_runs(project_root / "images" / "e", tmp_path, 8, 2)
+    left = repeat_short_runs(project_root / "images" / "e", tmp_path, 4, 2)
     assert left.unmet() == []
-    assert left.runs == 8
+    assert left.runs == 4
