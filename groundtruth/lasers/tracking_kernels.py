@@ -178,7 +178,7 @@ def refine_outline(
     -------
     pose : (3,)
     covariance : (3, 3)
-        Of (x, y, theta), from the readings alone.
+        Of (x, y, theta), from the readings alone, but for open directions, which have the prior's.
     calibration : (3, 3 scanners)
         Derivatives of the pose by the scanners' poses.
     summary : (4,)
