@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from groundtruth.errors import GroundTruthError
 from groundtruth.fusion.controls import pauses_of
 from groundtruth.fusion.learning import likeliest_noise, looser_over_seconds, noise_of
 from groundtruth.fusion.movement import movement_problem
@@ -132,17 +133,23 @@ def fuse(
     Raises
     ------
     GroundTruthError
-        If there is no measurement within the odometry's time, a stream has no covariances, or one
-        of them cannot be repaired.
+        If there is no measurement within the odometry's time, or no sample of odometry between the
+        first measurement and the last; if a stream has no covariances, or one of them cannot be
+        repaired.
     """
     chosen = settings or FuseSettings()
     problem = movement_problem(odometry, streams, chosen)
+    first, last = problem.times_s[0], problem.times_s[-1]
+    inside = odometry.times_s[(odometry.times_s >= first) & (odometry.times_s <= last)]
+    if not len(inside):
+        raise GroundTruthError(
+            f"no sample of odometry from the first measured pose ({first:.3f} s) to the last "
+            f"({last:.3f} s): expected some, which are the times of the result"
+        )
     noise = likeliest_noise(problem) if chosen.learn_noise else noise_of(chosen)
     looser = looser_over_seconds(problem, noise) if chosen.learn_noise else 1.0
     smoothed, spread, account = problem.smooth(noise, looser)
 
-    first, last = problem.times_s[0], problem.times_s[-1]
-    inside = odometry.times_s[(odometry.times_s >= first) & (odometry.times_s <= last)]
     at = np.searchsorted(problem.times_s, inside)
     poses = smoothed[at, :3]
     poses[:, 2] = wrap_angle(poses[:, 2])

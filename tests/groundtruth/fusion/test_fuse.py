@@ -240,6 +240,10 @@ def test_what_cannot_be_fused_is_refused() -> None:
     late = measure(rng, truth, np.arange(0.0, 4.0, 0.1), LASER_COVARIANCE)
     with pytest.raises(GroundTruthError, match="no measured pose within the odometry's time"):
         fuse(odometry, {"laser": PlanarPoses(late.times_s + 99, late.poses, late.covariances)})
+    assert late.covariances is not None
+    between = PlanarPoses(late.times_s[:1] + 1.003, late.poses[:1], late.covariances[:1])
+    with pytest.raises(GroundTruthError, match=r"no sample of odometry from .*\(1\.003 s\)"):
+        fuse(odometry, {"laser": between})
     with pytest.raises(GroundTruthError, match="gate_probability is 1"):
         FuseSettings(gate_probability=1.0)
     with pytest.raises(GroundTruthError, match="turn_sigma is -1"):
