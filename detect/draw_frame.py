@@ -20,7 +20,7 @@ from detect.compare_lines import joined_lines, pair_lines
 from detect.compare_lines_result import LineCompareOptions
 from detect.compare_result import CompareOptions
 from detect.draw_inputs import SeenRows
-from detect.draw_strokes import Colour, draw_curve, draw_text
+from detect.draw_strokes import Colour, draw_curve, draw_text, enlargement
 from detect.drawing import EDGE_COLOUR, circle_on_floor, outline_disc
 from detect.settings import CircleSettings
 from detect.tilt import level_rotation
@@ -92,8 +92,10 @@ def draw_rows(
     if rows.tilt is not None:
         pitch, roll = np.degrees([rows.tilt.pitch, rows.tilt.roll])
         words.append(f"pitch {pitch:.2f} roll {roll:.2f} deg")
-    legend = np.zeros((_LEGEND_PX, image.shape[1], 3), np.uint8)
-    draw_text(legend, "   ".join(words), (4, _LEGEND_PX - 5), _WORDS_COLOUR, 0.38)
+    times = enlargement(canvas)
+    legend = np.zeros((_LEGEND_PX * times, image.shape[1], 3), np.uint8)
+    at = (4 * times, (_LEGEND_PX - 5) * times)
+    draw_text(legend, "   ".join(words), at, _WORDS_COLOUR, 0.38)
     return np.concatenate([canvas, legend])
 
 
@@ -238,13 +240,15 @@ def _draw_lines(
         words += _fate(len(pairs.second_alone), len(missed))
     ends = ends_of(found)
     bars = sigma_bars(camera, ends, np.array([row.sigma for row in found], dtype=np.float64))
+    times = enlargement(canvas)
+    tick = times * np.array([[0.0, -2.0], [0.0, 2.0]])
     for curve, bar, colour, text in zip(line_curves(camera, ends), bars, colours, texts):
         draw_curve(canvas, curve, colour)
         draw_curve(canvas, bar, _SIGMA_COLOUR)
         for end in bar:
-            draw_curve(canvas, end + np.array([[0.0, -2.0], [0.0, 2.0]]), _SIGMA_COLOUR)
+            draw_curve(canvas, end + tick, _SIGMA_COLOUR)
         if text and np.all(np.isfinite(curve[-1])):
-            at = (round(float(curve[-1, 0])) - 8, round(float(curve[-1, 1])) + 9)
+            at = (round(float(curve[-1, 0])) - 8 * times, round(float(curve[-1, 1])) + 9 * times)
             draw_text(canvas, text, at, _SIGMA_COLOUR, 0.3)
     return words
 

@@ -11,6 +11,13 @@ Colour = tuple[int, int, int]
 _SUBPIXEL_BITS = 4
 # OpenCV's fixed-point coordinates are 32 bits; far beyond any picture, less is as good.
 _FARTHEST_PX = 1e6
+# Pictures of so many columns are drawn into by strokes of one pixel; those of telephones have more.
+_COLUMNS = 1500
+
+
+def enlargement(canvas: NDArray[np.uint8]) -> int:
+    """How many times as wide strokes and words are, to be seen when the picture is shown whole."""
+    return max(1, round(int(canvas.shape[1]) / _COLUMNS))
 
 
 def draw_curve(
@@ -21,7 +28,8 @@ def draw_curve(
 
     if np.all(np.abs(points) < _FARTHEST_PX):
         fixed = np.rint(points * (1 << _SUBPIXEL_BITS)).astype(np.int32)
-        cv2.polylines(canvas, [fixed], closed, colour, 1, cv2.LINE_AA, _SUBPIXEL_BITS)
+        width = enlargement(canvas)
+        cv2.polylines(canvas, [fixed], closed, colour, width, cv2.LINE_AA, _SUBPIXEL_BITS)
 
 
 def draw_text(
@@ -31,4 +39,6 @@ def draw_text(
     import cv2
 
     plain = text.encode("ascii", "replace").decode()
-    cv2.putText(canvas, plain, at, cv2.FONT_HERSHEY_SIMPLEX, size, colour, 1, cv2.LINE_AA)
+    times = enlargement(canvas)
+    font = cv2.FONT_HERSHEY_SIMPLEX
+    cv2.putText(canvas, plain, at, font, times * size, colour, times, cv2.LINE_AA)

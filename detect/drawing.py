@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera
-from detect.draw_strokes import Colour, draw_curve, draw_text
+from detect.draw_strokes import Colour, draw_curve, draw_text, enlargement
 from detect.settings import CircleSettings
 
 if TYPE_CHECKING:
@@ -87,7 +87,9 @@ def outline_disc(
         draw_curve(canvas, project(circle_on_floor(centre_xy, radius)), colour, closed=True)
     u, v = project(centre_xy + np.array([0.0, -settings.outer_radius_m]))
     if np.isfinite(u) and np.isfinite(v):
-        draw_text(canvas, text, (round(float(u)) - 14, max(10, round(float(v)) - 3)), _TEXT_COLOUR)
+        times = enlargement(canvas)
+        at = (round(float(u)) - 14 * times, max(10 * times, round(float(v)) - 3 * times))
+        draw_text(canvas, text, at, _TEXT_COLOUR)
 
 
 def circle_on_floor(centre_xy: FloatArray, radius_m: float) -> FloatArray:

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera
-from detect.draw_strokes import Colour, draw_curve
+from detect.draw_strokes import Colour, draw_curve, draw_text, enlargement
 from detect.line_tracks import LineTracks
 from detect.lines import ACCEPTED, JOINED, LineDetections
 from lut.verticals import VerticalTable
@@ -56,9 +56,9 @@ def draw_lines(
     (H, W, 3) uint8
         In OpenCV's order blue, green, red.
     """
-    import cv2
-
     canvas = np.repeat(image[:, :, None], 3, axis=2)
+    times = enlargement(canvas)
+    tick = times * np.array([[0.0, -2.0], [0.0, 2.0]])
     share = np.linspace(0.0, 1.0, _POINTS)[:, None]
     for ends, sigma, members in zip(found.ends, found.sigma_rad, found.members):
         points = camera.distort((1.0 - share) * ends[:2] + share * ends[2:])
@@ -68,16 +68,13 @@ def draw_lines(
         bar = np.array([[u - reach, v], [u + reach, v]])
         draw_curve(canvas, bar, _SIGMA_COLOUR)
         for end in bar:
-            draw_curve(canvas, end + np.array([[0.0, -2.0], [0.0, 2.0]]), _SIGMA_COLOUR)
+            draw_curve(canvas, end + tick, _SIGMA_COLOUR)
     if found.tilt is None:
         text = "no tilt"
     else:
         pitch, roll = np.degrees([found.tilt.pitch_rad, found.tilt.roll_rad])
         text = f"pitch {pitch:.2f}  roll {roll:.2f} deg  ({found.tilt.lines} lines)"
-    cv2.putText(
-        canvas, text, (4, image.shape[0] - 5), cv2.FONT_HERSHEY_SIMPLEX, 0.4, _SIGMA_COLOUR, 1,
-        cv2.LINE_AA,
-    )  # fmt: skip
+    draw_text(canvas, text, (4 * times, image.shape[0] - 5 * times), _SIGMA_COLOUR, 0.4)
     return canvas
 
 

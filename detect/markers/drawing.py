@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from detect.draw_strokes import Colour, draw_curve, draw_text, enlargement
 from detect.markers.detections import ACCEPTED, SAME_MARKER, MarkerDetections
 
 FloatArray = NDArray[np.float64]
-Colour = tuple[int, int, int]
 
 _SUBPIXEL_BITS = 4
 _EDGE_COLOUR: Colour = (60, 220, 60)
@@ -48,7 +48,7 @@ def draw_markers(
     if rejected:
         for candidate in found.candidates:
             if candidate.fate not in (ACCEPTED, SAME_MARKER):
-                _draw_quadrangle(canvas, candidate.outline, _CANDIDATE_COLOUR)
+                draw_curve(canvas, candidate.outline, _CANDIDATE_COLOUR, closed=True)
     for number, corners, covariance in zip(found.ids, found.corners, found.covariance):
         mark_marker(canvas, number, corners, covariance)
     per_row = max(1, image.shape[1] // 210)
@@ -82,31 +82,22 @@ def mark_marker(
     """
     import cv2
 
-    _draw_quadrangle(canvas, corners, _EDGE_COLOUR)
+    times = enlargement(canvas)
+    draw_curve(canvas, corners, _EDGE_COLOUR, closed=True)
     for place, spread in zip(corners, covariance):
         _draw_ellipse(canvas, place, spread, _EDGE_COLOUR)
     cv2.circle(
-        canvas, _fixed(corners[0]), 3 << _SUBPIXEL_BITS, _TOP_LEFT_COLOUR, 1, cv2.LINE_AA,
-        _SUBPIXEL_BITS,
+        canvas, _fixed(corners[0]), 3 * times << _SUBPIXEL_BITS, _TOP_LEFT_COLOUR, times,
+        cv2.LINE_AA, _SUBPIXEL_BITS,
     )  # fmt: skip
     middle = corners.mean(axis=0)
-    cv2.putText(
-        canvas, f"{number}", (round(float(middle[0])) - 8, round(float(middle[1])) + 5),
-        cv2.FONT_HERSHEY_SIMPLEX, 0.45, _TEXT_COLOUR, 1, cv2.LINE_AA,
-    )  # fmt: skip
+    at = (round(float(middle[0])) - 8 * times, round(float(middle[1])) + 5 * times)
+    draw_text(canvas, f"{number}", at, _TEXT_COLOUR, 0.45)
 
 
 def _fixed(place: FloatArray) -> tuple[int, int]:
     at = np.rint(place * (1 << _SUBPIXEL_BITS)).astype(np.int32)
     return int(at[0]), int(at[1])
-
-
-def _draw_quadrangle(canvas: NDArray[np.uint8], corners: FloatArray, colour: Colour) -> None:
-    import cv2
-
-    if np.all(np.isfinite(corners)):
-        fixed = np.rint(corners * (1 << _SUBPIXEL_BITS)).astype(np.int32)
-        cv2.polylines(canvas, [fixed], True, colour, 1, cv2.LINE_AA, _SUBPIXEL_BITS)
 
 
 def _draw_ellipse(
@@ -116,4 +107,4 @@ def _draw_ellipse(
     angle = np.linspace(0.0, 2.0 * np.pi, 33)
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     ellipse = place + _SIGMAS * (circle * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
-    _draw_quadrangle(canvas, ellipse, colour)
+    draw_curve(canvas, ellipse, colour, closed=True)
