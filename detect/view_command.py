@@ -149,8 +149,9 @@ def _log_world(
     rr: Any, recording: Any, rows: SeenRows, pose: FloatArray, settings: CircleSettings
 ) -> None:
     x, y, theta = pose.tolist()
-    turn = rr.RotationAxisAngle(axis=[0, 0, 1], radians=theta)
-    recording.log("world/robot", rr.Transform3D(translation=[x, y, 0.0], rotation=turn))
+    # As a quaternion: with an axis, Rerun 0.23 needs a NumPy that it does not demand.
+    turn = [0.0, 0.0, np.sin(0.5 * theta), np.cos(0.5 * theta)]
+    recording.log("world/robot", rr.Transform3D(translation=[x, y, 0.0], quaternion=turn))
     # Forward is -Y.
     arrow = rr.Arrows3D(origins=[[0, 0, 0]], vectors=[[0, -0.5, 0]], colors=_LINE)
     recording.log("world/robot/forward", arrow)

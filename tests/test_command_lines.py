@@ -19,7 +19,9 @@ def help_of(program: str, words: list[str], capsys: pytest.CaptureFixture[str]) 
 
 
 def commands_of(program: str, capsys: pytest.CaptureFixture[str]) -> list[str]:
-    return re.findall(r"• (\w+)", help_of(program, [], capsys))
+    choices = re.search(r"\{(\w+(?:,\w+)*)\}", help_of(program, [], capsys))
+    assert choices is not None
+    return choices[1].split(",")
 
 
 def examples_in(text: str) -> list[list[str]]:

@@ -92,6 +92,10 @@ def test_recording_holds_frames_rows_and_path(
     robot = {r["frame"]: r["Transform3D:translation"][0] for r in found["/world/robot"]}
     poses = summed_steps([frame.step for frame in detected])
     np.testing.assert_allclose([robot[k][:2] for k in range(3)], poses[1:, :2], atol=1e-6)
+    turns = {r["frame"]: r["Transform3D:quaternion"][0] for r in found["/world/robot"]}
+    half = 0.5 * poses[1:, 2]
+    expected = np.column_stack([0.0 * half, 0.0 * half, np.sin(half), np.cos(half)])
+    np.testing.assert_allclose([turns[k] for k in range(3)], expected, atol=1e-6)
     (path,) = found["/world/path"][0]["LineStrips3D:strips"]
     np.testing.assert_allclose(np.array(path)[:, :2], poses[:, :2], atol=1e-6)
 
