@@ -121,8 +121,9 @@ def _normalised_error(c: Comparison) -> str:
 def _over_distance(c: Comparison) -> Table:
     table = titled_table("By forward distance (position error and quality: medians)")
     for heading in (
-        "metres", "reference", "missed", "recall", "detected", "extra", "precision",
-        "error", "ref. quality", "det. quality", "diff.",
+        # Of a width that a terminal of 80 columns has.
+        "metres", "ref.", "missed", "recall", "det.", "extra", "prec.",
+        "error m", "ref. quality", "det. quality", "diff.",
     ):  # fmt: skip
         table.add_column(heading, justify="right")
     for part in c.bins:

@@ -303,6 +303,12 @@ def test_text_shows_the_figures_plainly() -> None:
     assert max(map(len, text.splitlines())) <= 100
 
 
+def test_no_heading_is_cut_off_in_a_usual_terminal() -> None:
+    text = format_text(compare(REFERENCE, DETECTED), width=80)
+    assert "\N{HORIZONTAL ELLIPSIS}" not in text
+    assert max(map(len, text.splitlines())) <= 80
+
+
 def test_text_escapes_what_a_terminal_would_obey() -> None:
     strange = [frame("[red]e\x1b[31m\udcfc", disc(0, 1))]
     text = format_text(compare(strange, strange))
