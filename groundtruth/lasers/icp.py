@@ -236,13 +236,13 @@ def trimmed_variance(kept: float) -> tuple[float, float]:
 
 
 def open_directions(
-    covariance_or_information: FloatArray, scale_m: float, weak_sigma_m: float
+    information: FloatArray, scale_m: float, weak_sigma_m: float
 ) -> FloatArray:
     """Directions (k, 3) of (x, y, theta) along which information (3, 3) is too little.
 
     Parameters
     ----------
-    covariance_or_information : (3, 3) array
+    information : (3, 3) array
         Information about x, y (m) and theta (rad).
     scale_m : float
         Metres that count as much as a radian.
@@ -250,7 +250,7 @@ def open_directions(
         Largest standard deviation of a direction that is determined (m).
     """
     scale = np.array([1.0, 1.0, 1.0 / max(scale_m, 1e-9)])
-    values, vectors = np.linalg.eigh(covariance_or_information * scale[:, None] * scale[None, :])
+    values, vectors = np.linalg.eigh(information * scale[:, None] * scale[None, :])
     return np.asarray(vectors[:, values < 1.0 / weak_sigma_m**2].T)
 
 

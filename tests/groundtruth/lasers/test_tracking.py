@@ -1,4 +1,4 @@
-"""Laser tracking: background, sets, the kernels' derivatives and covariances, whole tracks."""
+"""Laser tracking: the kernels' derivatives and covariances, whole tracks."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ from groundtruth.geometry.plane import compose, invert
 from groundtruth.lasers.acquisition import AGREES_M, Seen, acquire, explain, refine, robot_body
 from groundtruth.lasers.background import learn_background
 from groundtruth.lasers.blocks import combined_poses
-from groundtruth.lasers.outline import outline_faces, outline_radius_m, outline_symmetries
 from groundtruth.lasers.scanners import Robot, Scanner
 from groundtruth.lasers.scans import Scans
 from groundtruth.lasers.sets import ScannerTables, ScanSets, scanner_tables, sets_of_scans
@@ -78,100 +77,6 @@ def seen_in(sets: ScanSets, tables: ScannerTables, pose: FloatArray, index: int 
             pose[:2], 2.0, np.zeros(5), sets.ages_s[index],
         )
     )  # fmt: skip
-
-
-# --- outline
-
-
-def test_faces_run_counter_clockwise_whichever_way_the_file_goes() -> None:
-    for corners in (PLAIN, PLAIN[::-1]):
-        faces = outline_faces(corners)
-        twice = np.sum(faces[:, 0] * faces[:, 3] - faces[:, 2] * faces[:, 1])
-        assert twice == pytest.approx(2 * 0.42)
-    middle, radius = outline_radius_m(outline_faces(PLAIN))
-    assert middle == pytest.approx([-0.05, 0.0])
-    assert radius == pytest.approx(np.hypot(0.35, 0.3))
-
-
-def test_symmetries() -> None:
-    plain = outline_symmetries(outline_faces(PLAIN))
-    assert plain == pytest.approx(np.array([[-0.1, 0.0, -np.pi]]), abs=1e-6)
-    square = outline_symmetries(outline_faces([[0, 0], [1, 0], [1, 1], [0, 1]]))
-    assert square[:, 2] == pytest.approx([-np.pi, -np.pi / 2, np.pi / 2], abs=1e-3)
-    assert len(outline_symmetries(outline_faces(FRONTED))) == 0
-    # Within 0.12 m its front can be mistaken for its back.
-    assert outline_symmetries(outline_faces(FRONTED), 0.12)[0, 2] == pytest.approx(-np.pi)
-    assert len(outline_symmetries(outline_faces(np.array([[0, 0], [1, 0], [0.2, 0.7]])))) == 0
-
-
-def test_outlines_that_are_none() -> None:
-    with pytest.raises(GroundTruthError, match="cross"):
-        outline_faces(np.array([[0, 0], [1, 1.5], [1, 0], [0, 1]]))
-    with pytest.raises(GroundTruthError, match="the same"):
-        outline_faces([[0, 0], [0, 0], [1, 1]])
-    with pytest.raises(GroundTruthError, match="encloses"):
-        outline_faces([[0, 0], [1, 0], [2, 0]])
-    with pytest.raises(GroundTruthError, match="3 or more"):
-        outline_faces([[0, 0], [1, 0]])
-
-
-# --- background
-
-
-def test_background_is_learned() -> None:
-    rng = np.random.default_rng(1)
-    ranges = np.rint(1e3 * rng.normal(3.0, 0.01, (500, 4)) / 10.0).astype(np.uint16) * 10
-    ranges[:, 1] = 0  # sees nothing
-    ranges[rng.random(500) < 0.3, 2] = 0  # drops out
-    ranges[:5, 3] = 1000  # somebody passed
-    found = learn_background(ranges, 20.0)
-    assert found.range_m[[0, 2, 3]] == pytest.approx(3.0, abs=0.011)
-    assert np.isnan(found.range_m[1])
-    assert np.isinf(found.near_m[1])
-    assert found.drop_out[2] == pytest.approx(0.3, abs=0.06)
-    assert found.quantum_m == pytest.approx(0.01)
-    assert np.all((found.near_m[[0, 2, 3]] > 2.85) & (found.near_m[[0, 2, 3]] < 2.97))
-
-
-def test_background_raises_no_false_alarm(
-    scanners: tuple[Scanner, ...], tables: ScannerTables
-) -> None:
-    fresh = empty_scans(scanners, 99, 300)
-    for k, scans in enumerate(fresh):
-        new = (scans.ranges_mm > 0) & (scans.ranges_mm < tables.near_mm[k])
-        assert new.mean() < 1e-4
-
-
-def test_background_of_no_scans() -> None:
-    with pytest.raises(GroundTruthError, match="empty scans"):
-        learn_background(np.zeros((0, 5), dtype=np.uint16), 8.0)
-
-
-# --- sets
-
-
-def test_sets_use_every_scan_once() -> None:
-    rng = np.random.default_rng(2)
-    scans = []
-    for k in range(4):
-        times = np.arange(0.0, 4.0, (1.0 + 2e-4 * k) / 75.0) + 0.003 * k
-        times = times[rng.random(len(times)) > 0.02]
-        scans.append(Scans(times, np.zeros((len(times), 5 + k), dtype=np.uint16)))
-    sets = sets_of_scans(scans)
-    used = np.sort(sets.rows[sets.rows >= 0])
-    assert np.array_equal(used, np.arange(sum(len(s) for s in scans)))
-    assert np.all(np.diff(sets.times_s) > 0.0)
-    assert np.abs(sets.ages_s).max() <= 1.0 / 75.0
-    times = np.concatenate([s.times_s for s in scans])
-    seen = sets.rows >= 0
-    at = np.where(seen, times[sets.rows], 0.0)
-    assert (sets.times_s[:, None] - at)[seen] == pytest.approx(sets.ages_s[seen])
-    assert np.all(np.where(seen, sets.ages_s, 0.0).sum(axis=1) == pytest.approx(0.0, abs=1e-9))
-
-
-def test_no_scans_at_all() -> None:
-    with pytest.raises(GroundTruthError, match="no scans"):
-        sets_of_scans([Scans(np.zeros(0), np.zeros((0, 5), dtype=np.uint16))])
 
 
 def test_points_are_moved_on_with_the_robot() -> None:

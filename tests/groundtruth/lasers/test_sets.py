@@ -1,0 +1,88 @@
+"""What the scanners see of the empty area, and scans put into sets."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from groundtruth.errors import GroundTruthError
+from groundtruth.lasers.background import learn_background
+from groundtruth.lasers.scanners import Scanner
+from groundtruth.lasers.scans import Scans
+from groundtruth.lasers.sets import ScannerTables, scanner_tables, sets_of_scans
+from tests.groundtruth.lasers.scene import (
+    empty_scans,
+    four_scanners,
+)
+
+FloatArray = NDArray[np.float64]
+
+
+def tables_of(scanners: tuple[Scanner, ...]) -> ScannerTables:
+    empties = empty_scans(scanners, 7)
+    backgrounds = [learn_background(e.ranges_mm, s.max_range_m) for s, e in zip(scanners, empties)]
+    return scanner_tables(scanners, backgrounds)
+
+
+@pytest.fixture(scope="module")
+def scanners() -> tuple[Scanner, ...]:
+    return four_scanners()
+
+
+@pytest.fixture(scope="module")
+def tables(scanners: tuple[Scanner, ...]) -> ScannerTables:
+    return tables_of(scanners)
+
+
+def test_background_is_learned() -> None:
+    rng = np.random.default_rng(1)
+    ranges = np.rint(1e3 * rng.normal(3.0, 0.01, (500, 4)) / 10.0).astype(np.uint16) * 10
+    ranges[:, 1] = 0  # sees nothing
+    ranges[rng.random(500) < 0.3, 2] = 0  # drops out
+    ranges[:5, 3] = 1000  # somebody passed
+    found = learn_background(ranges, 20.0)
+    assert found.range_m[[0, 2, 3]] == pytest.approx(3.0, abs=0.011)
+    assert np.isnan(found.range_m[1])
+    assert np.isinf(found.near_m[1])
+    assert found.drop_out[2] == pytest.approx(0.3, abs=0.06)
+    assert found.quantum_m == pytest.approx(0.01)
+    assert np.all((found.near_m[[0, 2, 3]] > 2.85) & (found.near_m[[0, 2, 3]] < 2.97))
+
+
+def test_background_raises_no_false_alarm(
+    scanners: tuple[Scanner, ...], tables: ScannerTables
+) -> None:
+    fresh = empty_scans(scanners, 99, 300)
+    for k, scans in enumerate(fresh):
+        new = (scans.ranges_mm > 0) & (scans.ranges_mm < tables.near_mm[k])
+        assert new.mean() < 1e-4
+
+
+def test_background_of_no_scans() -> None:
+    with pytest.raises(GroundTruthError, match="empty scans"):
+        learn_background(np.zeros((0, 5), dtype=np.uint16), 8.0)
+
+
+def test_sets_use_every_scan_once() -> None:
+    rng = np.random.default_rng(2)
+    scans = []
+    for k in range(4):
+        times = np.arange(0.0, 4.0, (1.0 + 2e-4 * k) / 75.0) + 0.003 * k
+        times = times[rng.random(len(times)) > 0.02]
+        scans.append(Scans(times, np.zeros((len(times), 5 + k), dtype=np.uint16)))
+    sets = sets_of_scans(scans)
+    used = np.sort(sets.rows[sets.rows >= 0])
+    assert np.array_equal(used, np.arange(sum(len(s) for s in scans)))
+    assert np.all(np.diff(sets.times_s) > 0.0)
+    assert np.abs(sets.ages_s).max() <= 1.0 / 75.0
+    times = np.concatenate([s.times_s for s in scans])
+    seen = sets.rows >= 0
+    at = np.where(seen, times[sets.rows], 0.0)
+    assert (sets.times_s[:, None] - at)[seen] == pytest.approx(sets.ages_s[seen])
+    assert np.all(np.where(seen, sets.ages_s, 0.0).sum(axis=1) == pytest.approx(0.0, abs=1e-9))
+
+
+def test_no_scans_at_all() -> None:
+    with pytest.raises(GroundTruthError, match="no scans"):
+        sets_of_scans([Scans(np.zeros(0), np.zeros((0, 5), dtype=np.uint16))])
