@@ -1,0 +1,47 @@
+"""Rows of single frames, and what recordings without a kind of landmark have."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.filter_frames import FrameRows
+from slam.recording import CircleRows, LineRows
+
+FloatArray = NDArray[np.float64]
+CAMERA_XY = np.array([0.0179777, -0.0808609])
+NOTHING = LineRows(np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros(0), ())
+NO_DISCS = CircleRows(
+    np.zeros(0, dtype=np.int64),
+    np.zeros((0, 2)),
+    np.zeros((0, 2, 2)),
+    np.zeros(0, dtype=np.int64),
+)
+
+
+def spd(rng: np.random.Generator, size: int, scale: float) -> FloatArray:
+    """A random covariance whose numbers are correlated."""
+    root = rng.normal(0, 1, (size, size))
+    return np.asarray(scale**2 * (root @ root.T / size + 0.3 * np.eye(size)))
+
+
+def rows_of(discs: list[tuple[int, FloatArray, FloatArray]]) -> FrameRows:
+    return FrameRows(
+        disc_ids=tuple(number for number, _, _ in discs),
+        disc_xy=np.array([xy for _, xy, _ in discs]),
+        disc_covariance=np.array([c for _, _, c in discs]),
+        line_ids=(),
+        bearing_rad=np.zeros(0),
+        sigma_rad=np.zeros(0),
+    )
+
+
+def bearings_of(lines: list[tuple[tuple[int, ...], float, float]]) -> FrameRows:
+    return FrameRows(
+        disc_ids=(),
+        disc_xy=np.zeros((0, 2)),
+        disc_covariance=np.zeros((0, 2, 2)),
+        line_ids=tuple(numbers for numbers, _, _ in lines),
+        bearing_rad=np.array([bearing for _, bearing, _ in lines]),
+        sigma_rad=np.array([sigma for _, _, sigma in lines]),
+    )
