@@ -175,12 +175,13 @@ def convert_to_camera(
     placed = pose.robot_from_camera if pose is not None else _IDENTITY
     tcp = pose.sensor_to_tcp if pose is not None else _IDENTITY
     mount = pose.mount_index if pose is not None else 0
+    unknown = source.unknown if isinstance(source, Camera) else ()
     factor = {"same": 1.0, "halve": 0.5, "double": 2.0}[rows]
 
     def camera_of(p: FloatArray) -> Camera:
         sx, sy, ox, oy, a2, a3, b1, b2, b3, p1, p2, k1, k2, k3 = (float(x) for x in p)
         return Camera(
-            width, height, sx, sy, ox, oy, (a2, a3, b1, b2, b3), placed, tcp, mount,
+            width, height, sx, sy, ox, oy, (a2, a3, b1, b2, b3), placed, tcp, mount, unknown,
             tangential=(p1, p2), polynomial=(k1, k2, k3),
         )  # fmt: skip
 

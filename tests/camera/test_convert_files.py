@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from camera import Camera
 from camera.cli import main
 from camera.colmap_cameras import text_of_binary
+from camera.conversion import convert_to_camera
 from camera.conversion_models import ForeignCamera
 from camera.convert_command import format_of, format_of_text, parse, read_text
 from camera.convert_yaml import parse_yaml
@@ -40,9 +43,9 @@ def test_names_go_only_where_a_format_has_such_names() -> None:
 
 
 def test_colmaps_binary_is_its_text(tmp_path: Path) -> None:
-    from pycolmap import Camera, Reconstruction
+    import pycolmap
 
-    theirs = Reconstruction()
+    theirs = pycolmap.Reconstruction()
     models = {
         "SIMPLE_RADIAL": (500.1, 320.0, 240.0, -0.02),
         "FOV": (400.0, 400.0, 320.0, 240.0, 0.9),
@@ -52,7 +55,7 @@ def test_colmaps_binary_is_its_text(tmp_path: Path) -> None:
         "OPENCV_FISHEYE": (400.0, 401.0, 320.0, 240.0, 0.01, -0.002, 1e-4, 0.0),
     }
     for number, (model, values) in enumerate(models.items(), start=1):
-        made = Camera(model=model, width=640, height=480, params=values, camera_id=number)
+        made = pycolmap.Camera(model=model, width=640, height=480, params=values, camera_id=number)
         theirs.add_camera(made)
     theirs.write_binary(str(tmp_path))
     theirs.write_text(str(tmp_path))
@@ -112,6 +115,14 @@ def test_what_is_missing_is_told_with_what_to_do(
     told = capsys.readouterr().err
     assert message in told
     assert name in told
+
+
+def test_other_lines_of_the_same_camera_keep_all_else(published_camera: Camera) -> None:
+    camera = replace(published_camera, mount_index=3, unknown=(("serial", "4711"),))
+    there = convert_to_camera(camera, "double").camera
+    assert isinstance(there, Camera)
+    assert (there.height, there.unknown) == (2 * camera.height, camera.unknown)
+    assert convert_to_camera(there, "halve").camera == camera
 
 
 def test_what_cannot_be_converted_names_its_file(
