@@ -16,6 +16,7 @@ from groundtruth.markers.refinement import PoseProblem
 from groundtruth.markers.settings import PoseSettings
 from groundtruth.trajectories.streams import read_times
 from landmarks import MarkerLandmark, read_frames
+from storage.messages import excerpt
 
 DETECTED_NAME = "detected.markers"
 NETWORK_NAME = "network.json"
@@ -120,7 +121,7 @@ def read_marker_frames(
     times: dict[str, float] = {}
     times_path = run / f"{run.resolve().name}.times"
     if timed:
-        times = {_image_name(prefix): t for prefix, t in read_times(times_path).items()}
+        times = _times_by_name(times_path)
     frames = []
     for number, frame in enumerate(read_frames(path)):
         name = _image_name(frame.step.prefix)
@@ -229,6 +230,27 @@ def pose_problem(
         np.repeat(np.arange(len(views)), 4),
         floor,
     )
+
+
+def _times_by_name(path: Path) -> dict[str, float]:
+    """Times of images by their names without folder and ending, of which none may be there twice.
+
+    Raises
+    ------
+    GroundTruthError
+        If the file cannot be read, or two of its images are called alike.
+    """
+    times: dict[str, float] = {}
+    prefixes: dict[str, str] = {}
+    for prefix, time_s in read_times(path).items():
+        name = _image_name(prefix)
+        if name in prefixes:
+            raise GroundTruthError(
+                f"{path}: images {excerpt(prefixes[name])} and {excerpt(prefix)} are both "
+                f"called {excerpt(name)} without folder and ending: expected different names"
+            )
+        prefixes[name], times[name] = prefix, time_s
+    return times
 
 
 def _image_name(prefix: str) -> str:

@@ -18,6 +18,7 @@ from groundtruth.markers.session import (
     chain_points,
     find_runs,
     group_by_time,
+    read_marker_frames,
     rig_views,
 )
 from groundtruth.markers.settings import PoseSettings
@@ -56,6 +57,18 @@ def test_cameras_that_are_a_little_apart_are_used_together() -> None:
     frames = [frame(0, 1.000), frame(1, 1.004), frame(0, 1.010), frame(1, 1.013), frame(2, 1.5)]
     groups = group_by_time(frames, 0.005)
     assert [[f.camera for f in group] for group in groups] == [[0, 1], [0, 1], [2]]
+
+
+def test_times_of_images_that_are_called_alike_are_refused(tmp_path: Path) -> None:
+    """Folders and endings do not tell images apart: one's time must not be taken for another's."""
+    run = tmp_path / "a"
+    run.mkdir()
+    (run / "detected.markers").write_text("STEP 001 0 0 0 0 0 0 0 0 0\n")
+    (run / "a.times").write_text("left/001.png 1.0\nleft/002.png 2.0\n")
+    assert [frame.time_s for frame in read_marker_frames(run, 0)] == [1.0]
+    (run / "a.times").write_text("left/001.png 1.0\nright/001.png 2.0\n")
+    with pytest.raises(GroundTruthError, match=r"a\.times: images 'left/001\.png' and 'right/001"):
+        read_marker_frames(run, 0)
 
 
 def test_markers_that_are_not_on_the_rig_are_no_views() -> None:
