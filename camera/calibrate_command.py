@@ -78,7 +78,13 @@ def perform(options: Calibrate) -> int:
         pixels, floor_xy = floor_points(
             options.floor, board, options.floor_origin, options.floor_yaw, size
         )
-        placed = place_on_floor(camera, pixels, floor_xy, calibration.adjusted.covariance)
+        placed = place_on_floor(
+            camera,
+            pixels,
+            floor_xy,
+            calibration.adjusted.covariance,
+            radius_on_floor(options.floor, board),
+        )
         camera = with_pose(camera, placed.robot_from_camera)
         print(describe_pose(placed))
     else:
@@ -185,6 +191,11 @@ def floor_points(
     except CalibrationError as error:
         raise CalibrationError(f"{path}: {error}") from None
     return pixels, on_floor(board.points[indices], origin, radians(yaw_deg))[:, :2]
+
+
+def radius_on_floor(path: Path, board: Board) -> float:
+    """Radius of the circles whose centroids `floor_points` gives (m); 0 for points."""
+    return 0.0 if path.suffix.lower() == ".csv" else 0.5 * board.circle_m
 
 
 def describe(calibration: Calibration, camera: Camera) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from camera.board import Board
-from camera.calibrate_command import describe_pose, floor_points
+from camera.calibrate_command import describe_pose, floor_points, radius_on_floor
 from camera.calibration_floor import place_on_floor, read_floor_points, with_pose
 from camera.camfile import read_camera, write_camera
 from camera.errors import CalibrationError
@@ -16,6 +16,7 @@ def perform(options: Floor) -> int:
     if options.output.exists() and not options.force:
         raise OutputExistsError(options.output)
     camera = read_camera(options.camera)
+    radius_m = 0.0
     if options.floor.suffix.lower() == ".csv":
         pixels, floor_xy = read_floor_points(options.floor)
     else:
@@ -31,12 +32,14 @@ def perform(options: Floor) -> int:
             square_m=options.square_m,
             marker_m=options.marker_m,
             dictionary=options.dictionary,
+            circle_m=options.circle_m,
         )
+        radius_m = radius_on_floor(options.floor, board)
         size = (camera.width, camera.height)
         pixels, floor_xy = floor_points(
             options.floor, board, options.floor_origin, options.floor_yaw, size
         )
-    placed = place_on_floor(camera, pixels, floor_xy)
+    placed = place_on_floor(camera, pixels, floor_xy, radius_m=radius_m)
     print(describe_pose(placed))
     write_camera(
         with_pose(camera, placed.robot_from_camera), options.output, overwrite=options.force

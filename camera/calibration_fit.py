@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -40,16 +41,45 @@ def fit_points(
     """
     span = lens.span(settings.aspect)
     start = replace(start, intrinsics=_within(start.intrinsics, points, span, settings.aspect))
-    fit = adjust(start, points, span, robust=settings.robust)
-    if radius_m == 0.0:
-        return fit, points
+
+    def adjusted(start: Estimate, points: Points) -> Adjusted:
+        return adjust(start, points, span, robust=settings.robust)
+
+    return fit_to_centres(adjusted, start, points, radius_m)
+
+
+def fit_to_centres(
+    adjusted: Callable[[Estimate, Points], Adjusted],
+    start: Estimate,
+    points: Points,
+    radius_m: float,
+) -> tuple[Adjusted, Points]:
+    """Fit to points; of circles, again and again less the shifts that the fit before shows.
+
+    Parameters
+    ----------
+    adjusted : callable
+        From an estimate to begin with and points to the fit.
+    start : Estimate
+    points : Points
+        Where circles' centroids were seen.
+    radius_m : float
+        Radius of the circles; 0 for points.
+
+    Returns
+    -------
+    fit : Adjusted
+    points : Points
+        With the circles' shifts taken off (`circle_shifts`).
+    """
+    fit = adjusted(start, points)
     corrected = points
-    for _ in range(_CIRCLE_ROUNDS):
+    for _ in range(_CIRCLE_ROUNDS if radius_m > 0.0 else 0):
         shifts = circle_shifts(fit.estimate, points, radius_m)
         if not np.all(np.isfinite(shifts)):
             break
         corrected = replace(points, pixels=points.pixels - shifts)
-        fit = adjust(fit.estimate, corrected, span, robust=settings.robust)
+        fit = adjusted(fit.estimate, corrected)
     return fit, corrected
 
 

@@ -13,7 +13,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from camera.calibration_adjustment import Estimate, Points, adjust, project_estimate
+from camera.calibration_adjustment import Adjusted, Estimate, Points, adjust, project_estimate
+from camera.calibration_fit import fit_to_centres
 from camera.calibration_model import COUNT, cross_matrices
 from camera.calibration_projection import intrinsics_of
 from camera.calibration_start import best_poses, board_poses
@@ -80,6 +81,7 @@ def place_on_floor(
     pixels: FloatArray,
     floor_xy: FloatArray,
     intrinsics_covariance: FloatArray | None = None,
+    radius_m: float = 0.0,
 ) -> FloorPose:
     """The camera's pose from points on the floor.
 
@@ -92,7 +94,10 @@ def place_on_floor(
     floor_xy : (N, 2) array
         Where they are, robot X and Y in metres.
     intrinsics_covariance : (14, 14) array, optional
-        Of scaleX ... p2; zero if not given.
+        Of `calibration_model.INTRINSICS`; zero if not given.
+    radius_m : float
+        Where the points are the centroids of circles' images, the circles' radius: it takes off
+        what perspective and lens move them.
 
     Returns
     -------
@@ -108,9 +113,13 @@ def place_on_floor(
     points = Points(floor, pixels, np.zeros(1, dtype=np.int64), camera.width, camera.height)
     intrinsics = intrinsics_of(camera)
     start = Estimate(intrinsics, *board_poses(intrinsics, points))
+
+    def adjusted(start: Estimate, points: Points) -> Adjusted:
+        # Not robust with few: four points have no residuals to tell outliers by.
+        return adjust(start, points, np.zeros((COUNT, 0)), robust=len(floor) > 8)
+
     try:
-        # Without robustness at first: four points have no residuals to tell outliers by.
-        fit = adjust(best_poses(start, points), points, np.zeros((COUNT, 0)), robust=len(floor) > 8)
+        fit, _ = fit_to_centres(adjusted, best_poses(start, points), points, radius_m)
     except ValueError:
         raise CalibrationError(
             "no pose of the camera sees the floor's points where they are: are they in the order "

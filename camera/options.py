@@ -64,7 +64,7 @@ class Calibrate:
     every : int
         Of a video take every so many-th frame.
     max_images : int
-        Take at most so many pictures, evenly over all.
+        Take at most so many pictures, evenly over all; likewise of each video.
     floor : Path
         A picture of the board lying on the floor, or a .csv with the columns u,v,x,y of places on
         it (pixels; metres, X left and Y backward of the robot): gives the camera's pose.
@@ -131,6 +131,8 @@ class Floor:
         As in `camera calibrate`.
     dictionary : str
         As in `camera calibrate`.
+    circle_m : float
+        As in `camera calibrate`.
     floor_origin : two floats
         Where the middle of the board's points lies: X (left) and Y (backward) of the robot, m.
     floor_yaw : float
@@ -150,6 +152,7 @@ class Floor:
     square_m: float = 0.0
     marker_m: float = 0.0
     dictionary: str = "DICT_5X5_100"
+    circle_m: float = 0.0
     floor_origin: tuple[float, float] = (0.0, 0.0)
     floor_yaw: float = 0.0
     force: bool = False
