@@ -235,9 +235,7 @@ def trimmed_variance(kept: float) -> tuple[float, float]:
     return inside / kept, kept / inside
 
 
-def open_directions(
-    information: FloatArray, scale_m: float, weak_sigma_m: float
-) -> FloatArray:
+def open_directions(information: FloatArray, scale_m: float, weak_sigma_m: float) -> FloatArray:
     """Directions (k, 3) of (x, y, theta) along which information (3, 3) is too little.
 
     Parameters
