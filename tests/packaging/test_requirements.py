@@ -72,3 +72,8 @@ def test_every_locked_package_has_hashes(project_root: Path, name: str) -> None:
     entries = re.split(r"\n(?=\w)", path.read_text())
     assert len(entries) == len(pinned(path))
     assert all(re.search(r"--hash=sha256:[0-9a-f]{64}", entry) for entry in entries)
+
+
+def test_ci_tries_both_ends(project_root: Path) -> None:
+    commands = (project_root / ".ci" / "run").read_text().splitlines()
+    assert commands.index("make test") < commands.index("make lowest")
