@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from detect.frame_rows import FrameRows, FrameTask
+from detect.run import RunFrame
 from storage.parts import named, new_locked, old_locked, write_all
 
 _DIGITS = 16
@@ -196,22 +197,27 @@ def task_digest(task: FrameTask) -> str:
     Of an image file, name, size and time of change count.
     """
     frame = task.frame
-    image: object = None
-    if frame.image is not None:
-        image = frame.image.name
-        try:
-            status = os.stat(frame.image)  # noqa: PTH116 - that of a Path takes longer
-            image = (image, status.st_size, status.st_mtime_ns)
-        except (OSError, ValueError):
-            pass  # nothing there: that counts as well
     s = frame.step  # numbers in words, or a record's own representation, would take longer than all
     numbers = _STEP(s.dx, s.dy, s.dphi, s.cxx, s.cxy, s.cyy, s.cxphi, s.cyphi, s.cphiphi)
-    beside = s.prefix, image, frame.time_s, frame.bits, frame.failure, task.tilt, task.reference
+    beside = s.prefix, _file_of(frame), frame.time_s, frame.bits, frame.failure, task.tilt, task.reference
     digest = hashlib.sha256(numbers + repr(beside).encode("utf-8", "surrogateescape"))
     if frame.content is not None:
         content = frame.content
         digest.update(content if isinstance(content, bytes) else content.tobytes())
     return digest.hexdigest()[:_DIGITS]
+
+
+def _file_of(frame: RunFrame) -> object:
+    """What tells a frame's image file, as it is now, from others."""
+    if frame.image is None:
+        return None
+    if frame.stamp is not None:
+        return (frame.image.name, *frame.stamp)
+    try:
+        status = os.stat(frame.image)  # noqa: PTH116 - that of a Path takes longer
+    except (OSError, ValueError):
+        return frame.image.name  # nothing there: that counts as well
+    return frame.image.name, status.st_size, status.st_mtime_ns
 
 
 def _encoded(lengths: tuple[int, ...], task: str, rows: FrameRows) -> bytes:

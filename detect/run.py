@@ -13,8 +13,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Generator, Iterator
-from contextlib import suppress
+from collections.abc import Generator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
@@ -27,6 +26,7 @@ from detect.errors import DetectError, FrameError
 from detect.image_bounds import bounded_content
 from detect.image_names import IMAGE_SUFFIXES, ImageNames
 from detect.run_images import (
+    FileStamp,
     demand_no_link_out,
     homes_of,
     image_of,
@@ -34,7 +34,7 @@ from detect.run_images import (
     place_of,
 )
 from detect.sources.gray import decode_gray
-from landmarks import Step, read_rows
+from landmarks import Step, iterate_prefixes, iterate_steps
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,6 +54,8 @@ class RunFrame:
         Significant bits of a file with more than 8.
     failure : str or None
         Why there is no image, although there should be.
+    stamp : (int, int) or None
+        The file's size and time of change, where they have been looked at.
     """
 
     step: Step
@@ -62,6 +64,7 @@ class RunFrame:
     time_s: float | None = None
     bits: int = 16
     failure: str | None = None
+    stamp: FileStamp | None = field(default=None, compare=False, repr=False)
 
 
 class Frames(Protocol):
@@ -132,19 +135,20 @@ class RunFrames:
                 path = self._images.path(place)
                 step = _standing_still(path.stem)
                 try:
-                    demand_no_link_out(path, homes)
+                    stamp = demand_no_link_out(path, homes)
                 except FrameError as error:
                     yield RunFrame(step, None, failure=str(error))
                     continue
-                yield RunFrame(step, path, bits=self._bits)
+                yield RunFrame(step, path, bits=self._bits, stamp=stamp)
             return
-        for step in _steps(self._odometry):
+        for step in iterate_steps(self._odometry):
             try:
-                image = image_of(step, self._images, homes)
+                found = image_of(step.prefix, self._images, homes)
             except FrameError as error:
                 yield RunFrame(step, None, failure=str(error))
                 continue
-            yield RunFrame(step, image, bits=self._bits)
+            image, stamp = (None, None) if found is None else found
+            yield RunFrame(step, image, bits=self._bits, stamp=stamp)
 
 
 @dataclass(frozen=True)
@@ -282,14 +286,16 @@ def _image_run(folder: Path, bits: int | None) -> ImageRun:
         named = np.zeros(len(images), bool)
         count = 0
         homes = homes_of(images)
-        for step in _steps(odometry):
+        for prefix in iterate_prefixes(odometry):
             count += 1
-            with suppress(FrameError):  # told when it is the frame's turn
-                found = place_of(step, images, homes)
+            try:
+                found = place_of(prefix, images, homes)
                 if found is not None:
                     if images.has_links:
                         demand_no_link_out(images.path(found), homes)
                     named[found] = True
+            except FrameError:
+                continue  # told when it is the frame's turn
         frames = RunFrames(images, odometry, count, int(np.count_nonzero(~named)), bits)
     return ImageRun(folder, frames, odometry, folder / "detected")
 
@@ -362,10 +368,6 @@ def _only_camera(folder: Path) -> Path:
         names = ", ".join(path.name for path in cameras[:4])
         raise DetectError(f"{folder}: several calibrations ({names}): name one by --camera")
     return cameras[0]
-
-
-def _steps(odometry: Path) -> Iterator[Step]:
-    return (row.record for row in read_rows(odometry) if isinstance(row.record, Step))
 
 
 def _odometry(folder: Path) -> Path | None:

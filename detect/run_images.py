@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import os
+import stat
 from pathlib import Path
 
 from detect.errors import DetectError, FrameError
 from detect.image_names import IMAGE_SUFFIXES, ImageNames
-from landmarks import Step
 from storage.inside import leads_out, link_out
 from storage.messages import excerpt
+
+#: Size in bytes and time of change in nanoseconds: what tells one state of a file from another.
+FileStamp = tuple[int, int]
 
 
 def images_of_folder(folder: Path) -> ImageNames:
@@ -29,8 +32,10 @@ def images_of_folder(folder: Path) -> ImageNames:
     raise DetectError(f"{folder}: no images: expected {kinds} in it or in {folder / 'images'}")
 
 
-def image_of(step: Step, images: ImageNames, homes: tuple[str, ...]) -> Path | None:
-    """A step's image; None if there is none.
+def image_of(
+    prefix: str, images: ImageNames, homes: tuple[str, ...]
+) -> tuple[Path, FileStamp | None] | None:
+    """A step's image and the stamp of its file (see `demand_no_link_out`); None if there is none.
 
     Raises
     ------
@@ -38,15 +43,14 @@ def image_of(step: Step, images: ImageNames, homes: tuple[str, ...]) -> Path | N
         If the step's prefix, or a link of that name, leads out of the run: whoever made the file of
         steps does not decide which other files are read.
     """
-    found = place_of(step, images, homes)
+    found = place_of(prefix, images, homes)
     if found is None:
         return None
     path = images.path(found)
-    demand_no_link_out(path, homes)
-    return path
+    return path, demand_no_link_out(path, homes)
 
 
-def place_of(step: Step, images: ImageNames, homes: tuple[str, ...]) -> int | None:
+def place_of(prefix: str, images: ImageNames, homes: tuple[str, ...]) -> int | None:
     """The place of a step's image, by its name alone; None if there is none.
 
     Raises
@@ -54,24 +58,36 @@ def place_of(step: Step, images: ImageNames, homes: tuple[str, ...]) -> int | No
     FrameError
         If the step's prefix leads out of the run.
     """
-    name = step.prefix.strip('"')
+    name = prefix.strip('"')
     why = leads_out(name, *homes)
     if why is not None:
-        raise FrameError(f"{excerpt(step.prefix)}: the prefix {why}: expected an image of the run")
+        raise FrameError(f"{excerpt(prefix)}: the prefix {why}: expected an image of the run")
     return images.find(name.replace("\\", "/").rsplit("/", 1)[-1])
 
 
-def demand_no_link_out(path: Path, homes: tuple[str, ...]) -> None:
+def demand_no_link_out(path: Path, homes: tuple[str, ...]) -> FileStamp | None:
     """Refuse an image that is a link to somewhere outside the folders `homes`.
+
+    Returns
+    -------
+    FileStamp or None
+        None where it is a link, or nothing is there.
 
     Raises
     ------
     FrameError
     """
-    if os.path.islink(path) and link_out(path, *map(Path, homes)):  # noqa: PTH114 - much sooner
+    try:
+        status = os.lstat(path)
+    except (OSError, ValueError):
+        return None
+    if not stat.S_ISLNK(status.st_mode):
+        return status.st_size, status.st_mtime_ns
+    if link_out(path, *map(Path, homes)):
         raise FrameError(
             f"{path}: cannot be read: is a link that leads out of the run: expected an image in it"
         )
+    return None
 
 
 def homes_of(images: ImageNames) -> tuple[str, ...]:

@@ -18,6 +18,8 @@ from landmarks.association import (
 from landmarks.errors import LandmarkError, LandmarkFileError
 from landmarks.reading import (
     frames_of_rows,
+    iterate_prefixes,
+    iterate_steps,
     parse_record,
     parse_rows,
     read_frames,
@@ -75,6 +77,8 @@ __all__ = [
     "format_tilt",
     "frames_of_rows",
     "is_positive_definite",
+    "iterate_prefixes",
+    "iterate_steps",
     "iterate_tilts",
     "parse_record",
     "parse_rows",

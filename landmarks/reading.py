@@ -10,8 +10,9 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, TypeVar
 
 from landmarks.errors import LandmarkError, LandmarkFileError, excerpt
 from landmarks.records import (
@@ -32,6 +33,8 @@ from landmarks.records import (
     Step,
 )
 
+T = TypeVar("T")
+
 _LONGEST_ROW_BYTES = 1 << 16
 _LONGEST_ID_DIGITS = 20
 _BYTE_ORDER_MARK = b"\xef\xbb\xbf"
@@ -41,6 +44,10 @@ _NUMBER_PATTERN = rb"[+-]?(?:[0-9]++(?:\.[0-9]*+)?|\.[0-9]++)(?:[eE][+-]?[0-9]++
 _NUMBER = re.compile(_NUMBER_PATTERN)
 _NUMBERS = re.compile(rb"(?:%b )*+" % _NUMBER_PATTERN)
 _WHOLE_NUMBER = re.compile(rb"[+-]?[0-9]+")
+# A STEP as programs write it, in a line of its own: of a long run all are. Such numbers are finite.
+_PLAIN_STEP = re.compile(
+    rb"STEP ((?!#)[!-\[\]-~]++)" + len(STEP_NUMBERS) * rb" ++(-?[0-9]{1,15}\.[0-9]{1,20})" + rb"\r?\n"
+)
 
 
 def read_rows(path: str | os.PathLike[str]) -> Iterator[Row]:
@@ -64,16 +71,8 @@ def read_rows(path: str | os.PathLike[str]) -> Iterator[Row]:
         If the file cannot be opened, a row is malformed, or a landmark stands before any STEP; the
         message names the file, the line and what was expected.
     """
-    try:
-        with Path(path).open("rb") as stream:
-            yield from parse_rows(stream, name=os.fspath(path))
-    except FileNotFoundError:
-        raise LandmarkFileError(path, None, "no such landmark file") from None
-    except OSError as error:
-        reason = error.strerror or str(error)
-        raise LandmarkFileError(
-            path, None, f"cannot be read as a landmark file: {reason}"
-        ) from None
+    with _opened(path) as stream:
+        yield from parse_rows(stream, name=os.fspath(path))
 
 
 def read_frames(path: str | os.PathLike[str]) -> Iterator[Frame]:
@@ -102,7 +101,25 @@ def read_steps(path: str | os.PathLike[str]) -> list[Step]:
     LandmarkFileError
         As `read_rows`.
     """
-    return [row.record for row in read_rows(path) if isinstance(row.record, Step)]
+    return list(iterate_steps(path))
+
+
+def iterate_steps(path: str | os.PathLike[str]) -> Iterator[Step]:
+    """Read a run's odometry step by step; parameters and errors are those of `read_steps`."""
+    with _opened(path) as stream:
+        for record, _, _ in _parsed(stream, os.fspath(path), _plain_step):
+            if isinstance(record, Step):
+                yield record
+
+
+def iterate_prefixes(path: str | os.PathLike[str]) -> Iterator[str]:
+    """The prefixes of a run's steps: the same errors, sooner than by the steps themselves."""
+    with _opened(path) as stream:
+        for record, _, _ in _parsed(stream, os.fspath(path), _plain_prefix):
+            if isinstance(record, str):
+                yield record
+            elif isinstance(record, Step):
+                yield record.prefix
 
 
 def frames_of_rows(rows: Iterable[Row]) -> Iterator[Frame]:
@@ -123,16 +140,7 @@ def frames_of_rows(rows: Iterable[Row]) -> Iterator[Frame]:
 
 def parse_rows(stream: BinaryIO, name: str = "<stream>") -> Iterator[Row]:
     """Read rows from a binary stream; `name` stands for the file in errors (see `read_rows`)."""
-    seen_step = False
-    for line, source, text in _logical_lines(stream, name):
-        try:
-            record = _parse(text)
-        except LandmarkError as error:
-            raise LandmarkFileError(name, line, str(error)) from None
-        if isinstance(record, Step):
-            seen_step = True
-        elif isinstance(record, Landmark) and not seen_step:
-            raise LandmarkFileError(name, line, "landmark before any STEP: expected a STEP first")
+    for record, source, line in _parsed(stream, name, _plain_step):
         yield Row(record, source, line)
 
 
@@ -145,6 +153,55 @@ def parse_record(text: str) -> Record | None:
         If the row is malformed; the message says what was expected.
     """
     return _parse(text.encode("utf-8", "surrogateescape"))
+
+
+@contextmanager
+def _opened(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
+    """A landmark file for reading; what the system says against it becomes a `LandmarkFileError`."""
+    try:
+        with Path(path).open("rb") as stream:
+            yield stream
+    except FileNotFoundError:
+        raise LandmarkFileError(path, None, "no such landmark file") from None
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise LandmarkFileError(
+            path, None, f"cannot be read as a landmark file: {reason}"
+        ) from None
+
+
+def _parsed(
+    stream: BinaryIO, name: str, plain: Callable[[re.Match[bytes]], T]
+) -> Iterator[tuple[Record | T | None, bytes, int]]:
+    """Each row's record, its text in the file and the number of its first line.
+
+    Of a plain STEP, the record is what `plain` makes of its words.
+    """
+    seen_step = False
+    for line, source, text in _logical_lines(stream, name):
+        found = _PLAIN_STEP.fullmatch(source)
+        if found is not None:
+            seen_step = True
+            yield plain(found), source, line
+            continue
+        try:
+            record = _parse(text)
+        except LandmarkError as error:
+            raise LandmarkFileError(name, line, str(error)) from None
+        if isinstance(record, Step):
+            seen_step = True
+        elif isinstance(record, Landmark) and not seen_step:
+            raise LandmarkFileError(name, line, "landmark before any STEP: expected a STEP first")
+        yield record, source, line
+
+
+def _plain_step(found: re.Match[bytes]) -> Step:
+    prefix, *numbers = found.groups()
+    return Step(prefix.decode(), *map(float, numbers))
+
+
+def _plain_prefix(found: re.Match[bytes]) -> str:
+    return found[1].decode()
 
 
 def _logical_lines(stream: BinaryIO, name: str) -> Iterator[tuple[int, bytes, bytes]]:

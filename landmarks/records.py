@@ -23,7 +23,7 @@ MARKER_CORNERS = ("top left", "top right", "bottom right", "bottom left")
 MARKER_CORNER_NUMBERS = ("u", "v", "cuu", "cuv", "cvv")
 
 _LARGEST_ID = 2**63 - 1
-_BLANK = re.compile(r"[ \t\n\r\v\f]")
+_WORD = re.compile(r"[^# \t\n\r\v\f][^ \t\n\r\v\f]*(?<!\\)")
 
 
 @dataclass(frozen=True, slots=True)
@@ -309,7 +309,7 @@ def _demand_finite(record: object, names: tuple[str, ...]) -> None:
 
 def _demand_word(word: str, name: str) -> None:
     """Refuse what a file would not give back as one word."""
-    if not word or word.startswith("#") or word.endswith("\\") or _BLANK.search(word):
+    if not _WORD.fullmatch(word):
         shown = excerpt(word.encode("utf-8", "surrogatepass"))
         raise LandmarkError(
             f"{name} is {shown}: expected one word that starts with no # and ends with no backslash"

@@ -9,8 +9,11 @@ from pathlib import Path
 
 _DRIVE = re.compile(r"[A-Za-z]:")
 # What Windows takes for a device in any folder, whatever the ending.
-_DEVICE = re.compile(
-    r"(?:\A|/)(?:con|prn|aux|nul|com[0-9]|lpt[0-9])(?: *\.[^/]*)?(?:/|\Z)", re.IGNORECASE
+_DEVICES = "(?:con|prn|aux|nul|com[0-9]|lpt[0-9])"
+_DEVICE = re.compile(rf"(?:\A|/){_DEVICES}(?: *\.[^/]*)?(?:/|\Z)", re.IGNORECASE)
+# Most names: one look is enough.
+_PLAIN = re.compile(
+    rf"(?!{_DEVICES}(?:\.|\Z))[0-9a-z_-]++(?:\.[0-9a-z_-]++)*+", re.IGNORECASE | re.ASCII
 )
 
 
@@ -30,6 +33,8 @@ def leads_out(name: str, *folders: str) -> str | None:
     str or None
         What it does, to stand after the name; None if it may.
     """
+    if _PLAIN.fullmatch(name):
+        return None
     parts = name.replace("\\", "/")
     if "\0" in name:
         return "has a NUL in it"

@@ -11,7 +11,7 @@ from detect.name_index import NameIndex
 from detect.run import Frames, RunFrame
 from detect.sources.interface import PoseStream, Source, SourceImage, TimedPose
 from detect.sources.steps import movement_between, pose_between, step_of
-from landmarks import Step, read_rows
+from landmarks import Step, iterate_prefixes, iterate_steps
 
 #: Between poses farther apart than this (s), nothing is made up.
 LARGEST_GAP_S = 1.0
@@ -97,19 +97,16 @@ class FramesAlongRows(SourceFrames):
         super().__init__(source)
         self.why_left_out = "images are not named by a STEP row: left out"
         self._path = path
-        self._names = NameIndex(_bytes(_image_name(step)) for step in self._steps())
-
-    def _steps(self) -> Iterator[Step]:
-        return (row.record for row in read_rows(self._path) if isinstance(row.record, Step))
+        self._names = NameIndex(_bytes(_image_name(prefix)) for prefix in iterate_prefixes(path))
 
     def _framed(self, images: Iterator[SourceImage]) -> Iterator[RunFrame]:
-        steps = self._steps()
+        steps = iterate_steps(self._path)
         for image in images:
             if self._names.find(_bytes(image.prefix)) is None:
                 self.left_out += 1
                 continue
             for step in steps:
-                if _image_name(step) == image.prefix:
+                if _image_name(step.prefix) == image.prefix:
                     yield _frame(image, step)
                     break
                 yield RunFrame(step, None)
@@ -206,8 +203,8 @@ def _frame(image: SourceImage, step: Step) -> RunFrame:
     )
 
 
-def _image_name(step: Step) -> str:
-    return step.prefix.strip('"').replace("\\", "/").rsplit("/", 1)[-1]
+def _image_name(prefix: str) -> str:
+    return prefix.strip('"').replace("\\", "/").rsplit("/", 1)[-1]
 
 
 def _bytes(text: str) -> bytes:
