@@ -7,19 +7,17 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 from textwrap import indent
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from detect.errors import FrameError
 from detect.frame import FrameDetections, FramePlan, Tables, detect_in_image
-from detect.row_text import unknown_rows
-from detect.row_text_kernels import circle_numbers
+from detect.row_text import unknown_circles, unknown_rows
 from detect.run import RunFrame, read_image
 from detect.sources.times import format_time
 from landmarks import (
@@ -45,8 +43,7 @@ _PIXELS_AT_ONCE = 1 << 21
 _COSTS_THE_FRAME = (FrameError, ArithmeticError, np.linalg.LinAlgError, MemoryError)
 
 
-@dataclass(frozen=True, slots=True)
-class FrameTask:
+class FrameTask(NamedTuple):
     """A frame to be worked on, and what is known about it beforehand. Small.
 
     Attributes
@@ -64,8 +61,7 @@ class FrameTask:
     reference: tuple[LineLandmark, ...] | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class FrameRows:
+class FrameRows(NamedTuple):
     """What came of a frame.
 
     Attributes
@@ -185,7 +181,7 @@ def _rows_of(
         markers=markers,
         json=record,
         times=_time_row(task),
-        pictures=tuple(_pictures(step.prefix, found, plan, tables)),
+        pictures=_pictures(step.prefix, found, plan, tables),
         disc_count=0 if found.discs is None else len(found.discs),
         line_count=0 if found.lines is None else len(found.lines),
         marker_count=0 if found.markers is None else len(found.markers),
@@ -214,15 +210,12 @@ def _line_rows(found: LineDetections, reference: tuple[LineLandmark, ...] | None
         from detect.line_identity import carry_ids
 
         return _rows(carry_ids(found.landmarks(), reference))
-    columns = (found.ends, found.alpha_rad, found.beta_rad, np.zeros(len(found)), found.sigma_rad)
-    rows = unknown_rows("LANDMARK_L", np.column_stack(columns))
+    rows = unknown_rows("LANDMARK_L", found.row_numbers())
     return _rows(found.landmarks()) if rows is None else rows
 
 
 def _circle_rows(found: CircleDetections) -> bytes:
-    rows = unknown_rows(
-        "LANDMARK_C", circle_numbers(found.floor_xy, found.quality, found.covariance)
-    )
+    rows = unknown_circles(found.floor_xy, found.quality, found.covariance)
     if rows is not None:
         return rows
     unknown = np.full(len(found), -1)
@@ -265,9 +258,15 @@ def _disc_records(found: CircleDetections) -> list[dict[str, object]]:
 
 def _pictures(
     prefix: str, found: FrameDetections, plan: FramePlan, tables: Tables
-) -> Iterator[tuple[str, bytes]]:
+) -> tuple[tuple[str, bytes], ...]:
     if plan.drawing is None and not plan.draw_response:
-        return
+        return ()
+    return tuple(_drawn(prefix, found, plan, tables))
+
+
+def _drawn(
+    prefix: str, found: FrameDetections, plan: FramePlan, tables: Tables
+) -> Iterator[tuple[str, bytes]]:
     from detect.drawing import draw_circles
     from detect.line_drawing import draw_lines, draw_response, draw_tracks
     from detect.line_tracks import line_response

@@ -48,9 +48,9 @@ def bounded_content(path: Path | str, name: object, size: tuple[int, int] | None
         handle = os.open(path, _WITHOUT_WAITING)
         try:
             status = os.fstat(handle)
-            if stat.S_ISDIR(status.st_mode):
-                raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
             if not stat.S_ISREG(status.st_mode):
+                if stat.S_ISDIR(status.st_mode):
+                    raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
                 raise FrameError(f"{name}: cannot be read: is no file, but a pipe or a device")
             if status.st_size > limit:
                 raise FrameError(
@@ -96,7 +96,7 @@ def demand_bounded(content: bytes, name: object, size: tuple[int, int] | None) -
             f"{name}: cannot be decoded: claims {width}x{height} px: "
             f"expected at most {MOST_PIXELS} pixels"
         )
-    if size is not None and sorted(claimed) != sorted(size):
+    if size is not None and size not in ((width, height), (height, width)):
         raise FrameError(
             f"{name}: is {width}x{height} px: "
             f"expected {size[0]}x{size[1]}, the calibration's size: "

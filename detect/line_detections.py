@@ -138,6 +138,13 @@ class LineDetections:
             complete=True,
         )
 
+    def row_numbers(self) -> FloatArray:
+        """(N, 8) the numbers of `landmarks`, in the order of a file's rows."""
+        numbers = np.zeros((len(self), 8))
+        numbers[:, :6] = self._lines[:6].T
+        numbers[:, 7] = self._lines[6]
+        return numbers
+
     def landmarks(self) -> tuple[LineLandmark, ...]:
         """Rows for a landmark file, without identifiers; quality is 0 as in the data set's own."""
         return tuple(

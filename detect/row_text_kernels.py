@@ -17,6 +17,9 @@ _LEAST, _MOST = 10.0 ** (_DIGITS - 1), 10.0**_DIGITS
 _DOUBTFUL = 1e-7
 
 _ZERO, _POINT, _MINUS, _PLUS, _SPACE, _E = (ord(c) for c in "0.-+ e")
+#: "00" to "99", one after the other.
+_PAIRS = np.array([_ZERO + digit for n in range(100) for digit in divmod(n, 10)], np.uint8)
+_TEN, _HUNDRED, _MYRIAD = np.uint32(10), np.uint32(100), np.uint32(10_000)
 
 #: Most bytes of a number and the space before it.
 LONGEST = 14
@@ -28,19 +31,18 @@ def _significant_digits(size: float) -> tuple[int, int]:
 
     The digits are 100000 to 999999.
     """
-    exponent = math.floor(math.log10(size))
-    for _ in range(2):
-        power = _DIGITS - 1 - exponent
-        if not -len(_POWERS) < power < len(_POWERS):
-            return -1, 0
-        scaled = size * _POWERS[power] if power >= 0 else size / _POWERS[-power]
-        # The logarithm may be rounded over a whole number.
-        if scaled < _LEAST:
+    # Mostly a few steps: less than a logarithm takes.
+    exponent = 0
+    if size < 1.0:
+        first = size
+        while first < 1.0 and exponent > _DIGITS - len(_POWERS):
             exponent -= 1
-        elif scaled >= _MOST:
+            first = size * _POWERS[-exponent]
+    else:
+        while exponent < len(_POWERS) - 1 and size >= _POWERS[exponent + 1]:
             exponent += 1
-        else:
-            break
+    power = _DIGITS - 1 - exponent
+    scaled = size * _POWERS[power] if power >= 0 else size / _POWERS[-power]
     digits = math.floor(scaled)
     rest = scaled - digits
     if not _LEAST <= scaled < _MOST or abs(rest - 0.5) < _DOUBTFUL:
@@ -63,10 +65,19 @@ def _write_number(value: float, text: NDArray[np.uint8], at: int) -> int:
     number, exponent = _significant_digits(abs(value))
     if number < 0:
         return -1
-    count = _DIGITS
-    while number % 10 == 0:
-        number //= 10
-        count -= 1
+    first = np.uint32(number) // _MYRIAD
+    last = np.uint32(number) - first * _MYRIAD
+    middle = last // _HUNDRED
+    last -= middle * _HUNDRED
+    count = _DIGITS  # without the zeros at the end
+    if last == 0:
+        count = 4
+        if middle == 0:
+            count = 2 if first % _TEN != 0 else 1
+        elif middle % _TEN == 0:
+            count = 3
+    elif last % _TEN == 0:
+        count = 5
     scientific = exponent < -4 or exponent >= _DIGITS
     # Digits before the point; none at all is a zero.
     whole = 1 if scientific else exponent + 1
@@ -78,19 +89,17 @@ def _write_number(value: float, text: NDArray[np.uint8], at: int) -> int:
             text[at] = _ZERO
             at += 1
         whole = 0
-    length = max(count, whole) + (1 if 0 < whole < count else 0)
-    place = at + length - 1
-    for _ in range(whole - count):
-        text[place] = _ZERO
-        place -= 1
-    for k in range(count - 1, -1, -1):
-        text[place] = _ZERO + number % 10
-        number //= 10
-        place -= 1
-        if k == whole and whole > 0:
-            text[place] = _POINT
-            place -= 1
-    at += length
+    for k in range(2):  # all of them, whether or not they stay
+        text[at + k] = _PAIRS[2 * first + k]
+        text[at + 2 + k] = _PAIRS[2 * middle + k]
+        text[at + 4 + k] = _PAIRS[2 * last + k]
+    if 0 < whole < count:
+        for k in range(count, whole, -1):
+            text[at + k] = text[at + k - 1]
+        text[at + whole] = _POINT
+        at += count + 1
+    else:
+        at += max(count, whole)
     if scientific:
         text[at] = _E
         text[at + 1] = _MINUS if exponent < 0 else _PLUS
@@ -156,3 +165,16 @@ def write_rows(
             text[at + k] = tail[k]
         at += len(tail)
     return at
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def write_circle_rows(
+    head: NDArray[np.uint8],
+    floor_xy: NDArray[np.float64],
+    quality: NDArray[np.float64],
+    covariance: NDArray[np.float64],
+    tail: NDArray[np.uint8],
+    text: NDArray[np.uint8],
+) -> int:
+    """`write_rows` of `circle_numbers`: one call takes a microsecond less than two."""
+    return write_rows(head, circle_numbers(floor_xy, quality, covariance), tail, text)

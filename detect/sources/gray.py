@@ -86,7 +86,8 @@ def gray_of_pixels(pixels: NDArray[Any], name: object, bits: int = 16) -> NDArra
     if pixels.ndim == 2 and pixels.dtype == np.uint8:  # of all images but a few
         # For arrays that must not be written to, as those of a message are, Numba would compile
         # every kernel once more.
-        return np.require(pixels, requirements=["C", "W"])
+        sound = pixels.flags.c_contiguous and pixels.flags.writeable
+        return pixels if sound else np.require(pixels, requirements=["C", "W"])
     if pixels.dtype not in (np.uint8, np.uint16):
         raise FrameError(f"{name}: holds {pixels.dtype}: expected images of 8 or 16 bits")
     if pixels.ndim == 3:
