@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from camera import Camera
 from detect.circles import CircleDetections
-from detect.levelling_kernels import level_floor, level_floor_covariances
+from detect.levelling_kernels import level_discs, level_floor, level_floor_covariances
 from landmarks import FrameTilt
 
 FloatArray = NDArray[np.float64]
@@ -18,12 +18,19 @@ def levelled(found: CircleDetections, camera: Camera, tilt: FrameTilt) -> Circle
 
     Discs that the levelled camera would see above the horizon are left out.
     """
-    tilt_covariance = np.array([[tilt.cpp, tilt.cpr], [tilt.cpr, tilt.crr]])
-    floor_xy = level_positions(camera, found.floor_xy, tilt.pitch, tilt.roll)
-    covariance = level_covariances(
-        camera, found.floor_xy, found.covariance, tilt.pitch, tilt.roll, tilt_covariance
+    floor_xy, covariance = np.empty((len(found), 2)), np.empty((len(found), 2, 2))
+    down = np.empty(len(found), np.bool_)
+    all_down = level_discs(
+        np.ascontiguousarray(found.floor_xy),
+        np.ascontiguousarray(found.covariance),
+        camera.centre,
+        (tilt.pitch, tilt.roll, tilt.cpp, tilt.cpr, tilt.crr),
+        floor_xy,
+        covariance,
+        down,
     )
-    down = np.all(np.isfinite(floor_xy), axis=-1) & np.all(np.isfinite(covariance), axis=(-1, -2))
+    if all_down:
+        return CircleDetections(found.pixels, floor_xy, covariance, found.quality, found.evidence)
     return CircleDetections(
         pixels=found.pixels[down],
         floor_xy=floor_xy[down],

@@ -86,3 +86,44 @@ def level_floor_covariances(
                         total += by[i, m] * within[m, n] * by[j, n]
                 out[k, i, j] = total if down < 0.0 else math.nan
     return out
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def level_discs(
+    floor_xy: NDArray[np.float64],
+    covariance: NDArray[np.float64],
+    centre: NDArray[np.float64],
+    tilt: tuple[float, float, float, float, float],
+    level_xy: NDArray[np.float64],
+    level_covariance: NDArray[np.float64],
+    down: NDArray[np.bool_],
+) -> bool:
+    """Level positions and covariances in one call.
+
+    Parameters
+    ----------
+    floor_xy, covariance, centre
+        (N, 2), (N, 2, 2), (3,) float64.
+    tilt : tuple of float
+        Pitch, roll, and their covariance's entries: both pitch, pitch and roll, both roll.
+    level_xy, level_covariance : (N, 2), (N, 2, 2) float64
+        Results.
+    down : (N,) bool
+        Result: whether the levelled ray meets the floor.
+
+    Returns
+    -------
+    bool
+        Whether all do.
+    """
+    pitch, roll, cpp, cpr, crr = tilt
+    tilt_covariance = np.array([[cpp, cpr], [cpr, crr]])
+    level_xy[:] = level_floor(floor_xy, centre, pitch, roll)
+    level_covariance[:] = level_floor_covariances(
+        floor_xy, covariance, centre, pitch, roll, tilt_covariance
+    )
+    all_down = True
+    for k in range(len(floor_xy)):
+        down[k] = np.isfinite(level_xy[k]).all() and np.isfinite(level_covariance[k]).all()
+        all_down = all_down and down[k]
+    return all_down

@@ -15,20 +15,18 @@ run. Runs of the library without a log have no journal; their files grow and app
 from __future__ import annotations
 
 import errno
-import hashlib
 import logging
 import os
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Protocol
 
 from detect.conduct import Conduct
 from detect.errors import DetectError
 from detect.frame import FramePlan
 from detect.frame_rows import FrameRows, FrameTask
+from detect.growing_files import GrowingFile, RunOutput, held_open, sync_together
 from detect.resume_journal import (
     Journal,
     JournalHead,
@@ -36,6 +34,7 @@ from detect.resume_journal import (
     checked,
     journal_place,
     left_journal,
+    made_by,
     new_journal,
     task_digest,
 )
@@ -49,52 +48,9 @@ from detect.run_log import (
     log_tail,
 )
 from storage import OutputExistsError
-from storage.parts import PartFile, folder_locked, left_part, new_part, remove_left_part
+from storage.parts import folder_locked, left_part, new_part, remove_left_part
 
 _log = logging.getLogger("redetect")
-
-#: Raised with every change of what a journal or the rows that it stands for look like.
-_JOURNAL_VERSION = 3
-
-
-class RunOutput(Protocol):
-    """A file that a run is written to: `detect.stream.Output`."""
-
-    @property
-    def path(self) -> Path: ...
-    @property
-    def part(self) -> str: ...
-    @property
-    def head(self) -> bytes: ...
-    @property
-    def tail(self) -> bytes: ...
-    @property
-    def between(self) -> bytes: ...
-
-
-@dataclass
-class _Growing:
-    """A file of the run, its part, and what is in it so far."""
-
-    path: Path
-    head: bytes
-    tail: bytes
-    rows: Callable[[FrameRows, str], bytes]
-    overwrite: bool
-    part: PartFile | None = None
-    size: int = 0
-
-    def __post_init__(self) -> None:
-        self.digest = hashlib.sha256()
-
-    def write(self, content: bytes) -> None:
-        assert self.part is not None
-        self.part.write(content)
-        self.count(content)
-
-    def count(self, content: bytes) -> None:
-        self.size += len(content)
-        self.digest.update(content)
 
 
 class RunFiles:
@@ -118,20 +74,20 @@ class RunFiles:
         self._conduct = conduct
         self._overwrite = overwrite
         self._frames = self._failed = self._taken_over = 0
-        self._check = self._made_by = _made_by(outputs, plan, conduct)
+        self._check = self._made_by = made_by(outputs, plan, conduct)
         self._journal: Journal | None = None
         self._kept: Iterator[JournalLine] = iter(())
         self._pushed_back: FrameTask | None = None
         self._under_way: deque[tuple[str, str]] = deque()
         self._resumes = self._goes_on = self._done = False
         self._files = [
-            _Growing(output.path, output.head, output.tail, self._rows_of(output), overwrite)
+            GrowingFile(output.path, output.head, output.tail, self._rows_of(output), overwrite)
             for output in outputs
         ]
         if conduct.log is not None:
             head = log_head(plan, conduct)
             # That it may be replaced is made sure of when it is opened: it is a log.
-            self._files.append(_Growing(conduct.log, head, b"", self._failure, True))
+            self._files.append(GrowingFile(conduct.log, head, b"", self._failure, True))
 
     # -- beginning ------------------------------------------------------------------------
 
@@ -382,16 +338,16 @@ class RunFiles:
             file.write(log_tail(found, written) if is_log else file.tail)
             written.append(WrittenFile(file.path.name, file.size, file.digest.hexdigest()))
         parts = [(file, file.part) for file in self._files if file.part is not None]
-        for _, part in parts:
-            part.sync()
+        sync_together([part for _, part in parts])
         with folder_locked(self._files[-1].path.parent):
             for file, _ in parts:
                 if not file.overwrite and os.path.lexists(file.path):
                     raise OutputExistsError(file.path)
-            if self._journal is not None:
-                self._journal.complete()
-            for file, part in parts:
-                part.place(overwrite=file.overwrite)
+            with held_open([file.path for file, _ in parts]):
+                if self._journal is not None:
+                    self._journal.complete()
+                for file, part in parts:
+                    part.place(overwrite=file.overwrite)
         self._done = True
 
     def __exit__(
@@ -422,25 +378,3 @@ class RunFiles:
         if self._journal is not None:
             self._journal.remove()
             self._journal = None
-
-
-def _made_by(outputs: Sequence[RunOutput], plan: FramePlan, conduct: Conduct) -> str:
-    """A digest of whatever decides the rows, besides the frames themselves."""
-    import cv2
-    import numba
-    import numpy as np
-
-    settings = [
-        None if values is None else asdict(values)
-        for values in (plan.circles, plan.lines, plan.markers)
-    ]
-    values = (
-        _JOURNAL_VERSION,
-        conduct.version,
-        (np.__version__, cv2.__version__, numba.__version__),
-        settings,
-        None if plan.camera is None else plan.camera.content_hash,
-        (plan.json, plan.drawing, plan.draw_response),
-        [(output.part, output.head, output.tail, output.between) for output in outputs],
-    )
-    return hashlib.sha256(repr(values).encode("utf-8", "surrogateescape")).hexdigest()

@@ -11,13 +11,19 @@ import hashlib
 import json
 import os
 import struct
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from detect.conduct import Conduct
+from detect.frame import FramePlan
 from detect.frame_rows import FrameRows, FrameTask
+from detect.growing_files import RunOutput
 from detect.run import RunFrame
 from storage.parts import named, new_locked, old_locked, write_all
+
+#: Raised with every change of what a journal or the rows that it stands for look like.
+_JOURNAL_VERSION = 3
 
 _DIGITS = 16
 _COMPLETE = b'"complete"\n'
@@ -180,6 +186,28 @@ def left_journal(place: Path) -> Journal | None:
     return None if handle is None else Journal(place, handle)
 
 
+def made_by(outputs: Sequence[RunOutput], plan: FramePlan, conduct: Conduct) -> str:
+    """A digest of whatever decides the rows, besides the frames themselves."""
+    import cv2
+    import numba
+    import numpy as np
+
+    settings = [
+        None if values is None else asdict(values)
+        for values in (plan.circles, plan.lines, plan.markers)
+    ]
+    values = (
+        _JOURNAL_VERSION,
+        conduct.version,
+        (np.__version__, cv2.__version__, numba.__version__),
+        settings,
+        None if plan.camera is None else plan.camera.content_hash,
+        (plan.json, plan.drawing, plan.draw_response),
+        [(output.part, output.head, output.tail, output.between) for output in outputs],
+    )
+    return hashlib.sha256(repr(values).encode("utf-8", "surrogateescape")).hexdigest()
+
+
 def checked(
     before: str, lengths: tuple[int, ...], task: str, rows: FrameRows, content: list[bytes]
 ) -> str:
@@ -199,7 +227,15 @@ def task_digest(task: FrameTask) -> str:
     frame = task.frame
     s = frame.step  # numbers in words, or a record's own representation, would take longer than all
     numbers = _STEP(s.dx, s.dy, s.dphi, s.cxx, s.cxy, s.cyy, s.cxphi, s.cyphi, s.cphiphi)
-    beside = s.prefix, _file_of(frame), frame.time_s, frame.bits, frame.failure, task.tilt, task.reference
+    beside = (
+        s.prefix,
+        _file_of(frame),
+        frame.time_s,
+        frame.bits,
+        frame.failure,
+        task.tilt,
+        task.reference,
+    )
     digest = hashlib.sha256(numbers + repr(beside).encode("utf-8", "surrogateescape"))
     if frame.content is not None:
         content = frame.content

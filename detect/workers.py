@@ -21,6 +21,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import CancelledError, Executor, Future, ProcessPoolExecutor
 from contextlib import ExitStack, contextmanager
+from enum import Enum
 from multiprocessing.connection import wait
 from multiprocessing.process import BaseProcess
 from multiprocessing.synchronize import Event, Lock
@@ -152,11 +153,16 @@ class _SpawnedProcesses(ProcessPoolExecutor):
     """Processes that inherit a blocked interrupt: it would reach them even while they start.
 
     None is left half started: an interrupt of this process waits meanwhile.
+
+    The plan that they were started for, they have: it does not travel with every task.
     """
 
+    plan: FramePlan
+
     def submit(self, fn: Callable[P, R], /, *args: P.args, **kwargs: P.kwargs) -> Future[R]:
+        given = [_Known.PLAN if value is self.plan else value for value in args]
         with interrupts_deferred():
-            return super().submit(_unless_stopped, fn, *args, **kwargs)
+            return super().submit(_unless_stopped, fn, *given, **kwargs)
 
 
 @contextmanager
@@ -171,6 +177,7 @@ def _processes(jobs: int, plan: FramePlan) -> Iterator[Executor]:
                 initializer=_begin,
                 initargs=(plan, stop, first, ready, announcements_are_shown()),
             )
+            pool.plan = plan
             ending.callback(_shut_down, pool, stop)
         yield pool
 
@@ -208,12 +215,12 @@ def _end(processes: Sequence[BaseProcess]) -> None:
             process.join()
 
 
-def _unless_stopped(fn: Callable[P, R], /, *args: P.args, **kwargs: P.kwargs) -> R:
+def _unless_stopped(fn: Callable[..., R], /, *args: object, **kwargs: object) -> R:
     """Do a task, unless its result is no longer waited for."""
     if _stopped is not None and _stopped.is_set():
         raise CancelledError
     _tidy_now_and_then(_TIDY_EVERY)
-    return fn(*args, **kwargs)
+    return fn(*[_own_plan if value is _Known.PLAN else value for value in args], **kwargs)
 
 
 def _tidy_now_and_then(every: int) -> None:
@@ -228,14 +235,23 @@ def _tidy_now_and_then(every: int) -> None:
 _tasks_begun = 0
 
 
+class _Known(Enum):
+    """What stands in a task for what a worker has already."""
+
+    PLAN = "plan"
+
+
+#: In a worker process: the plan that it was started for.
+_own_plan: FramePlan | None = None
+
 #: Set in a worker process when the run ends early.
 _stopped: Event | None = None
 
 
 def _begin(plan: FramePlan, stop: Event, first: Lock, ready: Event, show: bool) -> None:
     """Make a new process a worker; one of them compiles what is to be compiled, for all."""
-    global _stopped
-    _stopped = stop
+    global _stopped, _own_plan
+    _stopped, _own_plan = stop, plan
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     if show:

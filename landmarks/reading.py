@@ -46,7 +46,9 @@ _NUMBERS = re.compile(rb"(?:%b )*+" % _NUMBER_PATTERN)
 _WHOLE_NUMBER = re.compile(rb"[+-]?[0-9]+")
 # A STEP as programs write it, in a line of its own: of a long run all are. Such numbers are finite.
 _PLAIN_STEP = re.compile(
-    rb"STEP ((?!#)[!-\[\]-~]++)" + len(STEP_NUMBERS) * rb" ++(-?[0-9]{1,15}\.[0-9]{1,20})" + rb"\r?\n"
+    rb"STEP ((?!#)[!-\[\]-~]{1,255}+)"
+    + len(STEP_NUMBERS) * rb" {1,32}+(-?[0-9]{1,15}\.[0-9]{1,20})"
+    + rb"\r?\n"
 )
 
 
@@ -157,7 +159,7 @@ def parse_record(text: str) -> Record | None:
 
 @contextmanager
 def _opened(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
-    """A landmark file for reading; what the system says against it becomes a `LandmarkFileError`."""
+    """A landmark file for reading; what the system has against it is a `LandmarkFileError`."""
     try:
         with Path(path).open("rb") as stream:
             yield stream
@@ -177,22 +179,26 @@ def _parsed(
 
     Of a plain STEP, the record is what `plain` makes of its words.
     """
+    number = 0  # of the last line
     seen_step = False
-    for line, source, text in _logical_lines(stream, name):
+    while source := stream.readline(_LONGEST_ROW_BYTES + 1):
+        number += 1
         found = _PLAIN_STEP.fullmatch(source)
         if found is not None:
             seen_step = True
-            yield plain(found), source, line
+            yield plain(found), source, number
             continue
+        first = number
+        source, text, number = _logical_line(stream, name, source, number)
         try:
             record = _parse(text)
         except LandmarkError as error:
-            raise LandmarkFileError(name, line, str(error)) from None
+            raise LandmarkFileError(name, first, str(error)) from None
         if isinstance(record, Step):
             seen_step = True
         elif isinstance(record, Landmark) and not seen_step:
-            raise LandmarkFileError(name, line, "landmark before any STEP: expected a STEP first")
-        yield record, source, line
+            raise LandmarkFileError(name, first, "landmark before any STEP: expected a STEP first")
+        yield record, source, first
 
 
 def _plain_step(found: re.Match[bytes]) -> Step:
@@ -204,34 +210,35 @@ def _plain_prefix(found: re.Match[bytes]) -> str:
     return found[1].decode()
 
 
-def _logical_lines(stream: BinaryIO, name: str) -> Iterator[tuple[int, bytes, bytes]]:
-    """Yield each row's first line number, its text in the file, and the same joined to one line."""
-    number = 0
+def _logical_line(
+    stream: BinaryIO, name: str, source: bytes, number: int
+) -> tuple[bytes, bytes, int]:
+    """A row from its first line: its text in the file, the same joined to one line, its last line.
 
-    def next_line(length_so_far: int) -> bytes:
-        line = stream.readline(_LONGEST_ROW_BYTES + 1)
-        if length_so_far + len(line) > _LONGEST_ROW_BYTES:
-            raise LandmarkFileError(
-                name, number + 1, f"longer than {_LONGEST_ROW_BYTES} bytes: expected a row of text"
-            )
-        return line
-
-    while source := next_line(0):
+    `number` is that of the first line.
+    """
+    _demand_row_length(source, name, number)
+    text = source.rstrip(b"\r\n")
+    if number == 1:
+        text = text.removeprefix(_BYTE_ORDER_MARK)
+    if text.lstrip().startswith(b"#"):
+        text = b""
+    while text.endswith(b"\\"):
+        following = stream.readline(_LONGEST_ROW_BYTES + 1)
+        if not following:
+            raise LandmarkFileError(name, number, "ends with \\: expected a line to follow")
         number += 1
-        first = number
-        text = source.rstrip(b"\r\n")
-        if first == 1:
-            text = text.removeprefix(_BYTE_ORDER_MARK)
-        if text.lstrip().startswith(b"#"):
-            text = b""
-        while text.endswith(b"\\"):
-            following = next_line(len(source))
-            if not following:
-                raise LandmarkFileError(name, number, "ends with \\: expected a line to follow")
-            number += 1
-            source += following
-            text = text[:-1] + following.rstrip(b"\r\n")
-        yield first, source, text
+        source += following
+        _demand_row_length(source, name, number)
+        text = text[:-1] + following.rstrip(b"\r\n")
+    return source, text, number
+
+
+def _demand_row_length(source: bytes, name: str, line: int) -> None:
+    if len(source) > _LONGEST_ROW_BYTES:
+        raise LandmarkFileError(
+            name, line, f"longer than {_LONGEST_ROW_BYTES} bytes: expected a row of text"
+        )
 
 
 def _parse(text: bytes) -> Record | None:

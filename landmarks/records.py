@@ -61,6 +61,10 @@ class Step:
         _demand_finite(self, STEP_NUMBERS)
         _demand_word(self.prefix, "image prefix")
 
+    def __reduce__(self) -> tuple[type[Step], tuple[str | float, ...]]:
+        # One travels to a worker with every frame: a dataclass's own way takes longer.
+        return Step, (self.prefix, *_values_of(STEP_NUMBERS)(self))
+
 
 @dataclass(frozen=True, slots=True)
 class CircleLandmark:
