@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 import shutil
 from pathlib import Path
 
@@ -11,8 +12,9 @@ import pytest
 from detect.frame import FramePlan, tables_of
 from detect.frame_rows import FrameRows, FrameTask, rows_of_frames
 from detect.resume_journal import Journal, JournalHead, new_journal
-from detect.run import open_run
+from detect.run import RunFrame, open_run
 from detect.settings import PUBLISHED
+from landmarks import FrameTilt
 
 FRAMES = 12
 
@@ -43,6 +45,16 @@ def test_frames_have_the_same_rows_together_and_alone(
     for rows, task in zip(together, tasks):
         assert rows.circles.startswith(f"STEP {task.frame.step.prefix} ".encode())
         assert rows.disc_count == rows.circles.count(b"LANDMARK_C")
+
+
+def test_tasks_travel_whole(tasks_and_plan: tuple[list[FrameTask], FramePlan]) -> None:
+    tasks, _ = tasks_and_plan
+    tasks[1] = FrameTask(tasks[1].frame, FrameTilt("e.0001", 0.1, 0.2, 1e-6, 0.0, 1e-6, 7))
+    shipped = RunFrame(tasks[2].frame.step, None, b"content", 1.5, 12, "why")
+    assert pickle.loads(pickle.dumps(tasks)) == tasks
+    arrived = pickle.loads(pickle.dumps(shipped))
+    assert arrived == shipped
+    assert arrived.content == b"content"
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from camera import Camera, parse_camera
-from detect.levelling import level_covariances, level_positions
+from detect.circles import CircleDetections
+from detect.levelling import level_covariances, level_positions, levelled
+from landmarks import FrameTilt
 from tests.conftest import PUBLISHED_CAM
 
 CAMERA = parse_camera(PUBLISHED_CAM)
@@ -61,3 +63,28 @@ def test_rays_that_rise_after_levelling_have_no_position() -> None:
     assert np.all(np.isnan(level_positions(CAMERA, far, -0.2, 0.0))) or np.all(
         np.isnan(level_positions(CAMERA, far, 0.2, 0.0))
     )
+
+
+@pytest.mark.parametrize("pitch", [-0.2, 0.0, 0.2])
+@pytest.mark.parametrize("farthest_m", [5.0, 60.0])
+def test_discs_are_levelled_as_positions_and_covariances_are(
+    pitch: float, farthest_m: float
+) -> None:
+    rng = np.random.default_rng(7)
+    floor_xy = np.column_stack([rng.normal(size=9), np.linspace(-1.0, -farthest_m, 9)])
+    half = rng.normal(0.0, 0.01, (9, 2, 2))
+    covariance = half @ half.transpose(0, 2, 1)
+    found = CircleDetections(
+        rng.integers(0, 288, (9, 2)), floor_xy, covariance, rng.random(9), rng.normal(size=9)
+    )
+    tilt = FrameTilt("e.0000", pitch, 0.01, 2e-6, 5e-7, 1e-6, 9)
+    after = levelled(found, CAMERA, tilt)
+    of_tilt = np.array([[2e-6, 5e-7], [5e-7, 1e-6]])
+    level_xy = level_positions(CAMERA, floor_xy, pitch, 0.01)
+    level_cov = level_covariances(CAMERA, floor_xy, covariance, pitch, 0.01, of_tilt)
+    down = np.isfinite(np.column_stack([level_xy, level_cov.reshape(9, 4)])).all(axis=1)
+    assert down.all() == (pitch != -0.2 or farthest_m == 5.0)
+    np.testing.assert_array_equal(after.floor_xy, level_xy[down])
+    np.testing.assert_array_equal(after.covariance, level_cov[down])
+    for name in ("pixels", "quality", "evidence"):
+        np.testing.assert_array_equal(getattr(after, name), getattr(found, name)[down])
