@@ -23,7 +23,7 @@ def levelled(found: CircleDetections, camera: Camera, tilt: FrameTilt) -> Circle
     all_down = level_discs(
         np.ascontiguousarray(found.floor_xy),
         np.ascontiguousarray(found.covariance),
-        camera.centre,
+        np.array(camera.centre),
         (tilt.pitch, tilt.roll, tilt.cpp, tilt.cpr, tilt.crr),
         floor_xy,
         covariance,

@@ -17,11 +17,12 @@ import pytest
 from numba import typeof
 
 from camera import Camera, parse_camera
-from detect.circles import refined_covariance
+from detect.circles import CircleDetections, refined_covariance
 from detect.disc_covariance_kernels import refined_covariances
-from detect.levelling import level_covariances, level_positions
-from detect.levelling_kernels import level_floor, level_floor_covariances
+from detect.levelling import level_covariances, level_positions, levelled
+from detect.levelling_kernels import level_discs, level_floor, level_floor_covariances
 from detect.settings import CircleSettings
+from landmarks import FrameTilt
 from lut import DiscShape, cached_disc_table, cached_vertical_table, floor_positions
 from lut.kernels import fill_floor_positions
 from tests.conftest import PUBLISHED_CAM
@@ -66,11 +67,18 @@ def test_cameras_that_are_read_and_handed_over_are_of_one_kind() -> None:
     assert read.centre[2] > 0.0  # kept by the camera, and handed over with it
     assert read.rotation.shape == (3, 3)
     handed_over = pickle.loads(pickle.dumps(read))
-    kernels = (level_floor, level_floor_covariances, refined_covariances, fill_floor_positions)
+    kernels = (
+        level_floor, level_floor_covariances, level_discs, refined_covariances,
+        fill_floor_positions,
+    )  # fmt: skip
+    pixels, two = np.array([[400, 200], [300, 150]]), np.ones(2)
+    discs = CircleDetections(pixels, FLOOR_XY, COVARIANCE, two, two)
+    tilt = FrameTilt("e.0000", 0.01, 0.02, 1e-6, 0.0, 1e-6, 9)
     compiled = []
     for camera in (read, handed_over):
         level_positions(camera, FLOOR_XY, 0.01, 0.02)
         level_covariances(camera, FLOOR_XY, COVARIANCE, 0.01, 0.02, np.eye(2))
+        levelled(discs, camera, tilt)
         refined_covariance(camera, FLOOR_XY, COVARIANCE, CircleSettings())
         floor_positions(camera)
         compiled.append([set(kernel.signatures) for kernel in kernels])
