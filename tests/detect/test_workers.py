@@ -27,7 +27,7 @@ from detect.settings import CircleSettings
 from detect.workers import FRAMES_PER_PROCESS, cluster_workers, default_jobs, local_workers
 
 KINDS = ("lines", "tilt", "circles")
-FRAMES = 80
+FRAMES = 48
 PATIENCE_S = 120.0
 
 
