@@ -60,7 +60,14 @@ LONGEST_FILES = (
     "tests/detect/markers/test_detect.py",
     "tests/detect/test_line_step.py",
     "tests/detect/test_workers.py",
+    "tests/camera/test_calibrate_photographs.py",
+    "tests/detect/test_sources_memory.py",
+    "tests/groundtruth/fusion/test_fuse.py",
+    "tests/tools/evaluation/test_marker_evaluation.py",
     "tests/detect/test_full_disks.py",
+    "tests/groundtruth/lasers/test_alignment.py",
+    "tests/tools/benchmark/test_benchmark.py",
+    "tests/tools/soak/test_soak.py",
 )
 
 
