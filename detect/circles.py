@@ -9,6 +9,7 @@ neighbours in the floor plane and refines the position.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
@@ -22,9 +23,10 @@ from camera.kernels import camera_numbers, lens_numbers
 from camera.model import PUBLISHED_STEP_PX
 from detect.centres import best_centres
 from detect.centres import quality_of_centres as quality_of_centres
+from detect.disc_candidate_kernels import strong_and_alone
 from detect.disc_covariance_kernels import refined_covariances
-from detect.disc_fit import blur_ratio_of, fit_settings, fitted_positions
-from detect.disc_search_kernels import middles, search_discs, strong_and_alone
+from detect.disc_fit import blur_ratio_of, fit_settings
+from detect.disc_search_kernels import DiscSearch, search_discs
 from detect.errors import FrameError
 from detect.noise import estimate_noise
 from detect.pixel_floor_kernels import published_positions as pixel_positions
@@ -123,33 +125,20 @@ def detect_circles(
         )
 
     noise = estimate_noise(image, _NOISE_ROWS)
-    weakest = settings.noise_floor * max(noise, _LEAST_NOISE)
-    # Each disc has several best centres: of those in the middle of it one is enough.
-    near = 0.5 * settings.separation_m
-    keep = strong_and_alone(pixels, found_quality, contrast, table.floor_xy, weakest, near)
-    starts = middles(pixels, found_quality, contrast, table.floor_xy, weakest, near, keep)
-    results, evidence, index = search_discs(
+    kernel = _kernel_camera(camera)
+    index, floor_xy, covariance, evidence = search_discs(
         image,
         table.floor_xy,
-        starts,
-        found_quality[keep],
-        contrast[keep],
-        settings.radius_m,
-        settings.inner_radius_m,
-        settings.outer_radius_m,
-        fit_settings(noise, blur_ratio_of(camera)),
-        settings.verify,
-        settings.refine,
-        settings.evidence,
-        settings.blur_px,
-        settings.separation_m,
+        pixels,
+        found_quality,
+        contrast,
+        _disc_search(settings, settings.noise_floor * max(noise, _LEAST_NOISE)),
+        fit_settings(noise, kernel.blur_ratio),
+        kernel.numbers,
+        kernel.centre,
     )
-    index = keep[index]
     pixels = pixels[index]
-    if settings.refine:
-        floor_xy, fitted = fitted_positions(results)
-        covariance = refined_covariance(camera, floor_xy, fitted, settings)
-    else:
+    if not settings.refine:
         floor_xy, covariance = published_positions(camera, pixels)
     return CircleDetections(
         pixels=pixels,
@@ -157,6 +146,22 @@ def detect_circles(
         covariance=covariance,
         quality=found_quality[index],
         evidence=evidence,
+    )
+
+
+def _disc_search(settings: CircleSettings, weakest: float) -> DiscSearch:
+    return DiscSearch(
+        radius=settings.radius_m,
+        inner=settings.inner_radius_m,
+        outer=settings.outer_radius_m,
+        weakest=weakest,
+        separation=settings.separation_m,
+        verify=settings.verify,
+        refine=settings.refine,
+        least_evidence=settings.evidence,
+        optics_px=settings.blur_px,
+        pixel_variance=settings.systematic_px**2,
+        tilt_variance=math.radians(settings.tilt_sigma_deg) ** 2,
     )
 
 
@@ -209,6 +214,8 @@ class _KernelCamera(NamedTuple):
     pose: FloatArray
     distorted: FloatArray
     undistorted: FloatArray
+    centre: FloatArray
+    blur_ratio: float
 
 
 @lru_cache(maxsize=4)
@@ -219,6 +226,8 @@ def _kernel_camera(camera: Camera) -> _KernelCamera:
         np.array([*pinhole, *lens_numbers(camera)]),
         np.array(camera.robot_from_camera),
         *inverse_table(camera.coef),
+        np.array(camera.centre, np.float64),
+        blur_ratio_of(camera),
     )
 
 

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from camera import Camera
 from detect import disc_fit_kernels as kernels
 from detect.circles import disc_shape, refined_covariance, tilt_jacobian
+from detect.disc_candidate_kernels import middles, nearest_pixel, strong_and_alone
 from detect.disc_fit import disc_evidence, fit_discs
-from detect.disc_search_kernels import _nearest_pixel, middles, strong_and_alone
 from detect.settings import CircleSettings
 from lut import DiscTable, build_disc_table
 from tests.detect.painted_floor import PaintedFloor
@@ -128,7 +128,7 @@ def test_nearest_pixel_sees_the_place(published_camera: Camera, table: DiscTable
     rng = np.random.default_rng(5)
     for place in rng.uniform((-1.0, -5.0), (1.0, -1.0), (100, 2)):
         u, v = nearest(published_camera, (place[0], place[1]))
-        found = _nearest_pixel(table.floor_xy, u + 5, v - 2, place[0], place[1])
+        found = nearest_pixel(table.floor_xy, u + 5, v - 2, place[0], place[1])
         exact = published_camera.project_floor(place)
         assert np.abs(np.array(found) - exact).max() < 0.6
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from camera import Camera
 from detect.circles import disc_shape
+from detect.disc_candidate_kernels import share_of_steps
 from detect.disc_fit import fit_settings
 from detect.disc_list_kernels import gather_list
 from detect.disc_model_kernels import CAPACITY, GEOMETRY
@@ -26,7 +27,6 @@ from detect.disc_patch_kernels import (
     new_patch,
     padded,
 )
-from detect.disc_search_kernels import share_of_steps
 from detect.settings import CircleSettings
 from lut import DiscTable, build_disc_table
 from tests.detect.painted_floor import PaintedFloor
