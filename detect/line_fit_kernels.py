@@ -13,18 +13,21 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from detect.line_group_kernels import MARGIN, STEP
 from detect.line_step_filters import SUBPIXELS
-from detect.line_vector_kernels import LANES, WORD, add_products, slope_and_bend
+from detect.line_vector_kernels import LANES, WORD, slope_and_bend, sum_of_products
+
+_Floats = NDArray[np.float64]
 
 #: Up to here series of tangents and arc tangents are as good as these.
 _SMALL = 0.1
+#: A step is not repeated where it moved no row farther than this, pixels.
+_STILL_PX = 0.02
 
 
-@njit(cache=True, error_model="numpy")
-def _tan_and_secant(angle: float) -> tuple[float, float]:
-    """Tangent and inverse cosine; by their series for the small angles of a chart."""
-    if abs(angle) > _SMALL:
-        return math.tan(angle), 1.0 / math.cos(angle)
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _short_tan_and_secant(angle: float) -> tuple[float, float]:
+    """Tangent and inverse cosine of the small angles of a chart, by their series."""
     q = angle * angle
     tangent = angle * (1.0 + q * (1.0 / 3.0 + q * (2.0 / 15.0 + q * (17.0 / 315.0))))
     secant = 1.0 + q * (0.5 + q * (5.0 / 24.0 + q * (61.0 / 720.0 + q * (277.0 / 8064.0))))
@@ -38,32 +41,25 @@ def _arctan_series(x: float) -> float:
     return x * (1.0 - q * (1.0 / 3.0 - q * (0.2 - q * (1.0 / 7.0 - q * (1.0 / 9.0)))))
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"})
 def fit_eigenlines(
     bearing: NDArray[np.float64],
-    elevation_tan: NDArray[np.float32],
+    elevation: NDArray[np.float32],
     bounds: NDArray[np.int64],
     row: NDArray[np.int32],
     column: NDArray[np.float64],
     score: NDArray[np.float32],
     least_points: int,
     least_score: float,
-) -> tuple[
-    NDArray[np.float64],
-    NDArray[np.float64],
-    NDArray[np.float64],
-    NDArray[np.float64],
-    NDArray[np.float64],
-    NDArray[np.float64],
-    NDArray[np.float64],
-    NDArray[np.float64],
-]:
+) -> tuple[_Floats, _Floats, _Floats, _Floats, _Floats, _Floats, _Floats, _Floats]:
     """Straight lines through tracks, by the eigen-decomposition of their points' scatter.
 
     Parameters
     ----------
-    bearing, elevation_tan
-        The table.
+    bearing
+        The table's.
+    elevation
+        See `detect.line_strip.Strip.rise`.
     bounds, row, column, score
         The tracks (see `follow_edges`).
     least_points, least_score : int, float
@@ -120,13 +116,26 @@ def fit_eigenlines(
         sum_xx = 0.0
         sum_xz = 0.0
         sum_zz = 0.0
+        widest = 0.0
         for i in range(begin, end):
             j = min(int(column[i]), width - 2)
             f = column[i] - j
             off[i] = (1.0 - f) * bearing[j] + f * bearing[j + 1] - phi
-            rise[i] = (1.0 - f) * elevation_tan[row[i], j] + f * elevation_tan[row[i], j + 1]
-            x, secant = _tan_and_secant(off[i])
+            rise[i] = (1.0 - f) * elevation[j, row[i]] + f * elevation[j + 1, row[i]]
+            widest = max(widest, abs(off[i]))
+        # Near the chart's origin in a loop that becomes vectors.
+        near = end if widest <= _SMALL else begin
+        for i in range(begin, near):
+            x, secant = _short_tan_and_secant(off[i])
             z = rise[i] * secant
+            sum_x += x
+            sum_z += z
+            sum_xx += x * x
+            sum_xz += x * z
+            sum_zz += z * z
+        for i in range(near, end):
+            x = math.tan(off[i])
+            z = rise[i] / math.cos(off[i])
             sum_x += x
             sum_z += z
             sum_xx += x * x
@@ -153,7 +162,7 @@ def fit_eigenlines(
 @njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"}, forceinline=True)
 def refine_lines(
     image: NDArray[np.uint8],
-    table_column: NDArray[np.float32],
+    strip: NDArray[np.float32],
     bearing: NDArray[np.float64],
     sign: NDArray[np.float64],
     bounds: NDArray[np.int64],
@@ -171,13 +180,7 @@ def refine_lines(
     second_weights: NDArray[np.float32],
     farthest: NDArray[np.float64],
     tracked_line: NDArray[np.float64],
-) -> tuple[
-    NDArray[np.float64],
-    NDArray[np.float64],
-    NDArray[np.float64],
-    NDArray[np.float64],
-    NDArray[np.float64],
-]:
+) -> tuple[_Floats, _Floats, _Floats, _Floats, _Floats]:
     """Move lines to where the grey values are steepest along all of their rows together.
 
     Newton's method on the sum, over a track's rows, of the derivative-of-Gaussian response at the
@@ -193,8 +196,10 @@ def refine_lines(
     ----------
     image : (H, W) uint8
         Grey values.
-    table_column, bearing
-        The table.
+    strip
+        See `detect.line_strip.Strip.column`.
+    bearing
+        The table's.
     sign, bounds, row, column
         The tracks (see `follow_edges`).
     reference, pixel, middle, rise, point_off
@@ -241,8 +246,6 @@ def refine_lines(
     second = np.empty(height)
     at_pixel = np.empty(height, np.int64)
     at_weight = np.empty(height, np.int64)
-    # Sums of the fine and the coarse filter.
-    heights = np.empty(2 * LANES, np.float32)
     for t in range(len(sign)):
         begin, end = bounds[t], bounds[t + 1]
         a = tracked_line[t, 0]
@@ -279,13 +282,19 @@ def refine_lines(
                 j = min(int(at), width - 2)
                 columns_per_rad = 1.0 / (bearing[j + 1] - bearing[j])
                 at = (phi + turn[i] - bearing[j]) * columns_per_rad
-                du_dc = table_column[v, j + 1] - table_column[v, j]
+                group = j // STEP
+                base = min(max(group * STEP - MARGIN, 0), width - LANES)
+                place = (group * height + v) * LANES + j - base
+                du_dc = strip[place + 1] - strip[place]
                 # Beside it a vertical may have ended.
                 if math.isfinite(du_dc):
-                    crossing[i] = table_column[v, j] + at * du_dc
+                    crossing[i] = strip[place] + at * du_dc
                     by_a[i] = du_dc * columns_per_rad * turn_by_a[i]
                     by_b[i] = by_a[i] * height_of[i]
+        largest_change = math.inf
         for step in range(len(farthest)):
+            if step > 0 and begin_of[step] == begin_of[step - 1] and largest_change <= _STILL_PX:
+                continue
             reach = half[step]
             hessian_aa = 0.0
             hessian_ab = 0.0
@@ -341,8 +350,11 @@ def refine_lines(
                 break
             a += change_a
             b += change_b
+            largest_change = 0.0
             for i in range(n):
-                crossing[i] += change_a * by_a[i] + change_b * by_b[i]
+                change = change_a * by_a[i] + change_b * by_b[i]
+                crossing[i] += change
+                largest_change = max(largest_change, abs(change))
             left_aa = inverse_aa * meat_aa + inverse_ab * meat_ab
             left_ab = inverse_aa * meat_ab + inverse_ab * meat_bb
             left_ba = inverse_ab * meat_aa + inverse_bb * meat_ab
@@ -360,7 +372,6 @@ def refine_lines(
         line[t, 1] = b
         moved = a - tracked_line[t, 0] + (b - tracked_line[t, 1]) * middle[t]
         shift_px[t] = abs(moved) / pixel[t]
-        heights[:] = 0.0
         used = 0
         margin = max(half[-2], half[-1])
         for i in range(n):
@@ -368,20 +379,15 @@ def refine_lines(
             if not (u > margin and u < width - 1 - margin):
                 continue
             whole = int(u)
-            node = int((u - whole) * SUBPIXELS)
-            for which in range(2):
-                reach = half[len(farthest) + which]
-                add_products(
-                    grey_values, row[begin + i] * width + whole - reach + 1, height_weights,
-                    begin_of[len(farthest) + which] + node * 2 * reach, 2 * reach // WORD,
-                    heights, which * LANES,
-                )  # fmt: skip
+            at_pixel[used] = row[begin + i] * width + whole + 1
+            at_weight[used] = int((u - whole) * SUBPIXELS)
             used += 1
-        fine_height = 0.0
-        coarse_height = 0.0
-        for lane in range(LANES):
-            fine_height += heights[lane]
-            coarse_height += heights[LANES + lane]
+        fine_height = sum_of_products(
+            grey_values, at_pixel, height_weights, at_weight, used, begin_of[-2], half[-2]
+        )
+        coarse_height = sum_of_products(
+            grey_values, at_pixel, height_weights, at_weight, used, begin_of[-1], half[-1]
+        )
         contrast[t] = sign[t] * fine_height / used if used > 0 else 0.0
         sharp = fine_height / coarse_height if sign[t] * coarse_height > 0.0 else 1.0
         sharpness[t] = min(max(sharp, 0.0), 1.0)

@@ -10,18 +10,19 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from detect.line_chain_kernels import tilt_of_chains
 from detect.line_detections import COUNTS
 from detect.line_kernels import follow_edges
-from detect.line_pass_kernels import fit_and_judge, lines_of_tracks
+from detect.line_pass_kernels import fit_and_judge, largest_lean, lines_of_tracks
 from detect.line_response_kernels import band_response
-from detect.line_start_kernels import find_starts
+from detect.line_start_kernels import find_maxima, ordered_starts
+from detect.tilt import TILT_NUMBERS
 
 
 @njit(cache=True, error_model="numpy")
 def find_lines(
     image: NDArray[np.uint8],
     pixels: NDArray[np.uint8],
-    table_column: NDArray[np.float32],
     elevation_tan: NDArray[np.float32],
     bearing: NDArray[np.float64],
     horizon_row: NDArray[np.float64],
@@ -30,6 +31,7 @@ def find_lines(
     robot_from_camera: NDArray[np.float64],
     strip: NDArray[np.float32],
     ends: NDArray[np.int32],
+    rise: NDArray[np.float32],
     lean_by_pitch: NDArray[np.float64],
     lean_by_roll: NDArray[np.float64],
     band_row: NDArray[np.int32],
@@ -63,9 +65,9 @@ def find_lines(
         Grey values.
     pixels : (N,) uint8
         See `detect.line_kernels.follow_edges`.
-    table_column, elevation_tan, bearing, horizon_row, first_row, last_row, robot_from_camera
+    elevation_tan, bearing, horizon_row, first_row, last_row, robot_from_camera
         The table (see `lut.verticals.VerticalTable`).
-    strip, ends, lean_by_pitch, lean_by_roll
+    strip, ends, rise, lean_by_pitch, lean_by_roll
         See `detect.line_strip.Strip`.
     band_row, band_pixel, band_runs, band_part, band_scale, band_visible, band_weights
         See `detect.line_filter.StartBand`.
@@ -78,7 +80,9 @@ def find_lines(
     few_half, few_begin_of, few_farthest
         The same for the few edges that are followed first.
     following, limits, doubt, grouping : float64
-        Settings as numbers (see `detect.line_judgement`).
+        Settings as numbers (see `detect.line_judgement`); `doubt` is that about the tilt of a few
+        edges, that about the tilt of the band (see `beyond_doubt`), and how far the lean of edges
+        may come out different from that of the band before they are followed once more (rad).
 
     Returns
     -------
@@ -92,8 +96,19 @@ def find_lines(
         band_weights, along, regulariser, response,
     )  # fmt: skip
     threshold = following[2]
-    start_row, start_column, start_sign, _ = find_starts(
+    level, start_column, start_sign = find_maxima(
         response, band_row, threshold, following[13] != 0.0
+    )
+    guided = following[9] != 0.0
+    first_edges = int(following[10])
+    tilt = np.full(TILT_NUMBERS, np.nan)
+    # Of images full of maxima everywhere the band tells nothing.
+    if guided and first_edges > 0 and following[14] != 0.0 and len(level) <= image.shape[1]:
+        tilt = tilt_of_chains(
+            response, band_row, level, start_column, start_sign, bearing, rise, limits
+        )
+    start_row, start_column, start_sign, _ = ordered_starts(
+        response, band_row, level, start_column, start_sign
     )
 
     groups = len(ends)
@@ -103,40 +118,43 @@ def find_lines(
     max_gap = int(following[4])
     border = int(following[5])
     row_aspect = following[6]
-    guided = following[9] != 0.0
-    first_edges = int(following[10])
     least_points = int(limits[0])
     least_score = limits[1]
-    pull, reach, enough = (
-        1.0,
-        1.0,
-        first_edges if guided and first_edges > 0 else len(start_row) + 1,
-    )
+    every = len(start_row) + 1
+    enough = first_edges if guided and first_edges > 0 else every
     pitch, roll = 0.0, 0.0
-    # A few edges, if they leave no doubt about the tilt; else all; then all by the tilt.
-    few = enough <= len(start_row)
+    # All by the tilt of the band, if that leaves no doubt about it, and once more if they show
+    # another one. Else a few edges, if they leave none; else all; then all by their tilt.
+    by_tilt = beyond_doubt(tilt, doubt[3:])
+    times = 0
+    most = 2 if by_tilt else 1
     while True:
+        pull, reach = 1.0, 1.0
+        if by_tilt:
+            pitch, roll = tilt[0], tilt[1]
+            pull, reach = following[7], following[8]
+            enough = every
+            times += 1
         polarity, bounds, row, column, score, complete = follow_edges(
-            pixels, strip, ends, lean_by_pitch, lean_by_roll, first_row, last_row, elevation_tan,
+            pixels, strip, ends, lean_by_pitch, lean_by_roll, first_row, last_row, rise,
             weights, half_width, along, regulariser, responses, known, start_row, start_column,
             start_sign, pitch, roll, threshold, max_gap, border, pull, reach, enough, least_points,
             least_score,
         )  # fmt: skip
         few = not complete
         fits, evidence, fate, tilt = fit_and_judge(
-            image, table_column, elevation_tan, bearing, horizon_row, row_aspect, polarity, bounds,
-            row, column, score, few_half if few else half, few_begin_of if few else begin_of,
-            height_weights, first_weights, second_weights, few_farthest if few else farthest,
-            limits,
+            image, strip, rise, bearing, horizon_row, row_aspect, polarity, bounds, row, column,
+            score, few_half if few else half, few_begin_of if few else begin_of, height_weights,
+            first_weights, second_weights, few_farthest if few else farthest, limits,
         )  # fmt: skip
-        enough = len(start_row) + 1
+        enough = every
         if few and not beyond_doubt(tilt, doubt):
             continue
-        if not guided or np.isnan(tilt[0]):
+        if not guided or np.isnan(tilt[0]) or times == most:
             break
-        guided = False
-        pitch, roll = tilt[0], tilt[1]
-        pull, reach = following[7], following[8]
+        if by_tilt and largest_lean(bearing, tilt[0] - pitch, tilt[1] - roll) <= doubt[6]:
+            break
+        by_tilt = True
 
     tilted = not np.isnan(tilt[0])
     members, member_bounds, lines = lines_of_tracks(
@@ -158,7 +176,7 @@ def beyond_doubt(tilt: NDArray[np.float64], doubt: NDArray[np.float64]) -> bool:
     ----------
     tilt : (`TILT_NUMBERS`,) float64
         See `fit_and_judge`.
-    doubt : (3,) float64
+    doubt : (N,) float64
         Least lines that agree and least share of the votes; largest deviation of the lean (rad).
     """
     return bool(tilt[6] >= doubt[0] and tilt[7] >= doubt[1] and tilt[8] <= doubt[2])

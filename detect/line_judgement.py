@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from detect.line_fit import LineFits
 from detect.line_settings import LineSettings
 from detect.line_step_filters import StepFilters, step_filters
+from detect.line_strip import strip_of
 from detect.line_tracks import LineTracks
 from detect.tilt import REFINEMENTS, SOFTENING, TiltEstimate, tilt_of_numbers
 from lut.verticals import VerticalTable
@@ -102,8 +103,9 @@ def judge_tracks(
     from detect.line_pass_kernels import fit_and_judge
 
     filters, farthest = refinement_of(settings, steps)
+    strip = strip_of(table)
     fits, evidence, fate, tilt = fit_and_judge(
-        image, table.column, table.elevation_tan, table.bearing_rad, table.horizon_row,
+        image, strip.column, strip.rise, table.bearing_rad, table.horizon_row,
         table.row_aspect, tracks.polarity, tracks.bounds, tracks.row, tracks.column, tracks.score,
         filters.half, filters.begin, filters.height, filters.first, filters.second, farthest,
         limits_of(settings, table.row_aspect),

@@ -35,7 +35,7 @@ def _follow(
     half_width: int,
     first_row: NDArray[np.int32],
     last_row: NDArray[np.int32],
-    elevation_tan: NDArray[np.float32],
+    rise: NDArray[np.float32],
     weights: NDArray[np.float32],
     along: NDArray[np.float32],
     regulariser: np.float32,
@@ -61,7 +61,7 @@ def _follow(
     0 if there is none in the first row. Points are written from the middle of the results on, in
     this direction.
     """
-    height, width = elevation_tan.shape
+    width, height = rise.shape
     v = row
     # The expected position is j + part. Whole columns change seldom: a processor that foresees it
     # works on the next rows before it knows where in this one the edge is.
@@ -75,7 +75,7 @@ def _follow(
             if v < border or v > height - 1 - border or j < 1 or j > width - 2:
                 break
             # A vertical leans in the strip of a tilted camera.
-            moved = columns_per_rise[j] * (elevation_tan[v, j] - elevation_tan[v - direction, j])
+            moved = columns_per_rise[j] * (rise[j, v] - rise[j, v - direction])
             if not math.isfinite(moved):
                 break
             part += moved
@@ -153,7 +153,7 @@ def follow_edges(
     lean_by_roll: NDArray[np.float64],
     first_row: NDArray[np.int32],
     last_row: NDArray[np.int32],
-    elevation_tan: NDArray[np.float32],
+    rise: NDArray[np.float32],
     weights: NDArray[np.float32],
     half_width: int,
     along: NDArray[np.float32],
@@ -187,9 +187,9 @@ def follow_edges(
     ----------
     pixels : (N,) uint8
         Grey values in scan order; where T > 2r + 2, behind the last of them as many as that more.
-    strip, ends, lean_by_pitch, lean_by_roll
+    strip, ends, rise, lean_by_pitch, lean_by_roll
         See `detect.line_strip.Strip`; the image is at least `LANES` wide.
-    first_row, last_row, elevation_tan
+    first_row, last_row
         The table (see `lut.verticals.VerticalTable`).
     weights : (4, T) float32
         See `detect.line_filter.LineFilter.weights_between`.
@@ -232,7 +232,7 @@ def follow_edges(
     complete : bool
         Whether all edges were followed.
     """
-    height, width = elevation_tan.shape
+    width, height = rise.shape
     columns_per_rise = pitch * lean_by_pitch + roll * lean_by_roll
     # Means, covariances and mean squares.
     moments = np.empty(3 * height * LANES, np.float32)
@@ -273,7 +273,7 @@ def follow_edges(
         for direction in range(-1, 2, 2):
             count = _follow(
                 pixels, strip, ends, columns_per_rise, half_width, first_row, last_row,
-                elevation_tan, weights, along, regulariser, moments, filtered, response, known,
+                rise, weights, along, regulariser, moments, filtered, response, known,
                 polarity, v, near, direction, threshold, max_gap, border, pull, reach,
                 own_row, own_column, own_score,
             )  # fmt: skip

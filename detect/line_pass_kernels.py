@@ -30,7 +30,7 @@ _LEAN_SPACING = 16
 
 
 @njit(cache=True, error_model="numpy")
-def _regression_covariance(
+def regression_covariance(
     covariance: NDArray[np.float64],
     scatter_px: NDArray[np.float64],
     pixel: NDArray[np.float64],
@@ -67,10 +67,71 @@ def _largest_lean_deviation(bearing: NDArray[np.float64], covariance: NDArray[np
 
 
 @njit(cache=True, error_model="numpy")
+def largest_lean(bearing: NDArray[np.float64], pitch: float, roll: float) -> float:
+    """How far a vertical leans in a camera of some tilt, where that is most (rad)."""
+    largest = 0.0
+    for c in range(0, len(bearing), _LEAN_SPACING):
+        if math.isfinite(bearing[c]):
+            lean = pitch * math.sin(bearing[c]) - roll * math.cos(bearing[c])
+            largest = max(largest, abs(lean))
+    return largest
+
+
+@njit(cache=True, error_model="numpy")
+def agreed_tilt(
+    bearing: NDArray[np.float64],
+    normal: NDArray[np.float64],
+    inclination: NDArray[np.float64],
+    tolerance: NDArray[np.float64],
+    weight: NDArray[np.float64],
+    limits: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """The tilt that most lines agree with, if they are enough.
+
+    Parameters
+    ----------
+    bearing
+        The table.
+    normal, inclination, tolerance, weight
+        The lines (see `weigh_verticals`).
+    limits
+        See `detect.line_judgement.limits_of`.
+
+    Returns
+    -------
+    tilt : (`TILT_NUMBERS`,) float64
+        See there; NaN where too few lines agree.
+    agrees : (N,) bool
+        Lines that agree with the best tilt, that of too few lines included.
+    """
+    pitch, roll, covariance, agrees = agree_on_tilt(
+        normal, inclination + limits[14], tolerance, weight, int(limits[15]), limits[16],
+        limits[17], limits[18], int(limits[19]),
+    )  # fmt: skip
+    lines = 0
+    votes = 0.0
+    total = 0.0
+    for k in range(len(weight)):
+        total += weight[k]
+        if agrees[k]:
+            lines += 1
+            votes += weight[k]
+    tilt = np.full(TILT_NUMBERS, np.nan)
+    if lines >= limits[20] and abs(pitch) <= limits[16] and abs(roll) <= limits[16]:
+        tilt[0] = pitch
+        tilt[1] = roll
+        tilt[2:6] = covariance.reshape(-1)
+        tilt[6] = lines
+        tilt[7] = votes / total
+        tilt[8] = _largest_lean_deviation(bearing, covariance)
+    return tilt, agrees
+
+
+@njit(cache=True, error_model="numpy")
 def fit_and_judge(
     image: NDArray[np.uint8],
-    table_column: NDArray[np.float32],
-    elevation_tan: NDArray[np.float32],
+    strip: NDArray[np.float32],
+    elevation: NDArray[np.float32],
     bearing: NDArray[np.float64],
     horizon_row: NDArray[np.float64],
     row_aspect: float,
@@ -93,7 +154,9 @@ def fit_and_judge(
     ----------
     image : (H, W) uint8
         Grey values.
-    table_column, elevation_tan, bearing, horizon_row, row_aspect
+    strip, elevation
+        See `detect.line_strip.Strip`: its columns and its rise.
+    bearing, horizon_row, row_aspect
         The table (see `lut.verticals.VerticalTable`).
     polarity, bounds, row, column, score
         The tracks (see `detect.line_tracks.LineTracks`).
@@ -117,18 +180,18 @@ def fit_and_judge(
         See there; NaN where too few lines agree.
     """
     reference, pixel, line, scatter_px, middle, spread, rise, off = fit_eigenlines(
-        bearing, elevation_tan, bounds, row, column, score, int(limits[0]), limits[1]
+        bearing, elevation, bounds, row, column, score, int(limits[0]), limits[1]
     )
     count = len(reference)
     if len(farthest) > 0:
         line, covariance, shift_px, contrast, sharpness = refine_lines(
-            image, table_column, bearing, polarity, bounds, row, column, reference, pixel, middle,
+            image, strip, bearing, polarity, bounds, row, column, reference, pixel, middle,
             rise, off, half, begin_of, height_weights, first_weights, second_weights, farthest,
             line,
         )  # fmt: skip
     else:
         covariance = np.empty((count, 2, 2))
-        _regression_covariance(covariance, scatter_px, pixel, bounds, middle, spread)
+        regression_covariance(covariance, scatter_px, pixel, bounds, middle, spread)
         shift_px = np.zeros(count)
         contrast = np.full(count, np.nan)
         sharpness = np.ones(count)
@@ -141,25 +204,8 @@ def fit_and_judge(
         reference, pixel, line, covariance, spread, evidence, fate, limits[9], limits[10],
         limits[11], limits[12], limits[13],
     )  # fmt: skip
-    pitch, roll, tilt_covariance, agrees = agree_on_tilt(
-        normal, inclination + limits[14], tolerance, weight, int(limits[15]), limits[16],
-        limits[17], limits[18], int(limits[19]),
-    )  # fmt: skip
-    lines = 0
-    votes = 0.0
-    for k in range(len(accepted)):
-        if agrees[k]:
-            lines += 1
-            votes += weight[k]
-    tilt = np.full(TILT_NUMBERS, np.nan)
-    sure = lines >= limits[20] and abs(pitch) <= limits[16] and abs(roll) <= limits[16]
-    if sure:
-        tilt[0] = pitch
-        tilt[1] = roll
-        tilt[2:6] = tilt_covariance.reshape(-1)
-        tilt[6] = lines
-        tilt[7] = votes / np.sum(weight)
-        tilt[8] = _largest_lean_deviation(bearing, tilt_covariance)
+    tilt, agrees = agreed_tilt(bearing, normal, inclination, tolerance, weight, limits)
+    sure = not np.isnan(tilt[0])
     for k in range(len(accepted)):
         if not (agrees[k] if sure else abs(normal[k, 2]) <= tolerance[k]):
             fate[accepted[k]] = NOT_VERTICAL

@@ -23,6 +23,8 @@ class Strip:
     ends : (G, 4) int32
         First and last row in which any of the group's verticals is seen; first and last row in
         which all are, the first after the last where there are none.
+    rise : (W, H) float32
+        Tangents of elevations: the table's, column by column, as tracks read them.
     lean_by_pitch, lean_by_roll : (W,) float64
         By how many columns of the strip a vertical moves for a rise of 1 in a camera of unit pitch,
         and of unit roll; NaN where there is no vertical, or none beside it.
@@ -30,6 +32,7 @@ class Strip:
 
     column: NDArray[np.float32]
     ends: NDArray[np.int32]
+    rise: NDArray[np.float32]
     lean_by_pitch: NDArray[np.float64]
     lean_by_roll: NDArray[np.float64]
 
@@ -60,6 +63,7 @@ def strip_of(table: VerticalTable) -> Strip:
     return Strip(
         column=np.ascontiguousarray(table.column.T[member].transpose(0, 2, 1)).reshape(-1),
         ends=ends.astype(np.int32),
+        rise=np.ascontiguousarray(table.elevation_tan.T),
         lean_by_pitch=np.sin(bearing) * per_rad,
         lean_by_roll=-np.cos(bearing) * per_rad,
     )

@@ -241,7 +241,7 @@ def line_tracks(
             strip.lean_by_roll,
             table.first_row,
             table.last_row,
-            table.elevation_tan,
+            strip.rise,
             window.weights_between,
             window.weights.shape[1] // 2,
             window.along,

@@ -16,6 +16,7 @@ from detect.line_vector_code import (
     FLOATS,
     I8,
     I16,
+    I64,
     INTS,
     LANES,
     LONGS,
@@ -26,7 +27,7 @@ from detect.line_vector_code import (
     operation,
 )
 
-__all__ = ["LANES", "WORD", "add_products", "interpolate", "interpolate_runs", "slope_and_bend"]
+__all__ = ["LANES", "WORD", "interpolate", "interpolate_runs", "slope_and_bend", "sum_of_products"]
 
 
 @operation
@@ -89,33 +90,60 @@ def slope_and_bend(
 
 
 @operation
-def add_products(
-    _typing: Any, pixels: Any, at: Any, weights: Any, at_weight: Any, words: Any, sums: Any, to: Any
+def sum_of_products(
+    _typing: Any,
+    pixels: Any,
+    at: Any,
+    weights: Any,
+    node: Any,
+    count: Any,
+    begin: Any,
+    half: Any,
 ) -> Any:
-    """Add weighted grey values to a vector whose numbers are to be summed up in the end.
+    """Sum of weighted grey values at several places.
 
     Parameters
     ----------
-    pixels, at, weights, at_weight, words
-        As for `slope_and_bend`.
-    sums : float32, contiguous
-        Changed: `LANES` of its numbers.
-    to : int64
-        Index of the first of them.
+    pixels : uint8, contiguous
+        The image in scan order.
+    at : int64, contiguous
+        The pixel in the middle of each place: there are ``half`` before it.
+    weights : float32, contiguous
+        Rows of ``2 half`` weights, each of sum 0, as grey values count from 128.
+    node : int64, contiguous
+        Which row each place takes.
+    count : int64
+        Number of places.
+    begin : int64
+        Index of the first row.
+    half : int64
+        A multiple of `WORD` / 2.
+
+    Returns
+    -------
+    float32
     """
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         code = Code(context, builder, signature, args)
-        total = cgutils.alloca_once_value(builder, code.load(5, args[6], FLOATS))
-        with cgutils.for_range(builder, args[4]) as loop:
-            begin = builder.mul(loop.index, code.number(WORD))
-            grey = code.grey(0, builder.add(args[1], begin))
-            weight = code.load(2, builder.add(args[3], begin), FLOATS)
-            code.increase(total, code.mul(weight, grey))
-        code.store(5, args[6], builder.load(total))
-        return context.get_dummy_value()
+        total = code.zeros()
+        taps = builder.mul(args[6], code.number(2))
+        words = builder.sdiv(taps, code.number(WORD))
+        with cgutils.for_range(builder, args[4]) as place:
+            pixel = builder.sub(code.load(1, place.index, I64), args[6])
+            row = builder.mul(code.load(3, place.index, I64), taps)
+            row = builder.add(row, args[5])
+            with cgutils.for_range(builder, words) as loop:
+                word = builder.mul(loop.index, code.number(WORD))
+                grey = code.grey(0, builder.add(pixel, word))
+                weight = code.load(2, builder.add(row, word), FLOATS)
+                code.increase(total, code.mul(weight, grey))
+        numbers = code.scattered(builder.load(total))
+        while len(numbers) > 1:
+            numbers = [code.add(a, b) for a, b in zip(numbers[::2], numbers[1::2])]
+        return numbers[0]
 
-    result = types.void(pixels, types.int64, weights, types.int64, types.int64, sums, types.int64)
+    result = types.float32(pixels, at, weights, node, types.int64, types.int64, types.int64)
     return result, generate
 
 

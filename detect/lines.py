@@ -10,8 +10,10 @@ The path of an image, each step a function of its own:
     tracks, fits    once more along the verticals of that tilt
     lines           bearings; one line for each edge, close ones joined
 
-The first time a few edges will do if they leave no doubt about the tilt. `detect_lines` goes it in
-one compiled call (`detect.line_image_kernels`).
+The first time is left out where the starts themselves, of which an edge has one on each of several
+rows, leave no doubt about the tilt (`detect.line_chain_kernels`); a few edges will do if these
+leave none.
+`detect_lines` goes it in one compiled call (`detect.line_image_kernels`).
 """
 
 from __future__ import annotations
@@ -51,6 +53,12 @@ FloatArray = NDArray[np.float64]
 _FIRST_LINES = 6
 _FIRST_VOTES = 0.75
 _FIRST_LEAN_RAD = math.radians(0.15)
+#: Chains of the band are short: so many must agree, and the band must be so high, pixels.
+_CHAINS = 7
+_BAND_PX = 60.0
+#: Edges that were followed by a tilt are followed again if the one that they show leaves tracks
+#: farther behind their edges, pixels.
+_LAG_PX = 0.1
 #: The refinement's steps that lines need for that.
 _FIRST_STEPS = 2
 
@@ -113,16 +121,20 @@ def _told_beforehand(table: VerticalTable, settings: LineSettings) -> tuple[Any,
         1.0 if level else -1.0,
         settings.consensus.building_rad if level else math.inf,
         band.supported,
+        band.supported and 2.0 * settings.start_band_rows * table.row_aspect >= _BAND_PX,
     )
+    of_chains = (_CHAINS, _FIRST_VOTES, _FIRST_LEAN_RAD)
+    # A track follows a lean that is wrong by so much that what it yields in a row makes up for it.
+    lean = _LAG_PX * settings.guided_pull / table.row_aspect
+    doubt = np.array([_FIRST_LINES, _FIRST_VOTES, _FIRST_LEAN_RAD, *of_chains, lean])
     return (
-        table.column, table.elevation_tan, table.bearing_rad, table.horizon_row, table.first_row,
-        table.last_row, table.robot_from_camera, strip.column, strip.ends, strip.lean_by_pitch,
-        strip.lean_by_roll, band.row, band.pixel, band.runs, band.part, band.scale, band.visible,
-        band.weights, window.weights_between, window.along, filters.half, filters.begin,
-        filters.height, filters.first, filters.second, farthest, filters.half[few],
+        table.elevation_tan, table.bearing_rad, table.horizon_row, table.first_row,
+        table.last_row, table.robot_from_camera, strip.column, strip.ends, strip.rise,
+        strip.lean_by_pitch, strip.lean_by_roll, band.row, band.pixel, band.runs, band.part,
+        band.scale, band.visible, band.weights, window.weights_between, window.along, filters.half,
+        filters.begin, filters.height, filters.first, filters.second, farthest, filters.half[few],
         filters.begin[few], farthest[:_FIRST_STEPS], np.array(following, np.float64),
-        limits_of(settings, table.row_aspect),
-        np.array([_FIRST_LINES, _FIRST_VOTES, _FIRST_LEAN_RAD]), grouping_of(settings),
+        limits_of(settings, table.row_aspect), doubt, grouping_of(settings),
     )  # fmt: skip
 
 

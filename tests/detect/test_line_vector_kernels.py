@@ -13,7 +13,7 @@ from detect.line_filter_vector_kernels import (
     response_along,
     response_along_two,
 )
-from detect.line_vector_kernels import LANES, WORD, add_products, slope_and_bend
+from detect.line_vector_kernels import LANES, WORD, slope_and_bend, sum_of_products
 
 
 @njit(error_model="numpy")
@@ -30,16 +30,16 @@ def both_sums(
 
 
 @njit(error_model="numpy")
-def add(
+def sum_at_places(
     pixels: NDArray[np.uint8],
-    at: int,
+    at: NDArray[np.int64],
     weights: NDArray[np.float32],
-    at_weight: int,
-    words: int,
-    sums: NDArray[np.float32],
-    to: int,
-) -> None:
-    add_products(pixels, at, weights, at_weight, words, sums, to)
+    node: NDArray[np.int64],
+    count: int,
+    begin: int,
+    half: int,
+) -> float:
+    return float(sum_of_products(pixels, at, weights, node, count, begin, half))
 
 
 @pytest.mark.parametrize("words", [1, 2, 5])
@@ -54,12 +54,26 @@ def test_weighted_sums_of_grey_values(words: int) -> None:
         np.testing.assert_allclose(
             both_sums(pixels, at, weights[0], weights[1], at_weight, words), own @ grey, atol=2e-3
         )
-        sums = np.arange(2.0 * LANES, dtype=np.float32)
-        add(pixels, at, weights[0], at_weight, words, sums, LANES)
-        np.testing.assert_array_equal(sums[:LANES], np.arange(LANES))
-        added = sums[LANES:] - np.arange(LANES, 2.0 * LANES)
-        products = (own[0] * grey).reshape(words, LANES).sum(axis=0)
-        np.testing.assert_allclose(added, products, atol=2e-3)
+
+
+@pytest.mark.parametrize("half", [4, 8])
+def test_sum_of_weighted_grey_values_at_several_places(half: int) -> None:
+    rng = np.random.default_rng(half)
+    pixels = rng.integers(0, 256, 200).astype(np.uint8)
+    begin = 5
+    weights = rng.normal(size=begin + 6 * 2 * half).astype(np.float32)
+    at = np.array([half, 200 - half, 60, 61, 7])
+    node = np.array([0, 5, 2, 2, 99])
+    # The last of these is not counted.
+    expected = sum(
+        weights[begin + 2 * half * n :][: 2 * half].astype(np.float64)
+        @ (pixels[u - half : u + half].astype(np.float64) - 128.0)
+        for u, n in zip(at[:4], node[:4])
+    )
+    assert sum_at_places(pixels, at, weights, node, 4, begin, half) == pytest.approx(
+        expected, abs=5e-3
+    )
+    assert sum_at_places(pixels, at, weights, node, 0, begin, half) == 0.0
 
 
 @njit(error_model="numpy")
