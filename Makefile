@@ -45,8 +45,8 @@ package: setup
 # detector (NumPy); poses (pycolmap), maps (SciPy, gtsam), drawings (ezdxf), YAML, tables (pyarrow), command lines
 # (tyro, rich), scikit-image; then reports (Jinja, matplotlib), recordings (rerun), videos, bags (rosbags), a cluster.
 LOWEST := $(CURDIR)/build/lowest
-LOWEST_TESTS := tests/detect/test_circles_run.py tests/detect/markers/test_markers_run.py \
-    tests/detect/test_lines_run.py tests/groundtruth/test_cli.py::test_a_sessions_poses_and_their_score \
+LOWEST_TESTS := tests/detect/runs/test_circles_run.py tests/detect/markers/test_markers_run.py \
+    tests/detect/runs/test_lines_run.py tests/groundtruth/test_cli.py::test_a_sessions_poses_and_their_score \
     'tests/groundtruth/markers/test_refinement.py::test_every_solver_recovers_the_pose_exactly[1-1-pycolmap]' \
     'tests/groundtruth/markers/test_refinement.py::test_every_solver_recovers_the_pose_exactly[6-2-pycolmap]' \
     tests/slam/test_map_command.py tests/slam/test_filter_commands.py::test_map_then_localise \
@@ -56,19 +56,19 @@ LOWEST_TESTS := tests/detect/test_circles_run.py tests/detect/markers/test_marke
     tests/camera/test_convert.py::test_opencv_reads_what_is_written_and_the_other_way \
     tests/camera/test_convert.py::test_colmap_counts_from_the_corner \
     tests/camera/test_convert.py::test_an_echoed_ros_message_is_read \
-    tests/detect/test_exports.py::test_parquet_has_the_files_numbers_and_units \
-    tests/detect/test_exports.py::test_mcap_has_the_files_numbers tests/test_command_lines.py \
-    tests/tools/benchmark/test_peers.py tests/detect/test_report.py::test_page_states_what_comparing_does \
-    tests/detect/test_view.py tests/detect/test_sources.py::test_a_video_gives_the_rows_of_its_images \
-    'tests/detect/test_sources_bag.py::test_a_bag_gives_the_rows_of_its_images[mcap-False]' \
-    'tests/detect/test_sources_bag.py::test_a_bag_gives_the_rows_of_its_images[sqlite-False]' \
-    'tests/detect/test_sources_bag.py::test_a_bag_gives_the_rows_of_its_images[ros1-True]' \
-    tests/detect/test_workers.py::test_a_cluster_writes_what_one_process_does
+    tests/detect/exports/test_exports.py::test_parquet_has_the_files_numbers_and_units \
+    tests/detect/exports/test_exports.py::test_mcap_has_the_files_numbers tests/test_command_lines.py \
+    tests/tools/benchmark/test_peers.py tests/detect/report/test_report.py::test_page_states_what_comparing_does \
+    tests/detect/test_view.py tests/detect/sources/test_sources.py::test_a_video_gives_the_rows_of_its_images \
+    'tests/detect/sources/test_bag.py::test_a_bag_gives_the_rows_of_its_images[mcap-False]' \
+    'tests/detect/sources/test_bag.py::test_a_bag_gives_the_rows_of_its_images[sqlite-False]' \
+    'tests/detect/sources/test_bag.py::test_a_bag_gives_the_rows_of_its_images[ros1-True]' \
+    tests/detect/runs/test_workers.py::test_a_cluster_writes_what_one_process_does
 # More of the same, and all readers: before a release.
-LOWEST_MORE := tests/detect/test_circles_run.py tests/detect/markers/test_markers_run.py tests/detect/test_lines_run.py \
+LOWEST_MORE := tests/detect/runs/test_circles_run.py tests/detect/markers/test_markers_run.py tests/detect/runs/test_lines_run.py \
     tests/groundtruth/test_cli.py tests/slam/test_map_command.py tests/slam/test_filter_commands.py \
     tests/slam/test_g2o_gtsam.py tests/slam/test_pictures.py tests/groundtruth/lasers/test_building.py \
-    tests/detect/test_sources_bag.py tests/detect/test_sources.py tests/detect/test_exports.py tests/detect/test_report.py \
+    tests/detect/sources/test_bag.py tests/detect/sources/test_sources.py tests/detect/exports/test_exports.py tests/detect/report/test_report.py \
     tests/detect/test_viewing_sources.py tests/camera/test_convert.py tests/lut tests/fuzz
 LOWEST_PYTEST := NUMBA_CACHE_DIR=$(LOWEST)/kernels REDETECT_CACHE=$(LOWEST)/tables $(LOWEST)/bin/python -m pytest \
     -n auto --dist loadfile --no-loadscope-reorder -q -p no:cacheprovider

@@ -21,15 +21,15 @@ from camera import Camera
 from camera.distortion import inverse_table
 from camera.kernels import camera_numbers, lens_numbers
 from camera.model import PUBLISHED_STEP_PX
-from detect.centres import best_centres
-from detect.centres import quality_of_centres as quality_of_centres
-from detect.disc_candidate_kernels import strong_and_alone
-from detect.disc_covariance_kernels import refined_covariances
-from detect.disc_fit import blur_ratio_of, fit_settings
-from detect.disc_search_kernels import DiscSearch, search_discs
+from detect.discs.candidate_kernels import strong_and_alone
+from detect.discs.centres import best_centres
+from detect.discs.centres import quality_of_centres as quality_of_centres
+from detect.discs.covariance_kernels import refined_covariances
+from detect.discs.fit import blur_ratio_of, fit_settings
+from detect.discs.pixel_floor_kernels import published_positions as pixel_positions
+from detect.discs.search_kernels import DiscSearch, search_discs
 from detect.errors import FrameError
 from detect.noise import estimate_noise
-from detect.pixel_floor_kernels import published_positions as pixel_positions
 from detect.settings import CircleSettings
 from lut import DiscShape, DiscTable
 

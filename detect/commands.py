@@ -17,18 +17,18 @@ from detect.cli import EXIT_FRAMES_FAILED, Command
 from detect.errors import DetectError, WorkerError
 from detect.kernel_loading import load_kernels_alone
 from detect.options import All, Circles, Compare, DetectorFlags, Lines, Markers
-from detect.progress import print_failures, progress_bar
+from detect.runs.progress import print_failures, progress_bar
 from detect.viewing_options import PERFORMED_BY
 from storage.exit_codes import EXIT_ERROR
 
 if TYPE_CHECKING:
     from rich.console import Group
 
-    from detect.compare_result import Rates
-    from detect.conduct import Conduct
-    from detect.dispatch import Workers
+    from detect.comparison.result import Rates
     from detect.run import ImageRun
-    from detect.stream import RunSummary
+    from detect.runs.conduct import Conduct
+    from detect.runs.dispatch import Workers
+    from detect.runs.stream import RunSummary
 
 
 def carry_out(command: Command) -> int:
@@ -51,8 +51,8 @@ def carry_out(command: Command) -> int:
 
 def _circles(command: Circles) -> int:
     from detect import __version__
-    from detect.circles_run import detect_circles_run
-    from detect.run_log import log_place
+    from detect.runs.circles_run import detect_circles_run
+    from detect.runs.run_log import log_place
     from detect.sources.opening import open_calibrated
 
     run = open_calibrated(command.run, command.camera, command.source)
@@ -61,7 +61,7 @@ def _circles(command: Circles) -> int:
     _demand_new([output, command.json], command.force, run, conduct)
     tilts = None
     if command.tilt is not None:
-        from detect.by_image import TiltsByImage
+        from detect.runs.by_image import TiltsByImage
 
         tilts = TiltsByImage(command.tilt)
     if command.draw is not None:
@@ -86,9 +86,9 @@ def _circles(command: Circles) -> int:
 
 def _lines(command: Lines) -> int:
     from detect import __version__
-    from detect.by_image import LinesByImage
-    from detect.lines_run import detect_lines_run
-    from detect.run_log import log_place
+    from detect.runs.by_image import LinesByImage
+    from detect.runs.lines_run import detect_lines_run
+    from detect.runs.run_log import log_place
     from detect.sources.opening import open_calibrated
 
     run = open_calibrated(command.run, command.camera, command.source)
@@ -128,8 +128,8 @@ def _lines(command: Lines) -> int:
 
 def _markers(command: Markers) -> int:
     from detect import __version__
-    from detect.markers_run import detect_markers_run
-    from detect.run_log import log_place
+    from detect.runs.markers_run import detect_markers_run
+    from detect.runs.run_log import log_place
     from detect.sources.opening import open_source
 
     run = open_source(command.run, command.camera, command.source)
@@ -159,8 +159,8 @@ def _markers(command: Markers) -> int:
 
 def _all(command: All) -> int:
     from detect import __version__
-    from detect.all_run import detect_all_run
-    from detect.run_log import log_place
+    from detect.runs.all_run import detect_all_run
+    from detect.runs.run_log import log_place
     from detect.sources.opening import open_calibrated
 
     run = open_calibrated(command.run, command.camera, command.source)
@@ -194,7 +194,7 @@ def _all(command: All) -> int:
 
 def _workers(command: DetectorFlags, run: ImageRun) -> Workers:
     """Who does the work of a command."""
-    from detect.workers import cluster_workers, default_jobs, local_workers
+    from detect.runs.workers import cluster_workers, default_jobs, local_workers
 
     # Tasks that carry images, or bring pictures back, are kept small.
     draws = isinstance(command, Circles | Lines | Markers) and command.draw is not None
@@ -210,7 +210,7 @@ def _workers(command: DetectorFlags, run: ImageRun) -> Workers:
 def _conduct(command: DetectorFlags, log: Path) -> Conduct:
     """How a command is carried out."""
     from detect import __version__
-    from detect.conduct import conduct_of
+    from detect.runs.conduct import conduct_of
 
     return conduct_of(command.conduct, log, type(command).__name__.lower(), __version__)
 
@@ -219,8 +219,8 @@ def _demand_new(
     outputs: Sequence[Path | None], force: bool, run: ImageRun, conduct: Conduct
 ) -> None:
     """Refuse what cannot be written, or would be overwritten, before there is any work done."""
-    from detect.resume_journal import journal_place
-    from detect.stream import times_file
+    from detect.runs.resume_journal import journal_place
+    from detect.runs.stream import times_file
     from storage import OutputExistsError
 
     for path in outputs:
@@ -248,7 +248,7 @@ def _exit_code(summary: RunSummary, run: ImageRun) -> int:
 def _compare(command: Compare) -> int:
     from rich.console import Console
 
-    from detect.compare_result import unmet_demands
+    from detect.comparison.result import unmet_demands
     from storage import write_whole
 
     _demand_rows(command)
@@ -283,8 +283,8 @@ def _demand_rows(command: Compare) -> None:
 
 def _compared_discs(command: Compare) -> tuple[Group, str, Rates]:
     """The tables, the JSON and the result of a comparison of discs."""
-    from detect.compare import compare_runs
-    from detect.compare_report import comparison_tables, format_json
+    from detect.comparison.circles import compare_runs
+    from detect.comparison.report import comparison_tables, format_json
 
     result = compare_runs(
         command.run,
@@ -297,9 +297,9 @@ def _compared_discs(command: Compare) -> tuple[Group, str, Rates]:
 
 def _compared_lines(command: Compare) -> tuple[Group, str, Rates]:
     """The tables, the JSON and the result of a comparison of verticals."""
-    from detect.compare_lines import compare_line_runs
-    from detect.compare_lines_report import format_line_json, line_comparison_tables
-    from detect.compare_lines_result import LineCompareOptions
+    from detect.comparison.lines import compare_line_runs
+    from detect.comparison.lines_report import format_line_json, line_comparison_tables
+    from detect.comparison.lines_result import LineCompareOptions
 
     options = LineCompareOptions(
         tolerance_deg=command.tolerance_deg,

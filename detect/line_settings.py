@@ -11,7 +11,7 @@ from detect.errors import DetectError
 from storage.bounds import ABOVE_0, LIMIT_OR_0, NOT_NEGATIVE, SHARE_ABOVE_0, demand, whole
 
 if TYPE_CHECKING:
-    from detect.tilt import ConsensusSettings
+    from detect.verticals.tilt import ConsensusSettings
 
 BearingConvention = Literal["level", "published"]
 
@@ -230,7 +230,7 @@ class LineSettings:
     @cached_property
     def consensus(self) -> ConsensusSettings:
         """What of this the estimation of the tilt is told."""
-        from detect.tilt import ConsensusSettings  # numpy is too much for `--help`
+        from detect.verticals.tilt import ConsensusSettings  # numpy is too much for `--help`
 
         return ConsensusSettings(
             largest_rad=math.radians(self.largest_tilt_deg),

@@ -11,9 +11,9 @@ The path of an image, each step a function of its own:
     lines           bearings; one line for each edge, close ones joined
 
 The first time is left out where the starts themselves, of which an edge has one on each of several
-rows, leave no doubt about the tilt (`detect.line_chain_kernels`); a few edges will do if these
+rows, leave no doubt about the tilt (`detect.verticals.chain_kernels`); a few edges will do if these
 leave none.
-`detect_lines` goes it in one compiled call (`detect.line_image_kernels`).
+`detect_lines` goes it in one compiled call (`detect.verticals.image_kernels`).
 """
 
 from __future__ import annotations
@@ -26,10 +26,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from detect.errors import FrameError
-from detect.line_detections import LineDetections
-from detect.line_filter import line_filter, start_band
-from detect.line_fit import LineFits
-from detect.line_judgement import (
+from detect.line_settings import DEFAULT, LineSettings
+from detect.verticals.detections import LineDetections
+from detect.verticals.filter import line_filter, start_band
+from detect.verticals.fit import LineFits
+from detect.verticals.judgement import (
     ACCEPTED,
     JOINED,
     grouping_of,
@@ -37,10 +38,9 @@ from detect.line_judgement import (
     limits_of,
     refinement_of,
 )
-from detect.line_settings import DEFAULT, LineSettings
-from detect.line_strip import strip_of
-from detect.line_tracks import LineTracks, padded_pixels
-from detect.tilt import TiltEstimate
+from detect.verticals.strip import strip_of
+from detect.verticals.tilt import TiltEstimate
+from detect.verticals.tracks import LineTracks, padded_pixels
 from lut.verticals import VerticalTable
 
 __all__ = ["ACCEPTED", "JOINED", "LineDetections", "detect_lines", "line_ends", "tilt_beyond_doubt"]
@@ -92,7 +92,7 @@ def detect_lines(
             f"image is {image.dtype} of shape {image.shape}: expected uint8 of the table's shape "
             f"{table.column.shape}"
         )
-    from detect.line_image_kernels import find_lines
+    from detect.verticals.image_kernels import find_lines
 
     image = np.ascontiguousarray(image)
     pixels = padded_pixels(image, line_filter(settings))
@@ -187,7 +187,7 @@ def line_ends(
     beta : (N,) float64
         Inclinations of the normals of their planes (rad).
     """
-    from detect.line_bearing_kernels import ends_of_lines
+    from detect.verticals.bearing_kernels import ends_of_lines
 
     ends, beta = ends_of_lines(
         table.bearing_rad, table.elevation_tan, table.robot_from_camera,

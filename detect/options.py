@@ -10,11 +10,11 @@ from pathlib import Path
 
 from tyro.conf import OmitArgPrefixes, Positional
 
-from detect.compare_result import CompareOptions
-from detect.conduct import ConductOptions
+from detect.comparison.result import CompareOptions
 from detect.flags import MaybeFloat, MaybeInt, MaybePath, MaybeStr, Preset, RunFlags
 from detect.line_settings import LineSettings
 from detect.markers.settings import MarkerSettings
+from detect.runs.conduct import ConductOptions
 from detect.settings import CircleSettings
 from detect.sources.options import SourceOptions
 

@@ -23,9 +23,9 @@ from numpy.typing import NDArray
 
 from camera import Camera, read_camera
 from detect.errors import DetectError, FrameError
-from detect.image_bounds import bounded_content
-from detect.image_names import IMAGE_SUFFIXES, ImageNames
-from detect.run_images import (
+from detect.runs.image_bounds import bounded_content
+from detect.runs.image_names import IMAGE_SUFFIXES, ImageNames
+from detect.runs.run_images import (
     FileStamp,
     demand_no_link_out,
     homes_of,

@@ -56,7 +56,7 @@ class CircleSettings:
     verify : bool
         Fit a disc to the grey values at each candidate and drop those without evidence of a disc.
     evidence : float
-        Least evidence (log-odds, see `detect.disc_fit.disc_evidence`).
+        Least evidence (log-odds, see `detect.discs.fit.disc_evidence`).
     blur_px : float
         Standard deviation of the optics' blur along u, pixels. Blurred edges speak against a disc
         unless the camera blurs everything: the data set's own does, by about 6.

@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.draw_frame import ends_of, floor_projection, line_curves, sigma_bars
-from detect.draw_inputs import SeenRows, find_files, open_rows
-from detect.draw_selection import select_frames
-from detect.drawing import circle_on_floor
+from detect.drawing.detections import circle_on_floor
+from detect.drawing.frame import ends_of, floor_projection, line_curves, sigma_bars
+from detect.drawing.inputs import SeenRows, find_files, open_rows
+from detect.drawing.selection import select_frames
 from detect.errors import DetectError, FrameError
-from detect.progress import print_failures, progress_bar
 from detect.run import Run, read_image
+from detect.runs.progress import print_failures, progress_bar
 from detect.settings import CircleSettings
 from detect.sources.opening import demand_recording, open_source
 from detect.viewing_options import View

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import OmitArgPrefixes, arg
 
-from detect.compare_result import CompareError, CompareOptions
+from detect.comparison.result import CompareError, CompareOptions
 from detect.exports.options import Export
 from detect.flags import MaybeInt, MaybePath, MaybeStr, PickedFrames, Preset, RunFlags
 from detect.line_settings import LineSettings
@@ -77,7 +77,7 @@ class Gates:
 
     @property
     def discs(self) -> CompareOptions:
-        """The same for `detect.compare`; raises CompareError for gates that are none."""
+        """The same for `detect.comparison.circles`; raises CompareError for gates that are none."""
         return CompareOptions(gate_m=self.gate_m)
 
 
@@ -227,9 +227,9 @@ class Tune(PickedFrames, RowsFlags):
 
 #: The module whose `perform` carries a command out.
 PERFORMED_BY: dict[type, str] = {
-    Draw: "detect.draw_command",
+    Draw: "detect.drawing.command",
     Export: "detect.exports.command",
     View: "detect.view_command",
-    Report: "detect.report_command",
-    Tune: "detect.tune_command",
+    Report: "detect.report.command",
+    Tune: "detect.tune.command",
 }

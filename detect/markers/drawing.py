@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.draw_strokes import Colour, draw_curve, draw_text, enlargement
+from detect.drawing.strokes import Colour, draw_curve, draw_text, enlargement
 from detect.markers.detections import ACCEPTED, SAME_MARKER, MarkerDetections
 
 FloatArray = NDArray[np.float64]

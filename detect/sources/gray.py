@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from detect.errors import FrameError
-from detect.image_bounds import bounded_content, demand_bounded
+from detect.runs.image_bounds import bounded_content, demand_bounded
 
 #: What an image of 16 bits may hold.
 BIT_DEPTHS = (8, 10, 12, 14, 16)

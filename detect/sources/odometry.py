@@ -7,8 +7,8 @@ from contextlib import closing
 from pathlib import Path
 
 from detect.errors import DetectError
-from detect.name_index import NameIndex
 from detect.run import Frames, RunFrame
+from detect.runs.name_index import NameIndex
 from detect.sources.interface import PoseStream, Source, SourceImage, TimedPose
 from detect.sources.steps import movement_between, pose_between, step_of
 from landmarks import Step, iterate_prefixes, iterate_steps

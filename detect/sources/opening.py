@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 
 from camera import Camera, read_camera
 from detect.errors import DetectError
-from detect.image_names import IMAGE_SUFFIXES
 from detect.run import (
     Frames,
     ImageRun,
@@ -20,7 +19,8 @@ from detect.run import (
     open_images,
     open_run,
 )
-from detect.run_images import images_of_folder
+from detect.runs.image_names import IMAGE_SUFFIXES
+from detect.runs.run_images import images_of_folder
 from detect.sources.options import SourceOptions
 
 if TYPE_CHECKING:

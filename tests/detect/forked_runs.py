@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 if TYPE_CHECKING:
-    from detect.frame_rows import FrameRows
+    from detect.runs.frame_rows import FrameRows
 
 PATIENCE_S = 120.0
 
@@ -65,7 +65,7 @@ class StopAfter:
         self.frames = frames
 
     def __call__(self) -> None:
-        from detect.resume import RunFiles
+        from detect.runs.resume import RunFiles
 
         add, count = RunFiles.add, [0]
         if self.frames == 0:

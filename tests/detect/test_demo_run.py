@@ -8,14 +8,14 @@ from pathlib import Path
 
 import pytest
 
-from detect.circles_run import detect_circles_run
-from detect.compare import compare_runs
-from detect.compare_lines import compare_line_runs
-from detect.compare_lines_result import LineComparison
-from detect.compare_result import CompareOptions, Comparison
+from detect.comparison.circles import compare_runs
+from detect.comparison.lines import compare_line_runs
+from detect.comparison.lines_result import LineComparison
+from detect.comparison.result import CompareOptions, Comparison
 from detect.line_settings import LineSettings
-from detect.lines_run import detect_lines_run
 from detect.run import open_run
+from detect.runs.circles_run import detect_circles_run
+from detect.runs.lines_run import detect_lines_run
 from detect.settings import PUBLISHED, CircleSettings
 
 #: What the shipped rows were detected with, apart from what makes one disc one row.

@@ -17,13 +17,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from camera import Camera, read_camera
+from detect.drawing.lines import draw_lines, draw_response, draw_tracks, track_pixels
 from detect.errors import DetectError, FrameError
-from detect.line_bearing import compensated_bearings, inclinations, plane_normals
-from detect.line_drawing import draw_lines, draw_response, draw_tracks, track_pixels
-from detect.line_judgement import judge_tracks
 from detect.line_settings import DEFAULT, PUBLISHED, LineSettings
-from detect.line_tracks import line_response, line_starts, line_tracks
 from detect.lines import ACCEPTED, JOINED, detect_lines, tilt_beyond_doubt
+from detect.verticals.bearing import compensated_bearings, inclinations, plane_normals
+from detect.verticals.judgement import judge_tracks
+from detect.verticals.tracks import line_response, line_starts, line_tracks
 from lut.verticals import build_vertical_table
 from tests.detect.line_scene import Edge, edge_columns, mirrored, pinhole, render, tilted
 

@@ -17,7 +17,7 @@ from groundtruth.errors import GroundTruthError
 from groundtruth.markers.boards_file import BoardImage, find_boards
 from groundtruth.markers.checkerboard import Checkerboard
 from storage.image_header import MOST_PIXELS, claimed_size
-from tests.detect.test_faults_images import SIDE, jpeg, png
+from tests.detect.runs.test_faults_images import SIDE, jpeg, png
 
 CONTENTS = (jpeg(SIDE, SIDE), png(SIDE, SIDE))
 

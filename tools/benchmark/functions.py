@@ -8,15 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from camera import Camera
-from detect.centres import best_centres, quality_of_centres
 from detect.circles import detect_circles, disc_shape
-from detect.frame import tilt_of_lines
-from detect.levelling import levelled
+from detect.discs.centres import best_centres, quality_of_centres
+from detect.discs.levelling import levelled
 from detect.line_settings import DEFAULT as LINES_DEFAULT
-from detect.line_tracks import line_response
 from detect.lines import detect_lines
 from detect.noise import estimate_noise
+from detect.runs.frame import tilt_of_lines
 from detect.settings import PUBLISHED, CircleSettings
+from detect.verticals.tracks import line_response
 from lut import cached_disc_table, cached_vertical_table
 from tools.benchmark.material import Picture, decode
 from tools.benchmark.plain_gather import gather_table, plain_quality_of_centres

@@ -9,13 +9,13 @@ import numpy as np
 
 from camera import Camera
 from detect.circles import detect_circles, disc_shape
-from detect.drawing import circle_on_floor
-from detect.line_drawing import track_pixels
+from detect.drawing.detections import circle_on_floor
+from detect.drawing.lines import track_pixels
 from detect.line_settings import LineSettings
-from detect.line_tracks import line_response
 from detect.lines import detect_lines
 from detect.run import open_run, read_image
 from detect.settings import CircleSettings
+from detect.verticals.tracks import line_response
 from lut import cached_disc_table, cached_vertical_table
 
 _EDGE, _RINGS, _LINE = "#e67e22", "#2ecc71", "#e67e22"
@@ -26,7 +26,7 @@ def draw_discs(figure: Any, run: Path, frame: int) -> None:
     camera, image = _frame(run, frame)
     settings = CircleSettings()
     table = cached_disc_table(camera, disc_shape(settings))
-    from detect.centres import quality_of_centres
+    from detect.discs.centres import quality_of_centres
 
     quality, _ = quality_of_centres(image, table)
     found = detect_circles(image, camera, table, settings)

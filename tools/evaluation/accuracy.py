@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from camera import Camera
 from detect.circles import disc_shape, refined_covariance
-from detect.disc_fit import blur_ratio_of, fit_discs
+from detect.discs.fit import blur_ratio_of, fit_discs
 from detect.noise import estimate_noise
 from detect.settings import CircleSettings
 from lut import DiscTable, cached_disc_table

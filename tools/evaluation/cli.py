@@ -238,8 +238,8 @@ def _rendered_lines(command: RenderedLines) -> int:
 
 
 def _tilt(command: Tilt) -> int:
-    from detect.compare import compare_runs
-    from detect.compare_result import CompareOptions
+    from detect.comparison.circles import compare_runs
+    from detect.comparison.result import CompareOptions
     from landmarks import read_tilts
 
     options = CompareOptions(gate_m=0.3)
@@ -284,8 +284,8 @@ def _print_tilt_errors(run: Path, tilts: dict[str, FrameTilt]) -> None:
 
 def _detect_lines(run: Path, settings: LineSettings, output: Path) -> None:
     from detect import __version__
-    from detect.lines_run import detect_lines_run
     from detect.run import open_run
+    from detect.runs.lines_run import detect_lines_run
 
     tilts = output.with_suffix(".tilt")
     summary = detect_lines_run(open_run(run), settings, output, tilts, version=__version__)
@@ -297,8 +297,8 @@ def _detect(
     run: Path, settings: CircleSettings, output: Path, tilts: dict[str, FrameTilt] | None = None
 ) -> None:
     from detect import __version__
-    from detect.circles_run import detect_circles_run
     from detect.run import open_run
+    from detect.runs.circles_run import detect_circles_run
 
     summary = detect_circles_run(open_run(run), settings, output, version=__version__, tilts=tilts)
     for failure in summary.failures:

@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 
 from camera import CameraError, parse_camera
 from camera.calibrate_images import read_grey
-from detect.draw_head import read_head
+from detect.drawing.head import read_head
 from detect.errors import DetectError, FrameError
-from detect.image_bounds import bounded_content
-from detect.resume_journal import left_journal
-from detect.run_log import demand_log_place
+from detect.runs.image_bounds import bounded_content
+from detect.runs.resume_journal import left_journal
+from detect.runs.run_log import demand_log_place
 from detect.sources.bag_images import pixels_of_message
 from detect.sources.gray import (
     DEEP_SUFFIXES,

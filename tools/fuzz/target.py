@@ -18,8 +18,8 @@ import atheris  # type: ignore[import-untyped,import-not-found,unused-ignore]
 with atheris.instrument_imports(
     include=[
         "camera",
-        "detect.draw_head",
-        "detect.resume_journal",
+        "detect.drawing.head",
+        "detect.runs.resume_journal",
         "detect.sources",
         "landmarks",
         "groundtruth",

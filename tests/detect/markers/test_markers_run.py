@@ -11,8 +11,8 @@ import pytest
 from camera import Camera, write_camera
 from detect.cli import main
 from detect.markers.settings import MarkerSettings
-from detect.markers_run import detect_markers_run
 from detect.run import Run, open_images
+from detect.runs.markers_run import detect_markers_run
 from landmarks import read_frames
 from tests.detect.markers.rendering import View, exposed, render, view_corners
 

@@ -1,0 +1,1 @@
+"""Detected rows held against reference rows of the same run."""

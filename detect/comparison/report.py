@@ -1,0 +1,169 @@
+"""A comparison as text for people and as JSON for programs."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+
+from rich.console import Group
+from rich.table import Table
+from rich.text import Text
+
+from detect.comparison.result import Comparison, DistanceBin
+from detect.comparison.tables import (
+    frames_text,
+    normalised_error_text,
+    number,
+    plain_text,
+    printable,
+    rows_text,
+    summary_table,
+    titled_table,
+)
+
+_WORST_FRAMES = 10
+
+
+def comparison_tables(comparison: Comparison) -> Group:
+    """Lay a comparison out for a rich console, which leaves colour out where there is no terminal.
+
+    Parameters
+    ----------
+    comparison : Comparison
+        The figures.
+
+    Returns
+    -------
+    rich.console.Group
+        Summary, figures over distance, and the worst frames.
+    """
+    if not (comparison.reference or comparison.detected):
+        return Group(_summary(comparison))
+    return Group(_summary(comparison), "", _over_distance(comparison), _worst_frames(comparison))
+
+
+def format_text(comparison: Comparison, *, width: int = 100) -> str:
+    """Lay a comparison out as plain text of at most `width` columns, without colour."""
+    return plain_text(comparison_tables(comparison), width)
+
+
+def format_json(comparison: Comparison) -> str:
+    """Write a comparison as JSON: same keys in the same order, numbers finite or null.
+
+    Lengths are in metres. Of the frames, the worst are listed, and those that only one file has.
+    """
+    figures = {
+        **asdict(comparison),
+        "missed": comparison.missed,
+        "extra": comparison.extra,
+        "bins": [
+            {**asdict(part), "quality_difference": part.quality_difference}
+            for part in comparison.bins
+        ],
+        "frames": len(comparison.frames),
+        "worst_frames": [asdict(frame) for frame in comparison.worst_frames(_WORST_FRAMES)],
+    }
+    return json.dumps(figures, indent=2, allow_nan=False) + "\n"
+
+
+def _summary(c: Comparison) -> Table:
+    gate = f"{c.options.gate_m:g} m" if c.options.sigma is None else f"{c.options.sigma:g} sigma"
+    rows = (
+        ("reference", printable(c.reference_name)),
+        ("detected", printable(c.detected_name)),
+        (
+            "frames",
+            frames_text(
+                len(c.frames),
+                len(c.frames_only_in_reference),
+                len(c.frames_only_in_detected),
+                counted=c.options.all_frames,
+            ),
+        ),
+        (
+            "rows",
+            rows_text(
+                c.reference, c.detected, c.set_aside, only_identified=c.options.only_identified
+            ),
+        ),
+        (f"within {gate}", f"{c.matched} matched, {c.missed} missed, {c.extra} extra"),
+        ("recall", number(c.recall, 4)),
+        ("precision", number(c.precision, 4)),
+        (
+            "position error",
+            f"median {number(c.error_median_m, 4)} m, 95 % {number(c.error_95_m, 4)} m",
+        ),
+        ("normalised error", _normalised_error(c)),
+        (
+            "reference quality",
+            f"median {number(c.reference_quality_matched, 3)} matched, "
+            f"{number(c.reference_quality_missed, 3)} missed",
+        ),
+        (
+            "detected quality",
+            f"median {number(c.detected_quality_matched, 3)} matched, "
+            f"{number(c.detected_quality_extra, 3)} extra",
+        ),
+    )
+    return summary_table(rows)
+
+
+def _normalised_error(c: Comparison) -> str:
+    error = c.normalised_error
+    text = normalised_error_text(error)
+    source = {"detected": "detected", "reference": "reference", "sum": "detected plus reference"}
+    text += f", covariance: {source[c.options.error_covariance]}"
+    if error.left_out:
+        text += f"; {error.left_out} not positive definite left out"
+    return text
+
+
+def _over_distance(c: Comparison) -> Table:
+    table = titled_table("By forward distance (position error and quality: medians)")
+    for heading in (
+        # Of a width that a terminal of 80 columns has.
+        "metres", "ref.", "missed", "recall", "det.", "extra", "prec.",
+        "error m", "ref. quality", "det. quality", "diff.",
+    ):  # fmt: skip
+        table.add_column(heading, justify="right")
+    for part in c.bins:
+        if part.reference == part.detected == 0:
+            continue
+        table.add_row(
+            _range(part),
+            str(part.reference),
+            str(part.missed),
+            number(part.recall, 3),
+            str(part.detected),
+            str(part.extra),
+            number(part.precision, 3),
+            number(part.error_median_m, 3),
+            number(part.reference_quality_median, 3),
+            number(part.detected_quality_median, 3),
+            number(part.quality_difference, 3),
+        )
+    return table
+
+
+def _range(part: DistanceBin) -> str:
+    if part.from_m is None:
+        return f"< {part.to_m:g}"
+    if part.to_m is None:
+        return f">= {part.from_m:g}"
+    return f"{part.from_m:g}-{part.to_m:g}"
+
+
+def _worst_frames(c: Comparison) -> Table:
+    table = titled_table("Worst frames")
+    table.add_column("image", overflow="fold")
+    for heading in ("matched", "missed", "extra", "largest error m"):
+        table.add_column(heading, justify="right")
+    for frame in c.worst_frames(_WORST_FRAMES):
+        table.add_row(
+            Text(printable(frame.name)),
+            str(frame.matched),
+            str(frame.missed),
+            str(frame.extra),
+            number(frame.largest_error_m, 3),
+        )
+    return table

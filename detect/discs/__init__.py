@@ -1,0 +1,1 @@
+"""Discs on the floor: quality of centres, the fit of a disc, the evidence that it is one."""

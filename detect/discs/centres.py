@@ -1,0 +1,176 @@
+"""The quality of possible centres of discs, and where it is highest.
+
+Both functions say the same: one as a map, the other only its peaks above a threshold, and sooner.
+"""
+
+from __future__ import annotations
+
+import threading
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from detect.discs.maxima_kernels import maxima
+from detect.discs.quality_kernels import centres_above, quality_map, working_memory
+from detect.errors import FrameError
+from detect.settings import Polarity
+from lut import DiscTable
+from lut.kernels import BLOCK
+
+FloatArray = NDArray[np.float64]
+
+_Ints = NDArray[np.int32]
+_Bytes = NDArray[np.uint8]
+_Arguments = tuple[_Bytes, int, NDArray[Any], NDArray[np.int64], _Ints, _Ints, _Ints, _Bytes]
+
+_SIGNS: dict[Polarity, float] = {"any": 0.0, "light": 1.0, "dark": -1.0}
+
+#: Room for so many centres above the threshold at a time.
+_ROOM = 4096
+
+
+def best_centres(
+    image: NDArray[np.uint8], table: DiscTable, threshold: float, polarity: Polarity = "any"
+) -> tuple[NDArray[np.int64], FloatArray, NDArray[np.float32]]:
+    """Local maxima of the quality: the peaks of `quality_of_centres`, without the map.
+
+    Parameters
+    ----------
+    image : (H, W) uint8
+        Grey image.
+    table : DiscTable
+        The camera's table.
+    threshold : float
+        Least quality, above 0, at most 1.
+    polarity : {"any", "light", "dark"}
+        Centres of another polarity count as quality 0: they hide no maximum next to them.
+
+    Returns
+    -------
+    pixels : (N, 2) int64
+        Pixels (u, v) that none of their 8 neighbours exceeds, in scan order. Connected pixels of
+        equal quality are one maximum, at the one nearest to their centroid.
+    quality : (N,) float64
+    contrast : (N,) float32
+        As in `quality_of_centres`.
+
+    Raises
+    ------
+    FrameError
+        If the image does not belong to the table.
+    """
+    sign = _SIGNS[polarity]
+    space = _working_space(image.size, table.samples)
+    arguments = _kernel_arguments(image, table, space.pixels)
+    room = space.columns, space.rows, space.quality, space.contrast
+    parts: list[tuple[NDArray[Any], ...]] = []
+    block, blocks = 0, len(table.block_row)
+    while True:
+        block, count = centres_above(
+            *arguments, threshold, sign, *space.memory, block,
+            space.columns, space.rows, space.quality, space.contrast,
+        )  # fmt: skip
+        found: tuple[NDArray[Any], ...] = tuple([values[:count] for values in room])
+        if block == blocks and not parts:
+            break
+        parts.append(tuple([values.copy() for values in found]))
+        if block == blocks:
+            found = tuple(np.concatenate(values) for values in zip(*parts))
+            break
+    columns, rows, quality, contrast = found
+    index = maxima(columns, rows, quality)
+    pixels = np.empty((len(index), 2), np.int64)
+    pixels[:, 0] = columns[index]
+    pixels[:, 1] = rows[index]
+    return pixels, quality[index], contrast[index]
+
+
+def quality_of_centres(
+    image: NDArray[np.uint8], table: DiscTable
+) -> tuple[FloatArray, NDArray[np.float32]]:
+    """Otsu's quality, and the contrast, of the outlines around every pixel.
+
+    Parameters
+    ----------
+    image : (H, W) uint8
+        Grey image.
+    table : DiscTable
+        The camera's table.
+
+    Returns
+    -------
+    quality : (H, W) float64
+        Between-class variance / total variance of the outlines' grey values, 0 to 1; 0 where the
+        table has no usable centre.
+    contrast : (H, W) float32
+        Mean grey value of the inner outline minus that of the outer.
+
+    Raises
+    ------
+    FrameError
+        If the image does not belong to the table.
+    """
+    pixels = np.zeros(image.size + BLOCK, np.uint8)
+    arguments = _kernel_arguments(image, table, pixels)
+    quality = np.zeros(image.shape)
+    contrast = np.zeros(image.shape, np.float32)
+    quality_map(*arguments, *working_memory(table.samples), quality, contrast)
+    return quality, contrast
+
+
+class _WorkingSpace(NamedTuple):
+    """What `best_centres` works in: memory that is new for every image has to be fetched first."""
+
+    pixels: _Bytes
+    memory: tuple[_Bytes, NDArray[np.uint16], NDArray[np.uint32]]
+    columns: NDArray[np.int64]
+    rows: NDArray[np.int64]
+    quality: FloatArray
+    contrast: NDArray[np.float32]
+
+
+_kept = threading.local()
+
+
+def _working_space(size: int, samples: int) -> _WorkingSpace:
+    """The calling thread's working space for images of so many pixels."""
+    if getattr(_kept, "key", None) != (size, samples):
+        _kept.key = None
+        _kept.space = _WorkingSpace(
+            np.zeros(size + BLOCK, np.uint8),
+            working_memory(samples),
+            np.empty(_ROOM, np.int64),
+            np.empty(_ROOM, np.int64),
+            np.empty(_ROOM),
+            np.empty(_ROOM, np.float32),
+        )
+        _kept.key = size, samples
+    space: _WorkingSpace = _kept.space
+    return space
+
+
+def _kernel_arguments(
+    image: NDArray[np.uint8], table: DiscTable, pixels: NDArray[np.uint8]
+) -> _Arguments:
+    """The image's pixels, with the zeros that the table wants behind them, and the table.
+
+    `pixels` are as many as the image's, and those zeros: they become the image's.
+    """
+    expected = table.floor_xy.shape[:2]
+    if image.shape != expected or image.dtype != np.uint8:
+        raise FrameError(
+            f"the image is {image.dtype} of shape {image.shape}: the table is for uint8 of shape "
+            f"{expected}"
+        )
+    pixels[: image.size].reshape(image.shape)[...] = image
+    return (
+        pixels,
+        table.samples,
+        table.copies,
+        table.block_copies,
+        table.block_row,
+        table.block_column,
+        table.block_pattern,
+        table.patterns,
+    )

@@ -1,0 +1,264 @@
+"""Compiled descent of the disc fit to the least squares, or until there is no hope of a disc."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from detect.discs import normal_kernels as normal
+from detect.discs.evidence_kernels import LEAST_EXPLAINED, evidence_of
+from detect.discs.gather_kernels import LEAST_BLUR, Gathered
+from detect.discs.model_kernels import (
+    CAPACITY,
+    FIELDS,
+    PIXEL_VARIANCE,
+    blur_across,
+    chord_shares,
+    edge_shares,
+)
+from detect.discs.normal_kernels import background_products, disc_products, factor_rows, left_over
+from detect.discs.outline_kernels import SECTOR_SUMS, blur_widths
+from detect.discs.patch_kernels import COLUMNS, LIST, ONE, FitSettings, Patch, new_patch, padded
+from detect.discs.step_kernels import gauss_newton_step, move
+
+#: A step that promises less than this, in variances of the noise, is the last,
+_CONVERGED = 0.3
+#: and one that is shorter than this share of the blur's width, and changes the blur by less than
+#: this share: what is left is less than the square of it.
+_SHORT = 0.05
+#: What the first step of a fit promises may be this much less evidence than is needed.
+_FIRST_STEP_SLACK = 2.0
+
+
+class Hope(NamedTuple):
+    """When a fit is given up: as soon as a step promises less than this."""
+
+    least_share: float
+    """Share of the variance that the disc explains."""
+    least_evidence: float
+    """Evidence, as far as it is known by then: for an even outline."""
+    optics_px: float
+    """Blur of the camera's optics, for the evidence."""
+
+
+#: Never give up.
+PATIENT = Hope(-math.inf, -math.inf, 1.0)
+
+
+class Work(NamedTuple):
+    """Working space of the fits of one image."""
+
+    patch: Patch
+    fields: NDArray[np.float32]
+    shares: NDArray[np.float32]
+    widths: NDArray[np.float32]
+    weights: NDArray[np.float32]
+    sums: NDArray[np.float32]
+    products: NDArray[np.float64]
+    kept: NDArray[np.float64]
+    damped: NDArray[np.float64]
+    factor: NDArray[np.float64]
+    values: NDArray[np.float64]
+    bare: NDArray[np.float64]
+    p: NDArray[np.float64]
+    best: NDArray[np.float64]
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def new_work() -> Work:
+    """Working space."""
+    n = normal.ROWS
+    return Work(
+        new_patch(),
+        np.zeros(FIELDS * CAPACITY, np.float32),
+        np.zeros(FIELDS * CAPACITY, np.float32),
+        np.zeros(CAPACITY, np.float32),
+        np.zeros(64, np.float32),
+        np.zeros(SECTOR_SUMS, np.float32),
+        np.zeros((n, n)),
+        np.zeros((n, n)),
+        np.zeros((n, n)),
+        np.zeros((n, n)),
+        np.zeros(n),
+        np.zeros(n),
+        np.zeros(4),
+        np.zeros(4),
+    )
+
+
+class Descent(NamedTuple):
+    """Where a descent came to; its parameters are the working space's `best`."""
+
+    arrived: bool
+    contrast: float
+    variance: float
+    """Of the residuals, grey levels squared."""
+    evaluations: int
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def sigma_of(blur: float) -> float:
+    """Standard deviation of optics and pixel together, pixels."""
+    return math.sqrt(blur * blur + PIXEL_VARIANCE)
+
+
+@njit(cache=True, error_model="numpy", forceinline=True, fastmath={"contract"})
+def _mask(n: int, terms: NDArray[np.float32], fields: NDArray[np.float32]) -> None:
+    for field in range(FIELDS):
+        row = field * CAPACITY
+        for i in range(n):
+            fields[row + i] *= terms[ONE * CAPACITY + i]
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _evaluate(patch: Gathered, p: NDArray[np.float64], ratio: float, work: Work) -> None:
+    """The disc's fields at the parameters p (x, y, radius, log blur)."""
+    blur = math.exp(p[3])
+    geometry = work.patch.geometry
+    if patch.shape == LIST:
+        edge_shares(geometry, patch.n, p[0], p[1], p[2], blur, blur * ratio, work.fields)
+        return
+    along, across = (blur, blur * ratio) if patch.shape == COLUMNS else (blur * ratio, blur)
+    grid = patch.margin > 0
+    # Scattered pixels: an even weight of the same variance stands for blur and pixel across.
+    width = 1.0 if grid else math.sqrt(12.0) * sigma_of(across)
+    shares = work.shares if grid else work.fields
+    chord_shares(geometry, padded(patch.n), p[0], p[1], p[2], along, width, shares)
+    if grid:
+        blur_across(work.shares, patch.n, patch.margin, across, work.weights, work.fields)
+        _mask(patch.n, work.patch.terms, work.fields)
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def blur_width(patch: Gathered, p: NDArray[np.float64], ratio: float, work: Work) -> float:
+    """Mean width of the blur across the edge, in nominal radii, at the parameters p."""
+    blur = math.exp(p[3])
+    sigma_u = sigma_of(blur)
+    sigma_v = sigma_of(blur * ratio)
+    if patch.shape == COLUMNS:
+        sigma_u, sigma_v = sigma_v, sigma_u
+    return blur_widths(
+        work.patch.geometry, work.patch.terms, work.fields, patch.shape == LIST, patch.n,
+        p[0], p[1], sigma_u, sigma_v, work.widths,
+    )  # fmt: skip
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _add_ridge(begin: int, end: int, n: int, products: NDArray[np.float64]) -> None:
+    """Where two unknowns do the same, or one does nothing, there is still one solution."""
+    for j in range(begin, end):
+        products[j, j] += 1e-9 * n
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def descend(
+    patch: Gathered,
+    start: NDArray[np.float64],
+    settings: FitSettings,
+    most_evaluations: int,
+    hope: Hope,
+    work: Work,
+) -> Descent:
+    """Levenberg-Marquardt steps from `start` (see `detect.discs.fit_kernels.fit_disc`).
+
+    In the working space are then the best parameters (`best`), the sums of products there (`kept`)
+    and the fields of the disc there (`fields`).
+    """
+    p, best = work.p, work.best
+    products, kept, factor, values = work.products, work.kept, work.factor, work.values
+    terms = work.patch.terms
+    n = patch.n
+    freedom = patch.fitted - normal.UNKNOWNS
+    noise_2 = settings.noise * settings.noise
+    log_least = math.log(LEAST_BLUR)
+    log_most = math.log(patch.most_blur)
+    log_blur = math.log(settings.blur_px)
+    for k in range(4):
+        p[k] = start[k]
+        best[k] = start[k]
+    p[3] = min(p[3], log_most)
+    damping = 1e-3
+    cost = math.inf
+    contrast = 0.0
+    variance = noise_2
+    evaluations = 0
+    width_per_px = 0.0
+    done = False
+    background_products(terms, n, products)
+    _add_ridge(0, normal.BACKGROUND, patch.fitted, products)
+    while True:
+        _evaluate(patch, p, settings.blur_ratio, work)
+        if done:
+            # These were the best parameters' fields once more.
+            break
+        evaluations += 1
+        disc_products(terms, work.fields, n, products)
+        _add_ridge(normal.BACKGROUND, normal.UNKNOWNS, patch.fitted, products)
+        if not factor_rows(products, 0, normal.LOG_BLUR, factor):
+            return Descent(False, contrast, variance, evaluations)
+        without = left_over(products, factor, normal.BACKGROUND)
+        residual = left_over(products, factor, normal.LOG_BLUR)
+        variance_now = max(residual / freedom, noise_2)
+        prior_blur = (p[3] - log_blur) / settings.blur_sigma
+        prior_radius = (p[2] - 1.0) / settings.radius_sigma
+        now = residual + variance_now * (prior_blur * prior_blur + prior_radius * prior_radius)
+        current = now <= cost
+        if current:
+            gain = cost - now
+            cost = now
+            variance = variance_now
+            contrast = (
+                factor[normal.GREYS, normal.CONTRAST] * factor[normal.CONTRAST, normal.CONTRAST]
+            )
+            for k in range(4):
+                best[k] = p[k]
+            for i in range(normal.ROWS):
+                for j in range(i + 1):
+                    kept[i, j] = products[i, j]
+            damping = max(0.2 * damping, 1e-7)
+            if not abs(contrast) > 1e-6:
+                return Descent(False, contrast, variance, evaluations)
+            done = gain <= 1e-3 * variance
+        else:
+            damping *= 10.0
+            done = damping > 1e6
+            if not factor_rows(kept, 0, normal.LOG_BLUR, factor):
+                return Descent(False, contrast, variance, evaluations)
+        if not done:
+            if not gauss_newton_step(
+                kept, damping, best, contrast, variance, settings, log_most, work.damped, factor,
+                values,
+            ):  # fmt: skip
+                return Descent(False, contrast, variance, evaluations)
+            promised = 0.0
+            for k in range(normal.LOG_BLUR, normal.UNKNOWNS):
+                promised += factor[normal.GREYS, k] ** 2
+            share = 1.0 - max(cost - promised, 0.0) / max(without, 1e-9)
+            if share < hope.least_share:
+                return Descent(False, contrast, variance, evaluations)
+            if hope.least_evidence > -math.inf and share < LEAST_EXPLAINED:
+                return Descent(False, contrast, variance, evaluations)
+            move(best, values, contrast, log_least, log_most, p)
+            if evaluations == 1:
+                # How wide a blur is on the floor: the first pixels tell it for all blurs.
+                blur = math.exp(best[3])
+                width_per_px = blur_width(patch, best, settings.blur_ratio, work) / sigma_of(blur)
+            width = width_per_px * sigma_of(math.exp(p[3]))
+            if hope.least_evidence > -math.inf:
+                slack = _FIRST_STEP_SLACK if evaluations == 1 else 0.0
+                promise = evidence_of(share, p[2], 0.0, 1.0, 1.0, width / p[2], hope.optics_px)
+                if promise < hope.least_evidence - slack:
+                    return Descent(False, contrast, variance, evaluations)
+            longest = max(math.hypot(p[0] - best[0], p[1] - best[1]), abs(p[2] - best[2]))
+            short = longest < _SHORT * width and abs(p[3] - best[3]) < _SHORT
+            done = promised <= _CONVERGED * variance or short or evaluations == most_evaluations
+        if done:
+            if current:
+                break
+            for k in range(4):
+                p[k] = best[k]
+    return Descent(cost < math.inf, contrast, variance, evaluations)

@@ -1,0 +1,296 @@
+"""Compiled search for discs among the maxima of the quality: looks, fits, and one row per disc."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from detect.discs import fit_kernels as fit
+from detect.discs.candidate_kernels import middles, nearest_pixel, strong_and_alone, worth_a_look
+from detect.discs.covariance_kernels import refined_covariances
+from detect.discs.descent_kernels import PATIENT, Hope, Work, new_work
+from detect.discs.evidence_kernels import evidence_of
+from detect.discs.fit_kernels import fit_disc
+from detect.discs.patch_kernels import FitSettings
+from detect.discs.quality_kernels import suppress_neighbours
+
+#: Candidates whose first look is this much below the required evidence are not fitted in full.
+_FIRST_LOOK_SLACK = 2.0
+#: A look must promise to explain this share of the variance.
+_LEAST_SHARE = 0.1
+#: A look this much above the required evidence shows a disc clearly; within this share of the
+#: separation from it nothing else is looked for.
+_CLEAR = 6.0
+_WITHIN = 0.75
+#: Looks that came to places nearer than this share of the separation are at the same disc.
+_SAME_DISC = 0.3
+#: A blur that reached this share of the most that a patch allows is fitted again in a wider one.
+_AT_BOUND = 0.98
+_MOST_REFITS = 2
+
+
+class DiscSearch(NamedTuple):
+    """What is searched for: see `detect.settings.CircleSettings`."""
+
+    radius: float
+    """Nominal radius, and those of the outlines, metres."""
+    inner: float
+    outer: float
+    weakest: float
+    """Least contrast, grey levels."""
+    separation: float
+    """Metres."""
+    verify: bool
+    """Drop candidates without evidence of a disc."""
+    refine: bool
+    """Neighbours are suppressed at the fitted positions; else at the candidates'."""
+    least_evidence: float
+    optics_px: float
+    pixel_variance: float
+    """Of the systematic error, pixels squared."""
+    tilt_variance: float
+    """Of pitch and of roll, radians squared."""
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def search_discs(
+    image: NDArray[np.uint8],
+    floor_xy: NDArray[np.float32],
+    pixels: NDArray[np.int64],
+    quality: NDArray[np.float64],
+    contrast: NDArray[np.float32],
+    search: DiscSearch,
+    settings: FitSettings,
+    camera_numbers: NDArray[np.float64],
+    centre: NDArray[np.float64],
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Fit discs at the best centres, weigh the evidence, and keep the best of those that are one.
+
+    Parameters
+    ----------
+    image : (H, W) uint8
+    floor_xy : (H, W, 2) float32
+        Floor position of each pixel, metres.
+    pixels, quality, contrast : (N, 2) int64, (N,) float64, (N,) float32
+        See `detect.discs.centres.best_centres`.
+    search : DiscSearch
+    settings : FitSettings
+    camera_numbers, centre : (K,) float64, (3,) float64
+        See `detect.discs.covariance_kernels.refined_covariances`.
+
+    Returns
+    -------
+    index : (M,) int64
+        Which of the best centres are discs, ascending.
+    found_xy : (M, 2) float64
+        Their fitted places, metres.
+    covariance : (M, 2, 2) float64
+        Square metres.
+    evidence : (M,) float64
+    """
+    # Each disc has several best centres: of those in the middle of it one is enough.
+    near = 0.5 * search.separation
+    keep = strong_and_alone(pixels, quality, contrast, floor_xy, search.weakest, near)
+    starts = middles(pixels, quality, contrast, floor_xy, search.weakest, near, keep)
+    results, evidence, found = _fit_all(
+        image, floor_xy, starts, quality[keep], contrast[keep], search, settings,
+        new_work(),
+    )  # fmt: skip
+    found_xy = np.empty((len(found), 2))
+    covariance = np.empty((len(found), 2, 2))
+    told = np.empty(len(found))
+    for k in range(len(found)):
+        result = results[found[k]]
+        found_xy[k, 0] = result[fit.X]
+        found_xy[k, 1] = result[fit.Y]
+        covariance[k, 0, 0] = result[fit.COV_XX]
+        covariance[k, 0, 1] = covariance[k, 1, 0] = result[fit.COV_XY]
+        covariance[k, 1, 1] = result[fit.COV_YY]
+        told[k] = evidence[found[k]]
+    covariance = refined_covariances(
+        camera_numbers, centre, found_xy, covariance, search.pixel_variance, search.tilt_variance
+    )
+    return keep[found], found_xy, covariance, told
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _evidence(result: NDArray[np.float64], radius: float, optics_px: float) -> float:
+    return evidence_of(
+        result[fit.EXPLAINED],
+        result[fit.RADIUS] / radius,
+        result[fit.OUTLINE_DEVIATION],
+        result[fit.SECTORS_GOOD],
+        result[fit.MIDDLE_STEP],
+        result[fit.RELATIVE_BLUR],
+        optics_px,
+    )
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _next_to_look_at(
+    image: NDArray[np.uint8],
+    floor_xy: NDArray[np.float32],
+    pixels: NDArray[np.int64],
+    quality: NDArray[np.float64],
+    contrast: NDArray[np.float32],
+    search: DiscSearch,
+    order: NDArray[np.int64],
+    begin: int,
+    clear: NDArray[np.float64],
+) -> int:
+    """The place in the order, from `begin` on, of the next candidate worth a look; or the end.
+
+    What lies within a disc that showed clearly need not be looked at.
+    """
+    within_2 = (_WITHIN * search.separation) ** 2
+    for at in range(begin, len(order)):
+        i = order[at]
+        u, v = pixels[i]
+        seen = False
+        for k in range(len(clear)):
+            dx = clear[k, 0] - floor_xy[v, u, 0]
+            dy = clear[k, 1] - floor_xy[v, u, 1]
+            if dx * dx + dy * dy < within_2:
+                seen = True
+                break
+        if not seen and (
+            not search.verify
+            or worth_a_look(
+                image, floor_xy, u, v, quality[i], float(contrast[i]), search.inner, search.outer
+            )
+        ):
+            return at
+    return len(order)
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _fit_all(
+    image: NDArray[np.uint8],
+    floor_xy: NDArray[np.float32],
+    pixels: NDArray[np.int64],
+    quality: NDArray[np.float64],
+    contrast: NDArray[np.float32],
+    search: DiscSearch,
+    settings: FitSettings,
+    work: Work,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
+    """Look at the candidates, then fit what the looks left: the results, the evidence, the discs.
+
+    Both are fits, and one call: it is inlined, and machine code of it twice takes twice as long to
+    compile.
+    """
+    n = len(pixels)
+    radius = search.radius
+    looks = np.zeros((n, fit.RESULT_SIZE))
+    results = np.zeros((n, fit.RESULT_SIZE))
+    place = np.zeros((n, 2))
+    promise = np.full(n, -np.inf)
+    evidence = np.full(n, -np.inf)
+    score = np.full(n, -np.inf)
+    start = np.zeros(4)
+    blur_start = max(settings.blur_px, 0.6 * search.optics_px)
+    hope = PATIENT
+    if search.verify:
+        hope = Hope(_LEAST_SHARE, search.least_evidence - _FIRST_LOOK_SLACK, search.optics_px)
+    clear = np.empty((n, 2))
+    clear_count = 0
+    # The best first.
+    order = np.argsort(-quality, kind="mergesort")
+    looking = True
+    at = -1
+    refits = 0
+    detail = fit.LOOK
+    i = 0
+    u = v = 0
+    blur = log_blur = at_x = at_y = 0.0
+    while True:
+        if looking:
+            at = _next_to_look_at(
+                image, floor_xy, pixels, quality, contrast, search, order, at + 1,
+                clear[:clear_count],
+            )  # fmt: skip
+            if at == len(order):
+                looking = False
+                order = np.flatnonzero(promise > -np.inf)
+                if search.separation > 0.0:
+                    order = order[
+                        suppress_neighbours(
+                            place[order], promise[order], _SAME_DISC * search.separation
+                        )
+                    ]
+                at = -1
+        if not looking and refits == 0:
+            at += 1
+            if at == len(order):
+                break
+        i = order[at]
+        result = looks[i] if looking else results[i]
+        if looking:
+            u, v = int(pixels[i, 0]), int(pixels[i, 1])
+            start[0] = 0.0
+            start[1] = 0.0
+            start[2] = 1.0
+            blur = blur_start
+            log_blur = math.log(blur_start)
+        else:
+            before = looks[i] if refits == 0 else results[i]
+            at_x, at_y = before[fit.X], before[fit.Y]
+            log_blur = math.log(before[fit.BLUR])
+            start[2] = before[fit.RADIUS] / radius
+            # First the pixels that tell most; a disc, or one too blurred for the patch, once more.
+            detail = fit.EDGE if refits == 0 else fit.ALL
+            if refits == 0:
+                u, v = nearest_pixel(floor_xy, pixels[i, 0], pixels[i, 1], at_x, at_y)
+                # A look tells the blur but roughly: too small a patch would be gathered again.
+                blur = max(before[fit.BLUR], blur_start)
+            else:
+                if before[fit.BLUR] > _AT_BOUND * before[fit.BLUR_BOUND]:
+                    blur = before[fit.BLUR_BOUND]
+            start[0] = (at_x - floor_xy[v, u, 0]) / radius
+            start[1] = (at_y - floor_xy[v, u, 1]) / radius
+        start[3] = log_blur
+        fitted = fit_disc(
+            image, floor_xy, u, v, radius, settings, start, blur,
+            detail, hope, work, result,
+        )  # fmt: skip
+        told = -math.inf
+        if fitted:
+            told = _evidence(result, radius, search.optics_px)
+        if looking:
+            place[i, 0] = result[fit.X]
+            place[i, 1] = result[fit.Y]
+            if not search.verify:
+                if fitted:
+                    promise[i] = told if told > -math.inf else -1e9
+            elif told >= search.least_evidence - _FIRST_LOOK_SLACK:
+                promise[i] = told
+                if told >= search.least_evidence + _CLEAR:
+                    clear[clear_count, 0] = result[fit.X]
+                    clear[clear_count, 1] = result[fit.Y]
+                    clear_count += 1
+            continue
+        evidence[i] = told
+        enough = fitted and (not search.verify or told >= search.least_evidence)
+        again = result[fit.BLUR] > _AT_BOUND * result[fit.BLUR_BOUND] or (
+            detail == fit.EDGE and result[fit.COMPLETE] == 0.0
+        )
+        if enough and again and refits < _MOST_REFITS:
+            refits += 1
+            continue
+        refits = 0
+        candidate = floor_xy[pixels[i, 1], pixels[i, 0]]
+        place[i, 0] = result[fit.X] if search.refine else candidate[0]
+        place[i, 1] = result[fit.Y] if search.refine else candidate[1]
+        # A fit that wandered off, or turned the disc's contrast round, is about something else.
+        stayed = math.hypot(result[fit.X] - candidate[0], result[fit.Y] - candidate[1]) < radius
+        same_sign = result[fit.CONTRAST] * contrast[i] > 0.0
+        if enough and stayed and same_sign:
+            score[i] = told if told > -math.inf else -1e9 + quality[i]
+    sound = np.flatnonzero(score > -np.inf)
+    if search.separation > 0.0:
+        sound = sound[suppress_neighbours(place[sound], score[sound], search.separation)]
+    return results, evidence, sound

@@ -1,0 +1,1 @@
+"""Detections drawn into their images."""

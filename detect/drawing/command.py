@@ -1,0 +1,153 @@
+"""The command ``detect draw``: rows from files drawn into the images."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from math import isfinite
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from detect.comparison.lines_result import LineCompareOptions
+from detect.drawing.frame import draw_rows
+from detect.drawing.inputs import find_files, open_rows, picture_name
+from detect.drawing.selection import select_frames
+from detect.errors import DetectError, FrameError
+from detect.run import Run, read_image
+from detect.runs.progress import print_failures, progress_bar
+from detect.runs.stream import KEPT_FAILURES
+from detect.settings import CircleSettings
+from detect.sources.opening import demand_recording, open_source
+from detect.viewing_options import Draw
+from storage import OutputExistsError, write_whole
+
+_FRAMES_FAILED = 3
+
+
+def perform(options: Draw) -> int:
+    """Carry the command out; returns the exit code."""
+    if options.output is None and options.video is None:
+        raise DetectError("nowhere to draw to: expected a folder (-o) or a file (--video)")
+    if not (isfinite(options.fps) and options.fps > 0.0):
+        raise DetectError(f"fps is {options.fps:g}: expected above 0")
+    demand_recording(options.run)
+    run = open_source(options.run, options.camera, options.source)
+    files = find_files(run, options.files)
+    camera = run.camera if isinstance(run, Run) else None
+    if camera is None and set(files.detected) != {"markers"}:
+        raise DetectError(
+            f"{options.run}: no calibration: expected a .cam file in it, or one named by --camera; "
+            "only markers can be drawn without"
+        )
+    if options.video is not None and options.video.exists() and not options.force:
+        raise OutputExistsError(options.video)
+    selection = select_frames(run.frames, options.frames, options.every)
+    source = open_rows(files)
+    head = files.heads.get("circles")
+    settings = CircleSettings() if head is None else head.circle_settings
+    gate, sigmas = options.gates.discs, options.gates.sigmas
+    line_gate = LineCompareOptions(tolerance_deg=options.gates.tolerance_deg, sigmas=sigmas)
+    if options.output is not None:
+        options.output.mkdir(parents=True, exist_ok=True)
+
+    drawn, failed = 0, 0
+    failures: list[str] = []
+    with ExitStack() as stack:
+        video = None
+        if options.video is not None:
+            video = stack.enter_context(mp4(options.video, options.fps, overwrite=options.force))
+        advance = stack.enter_context(progress_bar("pictures", selection.expected(run.frames)))
+        for _, frame in selection.of(run.frames):
+            try:
+                image = read_image(frame, camera)
+            except FrameError as error:
+                failed += 1
+                failures += [str(error)][: KEPT_FAILURES - len(failures)]
+                continue
+            prefix = frame.step.prefix
+            picture = draw_rows(
+                image, camera, source.of(prefix), settings, gate, line_gate, picture_name(prefix)
+            )
+            if options.output is not None:
+                path = options.output / f"{picture_name(prefix)}.png"
+                with write_whole(path, overwrite=options.force) as stream:
+                    stream.write(png(picture))
+            if video is not None:
+                video(picture)
+            drawn += 1
+            advance()
+    for where in (options.output, options.video):
+        if where is not None:
+            print(f"{where}: {drawn} pictures of {', '.join(files.detected)}")
+    print_failures(failed, failures)
+    return _FRAMES_FAILED if failed else 0
+
+
+def png(picture: NDArray[np.uint8]) -> bytes:
+    """A picture in OpenCV's order of colours as a PNG file."""
+    import cv2
+
+    _, encoded = cv2.imencode(".png", picture)
+    return encoded.tobytes()
+
+
+@contextmanager
+def mp4(
+    path: Path, fps: float, *, overwrite: bool
+) -> Iterator[Callable[[NDArray[np.uint8]], None]]:
+    """A video that appears once it is complete; yields what takes its pictures.
+
+    Parameters
+    ----------
+    path : path
+        The file.
+    fps : float
+        Pictures per second.
+    overwrite : bool
+        Whether an existing file may be replaced.
+
+    Raises
+    ------
+    DetectError
+        If OpenCV cannot write such videos here, or pictures are not all of one size.
+    storage.OutputExistsError
+        If the file exists and must not be replaced.
+    """
+    import cv2
+
+    writer: cv2.VideoWriter | None = None
+    size: tuple[int, int] | None = None
+
+    with tempfile.TemporaryDirectory() as folder:
+        raw = Path(folder) / "video.mp4"
+
+        def add(picture: NDArray[np.uint8]) -> None:
+            nonlocal writer, size
+            # The coder wants even numbers of rows and columns.
+            height, width = picture.shape[:2]
+            even = np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
+            if writer is None:
+                size = (even.shape[1], even.shape[0])
+                coder = cv2.VideoWriter.fourcc(*"mp4v")
+                writer = cv2.VideoWriter(str(raw), coder, fps, size)
+                if not writer.isOpened():
+                    raise DetectError(
+                        f"{path}: this OpenCV cannot write MP4 videos: expected -o and a folder"
+                    )
+            if (even.shape[1], even.shape[0]) != size:
+                raise DetectError(f"{path}: pictures of several sizes: expected one for a video")
+            writer.write(even)
+
+        try:
+            yield add
+        finally:
+            if writer is not None:
+                writer.release()
+        if writer is None:
+            raise DetectError(f"{path}: no picture: expected one at least for a video")
+        with write_whole(path, overwrite=overwrite) as stream, raw.open("rb") as content:
+            shutil.copyfileobj(content, stream)

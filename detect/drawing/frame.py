@@ -1,0 +1,267 @@
+"""Rows of one frame drawn into its image: discs, verticals, markers, tilt, and their residuals.
+
+What is drawn comes from files alone; nothing is detected again. Outlines of discs go through the
+tilt of the frame, where the rows are corrected for it, and through the lens; verticals through the
+lens, with a bar of one standard deviation to each side where they cross the horizon (the report's
+figures 5, 6 and 8). Where there are reference rows, those that are missing are drawn as well, and
+rows that fit none have another colour.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from camera import Camera
+from detect.comparison.circles import pair_discs
+from detect.comparison.lines import joined_lines, pair_lines
+from detect.comparison.lines_result import LineCompareOptions
+from detect.comparison.result import CompareOptions
+from detect.drawing.detections import EDGE_COLOUR, circle_on_floor, outline_disc
+from detect.drawing.inputs import SeenRows
+from detect.drawing.strokes import Colour, draw_curve, draw_text, enlargement
+from detect.settings import CircleSettings
+from detect.verticals.tilt import level_rotation
+from landmarks import (
+    CircleLandmark,
+    FrameTilt,
+    LineLandmark,
+    MarkerLandmark,
+    circle_arrays,
+    is_positive_definite,
+    squared_mahalanobis,
+    wrap_angle,
+)
+
+FloatArray = NDArray[np.float64]
+
+_POINTS = 33
+_LEGEND_PX = 16
+_LINE_COLOUR: Colour = (60, 220, 60)
+_SIGMA_COLOUR: Colour = (0, 170, 255)
+_EXTRA_COLOUR: Colour = (255, 60, 255)
+_MISSED_COLOUR: Colour = (60, 60, 255)
+_WORDS_COLOUR: Colour = (230, 230, 230)
+
+
+def draw_rows(
+    image: NDArray[np.uint8],
+    camera: Camera | None,
+    rows: SeenRows,
+    settings: CircleSettings,
+    gate: CompareOptions,
+    line_gate: LineCompareOptions,
+    title: str = "",
+) -> NDArray[np.uint8]:
+    """Draw what files say of a frame into its image, with a line of words below.
+
+    Parameters
+    ----------
+    image : (H, W) uint8
+        The grey image.
+    camera : Camera or None
+        The calibrated camera; without one, only markers are drawn.
+    rows : SeenRows
+        What the files say.
+    settings : CircleSettings
+        The radii of the discs' outlines.
+    gate, line_gate : CompareOptions, LineCompareOptions
+        What counts as the same disc or vertical as one of the reference.
+    title : str
+        Stands first in the line below.
+
+    Returns
+    -------
+    (H + h, W, 3) uint8
+        In OpenCV's order blue, green, red; h is the height of the line of words.
+    """
+    canvas = np.repeat(image[:, :, None], 3, axis=2)
+    words = [title] if title else []
+    if camera is not None:
+        if rows.lines is not None:
+            words.append(_draw_lines(canvas, camera, rows.lines, rows.reference_lines, line_gate))
+        if rows.circles is not None:
+            project = floor_projection(camera, rows.tilt if rows.levelled else None)
+            words.append(
+                _draw_discs(canvas, project, rows.circles, rows.reference_circles, settings, gate)
+            )
+    if rows.markers is not None:
+        words.append(_draw_markers(canvas, rows.markers))
+    if rows.tilt is not None:
+        pitch, roll = np.degrees([rows.tilt.pitch, rows.tilt.roll])
+        words.append(f"pitch {pitch:.2f} roll {roll:.2f} deg")
+    times = enlargement(canvas)
+    legend = np.zeros((_LEGEND_PX * times, image.shape[1], 3), np.uint8)
+    at = (4 * times, (_LEGEND_PX - 5) * times)
+    draw_text(legend, "   ".join(words), at, _WORDS_COLOUR, 0.38)
+    return np.concatenate([canvas, legend])
+
+
+def floor_projection(camera: Camera, tilt: FrameTilt | None) -> Callable[[FloatArray], FloatArray]:
+    """Where places on the floor are seen by a robot that is tilted.
+
+    Parameters
+    ----------
+    camera : Camera
+        The camera as calibrated on the level robot.
+    tilt : FrameTilt or None
+        The tilt (see `landmarks.FrameTilt`), about the origin of the robot frame; None is level.
+
+    Returns
+    -------
+    callable
+        From (..., 2) places in the level robot frame (m) to (..., 2) pixels; NaN where not seen.
+    """
+    if tilt is None:
+        return camera.project_floor
+    rotation = level_rotation(tilt.pitch, tilt.roll)
+
+    def project(floor_xy: FloatArray) -> FloatArray:
+        # The rotation turns measured directions level; its transpose turns level ones back.
+        return camera.project_robot(np.asarray(floor_xy) @ rotation[:2])
+
+    return project
+
+
+def line_curves(camera: Camera, ends: FloatArray) -> FloatArray:
+    """Lines as they are seen through the lens.
+
+    Parameters
+    ----------
+    camera : Camera
+    ends : (N, 4) float64
+        xtop, ytop, xbottom, ybottom: undistorted normalised coordinates.
+
+    Returns
+    -------
+    (N, P, 2) float64
+        Pixels from top to bottom.
+    """
+    share = np.linspace(0.0, 1.0, _POINTS)[:, None]
+    return camera.distort((1.0 - share) * ends[:, None, :2] + share * ends[:, None, 2:])
+
+
+def sigma_bars(camera: Camera, ends: FloatArray, sigma_rad: FloatArray) -> FloatArray:
+    """Bars of one standard deviation of the bearing to each side of where lines cross the horizon.
+
+    Parameters
+    ----------
+    camera : Camera
+        Its own horizon is meant, that of the level robot.
+    ends : (N, 4) float64
+        As for `line_curves`; a line that ends before the horizon is made longer.
+    sigma_rad : (N,) float64
+        Standard deviations of the bearings.
+
+    Returns
+    -------
+    (N, 2, 2) float64
+        Pixels of the bars' ends; NaN for lines that do not cross the horizon before the camera.
+    """
+    one = np.ones((len(ends), 1))
+    rotation = camera.rotation
+    top, bottom = (np.hstack([e, one]) @ rotation.T for e in (ends[:, :2], ends[:, 2:]))
+    fall = top[:, 2] - bottom[:, 2]
+    share = np.divide(top[:, 2], fall, out=np.full(len(ends), np.nan), where=np.abs(fall) > 1e-12)
+    crossing = top + share[:, None] * (bottom - top)
+    sine, cosine = np.sin(sigma_rad), np.cos(sigma_rad)
+    bars = []
+    # Bearings grow to the left, from -Y towards X: turned about Z.
+    for sign in (1.0, -1.0):
+        x = cosine * crossing[:, 0] - sign * sine * crossing[:, 1]
+        y = sign * sine * crossing[:, 0] + cosine * crossing[:, 1]
+        seen = np.column_stack([x, y, np.zeros(len(ends))]) @ rotation
+        ahead = np.where(seen[:, 2:] > 1e-6, seen[:, 2:], np.nan)
+        bars.append(camera.distort(seen[:, :2] / ahead))
+    return np.stack(bars, axis=1)
+
+
+def ends_of(rows: Sequence[LineLandmark]) -> FloatArray:
+    """(N, 4) xtop, ytop, xbottom, ybottom of rows."""
+    ends = [(r.xtop, r.ytop, r.xbottom, r.ybottom) for r in rows]
+    return np.array(ends, dtype=np.float64).reshape(-1, 4)
+
+
+def _draw_discs(
+    canvas: NDArray[np.uint8],
+    project: Callable[[FloatArray], FloatArray],
+    found: Sequence[CircleLandmark],
+    wanted: Sequence[CircleLandmark] | None,
+    settings: CircleSettings,
+    gate: CompareOptions,
+) -> str:
+    places = circle_arrays(found)
+    colours = [EDGE_COLOUR if wanted is None else _EXTRA_COLOUR] * len(found)
+    texts = [f"{row.quality:.2f}" for row in found]
+    words = f"{len(found)} discs"
+    if wanted is not None:
+        pairs = pair_discs(wanted, found, gate)
+        reference = circle_arrays(wanted)
+        for i, j in zip(pairs.first, pairs.second):
+            colours[j] = EDGE_COLOUR
+            offset = places.xy[j] - reference.xy[i]
+            texts[j] += f" {1000.0 * float(np.hypot(*offset)):.0f}mm"
+            if is_positive_definite(places.covariance[j : j + 1])[0]:
+                squared = squared_mahalanobis(offset[None], places.covariance[j : j + 1])
+                texts[j] += f" {float(np.sqrt(squared[0])):.1f}sd"
+        for i in pairs.first_alone:
+            edge = project(circle_on_floor(reference.xy[i], settings.radius_m))
+            draw_curve(canvas, edge, _MISSED_COLOUR, closed=True)
+        words += _fate(len(pairs.second_alone), len(pairs.first_alone))
+    for centre, text, colour in zip(places.xy, texts, colours):
+        outline_disc(canvas, project, centre, settings, text, edge_colour=colour)
+    return words
+
+
+def _draw_lines(
+    canvas: NDArray[np.uint8],
+    camera: Camera,
+    found: Sequence[LineLandmark],
+    wanted: Sequence[LineLandmark] | None,
+    gate: LineCompareOptions,
+) -> str:
+    colours = [_LINE_COLOUR if wanted is None else _EXTRA_COLOUR] * len(found)
+    texts = [""] * len(found)
+    words = f"{len(found)} verticals"
+    if wanted is not None:
+        pairs = pair_lines(wanted, found, gate)
+        for i, j in zip(pairs.first, pairs.second):
+            colours[j] = _LINE_COLOUR
+            if found[j].sigma > 0.0:
+                error = float(wrap_angle(found[j].alpha - wanted[i].alpha)) / found[j].sigma
+                texts[j] = f"{error:+.1f}"
+        left = [wanted[i] for i in pairs.first_alone]
+        joined = joined_lines(left, [found[j] for j in pairs.second], gate)
+        missed = [row for row, with_another in zip(left, joined) if not with_another]
+        for curve in line_curves(camera, ends_of(missed)):
+            draw_curve(canvas, curve, _MISSED_COLOUR)
+        words += _fate(len(pairs.second_alone), len(missed))
+    ends = ends_of(found)
+    bars = sigma_bars(camera, ends, np.array([row.sigma for row in found], dtype=np.float64))
+    times = enlargement(canvas)
+    tick = times * np.array([[0.0, -2.0], [0.0, 2.0]])
+    for curve, bar, colour, text in zip(line_curves(camera, ends), bars, colours, texts):
+        draw_curve(canvas, curve, colour)
+        draw_curve(canvas, bar, _SIGMA_COLOUR)
+        for end in bar:
+            draw_curve(canvas, end + tick, _SIGMA_COLOUR)
+        if text and np.all(np.isfinite(curve[-1])):
+            at = (round(float(curve[-1, 0])) - 8 * times, round(float(curve[-1, 1])) + 9 * times)
+            draw_text(canvas, text, at, _SIGMA_COLOUR, 0.3)
+    return words
+
+
+def _draw_markers(canvas: NDArray[np.uint8], found: Sequence[MarkerLandmark]) -> str:
+    from detect.markers.drawing import mark_marker
+
+    for row in found:
+        corners = np.array([(c.u, c.v) for c in row.corners])
+        covariance = np.array([[(c.cuu, c.cuv), (c.cuv, c.cvv)] for c in row.corners])
+        mark_marker(canvas, row.id, corners, covariance)
+    return f"{len(found)} markers"
+
+
+def _fate(extra: int, missed: int) -> str:
+    return f" ({extra} extra, {missed} missed)"

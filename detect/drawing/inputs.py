@@ -1,0 +1,164 @@
+"""Rows of a run from files, image by image: what was detected, and what it is held against."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from detect.comparison.pairing import image_name
+from detect.drawing.head import FileHead, read_head
+from detect.errors import DetectError
+from detect.run import ImageRun
+from detect.runs.by_image import FramesByImage, TiltsByImage
+from detect.viewing_options import RowFiles
+from landmarks import CircleLandmark, FrameTilt, LineLandmark, MarkerLandmark
+
+KINDS = ("circles", "lines", "markers", "tilt")
+
+
+@dataclass(frozen=True, slots=True)
+class SeenRows:
+    """What files say of one image; None where there is no file.
+
+    Attributes
+    ----------
+    circles, lines, markers : tuple of rows or None
+        Detected.
+    tilt : FrameTilt or None
+        None also where the frame has none.
+    levelled : bool
+        Whether the discs' positions are corrected for it.
+    reference_circles, reference_lines : tuple of rows or None
+        What they are held against; None also where that file does not know the image.
+    """
+
+    circles: tuple[CircleLandmark, ...] | None = None
+    lines: tuple[LineLandmark, ...] | None = None
+    markers: tuple[MarkerLandmark, ...] | None = None
+    tilt: FrameTilt | None = None
+    levelled: bool = False
+    reference_circles: tuple[CircleLandmark, ...] | None = None
+    reference_lines: tuple[LineLandmark, ...] | None = None
+
+
+@dataclass(frozen=True)
+class SeenFiles:
+    """The files of a run's rows.
+
+    Attributes
+    ----------
+    detected : dict
+        Path of each kind of `KINDS` that there is.
+    heads : dict
+        Their heads, by kind.
+    reference_circles, reference_lines : path or None
+        What they are held against.
+    """
+
+    detected: dict[str, Path]
+    heads: dict[str, FileHead]
+    reference_circles: Path | None
+    reference_lines: Path | None
+
+
+@dataclass(frozen=True)
+class RowSource:
+    """Rows of a run, looked up by image; of the files, only where frames stand is in memory."""
+
+    files: SeenFiles
+    _frames: dict[str, FramesByImage] = field(default_factory=dict)
+    _tilts: TiltsByImage | None = None
+
+    def of(self, prefix: str) -> SeenRows:
+        """The rows of an image, by the prefix of its STEP."""
+        found = {kind: source.get(prefix) for kind, source in self._frames.items()}
+        circles, lines, markers = (found.get(kind) for kind in KINDS[:3])
+        wanted, wanted_lines = found.get("reference_circles"), found.get("reference_lines")
+        head = self.files.heads.get("circles")
+        return SeenRows(
+            circles=None if circles is None else circles.circles,
+            lines=None if lines is None else lines.lines,
+            markers=None if markers is None else markers.markers,
+            tilt=None if self._tilts is None else self._tilts.get(prefix),
+            levelled=head is not None and head.levelled,
+            reference_circles=None if wanted is None else wanted.circles,
+            reference_lines=None if wanted_lines is None else wanted_lines.lines,
+        )
+
+
+def find_files(run: ImageRun, options: RowFiles) -> SeenFiles:
+    """Find the files of a run's rows, and read their heads.
+
+    Parameters
+    ----------
+    run : ImageRun
+        The run.
+    options : RowFiles
+        What a command line says of them.
+
+    Returns
+    -------
+    SeenFiles
+
+    Raises
+    ------
+    DetectError
+        If one that is named does not exist, or there is none at all.
+    """
+    detected: dict[str, Path] = {}
+    for kind in KINDS:
+        named: Path | None = getattr(options, kind)
+        path = run.output(kind) if options.rows is None else options.rows / f"detected.{kind}"
+        path = path if named is None else named
+        if path.is_file():
+            detected[kind] = path
+        elif named is not None:
+            raise DetectError(f"{path}: no such file: expected detected {kind}")
+    if not detected:
+        usual = run.output("circles") if options.rows is None else options.rows / "detected.circles"
+        raise DetectError(
+            f"{usual}: no such file, nor .lines, .markers or .tilt: expected one of them: run "
+            "detect all (or circles, lines, markers) on the same images first, or name files"
+        )
+    return SeenFiles(
+        detected,
+        {kind: read_head(path) for kind, path in detected.items()},
+        _reference(run.folder / "map.circles", options.reference, options.no_reference),
+        _reference(run.folder / "map.lines", options.reference_lines, options.no_reference),
+    )
+
+
+def open_rows(files: SeenFiles) -> RowSource:
+    """Look through the files.
+
+    Raises
+    ------
+    landmarks.LandmarkFileError
+        If one cannot be read or a row is malformed; names file and line.
+    """
+    frames = {kind: path for kind, path in files.detected.items() if kind != "tilt"}
+    if files.reference_circles is not None and "circles" in frames:
+        frames["reference_circles"] = files.reference_circles
+    if files.reference_lines is not None and "lines" in frames:
+        frames["reference_lines"] = files.reference_lines
+    tilt = files.detected.get("tilt")
+    return RowSource(
+        files,
+        {kind: FramesByImage(path) for kind, path in frames.items()},
+        None if tilt is None else TiltsByImage(tilt),
+    )
+
+
+def picture_name(prefix: str) -> str:
+    """Name of an image's picture without its ending: nothing that leads out of a folder."""
+    return image_name(prefix) or "frame"
+
+
+def _reference(usual: Path, named: Path | None, unwanted: bool) -> Path | None:
+    if unwanted:
+        return None
+    if named is not None:
+        if not named.is_file():
+            raise DetectError(f"{named}: no such file: expected reference rows")
+        return named
+    return usual if usual.is_file() else None

@@ -1,0 +1,111 @@
+"""What a file says of each image, looked up while a run goes by: little of it is in memory."""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from detect.comparison.pairing import image_name
+from detect.runs.name_index import NameIndex
+from landmarks import (
+    Frame,
+    FrameTilt,
+    LineLandmark,
+    Step,
+    frames_of_rows,
+    iterate_tilts,
+    parse_rows,
+    read_rows,
+)
+
+
+class TiltsByImage:
+    """The tilts of a ``.tilt`` file, by image prefix; 44 bytes each, and the prefix.
+
+    Parameters
+    ----------
+    path : path
+        The file.
+
+    Raises
+    ------
+    landmarks.LandmarkFileError
+        If the file cannot be read or a row is malformed; names file and line.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._numbers = array("d")
+        self._lines = array("l")
+
+        def prefixes() -> Iterator[bytes]:
+            for tilt in iterate_tilts(path):
+                self._numbers.extend((tilt.pitch, tilt.roll, tilt.cpp, tilt.cpr, tilt.crr))
+                self._lines.append(tilt.lines)
+                yield _bytes(tilt.prefix)
+
+        self._index = NameIndex(prefixes())
+
+    def get(self, prefix: str) -> FrameTilt | None:
+        """The tilt of a frame; None if the file has none."""
+        place = self._index.find(_bytes(prefix))
+        if place is None:
+            return None
+        pitch, roll, cpp, cpr, crr = self._numbers[5 * place : 5 * place + 5]
+        return FrameTilt(prefix, pitch, roll, cpp, cpr, crr, self._lines[place])
+
+
+class FramesByImage:
+    """The frames of a landmark file, by the name of their image; 12 bytes each, and the name.
+
+    The file is read once to learn where each frame stands, and there again when it is asked for.
+
+    Parameters
+    ----------
+    path : path
+        The file.
+
+    Raises
+    ------
+    landmarks.LandmarkFileError
+        If the file cannot be read or a row is malformed; names file and line.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._offsets = array("q")
+
+        def names() -> Iterator[bytes]:
+            offset = 0
+            for row in read_rows(path):
+                if isinstance(row.record, Step):
+                    self._offsets.append(offset)
+                    yield _bytes(image_name(row.record.prefix))
+                offset += len(row.source or b"")
+
+        self._index = NameIndex(names())
+
+    def get(self, prefix: str) -> Frame | None:
+        """A frame; None if the file does not know it."""
+        place = self._index.find(_bytes(image_name(prefix)))
+        if place is None:
+            return None
+        with self._path.open("rb") as stream:
+            stream.seek(self._offsets[place])
+            return next(frames_of_rows(parse_rows(stream, str(self._path))))
+
+
+class LinesByImage:
+    """The lines of a ``.lines`` file, by the name of their image; see `FramesByImage`."""
+
+    def __init__(self, path: Path) -> None:
+        self._frames = FramesByImage(path)
+
+    def get(self, prefix: str) -> Sequence[LineLandmark] | None:
+        """The lines of a frame; None if the file does not know it."""
+        frame = self._frames.get(prefix)
+        return None if frame is None else frame.lines
+
+
+def _bytes(text: str) -> bytes:
+    return text.encode("utf-8", "surrogateescape")

@@ -1,0 +1,180 @@
+"""Frames worked on by any number of workers, their rows in the order of the run.
+
+Workers are a standard `concurrent.futures.Executor`: this process, others on this machine, or a
+cluster (`detect.runs.workers`). Frames travel in chunks. Only a window of them is under way at any
+time, so that neither what waits nor what is finished grows with the run, and a slow frame holds the
+others up only when they are a window ahead of it.
+
+A worker that dies, killed or out of memory, costs no frame of its neighbours: whatever was under
+way is worked on again, one chunk at a time and then one frame at a time, until the frame that kills
+its worker is alone; that one is reported like an image that cannot be read.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Generator, Iterable
+from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future
+from contextlib import AbstractContextManager, ExitStack
+from dataclasses import dataclass
+from itertools import islice
+
+from detect.errors import WorkerError
+from detect.runs.frame import FramePlan, tables_of
+from detect.runs.frame_rows import FrameRows, FrameTask, rows_of_failure, rows_of_frames
+
+Chunk = tuple[FrameTask, ...]
+
+#: After so many frames that killed their workers, and none between that did not, it is not them.
+_DEADLY_FRAMES = 10
+
+
+@dataclass(frozen=True)
+class Workers:
+    """Who does the work.
+
+    Attributes
+    ----------
+    start : callable
+        Starts them for a plan: a context manager that gives the executor, and ends what it started.
+        Called again after workers have died.
+    chunk : int
+        How many frames a task has.
+    window : callable
+        How many tasks may be under way; asked again and again, as clusters grow.
+    died : tuple of exception types
+        What a task raises, besides `BrokenExecutor`, when its worker has died.
+    """
+
+    start: Callable[[FramePlan], AbstractContextManager[Executor]]
+    chunk: int
+    window: Callable[[], int]
+    died: tuple[type[BaseException], ...] = ()
+
+
+def detect_frames(
+    tasks: Iterable[FrameTask], plan: FramePlan, workers: Workers
+) -> Generator[FrameRows, None, None]:
+    """Work on frames.
+
+    Parameters
+    ----------
+    tasks : iterable of FrameTask
+        The frames; taken from as they are needed.
+    plan : FramePlan
+        What is done with each.
+    workers : Workers
+        By whom.
+
+    Yields
+    ------
+    FrameRows
+        One for each task, in their order. Close the generator (`contextlib.closing`) when it is not
+        asked for all of them: that ends the workers.
+
+    Raises
+    ------
+    WorkerError
+        If workers die whatever they are given, go away, or have not got this program.
+    """
+    source = iter(tasks)
+    chunks = iter(lambda: tuple(islice(source, workers.chunk)), ())
+    with _Crew(workers, plan) as crew:
+        # A chunk without a future is under suspicion: to be worked on alone.
+        under_way: deque[tuple[Chunk, Future[list[FrameRows]] | None]] = deque()
+        while True:
+            suspects = any(future is None for _, future in under_way)
+            room = 0 if suspects else max(0, workers.window() - len(under_way))
+            for chunk in islice(chunks, room):
+                under_way.append((chunk, crew.submit(chunk)))
+            if not under_way:
+                return
+            chunk, future = under_way.popleft()
+            try:
+                rows = crew.alone(chunk) if future is None else crew.finished(future)
+            except crew.died as error:
+                crew.bury(error)
+                under_way.appendleft((chunk, None))
+                under_way = deque((c, None if crew.lost(f) else f) for c, f in under_way)
+                continue
+            yield from rows
+
+
+def work_on_chunk(plan: FramePlan, chunk: Chunk) -> list[FrameRows]:
+    """What a worker does with a task; all it needs, and all that it gives back, is small."""
+    return rows_of_frames(chunk, plan, tables_of(plan))
+
+
+class _Crew:
+    """The workers of a run: replaced when one of them has died."""
+
+    def __init__(self, workers: Workers, plan: FramePlan) -> None:
+        self.died: tuple[type[BaseException], ...] = (BrokenExecutor, *workers.died)
+        self._workers = workers
+        self._plan = plan
+        self._started = ExitStack()
+        self._executor: Executor | None = None
+        self._deadly = 0
+
+    def __enter__(self) -> _Crew:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._started.close()
+
+    def submit(self, chunk: Chunk) -> Future[list[FrameRows]]:
+        try:
+            if self._executor is None:
+                self._executor = self._started.enter_context(self._workers.start(self._plan))
+            return self._executor.submit(work_on_chunk, self._plan, chunk)
+        except self.died as error:  # they died before they were given anything
+            failed: Future[list[FrameRows]] = Future()
+            failed.set_exception(error)
+            return failed
+
+    def finished(self, future: Future[list[FrameRows]]) -> list[FrameRows]:
+        """The rows of a chunk that was worked on beside others."""
+        try:
+            rows = future.result()
+        except ImportError as error:
+            raise WorkerError(
+                f"a worker cannot do the work: {error}: expected redetect there, the same version"
+            ) from None
+        except CancelledError:
+            raise WorkerError("the workers are gone: expected the cluster to stay") from None
+        self._deadly = 0
+        return rows
+
+    def bury(self, error: BaseException) -> None:
+        """End what is left of broken workers; the next chunk gets new ones."""
+        if isinstance(error, BrokenExecutor):
+            self._executor = None
+            self._started.close()
+
+    def lost(self, future: Future[list[FrameRows]] | None) -> bool:
+        """Whether a chunk went down with the workers that it was given to."""
+        if future is None or future.cancelled():
+            return True
+        if not future.done():
+            return self._executor is None
+        return isinstance(future.exception(), self.died)
+
+    def alone(self, chunk: Chunk) -> list[FrameRows]:
+        """The rows of a chunk during which a worker died; nothing else is under way."""
+        for _ in range(2 if len(chunk) == 1 else 1):
+            try:
+                return self.finished(self.submit(chunk))
+            except self.died as error:
+                self.bury(error)
+        if len(chunk) > 1:
+            return [rows for task in chunk for rows in self.alone((task,))]
+        (task,) = chunk
+        name = task.frame.image or task.frame.step.prefix
+        self._deadly += 1
+        if self._deadly == _DEADLY_FRAMES:
+            raise WorkerError(
+                f"{name}: every worker died that was given this frame or one of the "
+                f"{_DEADLY_FRAMES - 1} before it: killed, or out of memory?"
+            )
+        reason = f"{name}: every worker died that was given this frame: out of memory?"
+        return [rows_of_failure(task, reason)]

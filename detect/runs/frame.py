@@ -1,0 +1,253 @@
+"""One frame of a run: its image in, its verticals, its tilt, its discs and its markers out.
+
+The way of one frame, top to bottom, is `detect_frame`, and of its image `detect_in_image`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from camera import Camera
+from detect.run import RunFrame, read_image
+from landmarks import FrameTilt, tilt_as_written
+from lut import DiscShape, DiscTable, VerticalTable, cached_disc_table, cached_vertical_table
+
+# Detectors are imported when they are asked for: loading them all takes a tenth of a second each.
+if TYPE_CHECKING:
+    from detect.circles import CircleDetections
+    from detect.line_settings import LineSettings
+    from detect.lines import LineDetections
+    from detect.markers.detections import MarkerDetections
+    from detect.markers.settings import MarkerSettings
+    from detect.settings import CircleSettings
+
+
+@dataclass(frozen=True)
+class FramePlan:
+    """What is done with every frame of a run. Small: it travels with every task.
+
+    Attributes
+    ----------
+    camera : Camera or None
+        The calibrated camera; only markers can be looked for without one.
+    lines : LineSettings or None
+        Which verticals are looked for, if any.
+    circles : CircleSettings or None
+        Which discs are looked for, if any.
+    markers : MarkerSettings or None
+        Which square markers are looked for, if any.
+    json : bool
+        Whether the discs are wanted as JSON as well.
+    drawing : {"discs", "lines", "tracks", "markers"} or None
+        What is drawn into the image; "tracks" are all tracks of lines, with the reason of those
+        that are no lines.
+    draw_response : bool
+        Whether the filter's response of the lines is drawn as well.
+    working_folder : path or None
+        What relative image paths are relative to, on whatever machine; by default a process's own.
+    """
+
+    camera: Camera | None
+    lines: LineSettings | None = None
+    circles: CircleSettings | None = None
+    markers: MarkerSettings | None = None
+    json: bool = False
+    drawing: Literal["discs", "lines", "tracks", "markers"] | None = None
+    draw_response: bool = False
+    working_folder: Path | None = None
+
+
+@dataclass(frozen=True)
+class Tables:
+    """What the calibration decides before the first image, as far as a plan needs it."""
+
+    verticals: VerticalTable | None
+    discs: DiscTable | None
+
+
+@dataclass(frozen=True)
+class FrameDetections:
+    """What was found in one image; None is what was not looked for.
+
+    Attributes
+    ----------
+    image : (H, W) uint8
+    lines : LineDetections or None
+    tilt : FrameTilt or None
+        None also where too few lines tell.
+    discs : CircleDetections or None
+        Corrected for the tilt, where there is one.
+    markers : MarkerDetections or None
+    """
+
+    image: NDArray[np.uint8]
+    lines: LineDetections | None
+    tilt: FrameTilt | None
+    discs: CircleDetections | None
+    markers: MarkerDetections | None = None
+
+
+def detect_frame(
+    frame: RunFrame, plan: FramePlan, tables: Tables, tilt: FrameTilt | None = None
+) -> FrameDetections:
+    """Find what a plan asks for in the image of a frame, which is decoded once.
+
+    Parameters
+    ----------
+    frame : RunFrame
+        The frame.
+    plan : FramePlan
+        What to look for.
+    tables : Tables
+        See `tables_of`.
+    tilt : FrameTilt, optional
+        The frame's tilt, where it is known and no lines are looked for.
+
+    Returns
+    -------
+    FrameDetections
+
+    Raises
+    ------
+    FrameError
+        If there is no such image, or none of the calibration's size.
+    """
+    image = read_image(frame, plan.camera, plan.working_folder)
+    return detect_in_image(image, frame.step.prefix, plan, tables, tilt)
+
+
+def detect_in_image(
+    image: NDArray[np.uint8],
+    prefix: str,
+    plan: FramePlan,
+    tables: Tables,
+    tilt: FrameTilt | None = None,
+) -> FrameDetections:
+    """Find what a plan asks for in a grey image of the calibration's size.
+
+    Parameters
+    ----------
+    image : (H, W) uint8
+        See `detect.run.read_image`.
+    prefix : str
+        What the frame's rows call it.
+    plan, tables, tilt
+        As for `detect_frame`.
+
+    Returns
+    -------
+    FrameDetections
+    """
+    lines = None
+    if plan.lines is not None:
+        from detect.lines import detect_lines
+
+        assert tables.verticals is not None
+        lines = detect_lines(image, tables.verticals, plan.lines)
+        tilt = tilt_of_lines(prefix, lines)
+
+    discs = None
+    if plan.circles is not None:
+        from detect.circles import detect_circles
+
+        assert tables.discs is not None
+        assert plan.camera is not None
+        discs = detect_circles(image, plan.camera, tables.discs, plan.circles)
+        if tilt is not None:
+            from detect.discs.levelling import levelled
+
+            discs = levelled(discs, plan.camera, tilt)
+
+    markers = None
+    if plan.markers is not None:
+        from detect.markers.detect import detect_markers
+
+        markers = detect_markers(image, plan.markers, plan.camera)
+
+    return FrameDetections(image, lines, tilt, discs, markers)
+
+
+def tilt_of_lines(prefix: str, lines: LineDetections) -> FrameTilt | None:
+    """The tilt that lines show, in the digits of its file: one pass finds what two passes do."""
+    if lines.tilt is None:
+        return None
+    c = lines.tilt.covariance
+    return tilt_as_written(
+        FrameTilt(
+            prefix,
+            lines.tilt.pitch_rad,
+            lines.tilt.roll_rad,
+            float(c[0, 0]),
+            float(c[0, 1]),
+            float(c[1, 1]),
+            lines.tilt.lines,
+        )
+    )
+
+
+def tables_of(plan: FramePlan) -> Tables:
+    """The tables that a plan needs: a process makes them or takes them from the cache once.
+
+    Raises
+    ------
+    lut.TableError
+        If there can be none for the camera and the settings.
+    """
+    global _latest
+    if _latest is None or _latest[0] is not plan:
+        # Whether two plans are equal takes longer to tell.
+        shape = None
+        if plan.circles is not None:
+            from detect.circles import disc_shape
+
+            shape = disc_shape(plan.circles)
+        _latest = plan, _tables(plan.camera, plan.lines is not None, shape)
+    return _latest[1]
+
+
+#: The plan that this process was asked about last, and its tables.
+_latest: tuple[FramePlan, Tables] | None = None
+
+
+@lru_cache(maxsize=4)
+def _tables(camera: Camera | None, verticals: bool, shape: DiscShape | None) -> Tables:
+    if camera is None:
+        return Tables(None, None)
+    return Tables(
+        verticals=cached_vertical_table(camera) if verticals else None,
+        discs=None if shape is None else cached_disc_table(camera, shape),
+    )
+
+
+def rehearse(plan: FramePlan) -> None:
+    """Work on a made-up image, so that all tables and kernels that a plan needs are there."""
+    tables = tables_of(plan)
+    if plan.markers is not None:
+        from detect.markers.detect import detect_markers
+        from detect.markers.specimen import specimen_image
+
+        detect_markers(specimen_image(plan.markers), plan.markers)
+    if plan.camera is None:
+        return
+    column = np.arange(plan.camera.width)
+    bars = np.where(column // 40 % 2, 180, 60).astype(np.uint8)
+    image = np.repeat(bars[None, :], plan.camera.height, axis=0)
+    if plan.circles is not None and tables.discs is not None:
+        pitch = 6.0 * plan.circles.radius_m
+        seen = tables.discs.floor_xy
+        floor = np.isfinite(seen).all(axis=-1)
+        off = np.hypot(*(np.mod(seen[floor], pitch) - 0.5 * pitch).T)
+        image[floor] = np.where(off < plan.circles.radius_m, 200, 60)
+        from detect.circles import detect_circles
+
+        detect_circles(image, plan.camera, tables.discs, plan.circles)
+    if plan.lines is not None and tables.verticals is not None:
+        from detect.lines import detect_lines
+
+        detect_lines(image, tables.verticals, plan.lines)

@@ -1,0 +1,303 @@
+"""What is written of one frame: rows, JSON and pictures, as bytes.
+
+This is all that a worker sends back, whichever process or machine it runs on: some kilobytes.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import islice
+from pathlib import Path
+from textwrap import indent
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from detect.errors import FrameError
+from detect.run import RunFrame, read_image
+from detect.runs.frame import FrameDetections, FramePlan, Tables, detect_in_image
+from detect.runs.row_text import unknown_circles, unknown_rows
+from detect.sources.times import format_time
+from landmarks import (
+    Frame,
+    FrameTilt,
+    Landmark,
+    LineLandmark,
+    circle_landmarks,
+    format_frame,
+    format_no_tilt,
+    format_record,
+    format_tilt,
+)
+
+if TYPE_CHECKING:
+    from detect.circles import CircleDetections
+    from detect.lines import LineDetections
+
+#: So many pixels are decoded before any of them is looked at.
+_PIXELS_AT_ONCE = 1 << 21
+
+#: What is wrong with one frame, not with the run.
+_COSTS_THE_FRAME = (FrameError, ArithmeticError, np.linalg.LinAlgError, MemoryError)
+
+
+class FrameTask(NamedTuple):
+    """A frame to be worked on, and what is known about it beforehand. Small.
+
+    Attributes
+    ----------
+    frame : RunFrame
+        STEP row and path of the image.
+    tilt : FrameTilt or None
+        Its tilt, where it is known: the discs are corrected for it.
+    reference : tuple of LineLandmark or None
+        Its lines with IDs, which are carried over.
+    """
+
+    frame: RunFrame
+    tilt: FrameTilt | None = None
+    reference: tuple[LineLandmark, ...] | None = None
+
+
+class FrameRows(NamedTuple):
+    """What came of a frame.
+
+    Attributes
+    ----------
+    circles, lines, tilt, markers, json, times : bytes
+        The frame's rows in each of the files.
+    pictures : tuple of (name, PNG)
+        Drawings.
+    disc_count, line_count, marker_count : int
+        How many were found.
+    rejected : tuple of (cause, int)
+        How many candidates for markers were rejected, by cause.
+    error : str or None
+        Why the frame could not be worked on: its STEP stays, without landmarks.
+    """
+
+    circles: bytes = b""
+    lines: bytes = b""
+    tilt: bytes = b""
+    markers: bytes = b""
+    json: bytes = b""
+    times: bytes = b""
+    pictures: tuple[tuple[str, bytes], ...] = ()
+    disc_count: int = 0
+    line_count: int = 0
+    marker_count: int = 0
+    has_tilt: bool = False
+    rejected: tuple[tuple[str, int], ...] = ()
+    error: str | None = None
+
+
+def rows_of_frames(tasks: Sequence[FrameTask], plan: FramePlan, tables: Tables) -> list[FrameRows]:
+    """Work on some frames; an image that cannot be worked on costs its frame only.
+
+    As many images are decoded, then looked at, then written about, as fit into the processor's
+    caches: a decoder, a detector and Python drive each other's instructions out of them.
+
+    Parameters
+    ----------
+    tasks : sequence of FrameTask
+        The frames.
+    plan : FramePlan
+        What is done with each.
+    tables : Tables
+        See `detect.runs.frame.tables_of`.
+
+    Returns
+    -------
+    list of FrameRows
+        One for each.
+    """
+    camera = plan.camera
+    at_once = _PIXELS_AT_ONCE // (camera.width * camera.height) if camera is not None else 1
+    if plan.drawing is not None or plan.draw_response:
+        at_once = 1
+    rows: list[FrameRows] = []
+    source = iter(tasks)
+    while some := tuple(islice(source, max(1, at_once))):
+        images = [_image_of(task, plan) for task in some]
+        found = [_found_in(image, task, plan, tables) for image, task in zip(images, some)]
+        rows += [_rows_of(what, task, plan, tables) for what, task in zip(found, some)]
+    return rows
+
+
+def _image_of(task: FrameTask, plan: FramePlan) -> NDArray[np.uint8] | str:
+    """The image of a frame, or why there is none."""
+    try:
+        return read_image(task.frame, plan.camera, plan.working_folder)
+    except _COSTS_THE_FRAME as error:
+        return _reason(error, task)
+
+
+def _found_in(
+    image: NDArray[np.uint8] | str, task: FrameTask, plan: FramePlan, tables: Tables
+) -> FrameDetections | str:
+    """What there is in an image, or why it could not be looked for."""
+    if isinstance(image, str):
+        return image
+    try:
+        return detect_in_image(image, task.frame.step.prefix, plan, tables, task.tilt)
+    except _COSTS_THE_FRAME as error:
+        return _reason(error, task)
+
+
+def _reason(error: Exception, task: FrameTask) -> str:
+    if isinstance(error, FrameError):
+        return str(error)
+    name = task.frame.image or task.frame.step.prefix
+    return f"{name}: {type(error).__name__}: {error}"
+
+
+def _rows_of(
+    found: FrameDetections | str, task: FrameTask, plan: FramePlan, tables: Tables
+) -> FrameRows:
+    if isinstance(found, str):
+        return rows_of_failure(task, found)
+    step = task.frame.step
+    head = _line(format_record(step))
+    circles = lines = tilt = markers = record = b""
+    if found.lines is not None:
+        lines = head + _line_rows(found.lines, task.reference)
+        if found.tilt is None:
+            tilt = _line(format_no_tilt(step.prefix, len(found.lines)))
+        else:
+            tilt = _line(format_tilt(found.tilt))
+    if found.discs is not None:
+        discs = found.discs
+        circles = head + _circle_rows(discs)
+        if plan.json:
+            record = _json({"frame": step.prefix, "discs": _disc_records(discs)})
+    if found.markers is not None:
+        markers = head + _rows(found.markers.landmarks())
+    return FrameRows(
+        circles=circles,
+        lines=lines,
+        tilt=tilt,
+        markers=markers,
+        json=record,
+        times=_time_row(task),
+        pictures=_pictures(step.prefix, found, plan, tables),
+        disc_count=0 if found.discs is None else len(found.discs),
+        line_count=0 if found.lines is None else len(found.lines),
+        marker_count=0 if found.markers is None else len(found.markers),
+        rejected=() if found.markers is None else tuple(sorted(found.markers.rejected.items())),
+        has_tilt=found.lines is not None and found.tilt is not None,
+    )
+
+
+def rows_of_failure(task: FrameTask, reason: str) -> FrameRows:
+    """What is written of a frame that could not be worked on."""
+    step = task.frame.step
+    rows = format_frame(Frame(step))
+    return FrameRows(
+        circles=rows,
+        lines=rows,
+        tilt=_line(format_no_tilt(step.prefix, 0)),
+        markers=rows,
+        json=_json({"frame": step.prefix, "error": reason}),
+        times=_time_row(task),
+        error=reason,
+    )
+
+
+def _line_rows(found: LineDetections, reference: tuple[LineLandmark, ...] | None) -> bytes:
+    if reference is not None:
+        from detect.verticals.identity import carry_ids
+
+        return _rows(carry_ids(found.landmarks(), reference))
+    rows = unknown_rows("LANDMARK_L", found.row_numbers())
+    return _rows(found.landmarks()) if rows is None else rows
+
+
+def _circle_rows(found: CircleDetections) -> bytes:
+    rows = unknown_circles(found.floor_xy, found.quality, found.covariance)
+    if rows is not None:
+        return rows
+    unknown = np.full(len(found), -1)
+    return _rows(circle_landmarks(found.floor_xy, found.quality, found.covariance, unknown))
+
+
+def _rows(landmarks: Iterable[Landmark]) -> bytes:
+    return b"".join(_line(format_record(landmark)) for landmark in landmarks)
+
+
+def _time_row(task: FrameTask) -> bytes:
+    frame = task.frame
+    return b"" if frame.time_s is None else _line(format_time(frame.step.prefix, frame.time_s))
+
+
+def _line(text: str) -> bytes:
+    return f"{text}\n".encode("utf-8", "surrogateescape")
+
+
+def _json(record: dict[str, object]) -> bytes:
+    """A record as it stands in the list of frames of an indented document."""
+    return b"\n" + indent(json.dumps(record, indent=1), "  ").encode()
+
+
+def _disc_records(found: CircleDetections) -> list[dict[str, object]]:
+    return [
+        {
+            "pixel": [int(u), int(v)],
+            "x_m": float(x),
+            "y_m": float(y),
+            "quality": float(quality),
+            "evidence": float(evidence) if np.isfinite(evidence) else None,
+            "covariance_m2": [float(c[0, 0]), float(c[0, 1]), float(c[1, 1])],
+        }
+        for (u, v), (x, y), c, quality, evidence in zip(
+            found.pixels, found.floor_xy, found.covariance, found.quality, found.evidence
+        )
+    ]
+
+
+def _pictures(
+    prefix: str, found: FrameDetections, plan: FramePlan, tables: Tables
+) -> tuple[tuple[str, bytes], ...]:
+    if plan.drawing is None and not plan.draw_response:
+        return ()
+    return tuple(_drawn(prefix, found, plan, tables))
+
+
+def _drawn(
+    prefix: str, found: FrameDetections, plan: FramePlan, tables: Tables
+) -> Iterator[tuple[str, bytes]]:
+    from detect.drawing.detections import draw_circles
+    from detect.drawing.lines import draw_lines, draw_response, draw_tracks
+    from detect.verticals.tracks import line_response
+
+    name = Path(prefix).name
+    if plan.drawing == "markers" and found.markers is not None:
+        from detect.markers.drawing import draw_markers
+
+        yield f"{name}.png", _png(draw_markers(found.image, found.markers))
+    if plan.camera is None:
+        return
+    if plan.drawing == "discs" and found.discs is not None and plan.circles is not None:
+        picture = draw_circles(found.image, plan.camera, found.discs, plan.circles)
+        yield f"{name}.png", _png(picture)
+    if found.lines is None or tables.verticals is None:
+        return
+    if plan.drawing == "lines":
+        picture = draw_lines(found.image, plan.camera, tables.verticals, found.lines)
+        yield f"{name}.png", _png(picture)
+    elif plan.drawing == "tracks":
+        picture = draw_tracks(
+            found.image, tables.verticals, found.lines, rejected=True, reasons=True
+        )
+        yield f"{name}.png", _png(picture)
+    if plan.draw_response and plan.lines is not None:
+        response = line_response(found.image, tables.verticals, plan.lines)
+        yield f"{name}.response.png", _png(draw_response(response, tables.verticals))
+
+
+def _png(picture: NDArray[np.uint8]) -> bytes:
+    import cv2
+
+    _, encoded = cv2.imencode(".png", picture)
+    return encoded.tobytes()

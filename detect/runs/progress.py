@@ -1,0 +1,69 @@
+"""What a long run shows on a terminal."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+
+from detect.runs.interrupts import raise_if_interrupted
+
+_SHOWN_FAILURES = 10
+
+
+@contextmanager
+def progress_bar(label: str, total: int | None) -> Iterator[Callable[[], None]]:
+    """A progress bar with the rate, on a terminal; yields what to call after every frame.
+
+    Calling it raises an interrupt that got lost (see `detect.runs.interrupts`).
+
+    Without a total, it shows how many there were.
+
+    It appears with the first frame: until then, workers may have something to say.
+    """
+    if not sys.stderr.isatty():
+        yield raise_if_interrupted
+        return
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    progress = Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[rate]}", justify="right"),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+        console=Console(stderr=True),
+    )
+    task = progress.add_task(label, total=total, rate="")
+
+    def advance() -> None:
+        raise_if_interrupted()
+        progress.start()  # nothing happens if it has
+        progress.advance(task)
+        speed = progress.tasks[0].finished_speed or progress.tasks[0].speed
+        progress.update(task, rate=f"{speed:.1f} images/s" if speed else "")
+
+    try:
+        yield advance
+    finally:
+        progress.stop()
+
+
+def print_failures(count: int, first: Sequence[str]) -> None:
+    """Tell which frames could not be worked on, as far as they fit on a screen."""
+    if not count:
+        return
+    print(f"{count} frames could not be worked on:", file=sys.stderr)
+    for line in first[:_SHOWN_FAILURES]:
+        print(f"  {line}", file=sys.stderr)
+    if count > _SHOWN_FAILURES:
+        print(f"  and {count - _SHOWN_FAILURES} more", file=sys.stderr)

@@ -1,0 +1,123 @@
+"""What a run says of itself for machines to read: ``<output>.log.json``.
+
+Which program ran with which settings, which frames could not be worked on and why, how much was
+found, and what the other files are, by size and hash. Nothing in it depends on the time of day or
+on who did the work: the same run writes the same bytes.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+from detect.errors import DetectError
+from detect.runs.conduct import Conduct
+from detect.runs.frame import FramePlan
+
+_BEGIN = b'{\n "program": "redetect",'
+
+
+class Counted(Protocol):
+    """The counts of a run: `detect.runs.stream.RunSummary`."""
+
+    frames: int
+    discs: int
+    lines: int
+    tilts: int
+    markers: int
+    rejected: Counter[str]
+    failed: int
+    images_without_step: int
+
+
+@dataclass(frozen=True)
+class WrittenFile:
+    """A file as the log names it."""
+
+    name: str
+    size_bytes: int
+    sha256: str
+
+
+class FailedFrameError(DetectError):
+    """A frame that could not be worked on, where every frame is demanded."""
+
+    def __init__(self, reason: str) -> None:
+        super().__init__(f"{reason} (--strict: nothing is written)")
+
+
+def log_place(output: Path) -> Path:
+    """Where the log of a result goes."""
+    return output.with_name(f"{output.name}.log.json")
+
+
+def demand_log_place(place: Path, *, overwrite: bool) -> None:
+    """Refuse to write a log over a file that is none.
+
+    Raises
+    ------
+    storage.OutputExistsError
+        If something else than a log stands there, and must not be overwritten.
+    """
+    from storage import OutputExistsError
+
+    if overwrite or not os.path.lexists(place):
+        return
+    if place.is_symlink() or not place.is_file():
+        raise OutputExistsError(place)
+    with place.open("rb") as stream:
+        if stream.read(len(_BEGIN)) != _BEGIN:
+            raise OutputExistsError(place)
+
+
+def log_head(plan: FramePlan, conduct: Conduct) -> bytes:
+    """What stands before the failures."""
+    settings = {"circles": plan.circles, "lines": plan.lines, "markers": plan.markers}
+    document: dict[str, Any] = {
+        "program": "redetect",
+        "version": conduct.version,
+        "command": conduct.command,
+        "camera": None if plan.camera is None else plan.camera.content_hash,
+        "settings": {
+            name: dataclasses.asdict(values)
+            for name, values in settings.items()
+            if values is not None
+        },
+        "failures": [],
+    }
+    return json.dumps(document, indent=1).rsplit("]", 1)[0].encode()
+
+
+def log_failure(place: int, prefix: str, reason: str, *, first: bool) -> bytes:
+    """A frame that could not be worked on: its place in the run, from 0, its name and why."""
+    record = json.dumps({"frame": place, "prefix": prefix, "reason": reason})
+    return f"{'' if first else ','}\n  {record}".encode()
+
+
+def log_tail(found: Counted, files: list[WrittenFile]) -> bytes:
+    """What stands after the failures."""
+    from detect.cli import EXIT_FRAMES_FAILED
+
+    document = {
+        "frames": found.frames,
+        "failed": found.failed,
+        "images_left_out": found.images_without_step,
+        "found": {
+            "discs": found.discs,
+            "lines": found.lines,
+            "tilts": found.tilts,
+            "markers": found.markers,
+        },
+        "rejected": dict(sorted(found.rejected.items())),
+        "outputs": [
+            {"name": file.name, "bytes": file.size_bytes, "sha256": file.sha256} for file in files
+        ],
+        "exit_code": EXIT_FRAMES_FAILED if found.failed else 0,
+    }
+    end = "\n ]," if found.failed else "],"
+    return f"{end}{json.dumps(document, indent=1)[1:]}\n".encode()

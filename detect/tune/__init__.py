@@ -1,0 +1,1 @@
+"""Settings tried over a grid, and what precision and recall they give."""

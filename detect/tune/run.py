@@ -1,0 +1,143 @@
+"""Settings tried on the same frames, each held against the same reference rows."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing, nullcontext
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from detect.comparison.circles import compare_frames
+from detect.comparison.lines import compare_line_frames
+from detect.comparison.lines_result import LineCompareOptions
+from detect.comparison.result import CompareOptions
+from detect.line_settings import LineSettings
+from detect.run import Run, RunFrame
+from detect.runs.dispatch import Workers, detect_frames
+from detect.runs.frame import FramePlan, tables_of
+from detect.runs.frame_rows import FrameTask
+from detect.runs.stream import TiltSource
+from detect.settings import CircleSettings
+from landmarks import Frame, frames_of_rows, parse_rows
+
+Settings = CircleSettings | LineSettings
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What came of one setting.
+
+    Attributes
+    ----------
+    reference, detected, matched : int
+        Rows that count, and pairs of them; for verticals, `matched` are the reference rows that a
+        detected row stands for, alone or with others.
+    recall, precision : float or None
+        None where there are no rows to compute them from.
+    error_median : float or None
+        Of the pairs: metres (discs), degrees (verticals).
+    normalised_error : float or None
+        Squared, per degree of freedom: 1 if the covariances are right.
+    failures : tuple of str
+        Frames that could not be worked on: they count as frames without detections.
+    """
+
+    reference: int
+    detected: int
+    matched: int
+    recall: float | None
+    precision: float | None
+    error_median: float | None
+    normalised_error: float | None
+    failures: tuple[str, ...] = ()
+
+
+def tune_run(
+    run: Run,
+    frames: Sequence[RunFrame],
+    reference: Sequence[Frame],
+    settings: Sequence[Settings],
+    gate: CompareOptions | LineCompareOptions,
+    workers: Workers,
+    *,
+    tilts: TiltSource | None = None,
+    on_progress: Callable[[], None] | None = None,
+) -> Iterator[Trial]:
+    """Detect with each setting in turn, and compare.
+
+    Parameters
+    ----------
+    run : Run
+        The run.
+    frames : sequence of RunFrame
+        Which of its frames.
+    reference : sequence of Frame
+        Reference rows, at least of these frames.
+    settings : sequence of CircleSettings, or of LineSettings
+        What to try; all of one kind.
+    gate : CompareOptions for discs, LineCompareOptions for verticals
+        What counts as the same landmark.
+    workers : Workers
+        Who does the work. They are started once for all settings.
+    tilts : mapping, optional
+        Tilts by image prefix: positions of discs are corrected for them.
+    on_progress : callable, optional
+        Called once after every frame of every setting.
+
+    Yields
+    ------
+    Trial
+        Of each setting, in their order.
+
+    Raises
+    ------
+    lut.TableError
+        If there can be no table for the camera and a setting.
+    WorkerError
+        If there is nobody to do the work.
+    """
+    plans = [_plan(run, each) for each in settings]
+    tasks = [
+        FrameTask(frame, tilt=None if tilts is None else tilts.get(frame.step.prefix))
+        for frame in frames
+    ]
+    tables_of(plans[0])
+    with workers.start(plans[0]) as crew:
+        same = replace(workers, start=lambda _: nullcontext(crew))
+        for plan in plans:
+            found: list[Frame] = []
+            failures: list[str] = []
+            with closing(detect_frames(tasks, plan, same)) as rows:
+                for each in rows:
+                    text = each.circles if plan.circles is not None else each.lines
+                    found += frames_of_rows(parse_rows(io.BytesIO(text)))
+                    failures += [] if each.error is None else [each.error]
+                    if on_progress is not None:
+                        on_progress()
+            yield _trial(reference, found, gate, tuple(failures))
+
+
+def _plan(run: Run, settings: Settings) -> FramePlan:
+    if isinstance(settings, CircleSettings):
+        return FramePlan(run.camera, circles=settings, working_folder=Path.cwd())
+    return FramePlan(run.camera, lines=settings, working_folder=Path.cwd())
+
+
+def _trial(
+    reference: Sequence[Frame],
+    found: Sequence[Frame],
+    gate: CompareOptions | LineCompareOptions,
+    failures: tuple[str, ...],
+) -> Trial:
+    if isinstance(gate, CompareOptions):
+        discs = compare_frames(reference, found, gate)
+        return Trial(
+            discs.reference, discs.detected, discs.matched, discs.recall, discs.precision,
+            discs.error_median_m, discs.normalised_error.per_dof, failures,
+        )  # fmt: skip
+    lines = compare_line_frames(reference, found, gate)
+    return Trial(
+        lines.reference, lines.detected, lines.found, lines.recall, lines.precision,
+        lines.bearing_median_deg, lines.normalised_error.per_dof, failures,
+    )  # fmt: skip

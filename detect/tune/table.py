@@ -1,0 +1,163 @@
+"""Trials of settings as a table (CSV), as JSON and as a curve (PNG)."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from detect.report.plot import DATA, MARK, REFERENCE, plotted
+from detect.tune.curve import FloatArray, f1_score, knee, pareto_front
+from detect.tune.grid import Combination
+from detect.tune.run import Trial
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+# So many points can be told apart by words beside them.
+_MOST_NAMED = 12
+
+
+def trial_records(
+    combinations: Sequence[Combination], trials: Sequence[Trial], unit: str
+) -> list[dict[str, Any]]:
+    """One record for each trial: the parameters, then the figures.
+
+    Parameters
+    ----------
+    combinations : sequence of combinations
+        See `detect.tune.grid.combinations`.
+    trials : sequence of Trial
+        What came of each.
+    unit : str
+        Of the errors: ends the name of their column.
+    """
+    recall, precision = rates(trials)
+    f1 = f1_score(recall, precision)
+    front, best = set(pareto_front(recall, precision).tolist()), knee(recall, precision)
+    return [
+        {
+            **dict(combination),
+            "reference": trial.reference,
+            "detected": trial.detected,
+            "matched": trial.matched,
+            "recall": _rounded(trial.recall),
+            "precision": _rounded(trial.precision),
+            "f1": _rounded(float(f1[k]) if np.isfinite(f1[k]) else None),
+            f"error_median_{unit}": _rounded(trial.error_median),
+            "normalised_error": _rounded(trial.normalised_error),
+            "front": k in front,
+            "knee": k == best,
+        }
+        for k, (combination, trial) in enumerate(zip(combinations, trials))
+    ]
+
+
+def records_csv(records: Sequence[dict[str, Any]]) -> bytes:
+    """Records as CSV: a head with the names, truth as 1 and 0, nothing where there is no figure."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(records[0])
+    for record in records:
+        writer.writerow([int(v) if name in ("front", "knee") else v for name, v in record.items()])
+    return text.getvalue().encode()
+
+
+def records_json(head: dict[str, Any], records: Sequence[dict[str, Any]]) -> bytes:
+    """A head and the records as JSON."""
+    document = {**head, "trials": list(records)}
+    return (json.dumps(document, indent=1, allow_nan=False) + "\n").encode()
+
+
+def curve_picture(
+    combinations: Sequence[Combination], trials: Sequence[Trial], title: str
+) -> bytes:
+    """Precision over recall as a PNG file: all trials, their front, and the knee."""
+    recall, precision = rates(trials)
+    front, best = pareto_front(recall, precision), knee(recall, precision)
+
+    def draw(figure: Figure) -> None:
+        axes = figure.subplots()
+        known = np.isfinite(recall) & np.isfinite(precision)
+        if len(combinations[0]) == 1:
+            axes.plot(recall[known], precision[known], color=REFERENCE, lw=0.8, zorder=1)
+        axes.plot(recall[known], precision[known], "o", color=DATA, ms=4, label="tried", zorder=3)
+        axes.plot(
+            recall[front], precision[front], color=DATA, lw=1.4, ls=(0, (5, 2)), zorder=2,
+            label="none is better in both",
+        )  # fmt: skip
+        if best is not None:
+            axes.plot(
+                recall[best], precision[best], "o", mfc="none", mec=MARK, mew=2.0, ms=13, zorder=4,
+                label=f"knee: {_words(combinations[best])}",
+            )  # fmt: skip
+        if known.any():
+            low = _frame_axes(axes, recall[known], precision[known])
+            _f1_lines(axes, low)
+        named = range(len(trials)) if len(trials) <= _MOST_NAMED else sorted({*front.tolist()})
+        for k in list(named)[:: max(1, len(named) // _MOST_NAMED)]:
+            if known[k]:
+                words = _words(combinations[k])
+                if len(combinations[k]) == 1:
+                    words = f"{combinations[k][0][1]}"
+                # Towards the middle, where there is room.
+                left = recall[k] > sum(axes.get_xlim()) / 2.0
+                axes.annotate(
+                    words, (recall[k], precision[k]), xytext=(-7 if left else 7, 5),
+                    textcoords="offset points", ha="right" if left else "left", fontsize=7,
+                )  # fmt: skip
+        axes.set_xlabel("recall")
+        axes.set_ylabel("precision")
+        axes.grid(alpha=0.25, lw=0.6)
+        axes.set_title(title, fontsize=10)
+        figure.legend(loc="outside lower center", fontsize=8, ncols=1)
+
+    return plotted(draw, (6.4, 6.2))
+
+
+def rates(trials: Sequence[Trial]) -> tuple[FloatArray, FloatArray]:
+    """(N,) recall and precision, NaN where there is none."""
+    recall, precision = (
+        np.array([np.nan if v is None else v for v in values], dtype=np.float64)
+        for values in ([t.recall for t in trials], [t.precision for t in trials])
+    )
+    return recall, precision
+
+
+def _frame_axes(axes: Any, recall: FloatArray, precision: FloatArray) -> tuple[float, float]:
+    """Both axes from a little below the least to 1."""
+    low = []
+    for values, set_limits in ((recall, axes.set_xlim), (precision, axes.set_ylim)):
+        least = float(values.min())
+        start = max(0.0, least - 0.08 * (1.0 - least) - 0.01)
+        set_limits(start, 1.0 + 0.06 * (1.0 - start))
+        low.append(start)
+    return low[0], low[1]
+
+
+def _f1_lines(axes: Any, low: tuple[float, float]) -> None:
+    """Where the harmonic mean of both is the same."""
+    x = np.linspace(max(low[0], 1e-3), 1.0, 200)
+    for f1 in (0.2, 0.4, 0.6, 0.7, 0.8, 0.9, 0.95):
+        with np.errstate(divide="ignore"):
+            y = f1 * x / (2.0 * x - f1)
+        shown = (2.0 * x > f1) & (y <= 1.0) & (y >= low[1])
+        if shown.sum() > 5:
+            axes.plot(x[shown], y[shown], color="#cccccc", lw=0.7, zorder=0)
+            axes.annotate(
+                f"F1 {f1:g}", (x[shown][-1], y[shown][-1]), fontsize=6, color="#777777",
+                ha="right", va="bottom",
+            )  # fmt: skip
+
+
+def _words(combination: Combination) -> str:
+    return ", ".join(f"{name} {value}" for name, value in combination)
+
+
+def _rounded(value: float | None) -> float | None:
+    """Six significant digits, as in the files of rows."""
+    return None if value is None else float(f"{value:.6g}")

@@ -1,0 +1,270 @@
+"""Compiled loops that evaluate the filter: everywhere, and on the rows near the horizon.
+
+A *strip* image has a pixel (v, c) for row v of the vertical that crosses the horizon at column c
+(see `lut.verticals`): the building's verticals are its columns, whatever the camera's pose and
+distortion.
+
+The response at a pixel of the strip is the signed squared correlation of grey value and distance
+across the vertical in a Gaussian window, cov |cov| / (variance + regulariser). Tracks evaluate it
+where they go (`detect.verticals.follow_kernels.follow_edges`).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from detect.verticals.vector_kernels import LANES, interpolate, interpolate_runs
+
+_ZERO = np.float32(0.0)
+#: Grey values about 0 keep the small variances exact in single precision.
+_MIDDLE = np.float32(128.0)
+
+
+@njit(cache=True, error_model="numpy")
+def _cut_response(
+    mean_strip: NDArray[np.float32],
+    cov_strip: NDArray[np.float32],
+    square_strip: NDArray[np.float32],
+    along: NDArray[np.float32],
+    noise: np.float32,
+    v: int,
+    c: int,
+    first: int,
+    last: int,
+) -> np.float32:
+    """Response in a window that is cut off at a vertical's ends."""
+    s = (len(along) - 1) // 2
+    share = np.float32(0.0)
+    mean = np.float32(0.0)
+    cov = np.float32(0.0)
+    square = np.float32(0.0)
+    for k in range(max(-s, first - v), min(s, last - v) + 1):
+        w = along[k + s]
+        share += w
+        mean += w * mean_strip[v + k, c]
+        cov += w * cov_strip[v + k, c]
+        square += w * square_strip[v + k, c]
+    mean /= share
+    cov /= share
+    return cov * abs(cov) / (abs(square / share - mean * mean) + noise)
+
+
+@njit(cache=True, error_model="numpy")
+def strip_response(
+    image: NDArray[np.uint8],
+    column: NDArray[np.float32],
+    first_row: NDArray[np.int32],
+    last_row: NDArray[np.int32],
+    weights: NDArray[np.float32],
+    along: NDArray[np.float32],
+    regulariser: np.float32,
+    response: NDArray[np.float32],
+) -> None:
+    """Signed squared correlation of grey value and column, in a window along each vertical.
+
+    Parameters
+    ----------
+    image : (H, W) uint8
+        Grey values.
+    column, first_row, last_row
+        The table (see `lut.verticals.VerticalTable`).
+    weights, along, regulariser
+        The filter (see `detect.verticals.filter.LineFilter`). Along the line it is cut off, and
+        made up for, where the vertical ends.
+    response : (H, W) float32
+        Result: ``cov |cov| / (variance + regulariser)``, in [-1, 1]; positive where the image is
+        brighter on the right; 0 where the window leaves the image.
+    """
+    height, width = image.shape
+    r = weights.shape[1] // 2
+    s = (len(along) - 1) // 2
+    mean_strip = np.zeros((height, width), np.float32)
+    cov_strip = np.zeros((height, width), np.float32)
+    square_strip = np.zeros((height, width), np.float32)
+    grey = np.empty(width, np.float32)
+    mean = np.zeros(width, np.float32)
+    cov = np.zeros(width, np.float32)
+    square = np.zeros(width, np.float32)
+    leftmost = np.float32(r)
+    rightmost = np.float32(width - 1 - r)
+    for v in range(height):
+        # Grey values about 0 keep the small variances exact in single precision.
+        for u in range(width):
+            grey[u] = np.float32(image[v, u]) - np.float32(128.0)
+        centre = weights[0, r]
+        for u in range(r, width - r):
+            g = grey[u]
+            mean[u] = centre * g
+            cov[u] = np.float32(0.0)
+            square[u] = centre * g * g
+        for k in range(1, r + 1):
+            w = weights[0, r + k]
+            h = weights[1, r + k]
+            for u in range(r, width - r):
+                left = grey[u - k]
+                right = grey[u + k]
+                mean[u] += w * (left + right)
+                cov[u] += h * (right - left)
+                square[u] += w * (left * left + right * right)
+        for c in range(width):
+            x = column[v, c]
+            if x >= leftmost and x < rightmost:
+                j = int(x)
+                f = x - np.float32(j)
+                mean_strip[v, c] = mean[j] + f * (mean[j + 1] - mean[j])
+                cov_strip[v, c] = cov[j] + f * (cov[j + 1] - cov[j])
+                square_strip[v, c] = square[j] + f * (square[j + 1] - square[j])
+    for v in range(height):
+        mean[:] = 0.0
+        cov[:] = 0.0
+        square[:] = 0.0
+        for k in range(max(-s, -v), min(s, height - 1 - v) + 1):
+            w = along[k + s]
+            for c in range(width):
+                mean[c] += w * mean_strip[v + k, c]
+            for c in range(width):
+                cov[c] += w * cov_strip[v + k, c]
+            for c in range(width):
+                square[c] += w * square_strip[v + k, c]
+        for c in range(width):
+            # Rounding can make a vanishing variance negative.
+            variance = square[c] - mean[c] * mean[c]
+            grey[c] = cov[c] * abs(cov[c]) / (abs(variance) + regulariser)
+        for c in range(width):
+            x = column[v, c]
+            response[v, c] = grey[c] if (x >= leftmost) & (x < rightmost) else np.float32(0.0)
+    # Near a vertical's ends the window is cut off.
+    for c in range(width):
+        first = first_row[c]
+        last = last_row[c]
+        for end in range(2):
+            lowest = first if end == 0 else max(last - s + 1, first + s)
+            highest = min(first + s - 1, last) if end == 0 else last
+            for v in range(lowest, highest + 1):
+                x = column[v, c]
+                if x >= leftmost and x < rightmost:
+                    response[v, c] = _cut_response(
+                        mean_strip, cov_strip, square_strip, along, regulariser, v, c, first, last
+                    )
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def band_response(
+    image: NDArray[np.uint8],
+    pixel: NDArray[np.int32],
+    runs: NDArray[np.int32],
+    part: NDArray[np.float32],
+    scale: NDArray[np.float32],
+    visible: NDArray[np.bool_],
+    spacing: int,
+    weights: NDArray[np.float32],
+    along: NDArray[np.float32],
+    regulariser: np.float32,
+    response: NDArray[np.float32],
+) -> None:
+    """Responses on rows parallel to the horizon, with the window laid over the strip itself.
+
+    Near the horizon the strip's columns are a pixel wide. There it hardly matters whether the
+    moments across the vertical are taken in the image and interpolated, or the grey values and
+    their squares are interpolated first; the latter is separable, and fast.
+
+    Parameters
+    ----------
+    image : (H, W) uint8
+        Grey values.
+    pixel : (R, W) int32
+        Index into the flat image of the pixel on the left of each pixel of the strip, for rows that
+        are counted from the horizon; -1 beyond the ends of the vertical.
+    runs : (R * W // LANES, 3) int32
+        See `detect.verticals.filter.StartBand`.
+    part : (R, W) float32
+        How far the strip's pixel lies to the right of it.
+    scale : (K, W) float32
+        One over the sum of the weights along the vertical that lie on it, for each row of the
+        result.
+    visible : (K, W) bool
+        Where the result is to be other than 0.
+    spacing : int
+        Rows of the strip from one row of the result to the next; the first of them is row s.
+    weights : (K, 2, 2r + 1) float32
+        Weights across the vertical, as those of the filter, for each row of the result.
+    along, regulariser
+        The filter (see `detect.verticals.filter.LineFilter`).
+    response : (K, W) float32
+        Result: as `strip_response`.
+    """
+    width = image.shape[1]
+    r = weights.shape[2] // 2
+    s = len(along) // 2
+    inner = width - 2 * r
+    grey = np.empty(pixel.shape, np.float32)
+    square = np.empty(pixel.shape, np.float32)
+    flat = image.reshape(-1)
+    flat_pixel = pixel.reshape(-1)
+    flat_part = part.reshape(-1)
+    flat_grey = grey.reshape(-1)
+    flat_square = square.reshape(-1)
+    whole = len(flat_pixel) // LANES * LANES
+    for block in range(len(runs)):
+        i = block * LANES
+        if runs[block, 2] >= 0:
+            interpolate_runs(
+                flat, runs[block, 0], runs[block, 1], runs[block, 2], flat_part, flat_grey,
+                flat_square, i,
+            )  # fmt: skip
+        else:
+            interpolate(flat, flat_pixel, flat_part, flat_grey, flat_square, i)
+    for i in range(whole, len(flat_pixel)):
+        flat_grey[i] = _ZERO
+        flat_square[i] = _ZERO
+        if flat_pixel[i] >= 0:
+            left = np.float32(flat[flat_pixel[i]]) - _MIDDLE
+            right = np.float32(flat[flat_pixel[i] + 1]) - _MIDDLE
+            flat_grey[i] = left + flat_part[i] * (right - left)
+            left *= left
+            flat_square[i] = left + flat_part[i] * (right * right - left)
+    grey_sum = np.empty(width, np.float32)
+    square_sum = np.empty(width, np.float32)
+    mean = np.empty(max(inner, 0), np.float32)
+    cov = np.empty(max(inner, 0), np.float32)
+    mean_square = np.empty(max(inner, 0), np.float32)
+    response[:] = _ZERO
+    for k in range(len(response) if inner > 0 else 0):
+        middle = k * spacing + s
+        row = grey[middle]
+        square_row = square[middle]
+        for c in range(width):
+            grey_sum[c] = along[s] * row[c]
+            square_sum[c] = along[s] * square_row[c]
+        for t in range(1, s + 1):
+            w = along[s + t]
+            above = grey[middle - t]
+            below = grey[middle + t]
+            square_above = square[middle - t]
+            square_below = square[middle + t]
+            for c in range(width):
+                grey_sum[c] += w * (above[c] + below[c])
+                square_sum[c] += w * (square_above[c] + square_below[c])
+        for c in range(width):
+            grey_sum[c] *= scale[k, c]
+            square_sum[c] *= scale[k, c]
+        mean[:] = _ZERO
+        cov[:] = _ZERO
+        mean_square[:] = _ZERO
+        for t in range(2 * r + 1):
+            w = weights[k, 0, t]
+            h = weights[k, 1, t]
+            near = grey_sum[t : t + inner]
+            near_square = square_sum[t : t + inner]
+            for c in range(inner):
+                mean[c] += w * near[c]
+                cov[c] += h * near[c]
+                mean_square[c] += w * near_square[c]
+        out = response[k, r : r + inner]
+        shown = visible[k, r : r + inner]
+        for c in range(inner):
+            variance = abs(mean_square[c] - mean[c] * mean[c])
+            value = cov[c] * abs(cov[c]) / (variance + regulariser)
+            out[c] = value if shown[c] else _ZERO

@@ -1,0 +1,215 @@
+"""The vote of verticals for a tilt, compiled."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from detect.verticals.order_kernels import descending
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"}, forceinline=True)
+def _votes(
+    x: NDArray[np.float64],
+    y: NDArray[np.float64],
+    z: NDArray[np.float64],
+    weight: NDArray[np.float64],
+    pitch: float,
+    roll: float,
+) -> float:
+    """Votes of lines, whose normals are given in units of their tolerances, for a tilt."""
+    votes = 0.0
+    for line in range(len(weight)):
+        off = z[line] + pitch * y[line] - roll * x[line]
+        votes += weight[line] * max(1.0 - off * off, 0.0)
+    return votes
+
+
+@njit(cache=True, error_model="numpy")
+def vote_for_tilt(
+    normal: NDArray[np.float64],
+    tolerance: NDArray[np.float64],
+    weight: NDArray[np.float64],
+    proposer: NDArray[np.int64],
+    limit: float,
+    prior: float,
+) -> tuple[float, float]:
+    """Pitch and roll that the largest weight of lines agrees with.
+
+    Each pair of proposers gives the tilt that makes both vertical; a line votes for it with its
+    weight, less the farther it is from vertical.
+
+    Parameters
+    ----------
+    normal : (N, 3) float64
+        Unit normals of the lines' planes, robot frame.
+    tolerance : (N,) float64
+        Largest inclination after compensation (rad).
+    weight : (N,) float64
+        Votes of a line that is exactly vertical.
+    proposer : (M,) int64
+        Lines whose pairs are tried; no tilt is tried as well.
+    limit : float
+        Largest absolute pitch and roll (rad).
+    prior : float
+        Standard deviation of the tilt (rad): a tilt t loses t^2 / (2 prior^2) votes.
+
+    Returns
+    -------
+    pitch, roll : float
+        The tilt (rad); the first of those with the most votes.
+    """
+    best_pitch = 0.0
+    best_roll = 0.0
+    best = -math.inf
+    x = normal[:, 0] / tolerance
+    y = normal[:, 1] / tolerance
+    z = normal[:, 2] / tolerance
+    for i in range(-1, len(proposer)):
+        for k in range(i + 1, len(proposer) if i >= 0 else 1):
+            pitch = 0.0
+            roll = 0.0
+            if i >= 0:
+                m = proposer[i]
+                n = proposer[k]
+                # n_z + pitch n_y - roll n_x = 0 for both.
+                determinant = normal[m, 0] * normal[n, 1] - normal[m, 1] * normal[n, 0]
+                if determinant == 0.0:
+                    continue
+                pitch = (normal[m, 2] * normal[n, 0] - normal[m, 0] * normal[n, 2]) / determinant
+                roll = (normal[m, 2] * normal[n, 1] - normal[m, 1] * normal[n, 2]) / determinant
+                if not (abs(pitch) <= limit and abs(roll) <= limit):
+                    continue
+            votes = -0.5 * (pitch * pitch + roll * roll) / (prior * prior)
+            votes += _votes(x, y, z, weight, pitch, roll)
+            if votes > best:
+                best = votes
+                best_pitch = pitch
+                best_roll = roll
+    return best_pitch, best_roll
+
+
+@njit(cache=True, error_model="numpy")
+def level_matrix(pitch: float, roll: float) -> NDArray[np.float64]:
+    """(3, 3) rotation exp([pitch, roll, 0]x)."""
+    squared = pitch * pitch + roll * roll
+    angle = math.sqrt(squared)
+    # sin(x) / x and (1 - cos(x)) / x^2.
+    first = 1.0 - squared / 6.0
+    second = 0.5 - squared / 24.0
+    if angle > 1e-3:
+        first = math.sin(angle) / angle
+        second = 2.0 * (math.sin(0.5 * angle) / angle) ** 2
+    rotation = np.empty((3, 3))
+    rotation[0, 0] = 1.0 - second * roll * roll
+    rotation[0, 1] = second * pitch * roll
+    rotation[0, 2] = first * roll
+    rotation[1, 0] = second * pitch * roll
+    rotation[1, 1] = 1.0 - second * pitch * pitch
+    rotation[1, 2] = -first * pitch
+    rotation[2, 0] = -first * roll
+    rotation[2, 1] = first * pitch
+    rotation[2, 2] = 1.0 - second * squared
+    return rotation
+
+
+@njit(cache=True, error_model="numpy")
+def refine_tilt(
+    normal: NDArray[np.float64],
+    variance: NDArray[np.float64],
+    tolerance: NDArray[np.float64],
+    pitch: float,
+    roll: float,
+    prior: float,
+    softening: float,
+    repetitions: int,
+) -> tuple[float, float, NDArray[np.float64], NDArray[np.bool_]]:
+    """Least squares of a tilt over the lines that agree with it, repeated.
+
+    Parameters
+    ----------
+    normal, tolerance
+        See `vote_for_tilt`.
+    variance : (N,) float64
+        Of the inclinations that verticals show (rad^2).
+    pitch, roll : float
+        To begin with (rad).
+    prior : float
+        Standard deviation of the tilt (rad).
+    softening : float
+        Standard deviations from which on a line's pull no longer grows (Cauchy's weights).
+    repetitions : int
+        How often.
+
+    Returns
+    -------
+    pitch, roll : float
+        The tilt (rad).
+    covariance : (2, 2) float64
+        Of it (rad^2).
+    agrees : (N,) bool
+        Lines that are vertical under it.
+    """
+    count = len(variance)
+    covariance = np.zeros((2, 2))
+    covariance[0, 0] = prior * prior
+    covariance[1, 1] = prior * prior
+    agrees = np.empty(count, np.bool_)
+    for repetition in range(repetitions + 1):
+        rotation = level_matrix(pitch, roll)
+        pp = 1.0 / (prior * prior)
+        pr = 0.0
+        rr = pp
+        gradient_p = pitch / (prior * prior)
+        gradient_r = roll / (prior * prior)
+        for i in range(count):
+            x = 0.0
+            y = 0.0
+            z = 0.0
+            for k in range(3):
+                x += rotation[0, k] * normal[i, k]
+                y += rotation[1, k] * normal[i, k]
+                z += rotation[2, k] * normal[i, k]
+            agrees[i] = abs(z) <= tolerance[i]
+            if agrees[i]:
+                # A line of furniture or a shadow among few lines must not pull.
+                weight = 1.0 / (variance[i] + (z / softening) ** 2)
+                pp += weight * y * y
+                pr -= weight * y * x
+                rr += weight * x * x
+                gradient_p += weight * y * z
+                gradient_r -= weight * x * z
+        if repetition == repetitions:
+            break
+        determinant = pp * rr - pr * pr
+        covariance[0, 0] = rr / determinant
+        covariance[0, 1] = -pr / determinant
+        covariance[1, 0] = -pr / determinant
+        covariance[1, 1] = pp / determinant
+        pitch -= covariance[0, 0] * gradient_p + covariance[0, 1] * gradient_r
+        roll -= covariance[1, 0] * gradient_p + covariance[1, 1] * gradient_r
+    return pitch, roll, covariance, agrees
+
+
+@njit(cache=True, error_model="numpy")
+def agree_on_tilt(
+    normal: NDArray[np.float64],
+    variance: NDArray[np.float64],
+    tolerance: NDArray[np.float64],
+    weight: NDArray[np.float64],
+    proposers: int,
+    limit: float,
+    prior: float,
+    softening: float,
+    repetitions: int,
+) -> tuple[float, float, NDArray[np.float64], NDArray[np.bool_]]:
+    """The tilt that most lines vote for, refined; parameters and results as of these two.
+
+    Pairs of the `proposers` lines of the largest weight propose.
+    """
+    strongest = descending(weight)[:proposers]
+    pitch, roll = vote_for_tilt(normal, tolerance, weight, strongest, limit, prior)
+    return refine_tilt(normal, variance, tolerance, pitch, roll, prior, softening, repetitions)

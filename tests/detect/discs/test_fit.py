@@ -1,0 +1,188 @@
+"""The disc fit on single rendered discs: parameters back, limits, and the search around it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from camera import Camera
+from detect.circles import disc_shape, refined_covariance, tilt_jacobian
+from detect.discs import fit_kernels as kernels
+from detect.discs.candidate_kernels import middles, nearest_pixel, strong_and_alone
+from detect.discs.fit import disc_evidence, fit_discs
+from detect.settings import CircleSettings
+from lut import DiscTable, build_disc_table
+from tests.detect.painted_floor import PaintedFloor
+
+#: `PaintedFloor` blurs by as many pixels along v as along u.
+PAINTED_RATIO = 1.0
+
+PLACES = [(0.1, -0.95), (-0.6, -1.6), (0.4, -2.4), (-0.3, -3.6), (0.8, -5.2)]
+
+
+@pytest.fixture(scope="module")
+def table(published_camera: Camera) -> DiscTable:
+    return build_disc_table(published_camera, disc_shape(CircleSettings()))
+
+
+def nearest(camera: Camera, place: tuple[float, float]) -> NDArray[np.int64]:
+    return np.rint(camera.project_floor(np.array(place))).astype(np.int64)
+
+
+@pytest.mark.parametrize("place", PLACES)
+@pytest.mark.parametrize("offset", [(0, 0), (3, -1), (-2, 1)])
+@pytest.mark.parametrize("blur", [0.5, 1.0, 3.0])
+def test_parameters_come_back(
+    published_camera: Camera,
+    table: DiscTable,
+    place: tuple[float, float],
+    offset: tuple[int, int],
+    blur: float,
+) -> None:
+    floor = PaintedFloor(published_camera, 60.0).disc(place, 210.0, 0.1, blur)
+    pixel = nearest(published_camera, place) + (offset if place[1] > -3.0 else (0, 0))
+    fit = fit_discs(
+        floor.image(0.5), table.floor_xy, pixel[None], 0.1, 0.6, blur_ratio=PAINTED_RATIO,
+        blur_guess=np.array([0.8 * blur]),
+    )  # fmt: skip
+    assert fit.fitted[0]
+    per_px = np.linalg.norm(published_camera.floor_jacobian(pixel.astype(float)), 2)
+    # Where the blur is larger than the disc, perspective within it counts.
+    tiny = blur > 2.0 and place[1] < -5.0
+    assert np.hypot(*(fit.floor_xy[0] - place)) < (0.4 if tiny else 0.05) * per_px
+    assert fit.radius_m[0] == pytest.approx(0.1, rel=0.02 if blur < 2.0 else 0.1)
+    if blur < 2.0:
+        assert fit.contrast[0] == pytest.approx(150.0, rel=0.1)
+    assert fit.explained[0] > (0.9 if tiny else 0.97)
+    assert fit.sectors_good[0] == 1.0
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_fewer_pixels_tell_nearly_the_same(
+    published_camera: Camera, table: DiscTable, place: tuple[float, float]
+) -> None:
+    """A first look and the pixels at the edge agree with all pixels."""
+    image = PaintedFloor(published_camera, 60.0).disc(place, 210.0, 0.1, 0.7).image(1.0)
+    pixel = nearest(published_camera, place)[None]
+    look, full = (
+        fit_discs(
+            image, table.floor_xy, pixel, 0.1, 1.0, blur_ratio=PAINTED_RATIO, first_look=first
+        )
+        for first in (True, False)
+    )
+    per_px = np.linalg.norm(published_camera.floor_jacobian(pixel[0].astype(float)), 2)
+    assert np.hypot(*(look.floor_xy[0] - full.floor_xy[0])) < 0.25 * per_px
+    assert look.explained[0] == pytest.approx(full.explained[0], abs=0.08)
+    assert np.isfinite(disc_evidence(full, 0.1)[0])
+
+
+def test_covariance_counts_noise(published_camera: Camera, table: DiscTable) -> None:
+    """Monte Carlo: the scatter of fits is what they say it is."""
+    place = (0.3, -2.0)
+    floor = PaintedFloor(published_camera, 60.0).disc(place, 200.0, 0.1, 0.8)
+    pixel = nearest(published_camera, place)[None]
+    normalised = []
+    for seed in range(150):
+        fit = fit_discs(
+            floor.image(4.0, seed), table.floor_xy, pixel, 0.1, 4.0, blur_ratio=PAINTED_RATIO
+        )
+        off = fit.floor_xy[0] - place
+        normalised.append(off @ np.linalg.solve(fit.covariance[0], off) / 2.0)
+    assert 0.7 < np.mean(normalised) < 1.4
+
+
+def test_candidates_at_the_image_border_and_beyond_the_horizon(
+    published_camera: Camera, table: DiscTable
+) -> None:
+    image = PaintedFloor(published_camera).image(2.0)
+    width, height = published_camera.width, published_camera.height
+    pixels = np.array([[0, 0], [width - 1, 0], [0, height - 1], [width - 1, height - 1], [384, 1]])
+    fit = fit_discs(image, table.floor_xy, pixels, 0.1, 2.0, blur_ratio=0.5)
+    assert fit.fitted.shape == (5,)
+    assert np.all(np.isfinite(fit.floor_xy[fit.fitted]))
+
+
+def test_larger_discs_than_a_patch_are_fitted(published_camera: Camera, table: DiscTable) -> None:
+    """More pixels than fit into a patch: some are left out, evenly."""
+    place = (0.0, -1.5)
+    image = PaintedFloor(published_camera, 60.0).disc(place, 200.0, 0.25, 0.8).image(1.0)
+    pixel = nearest(published_camera, place)[None]
+    fit = fit_discs(image, table.floor_xy, pixel, 0.25, 1.0, blur_ratio=PAINTED_RATIO)
+    assert fit.fitted[0]
+    assert np.hypot(*(fit.floor_xy[0] - place)) < 2e-4
+    assert fit.radius_m[0] == pytest.approx(0.25, rel=2e-3)
+
+
+def test_strongest_alone_in_scan_order(table: DiscTable) -> None:
+    pixels = np.array([[300, 200], [304, 200], [500, 200], [600, 200]])
+    quality = np.array([0.7, 0.9, 0.8, 0.95])
+    contrast = np.array([30.0, -30.0, 30.0, 5.0])
+    keep = strong_and_alone(pixels, quality, contrast, table.floor_xy, 10.0, 0.07)
+    np.testing.assert_array_equal(keep, [1, 2])
+    keep = strong_and_alone(pixels, quality, contrast, table.floor_xy, 10.0, 0.0)
+    np.testing.assert_array_equal(keep, [0, 1, 2])
+
+
+def test_nearest_pixel_sees_the_place(published_camera: Camera, table: DiscTable) -> None:
+    rng = np.random.default_rng(5)
+    for place in rng.uniform((-1.0, -5.0), (1.0, -1.0), (100, 2)):
+        u, v = nearest(published_camera, (place[0], place[1]))
+        found = nearest_pixel(table.floor_xy, u + 5, v - 2, place[0], place[1])
+        exact = published_camera.project_floor(place)
+        assert np.abs(np.array(found) - exact).max() < 0.6
+
+
+def test_refined_covariance_is_the_sum(published_camera: Camera) -> None:
+    """The fit's, J J^T per square pixel, and the tilt's, from the camera's own functions."""
+    settings = CircleSettings(systematic_px=0.02, tilt_sigma_deg=0.4)
+    places = np.array(PLACES)
+    fitted = np.random.default_rng(1).normal(0.0, 1e-3, (len(places), 2, 2))
+    fitted = fitted @ fitted.swapaxes(-1, -2)
+    jacobian = published_camera.floor_jacobian(published_camera.project_floor(places))
+    tilt = tilt_jacobian(published_camera, places)
+    expected = fitted + 0.02**2 * jacobian @ jacobian.swapaxes(-1, -2)
+    expected += np.radians(0.4) ** 2 * tilt @ tilt.swapaxes(-1, -2)
+    found = refined_covariance(published_camera, places, fitted, settings)
+    np.testing.assert_allclose(found, expected, rtol=1e-6)
+
+
+def test_results_have_their_columns() -> None:
+    names = (
+        kernels.X, kernels.Y, kernels.RADIUS, kernels.BLUR, kernels.CONTRAST, kernels.EXPLAINED,
+        kernels.RESIDUAL_VARIANCE, kernels.PIXELS, kernels.COV_XX, kernels.COV_XY, kernels.COV_YY,
+        kernels.SECTORS_STEP, kernels.SECTORS_GOOD, kernels.OUTLINE_DEVIATION,
+        kernels.RELATIVE_BLUR, kernels.ITERATIONS, kernels.BLUR_BOUND, kernels.COMPLETE,
+        kernels.MIDDLE_STEP,
+    )  # fmt: skip
+    assert sorted(names) == list(range(kernels.RESULT_SIZE))
+
+
+def test_the_middle_of_a_discs_best_centres(table: DiscTable) -> None:
+    """Weighed by what speaks for each; neither weak ones nor those of the other sign count."""
+    pixels = np.array([[298, 200], [304, 200], [306, 200], [301, 201], [500, 200]])
+    quality = np.array([1.0, 0.5, 0.9, 0.9, 0.8])
+    contrast = np.array([30.0, 60.0, -40.0, 5.0, 30.0])
+    keep = np.array([0, 4])
+    found = middles(pixels, quality, contrast, table.floor_xy, 10.0, 0.07, keep)
+    # (30 * 298 + 0.25 * 60 * 304) / 45
+    np.testing.assert_array_equal(found, [[300, 200], [500, 200]])
+    alone = middles(pixels, quality, contrast, table.floor_xy, 10.0, 0.0, keep)
+    np.testing.assert_array_equal(alone, pixels[keep])
+
+
+@pytest.mark.parametrize("forward_m", [1.2, 1.8, 2.5, 3.2])
+@pytest.mark.parametrize("hole_m", [0.05, 0.06, 0.07])
+def test_a_ring_is_no_disc(
+    published_camera: Camera, table: DiscTable, forward_m: float, hole_m: float
+) -> None:
+    """Its outer edge is a disc's; what it has in the middle is not."""
+    place = (0.1, -forward_m)
+    ring = PaintedFloor(published_camera, 60.0).shape(
+        place, lambda x, y: (np.hypot(x, y) < 0.10) & (np.hypot(x, y) > hole_m), 190.0
+    )
+    disc = PaintedFloor(published_camera, 60.0).disc(place, 190.0, 0.10, 0.7)
+    pixel = nearest(published_camera, place)[None]
+    for painted, is_disc in ((ring, False), (disc, True)):
+        fit = fit_discs(painted.image(), table.floor_xy, pixel, 0.10, 1.5, blur_ratio=PAINTED_RATIO)
+        assert (disc_evidence(fit, 0.10)[0] > 1.1) == is_disc

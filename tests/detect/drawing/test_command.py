@@ -1,0 +1,285 @@
+"""Rows from files drawn into images where they belong, and refused in one line otherwise."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from camera import Camera
+from detect.circles import CircleDetections
+from detect.cli import main
+from detect.comparison.lines_result import LineCompareOptions
+from detect.comparison.result import CompareOptions
+from detect.discs.levelling import level_positions
+from detect.drawing.frame import draw_rows, floor_projection, line_curves, sigma_bars
+from detect.drawing.head import read_head
+from detect.drawing.inputs import SeenRows
+from detect.drawing.selection import select_frames
+from detect.errors import DetectError
+from detect.run import open_images
+from detect.settings import CircleSettings
+from landmarks import CircleLandmark, FrameTilt, LineLandmark, circle_landmarks
+from tests.detect.drawing.test_detections import changed
+from tests.detect.test_cli import assert_refused
+
+Captured = pytest.CaptureFixture[str]
+FloatArray = NDArray[np.float64]
+
+SETTINGS = CircleSettings()
+GATE, LINE_GATE = CompareOptions(), LineCompareOptions()
+
+
+def discs(*places: tuple[float, float]) -> tuple[CircleLandmark, ...]:
+    xy = np.array(places, float).reshape(-1, 2)
+    covariance = np.tile(1e-4 * np.eye(2), (len(xy), 1, 1))
+    return circle_landmarks(xy, np.full(len(xy), 0.9), covariance, np.full(len(xy), -1))
+
+
+def vertical(camera: Camera, bearing: float, sigma: float) -> LineLandmark:
+    """A vertical edge 4 m away from the robot's origin, from the floor to 2.2 m."""
+    x, y = 4.0 * np.sin(bearing), -4.0 * np.cos(bearing)
+    ends = camera.robot_to_camera(np.array([[x, y, 2.2], [x, y, 0.0]]))
+    (xt, yt), (xb, yb) = (ends[:, :2] / ends[:, 2:]).tolist()
+    seen = np.array([x, y]) - camera.centre[:2]
+    alpha = float(np.arctan2(seen[0], -seen[1]))
+    return LineLandmark(xt, yt, xb, yb, alpha, 0.0, 0.0, sigma, (-1,))
+
+
+@pytest.fixture
+def image() -> NDArray[np.uint8]:
+    return np.random.default_rng(2).integers(60, 130, (288, 768)).astype(np.uint8)
+
+
+# -- where things are drawn -------------------------------------------------------------------
+
+
+def test_positions_corrected_for_the_tilt_are_drawn_where_they_were_seen(
+    published_camera: Camera,
+) -> None:
+    tilt = FrameTilt("e.0000", 0.031, -0.017, 1e-6, 0.0, 1e-6, 9)
+    seen = np.array([[0.4, -1.2], [-0.9, -2.5], [0.1, -3.9]])
+    level = level_positions(published_camera, seen, tilt.pitch, tilt.roll)
+    assert np.abs(level - seen).max() > 0.05
+    drawn = floor_projection(published_camera, tilt)(level)
+    np.testing.assert_allclose(drawn, published_camera.project_floor(seen), atol=1e-9)
+
+
+def test_bars_cross_the_horizon_and_are_as_wide_as_their_sigma(published_camera: Camera) -> None:
+    bearing, sigma = np.array([0.3, -0.5, 0.02]), np.array([0.01, 0.004, 0.002])
+    rows = [vertical(published_camera, b, s) for b, s in zip(bearing, sigma)]
+    ends = np.array([(r.xtop, r.ytop, r.xbottom, r.ybottom) for r in rows])
+    bars = sigma_bars(published_camera, ends, sigma)
+    direction = published_camera.directions_robot(bars)
+    # The calibration's rotation has six digits.
+    np.testing.assert_allclose(direction[..., 2], 0.0, atol=1e-6)
+    reached = np.arctan2(direction[..., 0], -direction[..., 1])
+    alpha = np.array([r.alpha for r in rows])
+    np.testing.assert_allclose(reached, alpha[:, None] + sigma[:, None] * [1.0, -1.0], atol=2e-6)
+
+
+def test_lines_go_through_the_lens(published_camera: Camera) -> None:
+    row = vertical(published_camera, 0.6, 0.01)
+    curve = line_curves(
+        published_camera, np.array([[row.xtop, row.ytop, row.xbottom, row.ybottom]])
+    )[0]
+    back = published_camera.undistort(curve)
+    along = np.array([row.xbottom - row.xtop, row.ybottom - row.ytop])
+    off = (back - [row.xtop, row.ytop]) @ [-along[1], along[0]] / np.hypot(*along)
+    np.testing.assert_allclose(off, 0.0, atol=1e-8)
+    # It bends in the picture: the middle is pixels away from the chord.
+    chord = curve[-1] - curve[0]
+    bend = (curve - curve[0]) @ [-chord[1], chord[0]] / np.hypot(*chord)
+    assert np.abs(bend).max() > 2.0
+
+
+def test_matched_extra_and_missed_have_colours_of_their_own(
+    image: NDArray[np.uint8], published_camera: Camera
+) -> None:
+    rows = SeenRows(
+        circles=discs((0.2, -1.3), (-0.6, -1.5)),
+        reference_circles=discs((0.21, -1.3), (0.7, -1.6)),
+        lines=(vertical(published_camera, 0.3, 0.002),),
+        reference_lines=(vertical(published_camera, -0.4, 0.002),),
+    )
+    canvas = draw_rows(image, published_camera, rows, SETTINGS, GATE, LINE_GATE, "x.0001")
+    assert canvas.shape[0] > 288
+    assert canvas[288:].any()
+
+    def colour_at(place: FloatArray) -> NDArray[np.uint8]:
+        u, v = np.rint(place).astype(int)
+        return np.asarray(canvas[v, u].astype(int))
+
+    project = published_camera.project_floor
+    for centre, expected in (
+        ((0.2, -1.3), (0, 170, 255)),
+        ((-0.6, -1.5), (255, 60, 255)),
+        ((0.7, -1.6), (60, 60, 255)),
+    ):
+        edge = np.array([colour_at(p) for p in project(centre + 0.1 * _circle(32))])
+        assert np.median(np.abs(edge - expected).sum(axis=1)) < 120, centre
+    for bearing, expected in ((0.3, (255, 60, 255)), (-0.4, (60, 60, 255))):
+        row = vertical(published_camera, bearing, 0.002)
+        curve = line_curves(
+            published_camera, np.array([[row.xtop, row.ytop, row.xbottom, row.ybottom]])
+        )[0]
+        inside = curve[(curve[:, 1] > 40) & (curve[:, 1] < 280)]
+        seen = np.array([colour_at(p) for p in inside])
+        assert np.median(np.abs(seen - expected).sum(axis=1)) < 250, bearing
+
+
+def test_without_reference_nothing_is_missed_or_extra(
+    image: NDArray[np.uint8], published_camera: Camera
+) -> None:
+    from detect.drawing.detections import draw_circles
+
+    rows = SeenRows(circles=discs((0.2, -1.3)))
+    canvas = draw_rows(image, published_camera, rows, SETTINGS, GATE, LINE_GATE)
+    found = CircleDetections(
+        np.zeros((1, 2), np.int64), np.array([[0.2, -1.3]]), np.eye(2)[None], np.array([0.9]),
+        np.array([1.0]),
+    )  # fmt: skip
+    np.testing.assert_array_equal(
+        canvas[:288], draw_circles(image, published_camera, found, SETTINGS)
+    )
+
+
+def _circle(points: int) -> FloatArray:
+    angle = 2.0 * np.pi * np.arange(points) / points
+    return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+
+
+# -- which frames -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("wanted", "every", "expected"),
+    [
+        ([], 1, [0, 1, 2]),
+        ([], 2, [0, 2]),
+        (["1"], 1, [1]),
+        (["s.0002", "0"], 1, [0, 2]),
+        (["images/s.0002.png"], 1, [2]),
+        (["1:"], 1, [1, 2]),
+        ([":2"], 1, [0, 1]),
+        (["0:9:2"], 1, [0, 2]),
+        (["0:3"], 2, [0, 2]),
+    ],
+)
+def test_frames_are_selected(
+    small_run: Path, wanted: list[str], every: int, expected: list[int]
+) -> None:
+    frames = open_images(small_run).frames
+    selection = select_frames(frames, wanted, every)
+    assert [position for position, _ in selection.of(frames)] == expected
+
+
+@pytest.mark.parametrize(
+    ("wanted", "every", "says"),
+    [
+        (["s.0009"], 1, "expected the name of an image"),
+        (["3"], 1, "0 to 2"),
+        (["5:9"], 1, "none of the run's 3 frames"),
+        (["0:3:0"], 1, "step is 0"),
+        ([], 0, "every is 0"),
+    ],
+)
+def test_frames_that_are_none_are_refused(
+    small_run: Path, wanted: list[str], every: int, says: str
+) -> None:
+    with pytest.raises(DetectError, match=says):
+        select_frames(open_images(small_run).frames, wanted, every)
+
+
+# -- the command ------------------------------------------------------------------------------
+
+
+def test_rows_are_drawn_without_detecting_again(small_run: Path, tmp_path: Path) -> None:
+    (small_run / "detected.circles").write_text(
+        "STEP s.0001 0 0 0 0 0 0 0 0 0\nLANDMARK_C 0.3 -1.5 0.77 1e-4 0 1e-4 -1\n"
+    )
+    assert main(["draw", str(small_run), "-o", str(tmp_path / "d")]) == 0
+    names = sorted(path.name for path in (tmp_path / "d").iterdir())
+    assert names == ["s.0000.png", "s.0001.png", "s.0002.png"]
+    for name in names:
+        picture = cv2.imread(str(tmp_path / "d" / name))
+        grey = cv2.imread(str(small_run / "images" / name), cv2.IMREAD_GRAYSCALE)
+        assert picture is not None
+        assert grey is not None
+        marked = changed(np.asarray(picture[:288], np.uint8), np.asarray(grey, np.uint8))
+        assert marked.any() == (name == "s.0001.png")
+    again = tmp_path / "again"
+    assert main(["draw", str(small_run), "-o", str(again)]) == 0
+    assert (again / "s.0001.png").read_bytes() == (tmp_path / "d" / "s.0001.png").read_bytes()
+
+
+def test_settings_and_tilt_are_read_from_the_head(small_run: Path) -> None:
+    assert main(["circles", str(small_run), "--outer-radius-m", "0.15"]) == 0
+    head = read_head(small_run / "detected.circles")
+    assert head.circle_settings == CircleSettings(outer_radius_m=0.15)
+    assert not head.levelled
+    assert main(["all", str(small_run), "--force"]) == 0
+    assert read_head(small_run / "detected.circles").levelled
+
+
+def test_video_has_a_picture_per_frame(small_run: Path, tmp_path: Path) -> None:
+    assert main(["circles", str(small_run)]) == 0
+    video, folder = tmp_path / "v.mp4", tmp_path / "d"
+    arguments = ["draw", str(small_run), "--video", str(video), "-o", str(folder), "--fps", "4"]
+    assert main(arguments) == 0
+    reader = cv2.VideoCapture(str(video))
+    assert reader.get(cv2.CAP_PROP_FPS) == pytest.approx(4.0)
+    for name in ("s.0000", "s.0001", "s.0002"):
+        good, picture = reader.read()
+        assert good
+        still = cv2.imread(str(folder / f"{name}.png"))
+        assert still is not None
+        assert np.abs(picture.astype(int) - still).mean() < 12.0
+    assert not reader.read()[0]
+
+
+def test_markers_are_drawn_without_a_calibration(small_run: Path, tmp_path: Path) -> None:
+    (small_run / "s.cam").unlink()
+    corners = "100 50 1 0 1 160 50 1 0 1 160 110 1 0 1 100 110 1 0 1"
+    (small_run / "detected.markers").write_text(
+        f"STEP s.0000 0 0 0 0 0 0 0 0 0\nLANDMARK_M rawseeds 5 0.9 {corners}\n"
+    )
+    assert main(["draw", str(small_run), "-o", str(tmp_path / "d"), "--frames", "0"]) == 0
+    picture = cv2.imread(str(tmp_path / "d" / "s.0000.png"))
+    assert picture is not None
+    green = np.abs(picture[50, 110:150].astype(int) - (60, 220, 60)).sum(axis=1)
+    assert np.median(green) < 60
+
+
+def test_refusals(small_run: Path, tmp_path: Path, capsys: Captured) -> None:
+    run, out = str(small_run), str(tmp_path / "d")
+    assert_refused(["draw", run, "-o", out], small_run, "detect all", capsys)
+    (small_run / "detected.circles").write_text("STEP s.0000 0 0 0 0 0 0 0 0 0\n")
+    assert_refused(["draw", run], small_run, "--video", capsys)
+    assert_refused(["draw", run, "-o", out, "--lines", "no.lines"], small_run, "no.lines", capsys)
+    assert_refused(["draw", run, "-o", out, "--fps", "0"], small_run, "fps", capsys)
+    assert_refused(["draw", run, "-o", out, "--frames", "x"], small_run, "'x'", capsys)
+    with pytest.raises(SystemExit) as ended:
+        main(["draw", run, "-o", out, "--gate-m", "-1"])
+    assert ended.value.code == 2
+    assert "gate_m" in capsys.readouterr().err
+    video = tmp_path / "v.mp4"
+    video.write_bytes(b"mine")
+    assert_refused(["draw", run, "--video", str(video)], small_run, "--force", capsys)
+    assert video.read_bytes() == b"mine"
+    (small_run / "s.cam").unlink()
+    assert_refused(["draw", run, "-o", out], small_run, "--camera", capsys)
+
+
+def test_an_image_that_cannot_be_read_costs_its_frame(
+    small_run: Path, tmp_path: Path, capsys: Captured
+) -> None:
+    assert main(["circles", str(small_run)]) == 0
+    (small_run / "images" / "s.0001.png").write_bytes(b"no image")
+    capsys.readouterr()
+    assert main(["draw", str(small_run), "-o", str(tmp_path / "d")]) == 3
+    assert "s.0001.png" in capsys.readouterr().err
+    assert sorted(p.name for p in (tmp_path / "d").iterdir()) == ["s.0000.png", "s.0002.png"]

@@ -1,0 +1,335 @@
+"""The report's figures against truth made by hand, and its page: self-contained and escaped."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from detect.cli import main
+from detect.comparison.circles import compare_runs
+from detect.comparison.lines import compare_line_frames
+from detect.comparison.lines_result import LineCompareOptions
+from detect.comparison.result import CompareOptions
+from detect.drawing.head import read_head
+from detect.line_settings import PUBLISHED as PUBLISHED_LINES
+from detect.report.figures import binned
+from detect.report.statistics import (
+    FramePair,
+    disc_rates,
+    disc_residuals,
+    line_rates,
+    line_residuals,
+    normality,
+)
+from landmarks import CircleLandmark, Frame, LineLandmark, Step
+from tests.detect.test_cli import assert_refused
+
+Captured = pytest.CaptureFixture[str]
+
+GATE = CompareOptions(gate_m=0.1)
+LINE_GATE = LineCompareOptions(tolerance_deg=0.5, sigmas=2.0)
+
+
+def disc(x: float, y: float, quality: float = 0.9) -> CircleLandmark:
+    return CircleLandmark(x, y, quality, 4e-4, 1e-4, 9e-4, (-1,))
+
+
+def line(alpha: float, sigma: float) -> LineLandmark:
+    return LineLandmark(0.0, -0.5, 0.0, 0.2, alpha, 0.0, 0.0, sigma, (-1,))
+
+
+# -- rates over thresholds --------------------------------------------------------------------
+
+
+def test_rates_of_a_case_made_by_hand() -> None:
+    frames = [
+        # Both rows fit the first disc; the better one takes it until the threshold is above it.
+        FramePair(
+            [disc(0.0, -1.0), disc(1.0, -1.0)],
+            [disc(0.01, -1.0, 0.5), disc(0.05, -1.0, 0.8), disc(2.0, -2.0, 0.7)],
+        ),
+        FramePair([disc(0.0, -3.0)], [disc(0.0, -3.02, 0.95)]),
+        FramePair([], [disc(0.5, -1.5, 0.6)]),
+    ]
+    curve = disc_rates(frames, GATE, [0.4, 0.55, 0.65, 0.75, 0.9, 0.99])
+    assert curve.kept.tolist() == [5, 4, 3, 2, 1, 0]
+    np.testing.assert_allclose(curve.recall, [2 / 3, 2 / 3, 2 / 3, 2 / 3, 1 / 3, 0.0])
+    np.testing.assert_allclose(curve.precision, [2 / 5, 2 / 4, 2 / 3, 1.0, 1.0, np.nan])
+
+
+def test_rates_of_verticals_count_joined_ones_as_comparing_does() -> None:
+    wanted = [line(0.0, 0.001), line(0.004, 0.001), line(0.5, 0.001), line(-0.5, 0.001)]
+    found = [line(0.001, 0.01), line(0.502, 0.002), line(1.0, 0.004)]
+    curve = line_rates([FramePair(wanted, found)], LINE_GATE, [0.003, 0.005, 0.02])
+    # The wide one stands for both lines that it covers.
+    np.testing.assert_allclose(curve.recall, [1 / 4, 1 / 4, 3 / 4])
+    np.testing.assert_allclose(curve.precision, [1.0, 1 / 2, 2 / 3])
+    step = Step("a", *[0.0] * 9)
+    result = compare_line_frames(
+        [Frame(step, tuple(wanted))], [Frame(step, tuple(found))], LINE_GATE
+    )
+    assert (result.recall, result.precision) == (curve.recall[-1], curve.precision[-1])
+
+
+def test_without_rows_there_are_no_rates() -> None:
+    curve = disc_rates([FramePair([], [])], GATE, [0.5])
+    assert np.isnan(curve.recall).all()
+    assert np.isnan(curve.precision).all()
+
+
+# -- residuals --------------------------------------------------------------------------------
+
+
+def test_whitened_residuals_are_the_mahalanobis_distance() -> None:
+    residuals = disc_residuals([FramePair([disc(0.3, -1.0)], [disc(0.32, -1.05)])], GATE)
+    covariance = np.array([[4e-4, 1e-4], [1e-4, 9e-4]])
+    offset = np.array([0.02, -0.05])
+    np.testing.assert_allclose(
+        (residuals.whitened**2).sum(), offset @ np.linalg.solve(covariance, offset)
+    )
+    np.testing.assert_allclose(residuals.error, np.hypot(*offset))
+    np.testing.assert_allclose(residuals.distance_m, np.hypot(0.3, 1.0))
+    # To the left of forward is positive.
+    np.testing.assert_allclose(residuals.bearing_rad, np.arctan2(0.3, 1.0))
+
+
+def test_errors_drawn_from_the_covariance_are_standard_normal() -> None:
+    rng = np.random.default_rng(5)
+    factor = np.linalg.cholesky(np.array([[4e-4, 1e-4], [1e-4, 9e-4]]))
+    frames = []
+    for _ in range(2000):
+        dx, dy = factor @ rng.standard_normal(2)
+        frames.append(FramePair([disc(0.0, -2.0)], [disc(dx, -2.0 + dy)]))
+    residuals = disc_residuals(frames, CompareOptions(gate_m=1.0))
+    figures = normality(residuals.whitened)
+    assert figures is not None
+    assert figures.count == 4000
+    # Four standard deviations of these figures.
+    assert abs(figures.mean) < 4.0 / np.sqrt(4000)
+    assert abs(figures.deviation - 1.0) < 4.0 / np.sqrt(8000)
+    assert figures.within == pytest.approx((0.683, 0.954, 0.997), abs=0.03)
+
+
+def test_residuals_of_bearings_are_wrapped_and_need_a_sigma() -> None:
+    frames = [
+        FramePair([line(3.141, 0.01)], [line(-3.141, 0.002)]),
+        FramePair([line(0.1, 0.01)], [line(0.101, 0.0)]),
+    ]
+    residuals = line_residuals(frames, LINE_GATE)
+    np.testing.assert_allclose(residuals.error, [2 * np.pi - 6.282, 0.001], atol=1e-12)
+    np.testing.assert_allclose(residuals.whitened, [(2 * np.pi - 6.282) / 0.002])
+    assert normality(residuals.whitened[:0]) is None
+
+
+def test_bins_are_of_equally_many() -> None:
+    at = np.arange(80.0)
+    middle, median, most = binned(at, 2.0 * at)
+    assert len(middle) == 10
+    np.testing.assert_allclose(median, 2.0 * middle)
+    np.testing.assert_allclose(
+        most, [np.quantile(2.0 * at[k : k + 8], 0.95) for k in range(0, 80, 8)]
+    )
+    assert len(binned(np.zeros(0), np.zeros(0))[0]) == 0
+
+
+def test_settings_of_verticals_are_read_back(small_run: Path) -> None:
+    assert main(["lines", str(small_run), "--preset", "published", "--least-rows", "31"]) == 0
+    settings = read_head(small_run / "detected.lines").line_settings
+    assert settings.least_rows == 31
+    assert settings.largest_shift_px == PUBLISHED_LINES.largest_shift_px
+    assert settings.refine_steps_px == ()
+    assert main(["lines", str(small_run), "--force"]) == 0
+    assert read_head(small_run / "detected.lines").line_settings == type(settings)()
+
+
+# -- the page ---------------------------------------------------------------------------------
+
+
+class Page(HTMLParser):
+    """What a browser would make of a page: its elements, balanced."""
+
+    VOID = ("meta", "img", "br", "link")
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.elements: list[tuple[str, dict[str, str | None]]] = []
+        self.words: list[str] = []
+        self._open: list[str] = []
+        self.feed(text)
+        self.close()
+        assert self._open == []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.elements.append((tag, dict(attrs)))
+        if tag not in self.VOID:
+            self._open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self._open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.words.append(data)
+
+    def of(self, tag: str) -> list[dict[str, str | None]]:
+        return [attributes for name, attributes in self.elements if name == tag]
+
+
+def assert_self_contained(page: Page, text: str) -> None:
+    assert not {tag for tag, _ in page.elements} & {"script", "link", "iframe", "object", "form"}
+    for _, attributes in page.elements:
+        assert not any(name.startswith("on") for name in attributes)
+    for image in page.of("img"):
+        assert (image["src"] or "").startswith("data:image/")
+        assert image["alt"]
+    assert "url(" not in text
+    links = {attributes["href"] for attributes in page.of("a")}
+    ids = {attributes["id"] for _, attributes in page.elements if "id" in attributes}
+    assert all((link or "").removeprefix("#") in ids for link in links)
+    # What scrolls by itself can be reached by keyboard.
+    for attributes in page.of("div"):
+        if attributes.get("class") == "wide":
+            assert attributes["tabindex"] == "0"
+            assert attributes["aria-label"]
+
+
+def reported(small_run: Path, page: Path, *flags: str) -> Page:
+    assert main(["report", str(small_run), "-o", str(page), *flags]) == 0
+    text = page.read_text()
+    parsed = Page(text)
+    assert_self_contained(parsed, text)
+    return parsed
+
+
+@pytest.fixture
+def judged_run(small_run: Path) -> Path:
+    """The small run with everything detected, and reference rows of which one is not seen."""
+    assert main(["all", str(small_run)]) == 0
+    (small_run / "map.circles").write_text(
+        "STEP s.0000 0 0 0 0 0 0 0 0 0\n"
+        "LANDMARK_C 0.1 -1.2 0.9 1e-4 0 1e-4 1\nLANDMARK_C -0.5 -1.9 0.9 1e-4 0 1e-4 2\n"
+        "STEP s.0001 0 0 0 0 0 0 0 0 0\nLANDMARK_C 1.0 -1.5 0.9 1e-4 0 1e-4 3\n"
+    )
+    return small_run
+
+
+def test_page_states_what_comparing_does(judged_run: Path, tmp_path: Path) -> None:
+    page = reported(judged_run, tmp_path / "r.html")
+    words = " ".join(" ".join(page.words).split())
+    expected = compare_runs(judged_run)
+    assert (expected.matched, expected.missed, expected.extra) == (2, 1, 1)
+    assert f"recall {expected.recall:.4f}" in words
+    assert f"precision {expected.precision:.4f}" in words
+    assert "reference rows 3 detected rows 3 matched within 0.1 m 2 missed 1 extra 1" in words
+    assert "s.0001 0 1 1 -" in words
+    assert "radius_m 0.1" in words
+    first = (tmp_path / "r.html").read_bytes()
+    reported(judged_run, tmp_path / "r.html", "--force")
+    assert (tmp_path / "r.html").read_bytes() == first
+
+
+def test_page_without_reference_shows_some_frames(small_run: Path, tmp_path: Path) -> None:
+    assert main(["circles", str(small_run), "--threshold", "0.5"]) == 0
+    page = reported(small_run, tmp_path / "r.html")
+    words = " ".join(" ".join(page.words).split())
+    assert "No reference rows" in words
+    assert "Frame s.0002 (no reference rows)" in words
+    changed = [attributes for attributes in page.of("tr") if attributes.get("class") == "changed"]
+    assert len(changed) == 1
+    assert "threshold 0.5 0.4" in words
+
+
+def test_timing_is_measured_if_asked_for(judged_run: Path, tmp_path: Path) -> None:
+    page = reported(judged_run, tmp_path / "r.html", "--time-frames", "2")
+    words = " ".join(" ".join(page.words).split())
+    found = re.search(r"detecting discs and verticals (\d+\.\d+) (\d+\.\d+)", words)
+    assert found is not None
+    assert "medians of 2 frames" in words
+
+
+HOSTILE = "<script>document.title='in'</script><img/src=x/onerror=alert(2)>\"'&amp;{{7*7}}"
+
+
+@pytest.fixture
+def hostile_run(small_run: Path, tmp_path: Path) -> tuple[Path, str]:
+    """A run whose every name and line is hostile, and its frame's name."""
+    name = HOSTILE.replace("/", "")
+    step = f"STEP {name} 0 0 0 0 0 0 0 0 0\n"
+    (small_run / "s.txt").write_bytes(step.encode() + b"STEP x\xff\x01y 0 0 0 0 0 0 0 0 0\n")
+    row = "LANDMARK_C 0.1 -1.2 0.9 1e-4 0 1e-4 1\n"
+    head = f"# </style>{HOSTILE}\n# settings radius_m=0.1 {HOSTILE}={HOSTILE}\n"
+    (small_run / "detected.circles").write_text(head + step + row)
+    (small_run / "map.circles").write_text(step + row + row.replace("0.1", "0.9"))
+    # An image of such a name, so that it is in captions and alternative texts as well.
+    shutil.copy(small_run / "images" / "s.0000.png", small_run / "images" / f"{name}.png")
+    return Path(shutil.copytree(small_run, tmp_path / "<b>&run")), name
+
+
+def test_everything_from_files_is_escaped(hostile_run: tuple[Path, str], tmp_path: Path) -> None:
+    folder, name = hostile_run
+    page = reported(folder, tmp_path / "r.html")
+    assert not page.of("b")
+    words = " ".join(page.words)
+    assert "<b>&run" in words
+    assert f"Frame {name} (number 1 of discs)" in words
+    assert any(name in (image["alt"] or "") for image in page.of("img"))
+    assert f"</style>{HOSTILE}" in words
+    assert "49" not in re.findall(r"\{*49\}*", words)
+    assert not re.search(r"[\x00-\x08\x0b-\x1f\x7f]", words)
+
+
+def in_browser(page: Path, folder: Path) -> tuple[str, str]:
+    """What a browser made of a page, and what it said."""
+    browser = shutil.which("chromium") or shutil.which("google-chrome")
+    if browser is None:
+        pytest.skip("no Chromium on this machine")
+    flags = ("--headless", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr", "--v=0")
+    shown = subprocess.run(
+        [browser, *flags, f"--user-data-dir={folder}", "--dump-dom", page.as_uri()],
+        capture_output=True, text=True, timeout=120, check=True,
+    )  # fmt: skip
+    return shown.stdout, shown.stderr
+
+
+@pytest.mark.long
+def test_nothing_of_a_file_is_executed(hostile_run: tuple[Path, str], tmp_path: Path) -> None:
+    """Not even if the browser took no notice of the page's own prohibition of scripts."""
+    reported(hostile_run[0], tmp_path / "r.html")
+    text = (tmp_path / "r.html").read_text()
+    prohibition = re.compile(r'<meta http-equiv="Content-Security-Policy"[^>]*>')
+    (tmp_path / "r.html").write_text(prohibition.sub("", text))
+    shown, _ = in_browser(tmp_path / "r.html", tmp_path / "profile")
+    assert "<title>Detections of &lt;b&gt;&amp;run</title>" in shown
+    # The same words as they are would be.
+    (tmp_path / "x.html").write_text(f"<!DOCTYPE html><title>not in</title>{HOSTILE}")
+    shown, _ = in_browser(tmp_path / "x.html", tmp_path / "profile")
+    assert "<title>in</title>" in shown
+
+
+@pytest.mark.long
+def test_browser_has_nothing_to_complain_of(judged_run: Path, tmp_path: Path) -> None:
+    reported(judged_run, tmp_path / "r.html")
+    shown, said = in_browser(tmp_path / "r.html", tmp_path / "profile")
+    assert "Effective configuration" in shown
+    assert "CONSOLE" not in said
+
+
+def test_refusals(judged_run: Path, tmp_path: Path, capsys: Captured) -> None:
+    run, page = str(judged_run), tmp_path / "r.html"
+    report = ["report", run, "-o", str(page)]
+    capsys.readouterr()
+    assert_refused([*report, "--worst", "-1"], judged_run, "worst", capsys)
+    assert_refused([*report, "--time-frames", "-1"], judged_run, "time_frames", capsys)
+    assert_refused([*report, "--reference", "no.circles"], judged_run, "no.circles", capsys)
+    assert_refused([*report, "--rows", str(tmp_path)], judged_run, "detect all", capsys)
+    page.write_bytes(b"mine")
+    assert_refused(report, judged_run, "--force", capsys)
+    assert page.read_bytes() == b"mine"
+    (judged_run / "detected.circles").write_text("STEP s.0000 0\n")
+    assert_refused([*report, "--force"], judged_run, "detected.circles", capsys)
+    assert page.read_bytes() == b"mine"

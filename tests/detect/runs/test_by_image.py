@@ -1,0 +1,72 @@
+"""Files looked into image by image: what reading them whole says."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from detect.runs.by_image import LinesByImage, TiltsByImage
+from landmarks import LandmarkFileError, read_frames, read_tilts
+
+LINES = """\
+# IDs by hand
+STEP k.0001  0.1 0 0 1 0 1 0 0 1
+LANDMARK_L 0 -0.6 0 0.3 0.25 0 0 0.003 7
+
+STEP images/k.0000.jpg  0.1 0 0 1 0 1 0 0 1
+STEP k.0002  0.1 0 0 1 0 1 0 0 1
+LANDMARK_L 0 -0.6 0 0.3 \\
+  0.5 0 0 0.003 8 9
+LANDMARK_L 0 -0.6 0 0.3 0.75 0 0 0.003 -1
+STEP k.0003  0.1 0 0 1 0 1 0 0 1
+LANDMARK_L 0 -0.6 0 0.3 1.25 0 0 0.003 3
+STEP k.0003  0.1 0 0 1 0 1 0 0 1
+LANDMARK_L 0 -0.6 0 0.3 1.5 0 0 0.003 4
+"""
+
+TILTS = """\
+# pitch and roll
+TILT k.0001 0.010000 -0.020000 1e-06 2e-08 3e-06 12
+NOTILT k.0002 1
+TILT k.0000 0.030000 0.001000 4e-06 0 5e-06 3
+TILT k.0001 0.040000 0.001000 4e-06 0 5e-06 4
+"""
+
+
+@pytest.mark.parametrize("line_end", ["\n", "\r\n"])
+@pytest.mark.parametrize("mark", [b"", b"\xef\xbb\xbf"])
+def test_lines_are_those_of_the_frame(tmp_path: Path, line_end: str, mark: bytes) -> None:
+    path = tmp_path / "k.lines"
+    path.write_bytes(mark + LINES.replace("\n", line_end).encode())
+    found = LinesByImage(path)
+    for frame in list(read_frames(path))[:3]:
+        assert tuple(found.get(frame.step.prefix) or ()) == frame.lines
+    (line,) = found.get("k.0001.png") or ()
+    assert (line.alpha, line.ids) == (0.25, (7,))
+    assert [line.ids for line in found.get("k.0002") or ()] == [(8, 9), (-1,)]
+    assert found.get("k.0000") == ()
+    (last,) = found.get("k.0003") or ()
+    assert last.ids == (4,)
+    assert found.get("k.0004") is None
+
+
+def test_tilts_are_those_of_the_whole_file(tmp_path: Path) -> None:
+    path = tmp_path / "k.tilt"
+    path.write_text(TILTS)
+    whole, found = read_tilts(path), TiltsByImage(path)
+    assert sorted(whole) == ["k.0000", "k.0001"]
+    for prefix in ("k.0000", "k.0001", "k.0002", "k.0003"):
+        assert found.get(prefix) == whole.get(prefix)
+
+
+def test_malformed_files_are_named(tmp_path: Path) -> None:
+    path = tmp_path / "k"
+    path.write_text(TILTS + "TILT k.0005 0.1\n")
+    with pytest.raises(LandmarkFileError, match="k:6: "):
+        TiltsByImage(path)
+    path.write_text(LINES + "LANDMARK_L 0 0\n")
+    with pytest.raises(LandmarkFileError, match="k:14: "):
+        LinesByImage(path)
+    with pytest.raises(LandmarkFileError, match="no such"):
+        LinesByImage(tmp_path / "none")

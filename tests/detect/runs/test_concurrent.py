@@ -1,0 +1,192 @@
+"""Runs at the same time, on the same folder and with the same caches; runs one after the other."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from detect.cli import main
+from tests.detect.forked_runs import StopAfter, forked_runs
+from tools.soak.long_run import link_run
+from tools.soak.short_runs import repeat_short_runs
+
+PATIENCE_S = 400.0
+FRAMES = 16
+LONG_FRAMES = 80
+
+pytestmark = [
+    pytest.mark.long,
+    pytest.mark.skipif(sys.platform == "win32", reason="files are locked as Unix does"),
+]
+
+
+@pytest.fixture(scope="module")
+def run_folder(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    source, run = project_root / "images" / "e", tmp_path_factory.mktemp("run") / "e"
+    (run / "images").mkdir(parents=True)
+    shutil.copy(source / "e.cam", run)
+    for number in range(FRAMES):
+        image = source / "images" / f"e.{number % 8:04d}.jpg"
+        shutil.copy(image, run / "images" / f"e.{number:04d}.jpg")
+    return run
+
+
+@pytest.fixture(scope="module")
+def long_run(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Long enough for others to be at work meanwhile."""
+    folder = tmp_path_factory.mktemp("long") / "s"
+    return link_run(project_root / "images" / "e", folder, LONG_FRAMES)
+
+
+def started(arguments: list[str], **environment: str) -> subprocess.Popen[str]:
+    root = Path(__file__).resolve().parents[3]
+    return subprocess.Popen(
+        [sys.executable, "-m", "detect", *arguments],
+        cwd=root,
+        env={**os.environ, "PYTHONPATH": str(root), **environment},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def ended(process: subprocess.Popen[str]) -> tuple[int, str]:
+    _, said = process.communicate(timeout=PATIENCE_S)
+    return process.returncode, said
+
+
+def results(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in sorted(folder.iterdir()) if path.is_file()}
+
+
+def folder_of(path: Path) -> Path:
+    path.mkdir()
+    return path
+
+
+def wait_until(condition: Callable[[], bool], process: subprocess.Popen[str]) -> None:
+    end = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert process.poll() is None
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
+def parts_in(output: Path) -> set[str]:
+    return {path.name for path in output.glob(".*.part")}
+
+
+def assert_one_run_wrote_all(folder: Path) -> None:
+    """Every file is the one that the log names by its hash."""
+    log = json.loads((folder / "detected.log.json").read_text())
+    assert len(log["outputs"]) == 3
+    for file in log["outputs"]:
+        content = (folder / file["name"]).read_bytes()
+        assert hashlib.sha256(content).hexdigest() == file["sha256"]
+
+
+def test_different_commands_on_one_folder(run_folder: Path, tmp_path: Path) -> None:
+    """Cold tables, filled by all of them at once."""
+    kinds = ("circles", "lines", "markers")
+    alone, together = folder_of(tmp_path / "alone"), folder_of(tmp_path / "together")
+    for kind in kinds:
+        assert main([kind, str(run_folder), "-o", str(alone / f"rows.{kind}")]) == 0
+    cold = {"REDETECT_CACHE": str(tmp_path / "tables")}
+    processes = [
+        started([kind, str(run_folder), "-o", str(together / f"rows.{kind}")], **cold)
+        for kind in kinds
+    ]
+    for process in processes:
+        code, said = ended(process)
+        assert code == 0, said
+    assert results(together) == results(alone)
+    tables = [path.name for path in (tmp_path / "tables").iterdir()]
+    assert len(tables) == 2
+    assert all(name.endswith(".table") for name in tables)
+
+
+def test_the_same_command_twice_is_refused(run_folder: Path, tmp_path: Path) -> None:
+    output = folder_of(tmp_path / "output")
+    arguments = ["all", str(run_folder), "-o", str(output)]
+    with (
+        forked_runs(run_folder, folder_of(tmp_path / "forked")) as runs,
+        runs.started(arguments, StopAfter(FRAMES // 2)) as first,
+    ):
+        first.wait_until_stopped()
+        others = [started(arguments), started([*arguments, "--resume"])]
+        for code, said in map(ended, others):
+            assert code == 1, said
+            *_, line = said.splitlines()
+            journal = output / ".detected.journal"
+            assert line.startswith(f"error: {journal}: another run is writing")
+        first.go_on()
+        assert first.wait() == 0, first.said()
+    assert_one_run_wrote_all(output)
+    assert len(results(output)) == 4
+
+
+def test_of_two_runs_that_may_overwrite_one_is_the_last(
+    run_folder: Path, long_run: Path, tmp_path: Path
+) -> None:
+    """With other settings each, so that a mixture would be seen."""
+    output = folder_of(tmp_path / "output")
+    arguments = ["all", str(long_run), "-o", str(output), "--force"]
+    with (
+        forked_runs(run_folder, folder_of(tmp_path / "forked")) as runs,
+        runs.started(arguments, StopAfter(LONG_FRAMES // 10)) as first,
+    ):
+        first.wait_until_stopped()
+        own = parts_in(output)
+        others = [
+            started([*arguments, "--circles.threshold", "0.5", "--lines.alpha", "published"])
+            for _ in range(2)
+        ]
+        wait_until(lambda: len(parts_in(output)) > len(own), others[0])
+        first.go_on()
+        assert first.wait() == 0, first.said()
+        for process in others:
+            code, said = ended(process)
+            assert code == 0, said
+    assert_one_run_wrote_all(output)
+    assert len(results(output)) == 4  # and nothing that is hidden
+
+
+def test_cold_kernels_compiled_by_two_at_once(run_folder: Path, tmp_path: Path) -> None:
+    warm, cold = folder_of(tmp_path / "warm"), folder_of(tmp_path / "cold")
+    arguments = ["circles", str(run_folder), "--preset", "published"]
+    code, said = ended(started([*arguments, "-o", str(warm / "0.circles")]))
+    assert code == 0, said
+    caches = {
+        "NUMBA_CACHE_DIR": str(tmp_path / "kernels"),
+        "REDETECT_CACHE": str(tmp_path / "tables"),
+    }
+    processes = [
+        started([*arguments, "-o", str(cold / f"{number}.circles")], **caches)
+        for number in range(2)
+    ]
+    for process in processes:
+        code, said = ended(process)
+        assert code == 0, said
+        assert "compiling kernels" in said
+    rows = (warm / "0.circles").read_bytes()
+    assert [(cold / f"{number}.circles").read_bytes() for number in range(2)] == [rows, rows]
+    code, said = ended(started([*arguments, "-o", str(cold / "2.circles")], **caches))
+    assert code == 0, said
+    assert "compiling kernels" not in said
+    assert (cold / "2.circles").read_bytes() == rows
+
+
+@pytest.mark.skipif(not Path("/dev/shm").is_dir(), reason="looks for shared memory in /dev/shm")
+def test_short_runs_leave_nothing_behind(project_root: Path, tmp_path: Path) -> None:
+    left = repeat_short_runs(project_root / "images" / "e", tmp_path, 4, 2)
+    assert left.unmet() == []
+    assert left.runs == 4

@@ -1,0 +1,203 @@
+"""Image files that are no images, or claim to be enormous: refused, with little memory taken."""
+
+from __future__ import annotations
+
+import os
+import struct
+import subprocess
+import sys
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from camera import Camera
+from detect.errors import FrameError
+from detect.run import RunFrame, read_image
+from detect.runs.image_bounds import bounded_content, demand_bounded
+from landmarks import Step
+from storage.image_header import MOST_PIXELS, claimed_size
+
+TEXTURE = np.random.default_rng(3).integers(0, 256, (48, 96)).astype(np.uint8)
+SIDE = 60_000
+
+
+def jpeg(width: int, height: int) -> bytes:
+    """A JPEG whose header claims a size that its content does not have."""
+    content = bytearray(cv2.imencode(".jpg", TEXTURE)[1].tobytes())
+    frame = content.index(b"\xff\xc0")
+    content[frame + 5 : frame + 9] = struct.pack(">HH", height, width)
+    return bytes(content)
+
+
+def png(width: int, height: int) -> bytes:
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        crc = struct.pack(">I", zlib.crc32(kind + data))
+        return struct.pack(">I", len(data)) + kind + data + crc
+
+    return (
+        b"\x89PNG\r\n\x1a\n"
+        + chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0))
+        + chunk(b"IDAT", zlib.compress(bytes(1000)))
+        + chunk(b"IEND", b"")
+    )
+
+
+def pnm(width: int, height: int) -> bytes:
+    return f"P5\n# made by hand\n{width} {height}\n255\n".encode() + bytes(1000)
+
+
+def bmp(width: int, height: int) -> bytes:
+    content = bytearray(cv2.imencode(".bmp", TEXTURE)[1].tobytes())
+    content[18:26] = struct.pack("<ii", width, -height)
+    return bytes(content)
+
+
+def tiff(width: int, height: int, order: str = "<", tile: int = 0, big: bool = False) -> bytes:
+    mark = b"II" if order == "<" else b"MM"
+    sizes = [(256, width), (257, height), *([(322, tile), (323, tile)] if tile else [])]
+    if big:
+        head = mark + struct.pack(order + "HHHQ", 43, 8, 0, 16)
+        entries = [struct.pack(order + "HHQQ", tag, 16, 1, value) for tag, value in sizes]
+        return head + struct.pack(order + "Q", len(entries)) + b"".join(entries) + bytes(100)
+    head = mark + struct.pack(order + "HI", 42, 8)
+    entries = [struct.pack(order + "HHII", tag, 4, 1, value) for tag, value in sizes]
+    return head + struct.pack(order + "H", len(entries)) + b"".join(entries) + bytes(100)
+
+
+def frame_of(path: Path) -> RunFrame:
+    return RunFrame(Step(path.stem, *[0.0] * 9), path)
+
+
+@pytest.mark.parametrize("suffix", ["jpg", "png", "bmp", "pgm", "ppm", "tif"])
+@pytest.mark.parametrize("colour", [False, True])
+def test_sizes_are_those_of_the_decoder(suffix: str, colour: bool) -> None:
+    coloured = suffix != "pgm" and (colour or suffix == "ppm")
+    image = np.dstack([TEXTURE] * 3) if coloured else TEXTURE
+    done, content = cv2.imencode(f".{suffix}", image)
+    assert done
+    assert claimed_size(content.tobytes()) == (96, 48)
+
+
+@pytest.mark.parametrize("make", [jpeg, png, pnm, bmp, tiff])
+def test_sizes_that_are_only_claimed(make: Callable[[int, int], bytes]) -> None:
+    assert claimed_size(make(SIDE, SIDE - 1)) == (SIDE, SIDE - 1)
+
+
+def test_other_tiffs() -> None:
+    assert claimed_size(tiff(700, 300, ">")) == (700, 300)
+    assert claimed_size(tiff(700, 300, "<", big=True)) == (700, 300)
+    assert claimed_size(tiff(700, 300, ">", tile=1 << 20)) == (1 << 20, 1 << 20)
+    progressive = cv2.imencode(".jpg", TEXTURE, [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])[1].tobytes()
+    assert claimed_size(progressive) == (96, 48)
+
+
+@pytest.mark.parametrize("make", [jpeg, png, pnm, bmp, tiff])
+def test_headers_that_end_too_early_claim_nothing(make: Callable[[int, int], bytes]) -> None:
+    content = make(768, 288)
+    sizes = {claimed_size(content[:length]) for length in range(len(content))}
+    assert sizes <= {None, (768, 288), (768, 0)}
+    assert None in sizes
+
+
+@pytest.mark.parametrize("make", [jpeg, png, pnm, bmp, tiff])
+def test_enormous_images_are_refused_by_their_header(
+    tmp_path: Path, published_camera: Camera, make: Callable[[int, int], bytes]
+) -> None:
+    path = tmp_path / "a.jpg"
+    path.write_bytes(make(SIDE, SIDE))
+    claim = f"cannot be decoded: claims 60000x60000 px: expected at most {MOST_PIXELS}"
+    for camera in (published_camera, None):
+        with pytest.raises(FrameError, match=claim):
+            read_image(frame_of(path), camera)
+    path.write_bytes(make(SIDE, 288))
+    with pytest.raises(FrameError, match="is 60000x288 px: expected 768x288"):
+        read_image(frame_of(path), published_camera)
+
+
+_PEAK = """
+import resource, sys
+from pathlib import Path
+from detect.errors import FrameError
+from detect.run import RunFrame, read_image
+from landmarks import Step
+import cv2
+
+def peak_kib():
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+before = peak_kib()
+for path in sys.argv[1:]:
+    for _ in range(3):
+        try:
+            read_image(RunFrame(Step("a", *[0.0] * 9), Path(path)), None)
+        except FrameError:
+            pass
+        else:
+            raise SystemExit(1)
+print(peak_kib() - before)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="counts memory in Linux's units")
+def test_enormous_images_take_no_memory(tmp_path: Path) -> None:
+    """Also those of 30,000 x 30,000 pixels, which the decoder itself would begin to decode."""
+    paths = []
+    for side in (SIDE, 30_000):
+        for make in (jpeg, png, pnm, bmp, tiff):
+            paths.append(tmp_path / f"{make.__name__}.{side}.png")
+            paths[-1].write_bytes(make(side, side))
+    done = subprocess.run(
+        [sys.executable, "-c", _PEAK, *map(str, paths)],
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[3])},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    assert int(done.stdout) < 8 * 1024  # the images claim 0.9 and 3.6 million times that
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no pipes with names")
+def test_pipes_and_devices_are_no_images(tmp_path: Path, published_camera: Camera) -> None:
+    """Nobody writes into the pipe, and the device never ends: neither is waited for."""
+    os.mkfifo(tmp_path / "pipe.png")
+    (tmp_path / "zeros.png").symlink_to("/dev/zero")
+    for name in ("pipe.png", "zeros.png"):
+        with pytest.raises(FrameError, match="cannot be read: is no file, but a pipe or a device"):
+            read_image(frame_of(tmp_path / name), published_camera)
+
+
+def test_files_larger_than_any_such_image_are_not_read(
+    tmp_path: Path, published_camera: Camera
+) -> None:
+    path = tmp_path / "a.png"
+    with path.open("wb") as stream:
+        stream.truncate(1 << 40)  # a file of nothing takes no room
+    with pytest.raises(FrameError, match="has 1099511627776 bytes: expected an image, at most"):
+        read_image(frame_of(path), published_camera)
+
+
+def test_a_folder_leaves_no_descriptor_behind(tmp_path: Path) -> None:
+    if not Path("/dev/fd").is_dir():
+        pytest.skip("counts descriptors in /dev/fd")
+    (tmp_path / "a.png").mkdir()
+    before = len(list(Path("/dev/fd").iterdir()))
+    for _ in range(20):
+        with pytest.raises(FrameError, match="Is a directory"):
+            bounded_content(tmp_path / "a.png", "a", (768, 288))
+    assert len(list(Path("/dev/fd").iterdir())) == before
+
+
+def test_an_image_that_is_to_be_turned_may_have_its_sides_exchanged() -> None:
+    demand_bounded(png(288, 768), "a", (768, 288))
+    with pytest.raises(FrameError, match="is 288x767 px: expected 768x288"):
+        demand_bounded(png(288, 767), "a", (768, 288))
+
+
+@pytest.mark.parametrize("content", [b"RIFF0000WEBPVP8 ", b"GIF89a", b"\0\0\0\x0cjP  ", b"P6 junk"])
+def test_other_kinds_are_no_images_of_a_run(content: bytes) -> None:
+    with pytest.raises(FrameError, match="cannot be decoded: expected an image"):
+        demand_bounded(content + bytes(100), "a", None)

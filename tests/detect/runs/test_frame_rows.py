@@ -1,0 +1,82 @@
+"""Rows of frames that are worked on together, and lines of their journal."""
+
+from __future__ import annotations
+
+import json
+import pickle
+import shutil
+from pathlib import Path
+
+import pytest
+
+from detect.run import RunFrame, open_run
+from detect.runs.frame import FramePlan, tables_of
+from detect.runs.frame_rows import FrameRows, FrameTask, rows_of_frames
+from detect.runs.resume_journal import Journal, JournalHead, new_journal
+from detect.settings import PUBLISHED
+from landmarks import FrameTilt
+
+FRAMES = 12
+
+
+@pytest.fixture
+def tasks_and_plan(project_root: Path, tmp_path: Path) -> tuple[list[FrameTask], FramePlan]:
+    """More frames than are decoded at once; of some there is no image."""
+    source, run = project_root / "images" / "e", tmp_path / "e"
+    (run / "images").mkdir(parents=True)
+    shutil.copy(source / "e.cam", run)
+    for number in range(FRAMES):
+        shutil.copy(source / "images" / f"e.{number:04d}.jpg", run / "images")
+    opened = open_run(run)
+    (run / "images" / "e.0003.jpg").write_bytes(b"no image")
+    (run / "images" / "e.0009.jpg").unlink()
+    return [FrameTask(frame) for frame in opened.frames], FramePlan(
+        opened.camera, circles=PUBLISHED
+    )
+
+
+def test_frames_have_the_same_rows_together_and_alone(
+    tasks_and_plan: tuple[list[FrameTask], FramePlan],
+) -> None:
+    tasks, plan = tasks_and_plan
+    together = rows_of_frames(tasks, plan, tables_of(plan))
+    assert together == [rows for t in tasks for rows in rows_of_frames([t], plan, tables_of(plan))]
+    assert [place for place, rows in enumerate(together) if rows.error is not None] == [3, 9]
+    for rows, task in zip(together, tasks):
+        assert rows.circles.startswith(f"STEP {task.frame.step.prefix} ".encode())
+        assert rows.disc_count == rows.circles.count(b"LANDMARK_C")
+
+
+def test_tasks_travel_whole(tasks_and_plan: tuple[list[FrameTask], FramePlan]) -> None:
+    tasks, _ = tasks_and_plan
+    tasks[1] = FrameTask(tasks[1].frame, FrameTilt("e.0001", 0.1, 0.2, 1e-6, 0.0, 1e-6, 7))
+    shipped = RunFrame(tasks[2].frame.step, None, b"content", 1.5, 12, "why")
+    assert pickle.loads(pickle.dumps(tasks)) == tasks
+    arrived = pickle.loads(pickle.dumps(shipped))
+    assert arrived == shipped
+    assert arrived.content == b"content"
+
+
+@pytest.mark.parametrize(
+    "rows",
+    [
+        FrameRows(disc_count=3, line_count=21, has_tilt=True),
+        FrameRows(marker_count=2, rejected=(("size", 4), ("ink", 1))),
+        FrameRows(error='"e.0003": cannot be decoded:\n expected an image \\ \udcff'),
+    ],
+)
+def test_a_journal_gives_back_what_was_noted(tmp_path: Path, rows: FrameRows) -> None:
+    place = tmp_path / ".a.journal"
+    journal = new_journal(place)
+    assert isinstance(journal, Journal)
+    journal.begin(JournalHead("program", (0, 1), overwrite=False))
+    check = journal.add("program", (120, 0), "0123456789abcdef", rows, [b"x" * 120, b""])
+    head, lines = journal.read()
+    (line,) = lines
+    assert head == JournalHead("program", (0, 1), overwrite=False)
+    assert (line.lengths, line.task, line.rows) == ((120, 0), "0123456789abcdef", rows)
+    assert line.check == check
+    # Lines that are written sooner than others are written the same way.
+    written = place.read_bytes().splitlines()[1]
+    assert json.dumps(json.loads(written), separators=(",", ":")).encode() == written
+    journal.remove()

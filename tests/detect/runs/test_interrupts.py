@@ -1,0 +1,156 @@
+"""Interrupts: also those that were swallowed or came out as something else."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from detect import commands
+from detect.cli import main
+from detect.runs.interrupts import interrupts_deferred, interrupts_noted, raise_if_interrupted
+from detect.runs.progress import progress_bar
+
+
+@pytest.mark.parametrize("other", [SystemError, ValueError, OSError])
+def test_what_an_interrupt_turned_into(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    other: type[Exception],
+) -> None:
+    def disguise(_: object) -> int:
+        try:
+            signal.raise_signal(signal.SIGINT)
+        except KeyboardInterrupt:
+            raise other("with an exception set") from None
+        return 0
+
+    monkeypatch.setattr(commands, "carry_out", disguise)
+    before = signal.getsignal(signal.SIGINT)
+    assert main(["compare", str(tmp_path)]) == 130
+    assert capsys.readouterr().err == "interrupted\n"
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_a_swallowed_interrupt_comes_back_after_the_frame(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    frames = []
+
+    def swallow(_: object) -> int:
+        with progress_bar("frames", 5) as advance:
+            for frame in range(5):
+                frames.append(frame)
+                if frame == 2:
+                    with contextlib.suppress(KeyboardInterrupt):
+                        signal.raise_signal(signal.SIGINT)
+                advance()
+        return 0
+
+    monkeypatch.setattr(commands, "carry_out", swallow)
+    assert main(["compare", str(tmp_path)]) == 130
+    assert frames == [0, 1, 2]
+    assert main(["compare", str(tmp_path)]) == 130  # the note of one run is none of the next
+    assert frames == [0, 1, 2, 0, 1, 2]
+
+
+@pytest.fixture
+def caught() -> Iterator[None]:
+    """Interrupts are raised, whatever this process was started to do with them."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+def interrupted_block(done: list[str]) -> None:
+    with interrupts_deferred():
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(0.5)  # until another thread has run and taken it
+        done.append("the block")
+
+
+def test_an_interrupt_waits_for_the_end_of_what_must_not_be_torn() -> None:
+    before = signal.getsignal(signal.SIGINT)
+    done: list[str] = []
+    with interrupts_noted() as interrupted:
+        with pytest.raises(KeyboardInterrupt):
+            interrupted_block(done)
+        assert interrupted.is_set()
+        with pytest.raises(KeyboardInterrupt):
+            raise_if_interrupted()
+    assert done == ["the block"]
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_an_interrupt_that_another_thread_takes_waits_too(caught: None) -> None:
+    begun, end = threading.Event(), threading.Event()
+
+    def wait() -> None:
+        begun.set()
+        end.wait()
+
+    other = threading.Thread(target=wait)  # does not block the interrupt, as the first one does
+    other.start()
+    begun.wait()
+    done: list[str] = []
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            interrupted_block(done)
+    finally:
+        end.set()
+        other.join()
+    assert done == ["the block"]
+
+
+def test_without_an_interrupt_nothing_is_raised() -> None:
+    before = signal.getsignal(signal.SIGINT)
+    with interrupts_deferred():
+        pass
+    with pytest.raises(ValueError, match="own"), interrupts_deferred():
+        raise ValueError("own")
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_an_ignored_interrupt_stays_ignored() -> None:
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with interrupts_deferred():
+            os.kill(os.getpid(), signal.SIGINT)
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def test_nowhere_to_keep_kernels(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What Numba says of a read-only program without a cache folder is no help to its user."""
+    from numba.core.caching import FunctionCache
+
+    def compile_one(_: object) -> int:
+        FunctionCache(compile_one)
+        return 0
+
+    monkeypatch.setattr(FunctionCache._impl_class, "_locator_classes", [])
+    monkeypatch.setattr(commands, "carry_out", compile_one)
+    assert main(["compare", str(tmp_path)]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "NUMBA_CACHE_DIR" in line
+
+
+def test_an_error_of_the_program_is_no_interrupt(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def slip(_: object) -> int:
+        raise SystemError("a slip")
+
+    monkeypatch.setattr(commands, "carry_out", slip)
+    with pytest.raises(SystemError, match="a slip"):
+        main(["compare", str(tmp_path)])

@@ -1,0 +1,93 @@
+"""Verticals over a run: rows, tilts, IDs, and what bad frames cost."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from detect.cli import main
+from detect.line_settings import LineSettings
+from detect.run import open_run
+from detect.runs.lines_run import detect_lines_run
+from detect.verticals.identity import carry_ids
+from landmarks import LineLandmark, read_frames, read_tilts
+
+
+def line(alpha: float, ids: tuple[int, ...] = (-1,), sigma: float = 0.003) -> LineLandmark:
+    return LineLandmark(0.0, -0.6, 0.0, 0.3, alpha, 0.0, 0.0, sigma, ids)
+
+
+def test_ids_go_where_there_is_no_doubt() -> None:
+    rows = (line(0.1), line(0.3, sigma=0.02), line(-1.0), line(1.0), line(1.005))
+    reference = (
+        line(0.101, (7,)),
+        line(0.28, (3,)),
+        line(0.32, (4, 5)),
+        line(1.002, (9,)),
+        line(2.0, (11,)),
+    )
+    carried = carry_ids(rows, reference)
+    assert [row.ids for row in carried] == [(7,), (3, 4, 5), (-1,), (-1,), (-1,)]
+    assert [row.alpha for row in carried] == [row.alpha for row in rows]
+
+
+@pytest.fixture
+def short_run(project_root: Path, tmp_path: Path) -> Path:
+    source, run = project_root / "images" / "e", tmp_path / "e"
+    (run / "images").mkdir(parents=True)
+    shutil.copy(source / "e.cam", run)
+    for number in range(4):
+        shutil.copy(source / "images" / f"e.{number:04d}.jpg", run / "images")
+    return run
+
+
+def test_rows_and_tilts_are_written(short_run: Path, project_root: Path, tmp_path: Path) -> None:
+    output, tilt = tmp_path / "out.lines", tmp_path / "out.tilt"
+    summary = detect_lines_run(open_run(short_run), LineSettings(), output, tilt, version="test")
+    frames = list(read_frames(output))
+    assert [frame.step.prefix for frame in frames] == [f"e.{k:04d}" for k in range(4)]
+    assert sum(len(frame.lines) for frame in frames) == summary.lines >= 20
+    tilts = read_tilts(tilt)
+    assert len(tilts) == summary.tilts == 4
+    truth = json.loads((project_root / "images" / "e" / "truth.json").read_text())
+    for frame in truth["frames"][:4]:
+        found = tilts[frame["prefix"]]
+        np.testing.assert_allclose([found.pitch, found.roll], frame["tilt"], atol=0.003)
+
+
+def test_bad_frame_costs_its_frame_only(
+    short_run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (short_run / "images" / "e.0002.jpg").write_bytes(b"not an image")
+    assert main(["lines", str(short_run)]) == 3
+    assert "e.0002.jpg" in capsys.readouterr().err
+    frames = list(read_frames(short_run / "detected.lines"))
+    assert len(frames) == 4
+    assert frames[2].lines == ()
+    assert sorted(read_tilts(short_run / "detected.tilt")) == ["e.0000", "e.0001", "e.0003"]
+
+
+def test_all_corrects_discs_for_the_tilt(short_run: Path) -> None:
+    assert main(["all", str(short_run), "--circles.polarity", "light"]) == 0
+    levelled = [f.circles for f in read_frames(short_run / "detected.circles")]
+    assert main(["circles", str(short_run), "--polarity", "light", "--force"]) == 0
+    plain = [f.circles for f in read_frames(short_run / "detected.circles")]
+    assert [len(circles) for circles in levelled] == [len(circles) for circles in plain]
+    moved = [
+        np.hypot(a.px - b.px, a.py - b.py)
+        for before, after in zip(plain, levelled)
+        for a, b in zip(before, after)
+    ]
+    assert max(moved) > 0.005
+
+
+def test_existing_outputs_are_kept(short_run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (short_run / "detected.tilt").write_text("mine")
+    assert main(["lines", str(short_run)]) == 1
+    assert "detected.tilt: exists already" in capsys.readouterr().err
+    assert (short_run / "detected.tilt").read_text() == "mine"
+    assert not (short_run / "detected.lines").exists()

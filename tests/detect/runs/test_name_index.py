@@ -1,0 +1,57 @@
+"""Names looked up: what a dictionary would say, whatever the names."""
+
+from __future__ import annotations
+
+import re
+import tempfile
+from pathlib import Path
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from detect.runs.image_names import ImageNames
+from detect.runs.name_index import NameIndex
+
+# Short alphabets make names that begin alike; long names are known by their digest.
+NAMES = st.lists(
+    st.text("ab.0\xff", max_size=6).map(str.encode) | st.binary(min_size=60, max_size=70),
+    max_size=30,
+).map(lambda names: [name.replace(b"\0", b"x") for name in names])
+
+
+@given(names=NAMES, others=NAMES)
+def test_the_last_of_equal_names_is_found(names: list[bytes], others: list[bytes]) -> None:
+    index = NameIndex(names)
+    places = {name: place for place, name in enumerate(names)}
+    assert len(index) == len(names)
+    for name in [*names, *others]:
+        assert index.find(name) == places.get(name)
+
+
+def by_value(name: str) -> tuple[list[tuple[int, str]], str]:
+    parts = re.findall(r"[0-9]+|[^0-9]+", name)
+    return [(int(p), "") if p.isdigit() else (-1, p) for p in parts], name
+
+
+FILE_NAMES = st.from_regex(r"[ab0-9][ab0-9]{0,5}\.(jpg|PNG)", fullmatch=True)
+
+
+@given(names=st.sets(FILE_NAMES, min_size=1, max_size=12))
+def test_images_are_in_natural_order(names: set[str]) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        for name in names:
+            (Path(folder) / name).touch()
+        (Path(folder) / "notes.txt").touch()
+        images = ImageNames(Path(folder))
+        found = [images.path(place).name for place in range(len(images))]
+        assert found == sorted(names, key=by_value)
+        for name in names:
+            place = images.find(name)
+            assert place is not None
+            assert images.path(place).name == name
+            of_stem = images.find(Path(name).stem)
+            assert of_stem == next(
+                k for k, n in enumerate(found) if Path(n).stem == Path(name).stem
+            )
+        assert images.find("c") is None
+        assert images.find("notes") is None

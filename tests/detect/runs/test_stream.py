@@ -1,0 +1,238 @@
+"""A run in, files out: the same bytes in one pass or two, by however many workers."""
+
+from __future__ import annotations
+
+import gc
+import json
+import shutil
+from collections.abc import Generator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from detect.line_settings import LineSettings
+from detect.run import RunFrame, open_run
+from detect.runs.all_run import detect_all_run
+from detect.runs.by_image import LinesByImage, TiltsByImage
+from detect.runs.circles_run import detect_circles_run
+from detect.runs.lines_run import detect_lines_run
+from detect.runs.stream import KEPT_FAILURES
+from detect.runs.workers import local_workers
+from detect.settings import CircleSettings
+from landmarks import read_frames
+
+LIGHT = CircleSettings(polarity="light")
+FRAMES = 7
+
+
+@pytest.fixture
+def run_folder(project_root: Path, tmp_path: Path) -> Path:
+    """Some frames of the demo run; one of them is broken, one is missing."""
+    source, run = project_root / "images" / "e", tmp_path / "e"
+    (run / "images").mkdir(parents=True)
+    shutil.copy(source / "e.cam", run)
+    steps = []
+    for number in range(FRAMES):
+        shutil.copy(source / "images" / f"e.{10 * number:04d}.jpg", run / "images")
+        steps.append(f"STEP e.{10 * number:04d} 0.25 0 0.01 1e-5 0 1e-5 0 0 1e-4\n")
+    (run / "images" / "e.0020.jpg").write_bytes(b"not an image")
+    (run / "images" / "e.0050.jpg").unlink()
+    (run / "e.txt").write_text("".join(steps))
+    return run
+
+
+def in_two_passes(run: Path, output: Path) -> None:
+    opened = open_run(run)
+    lines, tilt = output / "detected.lines", output / "detected.tilt"
+    detect_lines_run(opened, LineSettings(), lines, tilt, version="test")
+    detect_circles_run(
+        opened, LIGHT, output / "detected.circles", version="test", tilts=TiltsByImage(tilt)
+    )
+
+
+def in_one_pass(run: Path, output: Path, jobs: int) -> None:
+    summary = detect_all_run(
+        open_run(run),
+        LineSettings(),
+        LIGHT,
+        output / "detected.lines",
+        output / "detected.tilt",
+        output / "detected.circles",
+        version="test",
+        workers=local_workers(jobs),
+    )
+    assert (summary.frames, summary.failed) == (FRAMES, 2)
+    assert summary.tilts >= 4
+    assert summary.discs >= 5
+
+
+def files_in(folder: Path) -> dict[str, bytes]:
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+def folder_of(path: Path) -> Path:
+    path.mkdir()
+    return path
+
+
+def test_one_pass_writes_what_two_passes_do(run_folder: Path, tmp_path: Path) -> None:
+    once, twice = folder_of(tmp_path / "once"), folder_of(tmp_path / "twice")
+    in_two_passes(run_folder, twice)
+    in_one_pass(run_folder, once, jobs=1)
+    assert files_in(once) == files_in(twice)
+    assert sorted(files_in(once)) == ["detected.circles", "detected.lines", "detected.tilt"]
+
+
+@pytest.mark.long
+def test_processes_write_what_one_does(run_folder: Path, tmp_path: Path) -> None:
+    by_jobs = {}
+    for jobs in (1, 2, 3):
+        folder = folder_of(tmp_path / str(jobs))
+        in_one_pass(run_folder, folder, jobs)
+        by_jobs[jobs] = files_in(folder)
+    assert by_jobs[2] == by_jobs[1]
+    assert by_jobs[3] == by_jobs[1]
+
+
+def all_there_is(run: Path, output: Path, jobs: int) -> dict[str, bytes]:
+    """Every kind of file: rows, tilts, IDs carried over, JSON, drawings."""
+    opened = open_run(run)
+    pictures = {kind: folder_of(output / kind) for kind in ("discs", "lines", "tracks")}
+    detect_lines_run(
+        opened,
+        LineSettings(),
+        output / "plain.lines",
+        output / "plain.tilt",
+        version="test",
+        pictures=pictures["lines"],
+        workers=local_workers(jobs, pictures=True),
+    )
+    reference = output / "reference.lines"
+    numbered = (
+        row[:-2] + f"{number}" if row.startswith("LANDMARK_L") else row
+        for number, row in enumerate((output / "plain.lines").read_text().splitlines())
+    )
+    reference.write_text("\n".join(numbered) + "\n")
+    detect_lines_run(
+        opened,
+        LineSettings(),
+        output / "known.lines",
+        output / "known.tilt",
+        version="test",
+        reference=LinesByImage(reference),
+        pictures=pictures["tracks"],
+        drawing="tracks",
+        draw_response=True,
+        workers=local_workers(jobs, pictures=True),
+    )
+    detect_circles_run(
+        opened,
+        LIGHT,
+        output / "level.circles",
+        version="test",
+        json_output=output / "level.json",
+        tilts=TiltsByImage(output / "plain.tilt"),
+        pictures=pictures["discs"],
+        workers=local_workers(jobs, pictures=True),
+    )
+    return files_in(output)
+
+
+@pytest.mark.long
+def test_drawings_ids_and_json_are_the_same_by_any_number(run_folder: Path, tmp_path: Path) -> None:
+    one = all_there_is(run_folder, folder_of(tmp_path / "one"), 1)
+    two = all_there_is(run_folder, folder_of(tmp_path / "two"), 2)
+    assert one == two
+    drawn = [name for name in one if name.endswith(".png")]
+    assert len(drawn) == 4 * (FRAMES - 2)
+    known = [line for f in read_frames(tmp_path / "one" / "known.lines") for line in f.lines]
+    assert sum(line.ids != (-1,) for line in known) > 0.5 * len(known) > 20
+
+
+def test_json_is_what_the_library_writes(run_folder: Path, tmp_path: Path) -> None:
+    as_json = tmp_path / "rows.json"
+    detect_circles_run(
+        open_run(run_folder), LIGHT, tmp_path / "o", version="test", json_output=as_json
+    )
+    text = as_json.read_text()
+    assert text == json.dumps(json.loads(text), indent=1) + "\n"
+
+
+def test_a_run_without_frames(small_run: Path, tmp_path: Path) -> None:
+    (small_run / "s.txt").write_text("# nothing yet\n")
+    as_json = tmp_path / "rows.json"
+    summary = detect_circles_run(
+        open_run(small_run), LIGHT, tmp_path / "o", version="test", json_output=as_json
+    )
+    assert (summary.frames, summary.images_without_step) == (0, 3)
+    assert json.loads(as_json.read_text())["frames"] == []
+    assert list(read_frames(tmp_path / "o")) == []
+
+
+def test_failures_are_counted_but_not_all_kept(small_run: Path, tmp_path: Path) -> None:
+    count = 3 * KEPT_FAILURES
+    with (small_run / "s.txt").open("a") as steps:
+        for number in range(count):
+            steps.write(f"STEP none.{number} 0.25 0 0.01 1e-5 0 1e-5 0 0 1e-4\n")
+    summary = detect_circles_run(open_run(small_run), LIGHT, tmp_path / "o", version="test")
+    assert (summary.frames, summary.failed) == (count + 3, count)
+    assert len(summary.failures) == KEPT_FAILURES
+    assert summary.failures[0].startswith("none.0: no image")
+
+
+class Arriving:
+    """Frames of a run that come one by one, as those of a camera do, and who waits for them."""
+
+    why_left_out = ""
+    left_out = 0
+    expected = None
+
+    def __init__(self, frames: list[RunFrame], *, ships_images: bool) -> None:
+        self.ships_images = ships_images
+        self.frames = frames
+        self.done = 0
+        self.largest_lead = 0
+
+    def __iter__(self) -> Generator[RunFrame, None, None]:
+        for number, frame in enumerate(self.frames):
+            self.largest_lead = max(self.largest_lead, number - self.done)
+            yield frame
+
+    def advance(self) -> None:
+        self.done += 1
+
+
+@pytest.mark.parametrize("ships_images", [True, False])
+def test_only_files_are_asked_for_ahead(
+    run_folder: Path, tmp_path: Path, ships_images: bool
+) -> None:
+    opened = open_run(run_folder)
+    frames = Arriving([*opened.frames] * 5, ships_images=ships_images)
+    run = replace(opened, frames=frames)
+    summary = detect_circles_run(
+        run, LIGHT, tmp_path / "a.circles", version="test", on_progress=frames.advance
+    )
+    assert summary.frames == frames.done == 5 * FRAMES
+    if ships_images:
+        assert frames.largest_lead == 0
+    else:
+        assert 0 < frames.largest_lead < 32
+
+
+def test_what_was_there_is_collected_again_after_a_run(run_folder: Path, tmp_path: Path) -> None:
+    assert gc.get_freeze_count() == 0
+    during = []
+    detect_circles_run(
+        open_run(run_folder),
+        LIGHT,
+        tmp_path / "a.circles",
+        version="test",
+        on_progress=lambda: during.append(gc.get_freeze_count()),
+    )
+    assert min(during) > 0
+    assert gc.get_freeze_count() == 0

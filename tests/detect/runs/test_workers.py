@@ -1,0 +1,259 @@
+"""Processes and machines that share the work: killed, interrupted, missing."""
+
+from __future__ import annotations
+
+import builtins
+import multiprocessing
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from detect.cli import main
+from detect.errors import WorkerError
+from detect.line_settings import LineSettings
+from detect.run import open_run
+from detect.runs.all_run import detect_all_run
+from detect.runs.dispatch import Workers
+from detect.runs.workers import FRAMES_PER_PROCESS, cluster_workers, default_jobs, local_workers
+from detect.settings import CircleSettings
+
+KINDS = ("lines", "tilt", "circles")
+FRAMES = 48
+PATIENCE_S = 120.0
+
+
+@pytest.fixture
+def run_folder(project_root: Path, tmp_path: Path) -> Path:
+    """Long enough to be disturbed: frames of the demo run, over and over."""
+    source, run = project_root / "images" / "e", tmp_path / "e"
+    (run / "images").mkdir(parents=True)
+    shutil.copy(source / "e.cam", run)
+    # Links that lead out of a run are refused.
+    (run / "few").mkdir()
+    for number in range(8):
+        shutil.copy(source / "images" / f"e.{number:04d}.jpg", run / "few")
+    for number in range(FRAMES):
+        image = run / "few" / f"e.{number % 8:04d}.jpg"
+        (run / "images" / f"e.{number:04d}.jpg").symlink_to(image)
+    return run
+
+
+def detected(
+    run: Path, output: Path, workers: Workers, on_progress: Callable[[], None] | None = None
+) -> list[bytes]:
+    output.mkdir()
+    lines, tilt, circles = (output / f"detected.{kind}" for kind in KINDS)
+    summary = detect_all_run(
+        open_run(run),
+        LineSettings(),
+        CircleSettings(polarity="light"),
+        lines,
+        tilt,
+        circles,
+        version="test",
+        workers=workers,
+        on_progress=on_progress,
+    )
+    assert (summary.frames, summary.failures) == (FRAMES, [])
+    return [path.read_bytes() for path in (lines, tilt, circles)]
+
+
+def at_frame(number: int, act: Callable[[], None]) -> Callable[[], None]:
+    """A progress callback that acts once, so many frames into the run."""
+    seen = [0]
+
+    def tick() -> None:
+        seen[0] += 1
+        if seen[0] == number:
+            act()
+
+    return tick
+
+
+def test_as_many_processes_as_are_worth_it() -> None:
+    assert default_jobs(1) == default_jobs(2 * FRAMES_PER_PROCESS - 1) == 1
+    assert 1 <= default_jobs(10**6) <= (os.cpu_count() or 1)
+
+
+def test_no_workers_are_refused() -> None:
+    with pytest.raises(WorkerError, match="jobs is 0: expected 1 or more"):
+        local_workers(0)
+
+
+@pytest.mark.long
+def test_a_killed_process_costs_nothing(run_folder: Path, tmp_path: Path) -> None:
+    expected = detected(run_folder, tmp_path / "one", local_workers(1))
+    killed: list[int | None] = []
+
+    def kill() -> None:
+        victim = multiprocessing.active_children()[0]
+        victim.kill()
+        killed.append(victim.pid)
+
+    found = detected(run_folder, tmp_path / "two", local_workers(2), at_frame(20, kill))
+    assert len(killed) == 1
+    assert found == expected
+    assert multiprocessing.active_children() == []
+
+
+# -- interrupts -----------------------------------------------------------------------------
+
+
+def processes_with(environment: str) -> list[int]:
+    """Processes that have a variable in their environment."""
+    found = []
+    for folder in Path("/proc").iterdir():
+        if folder.name.isdigit() and int(folder.name) != os.getpid():
+            try:
+                content = (folder / "environ").read_bytes()
+            except OSError:
+                continue
+            if environment.encode() in content.split(b"\0"):
+                found.append(int(folder.name))
+    return found
+
+
+def wait_until(condition: Callable[[], bool], what: str) -> None:
+    end = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < end, f"waited in vain for {what}"
+        time.sleep(0.05)
+
+
+@contextmanager
+def started(run: Path, jobs: int, mark: str) -> Iterator[subprocess.Popen[str]]:
+    """`detect all` at work in a process group of its own, as a shell starts it."""
+    name, value = mark.split("=")
+    root = Path(__file__).resolve().parents[3]
+    with subprocess.Popen(
+        [sys.executable, "-m", "detect", "all", str(run), "--jobs", str(jobs)],
+        cwd=root,
+        env={**os.environ, name: value},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    ) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+@pytest.mark.long
+@pytest.mark.skipif(not Path("/proc").is_dir(), reason="looks for processes in /proc")
+@pytest.mark.parametrize(("jobs", "delay_s"), [(1, 0.3), (1, 1.0), (2, 0.3), (2, 1.0), (2, 2.5)])
+def test_an_interrupt_ends_everything(run_folder: Path, jobs: int, delay_s: float) -> None:
+    """Control-C reaches the whole group of processes, at whatever they are."""
+    mark = f"REDETECT_TEST={run_folder}"
+    shutil.rmtree(run_folder / "images")
+    (run_folder / "images").mkdir()
+    source = run_folder / "few" / "e.0000.jpg"
+    for number in range(2000):
+        (run_folder / "images" / f"e.{number:04d}.jpg").symlink_to(source)
+    before = sorted(path.name for path in run_folder.iterdir())
+    with started(run_folder, jobs, mark) as process:
+        wait_until(lambda: bool(list(run_folder.glob(".*.part"))), "the run to begin")
+        time.sleep(delay_s)
+        os.killpg(process.pid, signal.SIGINT)
+        out, err = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == 130, err
+    assert out == ""
+    assert err.splitlines()[-1] == "interrupted"
+    assert "Traceback" not in err
+    left = {path.name for path in run_folder.iterdir()} - set(before)
+    kept = {f".detected.{kind}.part" for kind in (*KINDS, "log.json")} | {".detected.journal"}
+    assert left in (set(), kept)  # whether a frame was done: `--resume` goes on after it
+    assert ("--resume" in err) == bool(left)
+    wait_until(lambda: not processes_with(mark), "its processes to end")
+
+
+@pytest.mark.long
+@pytest.mark.skipif(not Path("/proc").is_dir(), reason="looks for processes in /proc")
+def test_processes_end_with_the_one_that_started_them(run_folder: Path) -> None:
+    mark = f"REDETECT_TEST={run_folder}"
+    with started(run_folder, 2, mark) as process:
+        wait_until(lambda: len(processes_with(mark)) >= 3, "the workers")
+        process.kill()
+    wait_until(lambda: not processes_with(mark), "its processes to end")
+
+
+# -- a cluster ------------------------------------------------------------------------------
+
+
+@contextmanager
+def cluster(folder: Path, workers: int) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]]]:
+    """A scheduler and workers, each a process of its own; yields address and workers."""
+    root = Path(__file__).resolve().parents[3]
+    environment = {**os.environ, "PYTHONPATH": str(root)}
+    contact = folder / "scheduler.json"
+    quiet: dict[str, Any] = {"cwd": folder, "env": environment, "stderr": subprocess.DEVNULL}
+    dask = [sys.executable, "-m", "dask"]
+    local = ["--host", "127.0.0.1", "--no-dashboard", "--scheduler-file", str(contact)]
+    processes = [subprocess.Popen([*dask, "scheduler", "--port", "0", *local], **quiet)]
+    try:
+        for _ in range(workers):
+            alone = ["--nthreads", "1", "--no-nanny", "--local-directory", str(folder)]
+            processes.append(subprocess.Popen([*dask, "worker", *local, *alone], **quiet))
+        wait_until(contact.is_file, "the scheduler")
+        import json
+
+        yield json.loads(contact.read_text())["address"], processes[1:]
+    finally:
+        for process in reversed(processes):
+            process.kill()
+            process.wait()
+
+
+@pytest.mark.long
+def test_a_cluster_writes_what_one_process_does(run_folder: Path, tmp_path: Path) -> None:
+    """Also when one of its workers is killed half-way."""
+    pytest.importorskip("distributed")
+    expected = detected(run_folder, tmp_path / "one", local_workers(1))
+    with cluster(tmp_path, workers=2) as (address, workers):
+        kill = at_frame(FRAMES // 2, workers[0].kill)
+        found = detected(run_folder, tmp_path / "cluster", cluster_workers(address), kill)
+        assert workers[0].wait(PATIENCE_S) == -signal.SIGKILL
+        assert workers[1].poll() is None
+    assert found == expected
+
+
+def test_a_missing_package_is_named(
+    small_run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    real = builtins.__import__
+
+    def without(name: str, *arguments: Any, **named: Any) -> Any:
+        if name == "distributed":
+            raise ImportError(name)
+        return real(name, *arguments, **named)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    assert main(["circles", str(small_run), "--cluster", "tcp://127.0.0.1:1"]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "pip install 'redetect[cluster]'" in line
+    assert not (small_run / "detected.circles").exists()
+
+
+@pytest.mark.parametrize("address", ["nonsense", "localhost:8786", "tcp://localhost", ":::"])
+def test_malformed_addresses(
+    small_run: Path, capsys: pytest.CaptureFixture[str], address: str
+) -> None:
+    assert main(["lines", str(small_run), "--cluster", address]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"cluster is {address!r}: expected the scheduler's tcp://host:port" in line
+
+
+def test_jobs_or_a_cluster(small_run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["all", str(small_run), "--jobs", "2", "--cluster", "tcp://127.0.0.1:1"]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "--jobs and --cluster: expected one of them" in line

@@ -1,0 +1,237 @@
+"""Grids of parameters, their curve and its knee, and the command that tries them."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from detect.cli import main
+from detect.comparison.circles import compare_runs
+from detect.errors import DetectError
+from detect.line_settings import LineSettings
+from detect.settings import CircleSettings
+from detect.tune.curve import f1_score, knee, pareto_front
+from detect.tune.grid import combinations, parameter_values, settings_with
+from detect.tune.run import Trial
+from detect.tune.table import curve_picture, trial_records
+from tests.detect.conftest import SMALL_RUN_DISCS
+from tests.detect.test_cli import assert_refused
+
+Captured = pytest.CaptureFixture[str]
+
+
+# -- curve and knee ---------------------------------------------------------------------------
+
+# Recall, precision; the last three are beaten by others.
+CURVE = [(0.50, 1.0), (0.90, 0.95), (0.95, 0.70), (1.0, 0.4), (0.90, 0.94), (0.4, 0.99), (0.6, 0.5)]
+
+
+def test_front_and_knee_of_a_curve_made_by_hand() -> None:
+    recall, precision = np.array(CURVE).T
+    assert pareto_front(recall, precision).tolist() == [0, 1, 2, 3]
+    assert knee(recall, precision) == 1
+
+
+def test_equal_settings_are_there_once() -> None:
+    assert pareto_front([0.5, 0.5, 0.7], [0.8, 0.8, 0.6]).tolist() == [0, 2]
+
+
+def test_without_a_bend_the_greatest_f1_stands_for_the_knee() -> None:
+    # Hollow: every point is below the chord.
+    assert knee([0.1, 0.5, 1.0], [1.0, 0.2, 0.1]) == 1
+    assert knee([0.9, 0.3], [0.8, 0.9]) == 0
+    assert knee([0.4], [0.5]) == 0
+    assert knee([np.nan, 0.5], [0.5, np.nan]) is None
+
+
+def test_harmonic_mean() -> None:
+    np.testing.assert_allclose(f1_score([0.5, 0.0, 1.0], [1.0, 0.0, 1.0]), [2 / 3, 0.0, 1.0])
+    assert np.isnan(f1_score(np.nan, 0.5))
+
+
+@given(st.lists(st.tuples(st.integers(0, 6), st.integers(0, 6)), max_size=12))
+def test_front_is_what_nothing_beats(points: list[tuple[int, int]]) -> None:
+    recall = np.array([r / 6 for r, _ in points])
+    precision = np.array([p / 6 for _, p in points])
+    front = pareto_front(recall, precision)
+    unbeaten = {
+        (r, p)
+        for r, p in points
+        if not any((a >= r and b > p) or (a > r and b >= p) for a, b in points)
+    }
+    assert [points[k] for k in front] == sorted(unbeaten)
+    chosen = knee(recall, precision)
+    assert (chosen is None) == (not points)
+    assert chosen is None or chosen in front
+
+
+# -- grids ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "expected"),
+    [
+        ("threshold", "0.3:0.7:0.1", (0.3, 0.4, 0.5, 0.6, 0.7)),
+        ("threshold", "0.4:0.6:0.15", (0.4, 0.55)),
+        ("threshold", "0.5", (0.5,)),
+        ("threshold", "0.5, 0.2,0.5", (0.5, 0.2)),
+        ("samples", "8:16:4", (8, 12, 16)),
+        ("verify", "true,False", (True, False)),
+        ("polarity", "light,any", ("light", "any")),
+        ("evidence", "-1,2.5", (-1.0, 2.5)),
+    ],
+)
+def test_values_of_a_parameter(name: str, text: str, expected: tuple[object, ...]) -> None:
+    values = parameter_values(CircleSettings, name, text)
+    assert values == expected
+    assert [type(v) for v in values] == [type(v) for v in expected]
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "text", "says"),
+    [
+        (CircleSettings, "radius", "1", "radius is no parameter of CircleSettings: .* radius_m"),
+        (CircleSettings, "least_rows", "1", "no parameter of CircleSettings"),
+        (LineSettings, "radius_m", "1", "no parameter of LineSettings"),
+        (LineSettings, "refine_steps_px", "1", "cannot be varied"),
+        (CircleSettings, "threshold", "0.3:0.7", "FROM:TO:STEP"),
+        (CircleSettings, "threshold", "0.7:0.3:0.1", "FROM:TO:STEP"),
+        (CircleSettings, "threshold", "0.3:0.7:0", "FROM:TO:STEP"),
+        (CircleSettings, "threshold", "0:inf:1", "FROM:TO:STEP"),
+        (CircleSettings, "threshold", "a:b:c", "FROM:TO:STEP"),
+        (CircleSettings, "threshold", "much", "expected a number"),
+        (CircleSettings, "samples", "8:9:0.5", "expected a whole number"),
+        (CircleSettings, "verify", "maybe", "True or False"),
+        (CircleSettings, "polarity", "grey", "any, light, dark"),
+    ],
+)
+def test_values_that_are_none_are_refused(kind: type, name: str, text: str, says: str) -> None:
+    with pytest.raises(DetectError, match=says):
+        parameter_values(kind, name, text)
+
+
+def test_all_combinations_are_tried() -> None:
+    grid = combinations(CircleSettings, {"threshold": "0.4,0.5", "samples": "8,16"}, 4)
+    assert [settings_with(CircleSettings(), c) for c in grid] == [
+        CircleSettings(threshold=t, samples=s) for t in (0.4, 0.5) for s in (8, 16)
+    ]
+    with pytest.raises(DetectError, match="4 combinations: expected at most 3"):
+        combinations(CircleSettings, {"threshold": "0.4,0.5", "samples": "8,16"}, 3)
+    with pytest.raises(DetectError, match="nothing is varied"):
+        combinations(CircleSettings, {}, 3)
+
+
+# -- tables and pictures ----------------------------------------------------------------------
+
+
+def test_records_mark_front_and_knee() -> None:
+    grid = [(("threshold", k / 10),) for k in range(len(CURVE))]
+    trials = [Trial(10, 9, 8, r, p, 0.0123456789, None) for r, p in CURVE]
+    records = trial_records(grid, trials, "m")
+    assert [r["front"] for r in records] == [True] * 4 + [False] * 3
+    assert [r["knee"] for r in records] == [False, True] + [False] * 5
+    assert records[0]["error_median_m"] == 0.0123457
+    assert records[0]["normalised_error"] is None
+    picture = curve_picture(grid, trials, "by hand")
+    assert picture == curve_picture(grid, trials, "by hand")
+    shown = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_COLOR)
+    assert shown is not None
+    # The ring round the knee (#a8321e).
+    assert (np.abs(shown.astype(int) - (0x1E, 0x32, 0xA8)).sum(axis=2) < 30).sum() > 50
+
+
+# -- the command ------------------------------------------------------------------------------
+
+
+def write_reference(run: Path, discs: dict[str, list[tuple[float, float]]]) -> None:
+    rows = []
+    for prefix, places in discs.items():
+        rows.append(f"STEP {prefix} 0 0 0 0 0 0 0 0 0")
+        rows += [f"LANDMARK_C {x} {y} 0.9 1e-4 0 1e-4 1" for x, y in places]
+    (run / "map.circles").write_text("\n".join(rows) + "\n")
+
+
+def test_trials_are_what_detecting_and_comparing_gives(small_run: Path, tmp_path: Path) -> None:
+    # Of the three discs one is not in the reference, and one of the reference is not in the image.
+    write_reference(
+        small_run, {**SMALL_RUN_DISCS, "s.0001": [], "s.0002": [(0.0, -1.4), (0.5, -1.4)]}
+    )
+    folder = tmp_path / "t"
+    arguments = ["tune", str(small_run), "--threshold", "0.4,0.999", "--samples", "8,16"]
+    assert main([*arguments, "-o", str(folder)]) == 0
+    with (folder / "table.csv").open() as stream:
+        rows = list(csv.DictReader(stream))
+    assert [(r["threshold"], r["samples"]) for r in rows] == [
+        ("0.4", "8"), ("0.999", "8"), ("0.4", "16"), ("0.999", "16"),
+    ]  # fmt: skip
+    assert (float(rows[2]["recall"]), float(rows[2]["precision"])) == (0.5, round(2 / 3, 6))
+    for row in rows:
+        flags = ["--threshold", row["threshold"], "--samples", row["samples"]]
+        assert main(["circles", str(small_run), *flags, "--force"]) == 0
+        expected = compare_runs(small_run)
+        counts = (expected.reference, expected.detected, expected.matched)
+        assert tuple(int(row[n]) for n in ("reference", "detected", "matched")) == counts
+        assert row["recall"] == f"{expected.recall:.6g}"
+        shown = "" if expected.precision is None else f"{expected.precision:.6g}"
+        assert row["precision"] == shown
+    document = json.loads((folder / "table.json").read_text())
+    assert len(document["trials"]) == 4
+    assert document["varied"] == {"samples": "8,16", "threshold": "0.4,0.999"}
+    assert document["settings"]["radius_m"] == 0.1
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    assert main([*arguments, "-o", str(folder), "--force"]) == 0
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+
+
+@pytest.mark.long
+def test_processes_give_the_same_bytes(small_run: Path, tmp_path: Path) -> None:
+    write_reference(small_run, SMALL_RUN_DISCS)
+    arguments = ["tune", str(small_run), "--threshold", "0.4:0.9:0.25"]
+    for jobs in ("1", "2"):
+        assert main([*arguments, "--jobs", jobs, "-o", str(tmp_path / jobs)]) == 0
+    for name in ("table.csv", "table.json", "curve.png"):
+        assert (tmp_path / "1" / name).read_bytes() == (tmp_path / "2" / name).read_bytes()
+
+
+def test_verticals_are_tuned_as_well(small_run: Path, tmp_path: Path) -> None:
+    (small_run / "map.lines").write_text(
+        "STEP s.0000 0 0 0 0 0 0 0 0 0\nLANDMARK_L 0 -0.5 0 0.2 0 0 0 0.002 1\n"
+    )
+    arguments = ["tune", str(small_run), "--verticals", "--least-rows", "14,20"]
+    assert main([*arguments, "-o", str(tmp_path / "t")]) == 0
+    document = json.loads((tmp_path / "t" / "table.json").read_text())
+    assert document["frames"] == ["s.0000"]
+    assert [trial["least_rows"] for trial in document["trials"]] == [14, 20]
+    assert [trial["matched"] for trial in document["trials"]] == [0, 0]
+    assert document["settings"]["largest_horizon_gap_px"] == 11.0
+
+
+def test_refusals(small_run: Path, tmp_path: Path, capsys: Captured) -> None:
+    run = str(small_run)
+    tune = ["tune", run, "-o", str(tmp_path / "t")]
+    assert_refused(tune, small_run, "nothing is varied", capsys)
+    assert_refused([*tune, "--threshold", "0.5"], small_run, "map.circles", capsys)
+    write_reference(small_run, {"other": [(0.0, -1.0)]})
+    assert_refused([*tune, "--threshold", "0.5"], small_run, "none of the 3", capsys)
+    write_reference(small_run, SMALL_RUN_DISCS)
+    assert_refused([*tune, "--threshold", "2"], small_run, "threshold is 2", capsys)
+    assert_refused([*tune, "--least-rows", "20"], small_run, "no parameter of Circle", capsys)
+    assert_refused(
+        [*tune, "--verticals", "--radius-m", "0.1"], small_run, "no parameter of Line", capsys
+    )
+    assert_refused([*tune, "--threshold", "0.1:0.9:0.001", "--most", "9"], small_run, "801", capsys)
+    assert not (tmp_path / "t").exists()
+    (tmp_path / "t").mkdir()
+    (tmp_path / "t" / "curve.png").write_bytes(b"mine")
+    assert_refused([*tune, "--threshold", "0.5"], small_run, "--force", capsys)
+    with pytest.raises(SystemExit) as ended:
+        main([*tune, "--treshold", "0.5"])
+    assert ended.value.code == 2
+    assert "--treshold" in capsys.readouterr().err

@@ -1,0 +1,58 @@
+"""Fates by number and by name; filters that are tabulated against their formula."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from detect.verticals import judgement_kernels as kernels
+from detect.verticals.judgement import FATES
+from detect.verticals.order_kernels import descending
+from detect.verticals.step_filters import SUBPIXELS, step_filters
+
+
+def test_numbers_of_fates_are_places_of_their_names() -> None:
+    numbers = {
+        name: value
+        for name, value in vars(kernels).items()
+        if name.isupper() and isinstance(value, int)
+    }
+    assert sorted(numbers.values()) == list(range(len(FATES)))
+    for name, number in numbers.items():
+        assert FATES[number] == name.lower().replace("_", " ")
+
+
+@pytest.mark.parametrize("sigma", [0.8, 1.2, 1.8, 3.0])
+def test_tabulated_filters_are_derivatives(sigma: float) -> None:
+    filters = step_filters((1.0, sigma))
+    half, begin = filters.half[1], filters.begin[1]
+    taps = np.arange(-half + 1, half + 1)
+    rows = slice(begin, begin + SUBPIXELS * 2 * half)
+    height, first, second = (
+        table[rows].reshape(SUBPIXELS, 2 * half)
+        for table in (filters.height, filters.first, filters.second)
+    )
+    position = (np.arange(SUBPIXELS) + 0.5) / SUBPIXELS
+    # A parabola's first derivative is seen in proportion to the distance from its vertex, which a
+    # sum over pixels reproduces as well as the integral does.
+    vertex = 0.3
+    signal = (taps - vertex) ** 2
+    scale = height @ taps.astype(np.float64)
+    expected = 2.0 * (position - vertex)
+    np.testing.assert_allclose(height @ signal / scale, expected, atol=0.02)
+    # Derivatives of the height by the position.
+    change = np.gradient(height @ signal, position) * sigma**2
+    np.testing.assert_allclose((first @ signal)[2:-2], change[2:-2], rtol=0.02, atol=0.02)
+    change = np.gradient(first @ signal, position)
+    np.testing.assert_allclose((second @ signal)[2:-2], change[2:-2], rtol=0.02, atol=0.1)
+    for table in (height, first, second):
+        np.testing.assert_allclose(table.sum(axis=1), 0.0, atol=1e-4)
+
+
+@given(st.lists(st.sampled_from([0.0, -1.0, 2.5, 2.5000001, 7.0, -np.inf, np.inf]), max_size=40))
+@settings(max_examples=40, deadline=None)
+def test_order_is_that_of_a_stable_sort(values: list[float]) -> None:
+    numbers = np.array(values)
+    np.testing.assert_array_equal(descending(numbers), np.argsort(-numbers, kind="stable"))
