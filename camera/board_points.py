@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,6 +20,10 @@ _WINDOW = 0.3
 _SMALLEST_HALF_WINDOW = 2
 _LARGEST_HALF_WINDOW = 9
 _FEWEST_POINTS = 8
+# A checkerboard is looked for in pictures reduced to so many pixels along their longer side, one
+# after the other: what OpenCV's search takes grows faster than the picture, most where there is no
+# board, and squares of a few pixels are enough for it.
+_SEARCHED_PX = (1280, 2048)
 
 
 def find_board(
@@ -65,23 +71,35 @@ def _checkerboard(image: GreyImage, board: Board, window: float) -> FloatArray:
     import cv2
 
     size = (board.columns, board.rows)
-    found, corners = cv2.findChessboardCorners(image, size)
-    if not found:
-        found, corners = _checkerboard_stretched(image, size)
-    if not found:
-        raise _not_found(board)
-    grid = np.asarray(corners, dtype=np.float32).reshape(board.rows, board.columns, 2)
-    return _in_order(image, _refined(image, grid, window))
+    for reduced in _reductions(image):
+        per_pixel = np.array([image.shape[1] / reduced.shape[1], image.shape[0] / reduced.shape[0]])
+        # Half-height images flatten the squares.
+        for taller in (False, True):
+            searched = _twice_as_high(reduced) if taller else reduced
+            found, corners = cv2.findChessboardCorners(searched, size)
+            if not found:
+                continue
+            flat = np.asarray(corners, dtype=np.float64).reshape(-1, 2)
+            flat = _of_half_height(flat) if taller else flat
+            flat = (flat + 0.5) * per_pixel - 0.5
+            grid = flat.astype(np.float32).reshape(board.rows, board.columns, 2)
+            return _in_order(image, _refined(image, grid, window))
+    raise _not_found(board)
 
 
-def _checkerboard_stretched(image: GreyImage, size: tuple[int, int]) -> tuple[bool, FloatArray]:
-    """Look again in an image of twice the height: half-height images flatten the squares."""
+def _reductions(image: GreyImage) -> Iterator[GreyImage]:
+    """The image as small as it is searched, smallest first."""
     import cv2
 
-    found, corners = cv2.findChessboardCorners(_twice_as_high(image), size)
-    if not found:
-        return False, np.empty(0)
-    return True, _of_half_height(np.asarray(corners, dtype=np.float64).reshape(-1, 2))
+    height, width = image.shape
+    for longest in _SEARCHED_PX:
+        if longest >= max(height, width):
+            break
+        scale = longest / max(height, width)
+        reduced = (max(round(scale * width), 1), max(round(scale * height), 1))
+        yield np.asarray(cv2.resize(image, reduced, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    if max(height, width) <= _SEARCHED_PX[-1]:
+        yield image
 
 
 def _refined(image: GreyImage, grid: NDArray[np.float32], share: float) -> FloatArray:

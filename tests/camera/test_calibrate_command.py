@@ -10,6 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from camera import Camera, read_camera, write_camera
 from camera.board import Board
@@ -168,6 +169,43 @@ def test_a_board_upside_down_is_still_in_its_order(rays: Rays) -> None:
     expected = rays.camera.project(BOARD.points @ turned.T + t)
     # Upright edges are rendered to a quarter of a pixel.
     assert np.linalg.norm(pixels - expected, axis=1).max() < 0.3
+
+
+@pytest.mark.parametrize("times", [5, 6])
+def test_large_pictures_are_searched_reduced_and_measured_whole(
+    rays: Rays, times: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    searched = []
+    find = cv2.findChessboardCorners
+
+    def finding(image: NDArray[np.uint8], size: tuple[int, int]) -> object:
+        searched.append(image.shape)
+        return find(image, size)
+
+    monkeypatch.setattr(cv2, "findChessboardCorners", finding)
+    turned = rotation_of(np.array([0.2, -0.3, 0.15])) @ np.diag([1.0, -1.0, -1.0])
+    t = np.array([0.01, 0.0, 0.42])
+    image = render_board(rays, BOARD, turned, t, noise=1.0)
+    large = cv2.resize(image, None, fx=times, fy=times, interpolation=cv2.INTER_CUBIC)
+    _, pixels = find_board(np.asarray(large, dtype=np.uint8), BOARD)
+    expected = (rays.camera.project(BOARD.points @ turned.T + t) + 0.5) * times - 0.5
+    assert np.linalg.norm(pixels - expected, axis=1).max() < 0.15 * times
+    assert searched == [(960, 1280)]
+
+
+def test_a_board_that_is_not_there_is_not_searched_in_a_whole_large_picture(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    searched = []
+
+    def finding(image: NDArray[np.uint8], _: tuple[int, int]) -> tuple[bool, None]:
+        searched.append(image.shape)
+        return False, None
+
+    monkeypatch.setattr(cv2, "findChessboardCorners", finding)
+    with pytest.raises(CalibrationError, match="are --columns and --rows right"):
+        find_board(np.zeros((3000, 4000), np.uint8), BOARD)
+    assert searched == [(960, 1280), (1920, 1280), (1536, 2048), (3072, 2048)]
 
 
 def test_pose_on_the_floor_and_its_covariance(published_camera: Camera) -> None:
