@@ -151,6 +151,7 @@ def test_what_is_no_fault_of_the_file_is_not_called_damage(
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "kernel.nbc")
 
     monkeypatch.setattr(lut.cache, "floor_positions", full)
+    caplog.clear()
     with caplog.at_level(logging.INFO, logger="redetect"), pytest.raises(OSError, match="kernel"):
         cached_disc_table(camera, SHAPE, tmp_path)
     assert caplog.messages == []

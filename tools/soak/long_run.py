@@ -78,7 +78,7 @@ class SoakResult:
         Memory of the process that hands out the frames, and of the largest worker, at 10, 50, 90
         and 99 % of the run.
     descriptors : tuple of int
-        Open in all processes, at the same moments.
+        Open in all processes, at the same moments; the least of nine looks around each.
     processes : int
         The most that there were.
     """
@@ -209,6 +209,11 @@ def _looks_at(
     return looks
 
 
+def _staying_descriptors(looks: list[_Look], moment: int) -> int:
+    """Open descriptors around a look, without an image's that happened to be read just then."""
+    return min(look.descriptors for look in looks[max(moment - 4, 0) : moment + 5])
+
+
 def _decoding_s(image: bytes) -> float:
     """What decoding an image takes of the processor; the first of some is not counted."""
     import cv2
@@ -238,8 +243,9 @@ def _result(looks: list[_Look], frames: int, jobs: int, duration_s: float) -> So
     times_s = [look.time_s for look in looks]
     processor_s = [look.processor_s for look in looks]
     decodings_s = (decoding_s(_FIRST), decoding_s(_LAST))
-    chosen = [looks[int(np.argmax(done >= share * frames))] for share in (0.1, 0.5, 0.9)]
-    chosen.append(looks[int(np.argmax(done >= min(0.99 * frames, done[-1])))])
+    moments = [int(np.argmax(done >= share * frames)) for share in (0.1, 0.5, 0.9)]
+    moments.append(int(np.argmax(done >= min(0.99 * frames, done[-1]))))
+    chosen = [looks[moment] for moment in moments]
     return SoakResult(
         frames=frames,
         jobs=jobs,
@@ -252,6 +258,6 @@ def _result(looks: list[_Look], frames: int, jobs: int, duration_s: float) -> So
         ),
         resident_mib=tuple(look.resident_mib for look in chosen),
         worker_mib=tuple(look.worker_mib for look in chosen),
-        descriptors=tuple(look.descriptors for look in chosen),
+        descriptors=tuple(_staying_descriptors(looks, moment) for moment in moments),
         processes=max(len(look.processes) for look in looks),
     )

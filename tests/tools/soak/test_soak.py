@@ -119,6 +119,6 @@ def test_a_soak_of_some_seconds(
     assert "1500 frames, 1 jobs" in said.out, said.err
     found = json.loads(figures.read_text())
     assert 50.0 < found["resident_mib"][0] < 600.0
-    assert found["descriptors"][0] == found["descriptors"][-1]
+    assert 3 <= found["descriptors"][-1] <= found["descriptors"][0]
     assert found["processes"] == 1
     assert [path.name for path in tmp_path.iterdir()] == ["soak.json"]  # the run is removed
