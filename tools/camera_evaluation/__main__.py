@@ -5,6 +5,8 @@ from __future__ import annotations
 import sys
 from importlib import import_module
 
+from camera.errors import CameraError
+
 #: The module whose `main` carries a study out.
 STUDIES = {
     "rendered": "tools.camera_evaluation.rendered",
@@ -21,7 +23,11 @@ def main(arguments: list[str]) -> int:
             f"usage: python -m tools.camera_evaluation {{{','.join(STUDIES)}}} ...", file=sys.stderr
         )
         return 2
-    return int(import_module(STUDIES[arguments[0]]).main(arguments[1:]) or 0)
+    try:
+        return int(import_module(STUDIES[arguments[0]]).main(arguments[1:]) or 0)
+    except (CameraError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
 
 
 if __name__ == "__main__":

@@ -25,6 +25,7 @@ from camera.calibration import BoardView, calibrate
 from camera.calibration_adjustment import Points
 from camera.calibration_choice import holdout_error
 from camera.calibration_settings import CalibrationSettings, FreeLens
+from camera.errors import CalibrationError
 
 FloatArray = NDArray[np.float64]
 DISC_RADIUS_M = 0.1
@@ -47,11 +48,17 @@ def fixed_board(places: FloatArray) -> Board:
 
 
 def read_group(folder: Path, group: str) -> tuple[list[BoardView], Board, tuple[int, int]]:
-    """All photographs of a camera: views, the board, and the image size."""
+    """All photographs of a camera, in the folder or below: views, the board, and the image size.
+
+    Raises
+    ------
+    CalibrationError
+        If there are none.
+    """
     views: list[BoardView] = []
     places: list[FloatArray] = []
     offset, size = 0, (0, 0)
-    for path in sorted(folder.glob(f"{group}_*/truth.json")):
+    for path in sorted(folder.glob(f"**/{group}_*/truth.json")):
         truth = json.loads(path.read_text())
         discs = [d for d in truth["discs"] if d["how"] == "measured" and d["visible"]]
         uv = np.array([[d["u"], d["v"]] for d in discs])
@@ -66,6 +73,8 @@ def read_group(folder: Path, group: str) -> tuple[list[BoardView], Board, tuple[
         views.append(BoardView(path.parent.name, np.arange(offset, offset + len(uv)), uv))
         places.append(xy)
         offset += len(uv)
+    if not views:
+        raise CalibrationError(f"{folder}: no photographs there, expected {group}_*/truth.json")
     return views, fixed_board(np.concatenate(places)), size
 
 
