@@ -252,10 +252,11 @@ def refined_covariance(
     (N, 2, 2) float64
         Square metres.
     """
+    kernel = _kernel_camera(camera)
     return np.asarray(
         refined_covariances(
-            _kernel_camera(camera).numbers,
-            np.array(camera.centre),
+            kernel.numbers,
+            kernel.centre,
             np.ascontiguousarray(floor_xy, np.float64),
             np.ascontiguousarray(fitted, np.float64),
             settings.systematic_px**2,

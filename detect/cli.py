@@ -30,8 +30,6 @@ from detect.settings import PUBLISHED, CircleSettings
 from detect.viewing_options import Draw, Report, Tune, View
 from storage.exit_codes import say_error, say_interrupted
 
-EXIT_FRAMES_FAILED = 3
-
 # Numba's words where neither the program's folder nor the user's cache can be written to.
 _NO_KERNEL_CACHE = "no locator available"
 _WHERE_KERNELS_GO = (

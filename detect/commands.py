@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from detect.announcing import show_announcements
-from detect.cli import EXIT_FRAMES_FAILED, Command
-from detect.errors import DetectError, WorkerError
+from detect.cli import Command
+from detect.errors import EXIT_FRAMES_FAILED, DetectError, WorkerError
 from detect.kernel_loading import load_kernels_alone
 from detect.options import All, Circles, Compare, DetectorFlags, Lines, Markers
 from detect.runs.progress import print_failures, progress_bar

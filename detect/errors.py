@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from storage.messages import OneLineError
 
+#: Exit code of a command of which some frames could not be worked on; the others were.
+EXIT_FRAMES_FAILED = 3
+
 
 class DetectError(OneLineError, ValueError):
     """A run or setting that cannot be worked on.

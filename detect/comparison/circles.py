@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from detect.comparison.figures import fraction, normalised_error, quantile
-from detect.comparison.pairing import FrameMatch, image_name, match_rows, pair_frames, shown_name
+from detect.comparison.pairing import FrameMatch, match_rows, pair_frames, shown_name
 from detect.comparison.result import (
     CompareError,
     CompareOptions,
@@ -27,6 +27,7 @@ from detect.comparison.result import (
     FrameScore,
     NormalisedError,
 )
+from detect.runs.image_names import image_name
 from landmarks import (
     Association,
     CircleLandmark,

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from typing import Generic, TypeVar
 
 from detect.comparison.result import CompareError
+from detect.runs.image_names import image_name
 from landmarks import Association, CircleLandmark, Frame, LineLandmark
 
 RowType = TypeVar("RowType", bound=CircleLandmark | LineLandmark)
 
-_IMAGE_EXTENSIONS = (".jpg", ".jpeg", ".png", ".pgm", ".ppm", ".bmp", ".tif", ".tiff")
 _LONGEST_SHOWN_NAME = 80
 
 
@@ -141,14 +141,6 @@ def match_rows(
         detected = [detected[i] for i in kept]
         pairs = pair_up(counted, detected)
     return FrameMatch(name, counted, detected, pairs, set_aside)
-
-
-def image_name(prefix: str) -> str:
-    """Name of an image without directories (of either system) and image extension."""
-    name = prefix.replace("\\", "/").rpartition("/")[2]
-    # Not just any suffix: the data set's prefixes end in a number, as in e.0067.
-    stem, dot, extension = name.rpartition(".")
-    return stem if stem and (dot + extension).lower() in _IMAGE_EXTENSIONS else name
 
 
 def shown_name(image: str) -> str:

@@ -37,7 +37,7 @@ def _level(
 def level_floor(
     floor_xy: NDArray[np.float64], centre: NDArray[np.float64], pitch: float, roll: float
 ) -> NDArray[np.float64]:
-    """(N, 2) levelled positions (see `detect.discs.levelling.level_positions`)."""
+    """(N, 2) levelled positions (see `detect.levelling.level_positions`)."""
     rotation = level_matrix(pitch, roll)
     out = np.empty((len(floor_xy), 2))
     for k in range(len(floor_xy)):
@@ -54,7 +54,7 @@ def level_floor_covariances(
     roll: float,
     tilt_covariance: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """(N, 2, 2) covariances of levelled positions (`detect.discs.levelling.level_covariances`)."""
+    """(N, 2, 2) covariances of levelled positions (`detect.levelling.level_covariances`)."""
     rotation = level_matrix(pitch, roll)
     ahead_p, behind_p = level_matrix(pitch + _STEP_RAD, roll), level_matrix(pitch - _STEP_RAD, roll)
     ahead_r, behind_r = level_matrix(pitch, roll + _STEP_RAD), level_matrix(pitch, roll - _STEP_RAD)

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from detect.comparison.pairing import image_name
 from detect.drawing.head import FileHead, read_head
 from detect.errors import DetectError
 from detect.run import ImageRun
 from detect.runs.by_image import FramesByImage, TiltsByImage
+from detect.runs.image_names import image_name
 from detect.viewing_options import RowFiles
 from landmarks import CircleLandmark, FrameTilt, LineLandmark, MarkerLandmark
 

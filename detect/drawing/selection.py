@@ -6,9 +6,9 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from detect.comparison.pairing import image_name
 from detect.errors import DetectError
 from detect.run import Frames, RunFrame
+from detect.runs.image_names import image_name
 
 _RANGE = re.compile(r"(\d*):(\d*)(?::(\d+))?")
 
@@ -24,7 +24,7 @@ class FrameSelection:
     ranges : tuple of range
         Positions in the run.
     names : frozenset of str
-        Images, as `detect.comparison.pairing.image_name` gives them.
+        Images, as `detect.runs.image_names.image_name` gives them.
 
     Without ranges and names, all frames are selected.
     """

@@ -6,7 +6,7 @@ from array import array
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from detect.comparison.pairing import image_name
+from detect.runs.image_names import image_name
 from detect.runs.name_index import NameIndex
 from landmarks import (
     Frame,

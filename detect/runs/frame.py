@@ -160,7 +160,7 @@ def detect_in_image(
         assert plan.camera is not None
         discs = detect_circles(image, plan.camera, tables.discs, plan.circles)
         if tilt is not None:
-            from detect.discs.levelling import levelled
+            from detect.levelling import levelled
 
             discs = levelled(discs, plan.camera, tilt)
 

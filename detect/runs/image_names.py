@@ -20,6 +20,14 @@ IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".pgm", ".ppm", ".tif", ".t
 _DIGITS = re.compile(r"[0-9]+")
 
 
+def image_name(prefix: str) -> str:
+    """Name of an image without directories (of either system) and image extension."""
+    name = prefix.replace("\\", "/").rpartition("/")[2]
+    # Not just any suffix: the data set's prefixes end in a number, as in e.0067.
+    stem, dot, extension = name.rpartition(".")
+    return stem if stem and (dot + extension).lower() in IMAGE_SUFFIXES else name
+
+
 class ImageNames:
     """Names of image files, in natural order: numbers by value.
 

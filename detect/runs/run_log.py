@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from detect.errors import DetectError
+from detect.errors import EXIT_FRAMES_FAILED, DetectError
 from detect.runs.conduct import Conduct
 from detect.runs.frame import FramePlan
 
@@ -101,8 +101,6 @@ def log_failure(place: int, prefix: str, reason: str, *, first: bool) -> bytes:
 
 def log_tail(found: Counted, files: list[WrittenFile]) -> bytes:
     """What stands after the failures."""
-    from detect.cli import EXIT_FRAMES_FAILED
-
     document = {
         "frames": found.frames,
         "failed": found.failed,

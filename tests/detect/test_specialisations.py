@@ -19,8 +19,8 @@ from numba import typeof
 from camera import Camera, parse_camera
 from detect.circles import CircleDetections, refined_covariance
 from detect.discs.covariance_kernels import refined_covariances
-from detect.discs.levelling import level_covariances, level_positions, levelled
 from detect.discs.levelling_kernels import level_discs, level_floor, level_floor_covariances
+from detect.levelling import level_covariances, level_positions, levelled
 from detect.settings import CircleSettings
 from landmarks import FrameTilt
 from lut import DiscShape, cached_disc_table, cached_vertical_table, floor_positions

@@ -10,7 +10,7 @@ import numpy as np
 from camera import Camera
 from detect.circles import detect_circles, disc_shape
 from detect.discs.centres import best_centres, quality_of_centres
-from detect.discs.levelling import levelled
+from detect.levelling import levelled
 from detect.line_settings import DEFAULT as LINES_DEFAULT
 from detect.lines import detect_lines
 from detect.noise import estimate_noise

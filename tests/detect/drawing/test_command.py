@@ -14,12 +14,12 @@ from detect.circles import CircleDetections
 from detect.cli import main
 from detect.comparison.lines_result import LineCompareOptions
 from detect.comparison.result import CompareOptions
-from detect.discs.levelling import level_positions
 from detect.drawing.frame import draw_rows, floor_projection, line_curves, sigma_bars
 from detect.drawing.head import read_head
 from detect.drawing.inputs import SeenRows
 from detect.drawing.selection import select_frames
 from detect.errors import DetectError
+from detect.levelling import level_positions
 from detect.run import open_images
 from detect.settings import CircleSettings
 from landmarks import CircleLandmark, FrameTilt, LineLandmark, circle_landmarks

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from camera import Camera, parse_camera
 from detect.circles import CircleDetections
-from detect.discs.levelling import level_covariances, level_positions, levelled
+from detect.levelling import level_covariances, level_positions, levelled
 from landmarks import FrameTilt
 from tests.conftest import PUBLISHED_CAM
 
