@@ -50,7 +50,7 @@ def _detector(project_root: Path, kind: str) -> tuple[Path, Callable[[Image], by
 
 def _is_compiled(project_root: Path) -> bool:
     """Whether discs' kernels were compiled before, some of them at least."""
-    cached = (project_root / "detect" / "__pycache__").glob("disc_*.nbc")
+    cached = (project_root / "detect" / "discs" / "__pycache__").glob("*.nbc")
     return "NUMBA_CACHE_DIR" in os.environ or any(cached)
 
 
