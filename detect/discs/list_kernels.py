@@ -21,6 +21,7 @@ from detect.discs.patch_kernels import (
     FitSettings,
     Patch,
 )
+from detect.discs.uncounted import UNCOUNTED
 from detect.discs.vector_kernels import lowest_bit
 
 #: Numba knows them as types, the type checker as functions.
@@ -104,7 +105,7 @@ def floor_steps(
     )
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@njit(cache=True, error_model="numpy", forceinline=True, **UNCOUNTED)
 def gather_list(
     image: NDArray[np.uint8],
     floor_xy: NDArray[np.float32],
@@ -185,7 +186,7 @@ def gather_list(
     return n
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@njit(cache=True, error_model="numpy", forceinline=True, **UNCOUNTED)
 def gather_sparse(
     image: NDArray[np.uint8],
     floor_xy: NDArray[np.float32],
