@@ -22,7 +22,17 @@ from detect.discs.model_kernels import (
 )
 from detect.discs.normal_kernels import background_products, disc_products, factor_rows, left_over
 from detect.discs.outline_kernels import SECTOR_SUMS, blur_widths
-from detect.discs.patch_kernels import COLUMNS, LIST, ONE, FitSettings, Patch, new_patch, padded
+from detect.discs.patch_kernels import (
+    COLUMNS,
+    LIST,
+    ONE,
+    PATCH_INDICES,
+    PATCH_MEMORY,
+    FitSettings,
+    Patch,
+    padded,
+    patch_in,
+)
 from detect.discs.step_kernels import gauss_newton_step, move
 from detect.discs.uncounted import UNCOUNTED
 
@@ -69,25 +79,51 @@ class Work(NamedTuple):
     best: NDArray[np.float64]
 
 
+#: Sizes of the arrays that `work_in` takes.
+_MOST_WEIGHTS = 64
+WORK_MEMORY = PATCH_MEMORY + (2 * FIELDS + 1) * CAPACITY + _MOST_WEIGHTS + SECTOR_SUMS
+WORK_INDICES = PATCH_INDICES
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def work_in(
+    memory: NDArray[np.float32], indices: NDArray[np.uint32], marks: NDArray[np.uint8]
+) -> Work:
+    """Working space in arrays that may be used again, for the next image: all of it is written
+    before it is read.
+
+    They are of the sizes above, and those of `detect.discs.patch_kernels.patch_in`.
+    """
+    n = normal.ROWS
+    shares = PATCH_MEMORY + FIELDS * CAPACITY
+    widths = shares + FIELDS * CAPACITY
+    weights = widths + CAPACITY
+    sums = weights + _MOST_WEIGHTS
+    return Work(
+        patch_in(memory, indices, marks),
+        memory[PATCH_MEMORY:shares],
+        memory[shares:widths],
+        memory[widths:weights],
+        memory[weights:sums],
+        memory[sums : sums + SECTOR_SUMS],
+        np.zeros((n, n)),
+        np.zeros((n, n)),
+        np.zeros((n, n)),
+        np.zeros((n, n)),
+        np.zeros(n),
+        np.zeros(n),
+        np.zeros(4),
+        np.zeros(4),
+    )
+
+
 @njit(cache=True, error_model="numpy", forceinline=True)
 def new_work() -> Work:
-    """Working space."""
-    n = normal.ROWS
-    return Work(
-        new_patch(),
-        np.zeros(FIELDS * CAPACITY, np.float32),
-        np.zeros(FIELDS * CAPACITY, np.float32),
-        np.zeros(CAPACITY, np.float32),
-        np.zeros(64, np.float32),
-        np.zeros(SECTOR_SUMS, np.float32),
-        np.zeros((n, n)),
-        np.zeros((n, n)),
-        np.zeros((n, n)),
-        np.zeros((n, n)),
-        np.zeros(n),
-        np.zeros(n),
-        np.zeros(4),
-        np.zeros(4),
+    """Working space of its own."""
+    return work_in(
+        np.zeros(WORK_MEMORY, np.float32),
+        np.zeros(WORK_INDICES, np.uint32),
+        np.zeros(CAPACITY, np.uint8),
     )
 
 

@@ -82,17 +82,35 @@ class Patch(NamedTuple):
     """(CAPACITY / 8,): the same, eight at a time."""
 
 
+#: Sizes of the arrays that `patch_in` takes.
+PATCH_MEMORY = (GEOMETRY + TERMS + 2) * CAPACITY
+PATCH_INDICES = 2 * CAPACITY
+
+
 @njit(cache=True, error_model="numpy", forceinline=True)
-def new_patch() -> Patch:
-    """An empty patch."""
-    marks = np.zeros(CAPACITY, np.uint8)
+def patch_in(
+    memory: NDArray[np.float32], indices: NDArray[np.uint32], marks: NDArray[np.uint8]
+) -> Patch:
+    """A patch in arrays of at least the sizes above, float32 and uint32, and `CAPACITY` uint8."""
+    terms = GEOMETRY * CAPACITY
+    floor = terms + TERMS * CAPACITY
     return Patch(
-        np.zeros(GEOMETRY * CAPACITY, np.float32),
-        np.zeros(TERMS * CAPACITY, np.float32),
-        np.zeros(2 * CAPACITY, np.float32),
-        np.zeros(2 * CAPACITY, np.uint32),
+        memory[:terms],
+        memory[terms:floor],
+        memory[floor:PATCH_MEMORY],
+        indices,
         marks,
         marks.view(np.uint64),
+    )
+
+
+@njit(cache=True, error_model="numpy")
+def new_patch() -> Patch:
+    """An empty patch."""
+    return patch_in(
+        np.zeros(PATCH_MEMORY, np.float32),
+        np.zeros(PATCH_INDICES, np.uint32),
+        np.zeros(CAPACITY, np.uint8),
     )
 
 

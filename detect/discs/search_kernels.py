@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from detect.discs import fit_kernels as fit
 from detect.discs.candidate_kernels import middles, nearest_pixel, strong_and_alone, worth_a_look
 from detect.discs.covariance_kernels import refined_covariances
-from detect.discs.descent_kernels import PATIENT, Hope, Work, new_work
+from detect.discs.descent_kernels import PATIENT, Hope, Work, work_in
 from detect.discs.evidence_kernels import evidence_of
 from detect.discs.fit_kernels import fit_disc
 from detect.discs.patch_kernels import FitSettings
@@ -67,6 +67,9 @@ def search_discs(
     settings: FitSettings,
     camera_numbers: NDArray[np.float64],
     centre: NDArray[np.float64],
+    memory: NDArray[np.float32],
+    indices: NDArray[np.uint32],
+    marks: NDArray[np.uint8],
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Fit discs at the best centres, weigh the evidence, and keep the best of those that are one.
 
@@ -81,6 +84,8 @@ def search_discs(
     settings : FitSettings
     camera_numbers, centre : (K,) float64, (3,) float64
         See `detect.discs.covariance_kernels.refined_covariances`.
+    memory, indices, marks : float32, uint32, uint8
+        Memory to work in (`detect.discs.descent_kernels.work_in`).
 
     Returns
     -------
@@ -98,7 +103,7 @@ def search_discs(
     starts = middles(pixels, quality, contrast, floor_xy, search.weakest, near, keep)
     results, evidence, found = _fit_all(
         image, floor_xy, starts, quality[keep], contrast[keep], search, settings,
-        new_work(),
+        work_in(memory, indices, marks),
     )  # fmt: skip
     found_xy = np.empty((len(found), 2))
     covariance = np.empty((len(found), 2, 2))
