@@ -36,7 +36,7 @@ _TWO = np.uint64(2)
 _FIRST_COMPARISON = 1.0 - 4e-6
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _sum_block(
     pixels: NDArray[np.uint8],
     samples: int,
