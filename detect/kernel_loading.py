@@ -12,16 +12,36 @@ as Numba does it.
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
 from importlib import import_module
 from typing import Any
 
+#: What is done before a kernel is compiled, if anything: it may be in the cache afterwards.
+_before_compiling: Callable[[], object] | None = None
+
+
+@contextmanager
+def waiting_before_compiling(wait: Callable[[], object]) -> Iterator[bool]:
+    """Have `wait` called, during a block, before a kernel is compiled, and the cache asked again.
+
+    Gives whether that can be done: else the caller waits before anything is loaded.
+    """
+    global _before_compiling
+    _before_compiling = wait
+    try:
+        yield load_kernels_alone()
+    finally:
+        _before_compiling = None
+
 
 @cache
-def load_kernels_alone() -> None:
-    """Have this process load cached kernels without getting ready to compile."""
+def load_kernels_alone() -> bool:
+    """Have this process load cached kernels without getting ready to compile.
+
+    Returns whether it will.
+    """
     try:
         cache_class: Any = import_module("numba.core.caching").Cache
         environment: Any = import_module("numba.core.environment")
@@ -37,19 +57,25 @@ def load_kernels_alone() -> None:
         ):
             getattr(holder, name)
     except (ImportError, AttributeError):
-        return
+        return False
 
     def load_overload(self: Any, signature: Any, target_context: Any) -> Any:
-        loaded = None
+        loaded = load_alone(self, signature, target_context)
+        if loaded is None and _before_compiling is not None:
+            _before_compiling()
+            loaded = load_alone(self, signature, target_context)
+        return numbas_own(self, signature, target_context) if loaded is None else loaded
+
+    def load_alone(self: Any, signature: Any, target_context: Any) -> Any:
         try:
             runtime.initialize(target_context)  # what allocates arrays
             with _environments_alone(environment), self._guard_against_spurious_io_errors():
-                loaded = self._load_overload(signature, target_context)
+                return self._load_overload(signature, target_context)
         except Exception:
-            loaded = None  # whatever it is: Numba itself will tell
-        return numbas_own(self, signature, target_context) if loaded is None else loaded
+            return None  # whatever it is: Numba itself will tell
 
     cache_class.load_overload = load_overload
+    return True
 
 
 @contextmanager

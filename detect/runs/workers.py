@@ -33,7 +33,7 @@ from detect.announcing import (
     show_announcements,
 )
 from detect.errors import WorkerError
-from detect.kernel_loading import load_kernels_alone
+from detect.kernel_loading import load_kernels_alone, waiting_before_compiling
 from detect.runs.dispatch import Workers
 from detect.runs.frame import FramePlan, rehearse
 from detect.runs.interrupts import interrupts_deferred
@@ -48,6 +48,7 @@ R = TypeVar("R")
 FRAMES_PER_PROCESS = 500
 
 _LOCAL_CHUNK = 8
+_PROCESS_CHUNK = 16
 _CLUSTER_CHUNK = 16
 _WINDOW_PER_WORKER = 3
 _GRACE_S = 1.0
@@ -86,7 +87,7 @@ def local_workers(jobs: int, *, pictures: bool = False) -> Workers:
     window = 2 + _WINDOW_PER_WORKER * jobs
     return Workers(
         lambda plan: _processes(jobs, plan),
-        chunk=1 if pictures else _LOCAL_CHUNK,
+        chunk=1 if pictures else _PROCESS_CHUNK,
         window=lambda: window,
     )
 
@@ -260,12 +261,15 @@ def _begin(plan: FramePlan, stop: Event, first: Lock, ready: Event, show: bool) 
 
     cv2.setNumThreads(1)
     announce_compiling()
-    load_kernels_alone()
     if first.acquire(block=False):
+        load_kernels_alone()
         rehearse(plan)
         ready.set()
     else:
-        ready.wait()
+        with waiting_before_compiling(ready.wait) as waits:
+            if not waits:
+                ready.wait()
+            rehearse(plan)
     gc.collect()
     gc.freeze()  # what is there stays: collections need not look at it
 

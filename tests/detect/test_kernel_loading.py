@@ -45,10 +45,29 @@ if "more" in sys.argv:
 """
 
 
-def said(folder: Path, *arguments: str) -> list[str]:
+WAITING_PROGRAM = """
+import subprocess, sys
+from detect.kernel_loading import waiting_before_compiling
+
+def another_compiles():
+    waited.append(True)
+    subprocess.run([sys.executable, "-c", sys.argv[1]], stdout=subprocess.DEVNULL, check=True)
+
+waited = []
+with waiting_before_compiling(another_compiles) as waits:
+    import numpy as np
+    from kernels import spread
+    print(waits, spread(np.array([1.0, 2.0, 3.0, 4.0])), len(waited))
+print(sum(spread.stats.cache_hits.values()), sum(spread.stats.cache_misses.values()))
+spread(np.array([1, 2, 3, 4]))  # afterwards nobody is waited for
+print(len(waited), sum(spread.stats.cache_misses.values()))
+"""
+
+
+def said(folder: Path, *arguments: str, program: str = PROGRAM) -> list[str]:
     root = Path(__file__).resolve().parents[2]
     process = subprocess.run(
-        [sys.executable, "-c", PROGRAM, *arguments],
+        [sys.executable, "-c", program, *arguments],
         env={
             **os.environ,
             "PYTHONPATH": os.pathsep.join([str(root), str(folder)]),
@@ -72,6 +91,16 @@ def test_loaded_kernels_need_no_compiler_and_are_the_same(tmp_path: Path) -> Non
     assert said(tmp_path, "more") == [deviation, "False", refused, *both]  # compiled round it
 
 
+@pytest.mark.long
+def test_what_another_process_compiles_meanwhile_is_loaded(tmp_path: Path) -> None:
+    (tmp_path / "kernels.py").write_text(KERNELS)
+    deviation = str(1.25**0.5)
+    compiled_there = said(tmp_path, PROGRAM, program=WAITING_PROGRAM)
+    assert compiled_there == [f"True {deviation} 1", "1 0", "1 1"]
+    cached = said(tmp_path, PROGRAM, program=WAITING_PROGRAM)  # nothing to wait for
+    assert cached == [f"True {deviation} 0", "1 0", "0 0"]
+
+
 def test_a_numba_without_the_attributes_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     from numba.core import environment
     from numba.core.caching import Cache
@@ -81,5 +110,5 @@ def test_a_numba_without_the_attributes_is_left_alone(monkeypatch: pytest.Monkey
     own = Cache.load_overload
     monkeypatch.setattr(Cache, "load_overload", own)  # put back afterwards
     monkeypatch.delattr(environment, "lookup_environment")
-    load_kernels_alone.__wrapped__()
+    assert not load_kernels_alone.__wrapped__()
     assert Cache.load_overload is own
