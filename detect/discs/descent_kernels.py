@@ -34,7 +34,7 @@ from detect.discs.patch_kernels import (
     patch_in,
 )
 from detect.discs.step_kernels import gauss_newton_step, move
-from detect.discs.uncounted import UNCOUNTED
+from detect.discs.uncounted import uncounted
 
 #: A step that promises less than this, in variances of the noise, is the last,
 _CONVERGED = 0.3
@@ -151,7 +151,7 @@ def _mask(n: int, terms: NDArray[np.float32], fields: NDArray[np.float32]) -> No
             fields[row + i] *= terms[ONE * CAPACITY + i]
 
 
-@njit(cache=True, error_model="numpy", forceinline=True, **UNCOUNTED)
+@uncounted
 def _evaluate(patch: Gathered, p: NDArray[np.float64], ratio: float, work: Work) -> None:
     """The disc's fields at the parameters p (x, y, radius, log blur)."""
     blur = math.exp(p[3])
@@ -170,7 +170,7 @@ def _evaluate(patch: Gathered, p: NDArray[np.float64], ratio: float, work: Work)
         _mask(patch.n, work.patch.terms, work.fields)
 
 
-@njit(cache=True, error_model="numpy", forceinline=True, **UNCOUNTED)
+@uncounted
 def blur_width(patch: Gathered, p: NDArray[np.float64], ratio: float, work: Work) -> float:
     """Mean width of the blur across the edge, in nominal radii, at the parameters p."""
     blur = math.exp(p[3])
@@ -191,7 +191,7 @@ def _add_ridge(begin: int, end: int, n: int, products: NDArray[np.float64]) -> N
         products[j, j] += 1e-9 * n
 
 
-@njit(cache=True, error_model="numpy", forceinline=True, **UNCOUNTED)
+@uncounted
 def descend(
     patch: Gathered,
     start: NDArray[np.float64],

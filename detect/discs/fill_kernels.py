@@ -45,7 +45,7 @@ from detect.discs.patch_kernels import (
     Patch,
     padded,
 )
-from detect.discs.uncounted import UNCOUNTED
+from detect.discs.uncounted import uncounted
 
 #: Numba knows them as types, the type checker as functions.
 _U32: Callable[[Any], Any] = np.uint32
@@ -55,7 +55,7 @@ _1, _2, _3 = _U64(1), _U64(2), _U64(3)
 _NOWHERE = F32(1e3)
 
 
-@njit(cache=True, error_model="numpy", forceinline=True, **UNCOUNTED)
+@uncounted
 def fill_terms(
     image: NDArray[np.uint8],
     floor_xy: NDArray[np.float32],
@@ -102,7 +102,7 @@ def _finish_terms(count: int, n: int, terms: NDArray[np.float32]) -> None:
         terms[ONE * CAPACITY + i] = F32(0.0)
 
 
-@njit(cache=True, error_model="numpy", forceinline=True, **UNCOUNTED)
+@uncounted
 def fill_edges(floor_xy: NDArray[np.float32], radius: float, count: int, patch: Patch) -> None:
     """The geometry for `edge_shares` of the pixels in the patch's list."""
     index = patch.pixels
@@ -131,7 +131,7 @@ def fill_edges(floor_xy: NDArray[np.float32], radius: float, count: int, patch: 
     _fill_up(count, geometry)
 
 
-@njit(cache=True, error_model="numpy", forceinline=True, **UNCOUNTED)
+@uncounted
 def fill_chords(
     floor_xy: NDArray[np.float32], radius: float, columns: bool, count: int, patch: Patch
 ) -> None:

@@ -36,7 +36,7 @@ from detect.discs.normal_kernels import factor_rows, solution
 from detect.discs.outline_kernels import correlated_area, outline_statistics, residuals
 from detect.discs.patch_kernels import FitSettings
 from detect.discs.step_kernels import gauss_newton_step, move
-from detect.discs.uncounted import UNCOUNTED
+from detect.discs.uncounted import uncounted
 
 #: Columns of a result.
 X, Y, RADIUS, BLUR, CONTRAST = range(5)
@@ -50,7 +50,7 @@ _MAX_EVALUATIONS = 15
 _LOOK_EVALUATIONS = 3
 
 
-@njit(cache=True, error_model="numpy", forceinline=True, **UNCOUNTED)
+@uncounted
 def fit_disc(
     image: NDArray[np.uint8],
     floor_xy: NDArray[np.float32],
@@ -104,7 +104,7 @@ def fit_disc(
     return True
 
 
-@njit(cache=True, error_model="numpy", forceinline=True, **UNCOUNTED)
+@uncounted
 def _take_last_step(patch: Gathered, descent: Descent, settings: FitSettings, work: Work) -> bool:
     """The last step is taken as the linear model has it, and so are its residuals."""
     factor = work.factor
@@ -122,7 +122,7 @@ def _take_last_step(patch: Gathered, descent: Descent, settings: FitSettings, wo
     return True
 
 
-@njit(cache=True, error_model="numpy", forceinline=True, **UNCOUNTED)
+@uncounted
 def _conclude(
     patch: Gathered,
     radius: float,

@@ -5,14 +5,13 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from detect.discs.grid_kernels import gather_grid
 from detect.discs.list_kernels import gather_list, gather_sparse
 from detect.discs.model_kernels import CAPACITY
 from detect.discs.patch_kernels import COLUMNS, LIST, FitSettings, Patch, padded, view_of
-from detect.discs.uncounted import UNCOUNTED
+from detect.discs.uncounted import uncounted
 
 #: How many pixels a fit uses.
 LOOK, EDGE, ALL = range(3)
@@ -40,7 +39,7 @@ class Gathered(NamedTuple):
     """Whether all pixels within reach are there."""
 
 
-@njit(cache=True, error_model="numpy", forceinline=True, **UNCOUNTED)
+@uncounted
 def gather(
     image: NDArray[np.uint8],
     floor_xy: NDArray[np.float32],

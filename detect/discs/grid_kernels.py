@@ -39,7 +39,7 @@ from detect.discs.patch_kernels import (
     Patch,
     padded,
 )
-from detect.discs.uncounted import UNCOUNTED
+from detect.discs.uncounted import uncounted
 
 _SMALLEST = F32(1e-6)
 _ONE, _TWO = np.uint64(1), np.uint64(2)
@@ -100,7 +100,7 @@ def finish_chords(count: int, terms: NDArray[np.float32], geometry: NDArray[np.f
         )  # fmt: skip
 
 
-@njit(cache=True, error_model="numpy", forceinline=True, **UNCOUNTED)
+@uncounted
 def gather_grid(
     image: NDArray[np.uint8],
     floor_xy: NDArray[np.float32],

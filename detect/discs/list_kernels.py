@@ -21,7 +21,7 @@ from detect.discs.patch_kernels import (
     FitSettings,
     Patch,
 )
-from detect.discs.uncounted import UNCOUNTED
+from detect.discs.uncounted import uncounted
 from detect.discs.vector_kernels import lowest_bit
 
 #: Numba knows them as types, the type checker as functions.
@@ -105,7 +105,7 @@ def floor_steps(
     )
 
 
-@njit(cache=True, error_model="numpy", forceinline=True, **UNCOUNTED)
+@uncounted
 def gather_list(
     image: NDArray[np.uint8],
     floor_xy: NDArray[np.float32],
@@ -186,7 +186,7 @@ def gather_list(
     return n
 
 
-@njit(cache=True, error_model="numpy", forceinline=True, **UNCOUNTED)
+@uncounted
 def gather_sparse(
     image: NDArray[np.uint8],
     floor_xy: NDArray[np.float32],
