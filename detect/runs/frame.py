@@ -128,6 +128,7 @@ def detect_in_image(
     plan: FramePlan,
     tables: Tables,
     tilt: FrameTilt | None = None,
+    lines: LineDetections | None = None,
 ) -> FrameDetections:
     """Find what a plan asks for in a grey image of the calibration's size.
 
@@ -139,17 +140,16 @@ def detect_in_image(
         What the frame's rows call it.
     plan, tables, tilt
         As for `detect_frame`.
+    lines : LineDetections, optional
+        Of `lines_in_image`, where they have been looked for already.
 
     Returns
     -------
     FrameDetections
     """
-    lines = None
-    if plan.lines is not None:
-        from detect.lines import detect_lines
-
-        assert tables.verticals is not None
-        lines = detect_lines(image, tables.verticals, plan.lines)
+    if lines is None:
+        lines = lines_in_image(image, plan, tables)
+    if lines is not None:
         tilt = tilt_of_lines(prefix, lines)
 
     discs = None
@@ -171,6 +171,18 @@ def detect_in_image(
         markers = detect_markers(image, plan.markers, plan.camera)
 
     return FrameDetections(image, lines, tilt, discs, markers)
+
+
+def lines_in_image(
+    image: NDArray[np.uint8], plan: FramePlan, tables: Tables
+) -> LineDetections | None:
+    """The lines of an image, if a plan asks for lines."""
+    if plan.lines is None:
+        return None
+    from detect.lines import detect_lines
+
+    assert tables.verticals is not None
+    return detect_lines(image, tables.verticals, plan.lines)
 
 
 def tilt_of_lines(prefix: str, lines: LineDetections) -> FrameTilt | None:

@@ -6,18 +6,24 @@ This is all that a worker sends back, whichever process or machine it runs on: s
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import islice
 from pathlib import Path
 from textwrap import indent
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, ParamSpec, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from detect.errors import FrameError
 from detect.run import RunFrame, read_image
-from detect.runs.frame import FrameDetections, FramePlan, Tables, detect_in_image
+from detect.runs.frame import (
+    FrameDetections,
+    FramePlan,
+    Tables,
+    detect_in_image,
+    lines_in_image,
+)
 from detect.runs.row_text import unknown_circles, unknown_rows
 from detect.sources.times import format_time
 from landmarks import (
@@ -35,6 +41,9 @@ from landmarks import (
 if TYPE_CHECKING:
     from detect.circles import CircleDetections
     from detect.lines import LineDetections
+
+P = ParamSpec("P")
+R = TypeVar("R")
 
 #: So many pixels are decoded before any of them is looked at.
 _PIXELS_AT_ONCE = 1 << 21
@@ -96,8 +105,9 @@ class FrameRows(NamedTuple):
 def rows_of_frames(tasks: Sequence[FrameTask], plan: FramePlan, tables: Tables) -> list[FrameRows]:
     """Work on some frames; an image that cannot be worked on costs its frame only.
 
-    As many images are decoded, then looked at, then written about, as fit into the processor's
-    caches: a decoder, a detector and Python drive each other's instructions out of them.
+    As many images are decoded, then looked at by one detector, then by the other, then written
+    about, as fit into the processor's caches: a decoder, the detectors and Python drive each
+    other's instructions and tables out of them.
 
     Parameters
     ----------
@@ -120,30 +130,46 @@ def rows_of_frames(tasks: Sequence[FrameTask], plan: FramePlan, tables: Tables) 
     rows: list[FrameRows] = []
     source = iter(tasks)
     while some := tuple(islice(source, max(1, at_once))):
-        images = [_image_of(task, plan) for task in some]
-        found = [_found_in(image, task, plan, tables) for image, task in zip(images, some)]
+        images = [
+            _attempt(task, read_image, task.frame, plan.camera, plan.working_folder)
+            for task in some
+        ]
+        lines = [
+            image if isinstance(image, str) else _attempt(task, lines_in_image, image, plan, tables)
+            for image, task in zip(images, some)
+        ]
+        found = [
+            _found_in(image, seen, task, plan, tables)
+            for image, seen, task in zip(images, lines, some)
+        ]
         rows += [_rows_of(what, task, plan, tables) for what, task in zip(found, some)]
     return rows
 
 
-def _image_of(task: FrameTask, plan: FramePlan) -> NDArray[np.uint8] | str:
-    """The image of a frame, or why there is none."""
+def _attempt(
+    task: FrameTask, work: Callable[P, R], /, *args: P.args, **kwargs: P.kwargs
+) -> R | str:
+    """The result of something done for a frame, or why it could not be done."""
     try:
-        return read_image(task.frame, plan.camera, plan.working_folder)
+        return work(*args, **kwargs)
     except _COSTS_THE_FRAME as error:
         return _reason(error, task)
 
 
 def _found_in(
-    image: NDArray[np.uint8] | str, task: FrameTask, plan: FramePlan, tables: Tables
+    image: NDArray[np.uint8] | str,
+    lines: LineDetections | str | None,
+    task: FrameTask,
+    plan: FramePlan,
+    tables: Tables,
 ) -> FrameDetections | str:
-    """What there is in an image, or why it could not be looked for."""
+    """What there is in an image whose lines are known, or why it could not be looked for."""
     if isinstance(image, str):
         return image
-    try:
-        return detect_in_image(image, task.frame.step.prefix, plan, tables, task.tilt)
-    except _COSTS_THE_FRAME as error:
-        return _reason(error, task)
+    if isinstance(lines, str):
+        return lines
+    prefix = task.frame.step.prefix
+    return _attempt(task, detect_in_image, image, prefix, plan, tables, task.tilt, lines)
 
 
 def _reason(error: Exception, task: FrameTask) -> str:
