@@ -28,10 +28,13 @@ from detect.sources.interface import (
     only_calibration,
 )
 from detect.sources.tum import heading_rad
-from storage.messages import OneLineError
+from storage.messages import OneLineError, excerpt, one_line
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
+
+#: Characters that are shown of what another package says, and of topics and types in a bag.
+_LONGEST_CAUSE, LONGEST_NAME = 200, 60
 
 #: Endings of bags that are one file.
 BAG_SUFFIXES = frozenset({".bag", ".mcap", ".db3"})
@@ -142,7 +145,7 @@ class BagOdometry:
 
     def __init__(self, path: Path, topic: str) -> None:
         self.path = path
-        self.name = f"{path}: {topic}"
+        self.name = f"{path}: {one_line(topic, LONGEST_NAME)}"
         self._topic = topic
 
     def __iter__(self) -> Generator[TimedPose, None, None]:
@@ -218,7 +221,8 @@ def messages(reader: AnyReader, path: Path, topic: str) -> Iterator[tuple[str, f
             return
         except Exception as error:  # as above
             raise DetectError(
-                f"{path}: message {number + 1} of {topic} cannot be read: {_one_line(error)}: "
+                f"{path}: message {number + 1} of {one_line(topic, LONGEST_NAME)} cannot be read: "
+                f"{_one_line(error)}: "
                 f"expected a whole bag (--frames takes the first images only)"
             ) from None
         number += 1
@@ -260,7 +264,7 @@ def chosen_topic(
         If there is no such topic, or there are several and none was named.
     """
     topics = sorted({c.topic for c in reader.connections if c.msgtype in kinds})
-    listed = ", ".join(topic[:60] for topic in topics[:6]) or "none"
+    listed = ", ".join(one_line(topic, LONGEST_NAME) for topic in topics[:6]) or "none"
     expected = " or ".join(kind.replace("/msg", "") for kind in kinds)
     if named is not None:
         if named in topics:
@@ -268,7 +272,7 @@ def chosen_topic(
         raise DetectError(f"{path}: no {what} in {named!r}: expected {expected}, of {listed}")
     if not topics:
         there = sorted({str(c.msgtype) for c in reader.connections})[:6]
-        held = ", ".join(kind[:60] for kind in there) or "no messages"
+        held = ", ".join(one_line(kind, LONGEST_NAME) for kind in there) or "no messages"
         raise DetectError(f"{path}: no {what} in it, but {held}: expected {expected}")
     if len(topics) > 1:
         raise DetectError(f"{path}: several topics of {what} ({listed}): name one by {flag}")
@@ -284,7 +288,7 @@ def compressed_content(message: Any, name: object) -> bytes:
         If it is none that can be decoded: compressed depth.
     """
     if "compressedDepth" in message.format:
-        raise FrameError(f"{name}: format {message.format[:40]!r}: expected jpeg, png or tiff")
+        raise FrameError(f"{name}: format {excerpt(message.format)}: expected jpeg, png or tiff")
     return bytes(message.data)
 
 
@@ -295,4 +299,4 @@ def stamp_s(message: Any, recorded_s: float) -> float:
 
 
 def _one_line(error: Exception) -> str:
-    return (" ".join(str(error).split()) or type(error).__name__)[:200]
+    return one_line(" ".join(str(error).split()) or type(error).__name__, _LONGEST_CAUSE)

@@ -19,6 +19,7 @@ from camera import Camera
 from detect.errors import DetectError
 from detect.sources.interface import Calibration
 from detect.sources.steps import DATASET_FROM_ROBOTICS
+from storage.messages import one_line
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
@@ -193,13 +194,13 @@ def recorded_calibration(path: Path, image_topic: str, base: str) -> Calibration
     DetectError, camera.CameraError
         As `calibration_of_info`, or if the bag cannot be read.
     """
-    from detect.sources.bag import messages, opened_bag, understood
+    from detect.sources.bag import LONGEST_NAME, messages, opened_bag, understood
 
     with opened_bag(path) as reader:
         topic = info_topic(reader, image_topic)
         if topic is None:
             return None
-        name = f"{path}: {topic}"
+        name = f"{path}: {one_line(topic, LONGEST_NAME)}"
         found = next(messages(reader, path, topic), None)
         with understood(name):
             if found is None or not is_calibrated(found[2]):

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from detect.errors import FrameError
+from storage.messages import excerpt
 
 _GRAY = frozenset({"mono8", "8UC1", "mono16", "16UC1"})
 _CHANNELS = {
@@ -59,8 +60,8 @@ def pixels_of_message(message: ImageMessage, name: object) -> NDArray[Any]:
         return _rows(message, name, np.dtype(np.uint8), 2)[:, _LUMA[encoding] :: 2]
     if encoding not in _GRAY and encoding not in _CHANNELS and bayer not in _BAYER:
         raise FrameError(
-            f"{name}: encoding {encoding[:40]!r}: expected mono, bgr, rgb, bgra, rgba or bayer of "
-            "8 or 16 bits, or yuv422"
+            f"{name}: encoding {excerpt(encoding)}: expected mono, bgr, rgb, bgra, rgba or bayer "
+            "of 8 or 16 bits, or yuv422"
         )
     deep = encoding.endswith("16") or encoding.startswith("16")
     order = ">" if message.is_bigendian else "<"

@@ -9,7 +9,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -116,7 +116,7 @@ def repeat_short_runs(
     return ShortRuns(
         runs=runs,
         processes=len(marked(mark)),
-        shared=len(_shared() - shared),
+        shared=len(in_nobodys_use(_shared() - shared)),
         temporary=len(_names(temporary)),
         hidden=sum(name.startswith(".") for name in _names(output)),
         caches=len(_names(caches)) - cached,
@@ -181,6 +181,26 @@ def _command(arguments: list[str]) -> None:
 def _shared() -> set[str]:
     """Shared memory and semaphores as Python names them, of all programs."""
     return {name for name in _names(_SHARED_MEMORY) if name.startswith(("sem.", "psm_"))}
+
+
+def in_nobodys_use(names: set[str]) -> set[str]:
+    """Which pieces of shared memory are there that no process has mapped.
+
+    Those of programs that run at the same time are mapped: under the names that they were made by,
+    which are others, so that only their numbers tell.
+    """
+    mapped = set()
+    for maps in Path("/proc").glob("[0-9]*/maps"):
+        with suppress(OSError):  # it ended, or is somebody else's
+            for line in maps.read_text().splitlines():
+                if str(_SHARED_MEMORY) in line:
+                    mapped.add(int(line.split()[4]))
+    left = set()
+    for name in names:
+        with suppress(FileNotFoundError):
+            if (_SHARED_MEMORY / name).stat().st_ino not in mapped:
+                left.add(name)
+    return left
 
 
 def _names(folder: Path) -> set[str]:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import shutil
+import sqlite3
 import sys
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -343,6 +345,32 @@ def test_damaged_bags_are_told_in_one_line(
     (line,) = told
     assert line.startswith(f"error: {path}: ")
     assert "expected" in line
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        "UPDATE topics SET type_description_hash = ?",  # shown by the package that reads bags
+        "UPDATE topics SET name = ? || id",
+        "UPDATE topics SET type = ?",
+    ],
+)
+def test_what_a_bag_says_is_shown_in_part_however_it_is_written(
+    small_run: Path, tmp_path: Path, damage: str
+) -> None:
+    ros = Ros("sqlite")
+    bag = ros.write(tmp_path / "d", recorded(ros, small_run))
+    (file,) = bag.glob("*.db3")
+    with closing(sqlite3.connect(file)) as database:
+        database.execute(damage, ("\x01\U000e0001" * 100,))
+        database.commit()
+    (bag / "metadata.yaml").unlink()  # it says the same
+    try:
+        list(open_source(file).frames)
+    except DetectError as error:
+        said = str(error).replace(str(file), "")
+        assert said.isprintable()
+        assert len(said) < 500
 
 
 def test_without_the_package(

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import json
+import multiprocessing
 import os
 import subprocess
 import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from tools.soak import short_runs
 from tools.soak.cli import main
 from tools.soak.long_run import MOST_GROWTH_MIB, SoakError, SoakResult, link_run
 from tools.soak.processes import family, marked
@@ -122,3 +125,17 @@ def test_a_soak_of_some_seconds(
     assert 3 <= found["descriptors"][-1] <= found["descriptors"][0]
     assert found["processes"] == 1
     assert [path.name for path in tmp_path.iterdir()] == ["soak.json"]  # the run is removed
+
+
+@pytest.mark.skipif(not Path("/dev/shm").is_dir(), reason="looks for shared memory in /dev/shm")
+def test_shared_memory_in_use_was_not_left_behind() -> None:
+    lock: Any = multiprocessing.get_context("spawn").Lock()  # of a program that goes on
+    in_use = f"sem.{lock._semlock.name.strip('/')}"
+    orphan = Path(f"/dev/shm/psm_redetect_{os.getpid()}")
+    assert (orphan.parent / in_use).exists()
+    orphan.touch()
+    try:
+        names = {in_use, orphan.name, "psm_gone"}
+        assert short_runs.in_nobodys_use(names) == {orphan.name}
+    finally:
+        orphan.unlink()
