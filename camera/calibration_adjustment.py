@@ -178,7 +178,7 @@ def adjust(
     start : Estimate
         Must project all points.
     points : Points
-    span : (11, K) array
+    span : (14, K) array
         Directions in which the intrinsics may change (`free_span`); K = 0 fits poses alone.
     robust : bool
         Huber's loss per coordinate, at `HUBER` standard deviations.

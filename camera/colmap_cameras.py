@@ -75,6 +75,11 @@ def parse_colmap(text: str, name: str = "<text>", camera_name: str = "") -> Fore
                 raise ConversionError(
                     f"{name}:{number}: expected CAMERA_ID MODEL WIDTH HEIGHT PARAMS..."
                 )
+            if fields[0] in rows:
+                raise ConversionError(
+                    f"{name}:{number}: camera {one_line(fields[0], _LONGEST_LIST)} a second time, "
+                    f"after line {rows[fields[0]][0]}: expected different numbers"
+                )
             rows[fields[0]] = (number, fields)
     held = one_line(", ".join(rows), _LONGEST_LIST)
     if camera_name and camera_name not in rows:

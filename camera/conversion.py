@@ -28,6 +28,8 @@ _IDENTITY = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
 _FIT_GRID = (41, 31)
 _CHECK_GRID = (129, 97)
 _MANY_STEPS = 200
+# The rational model's coefficients before those of the thin prism.
+_WITHOUT_PRISM = 8
 # A largest deviation after least squares from which on another start is tried.
 _NEAR_PX = 0.02
 # b1, b2, b3 of a denominator that dips towards the image's corner, at radius 1.
@@ -79,8 +81,8 @@ def convert_to_foreign(
     rows : str
         `same`, `halve` or `double`.
     free : int
-        Number of the model's first coefficients that may differ from 0; -1: the radial and the
-        tangential ones, but not a thin prism's.
+        Number of the model's first coefficients that may differ from 0; -1: all. A thin prism's are
+        taken over, but never fitted.
 
     Returns
     -------
@@ -92,9 +94,9 @@ def convert_to_foreign(
         If the source does not see all of its image, or the fit fails.
     """
     number = COEFFICIENTS[model] if free < 0 else free
-    if model == "rational":
-        number = min(number, 8)
     contained = _contained(source, model, number)
+    if model == "rational":
+        number = min(number, _WITHOUT_PRISM)
     width, height = target_size(source, rows)
     factor = {"same": 1.0, "halve": 0.5, "double": 2.0}[rows]
     if contained is not None:
@@ -140,6 +142,11 @@ def convert_to_foreign(
     if best is None:
         raise ConversionError(f"no {model} camera sees what the source sees")
     return best
+
+
+def contains(model: Model, source: AnyCamera, *, free: int = -1) -> bool:
+    """Whether a model holds a camera as it is; parameters as of `convert_to_foreign`."""
+    return _contained(source, model, COEFFICIENTS[model] if free < 0 else free) is not None
 
 
 def convert_to_camera(

@@ -6,7 +6,13 @@ from pathlib import Path
 
 from camera.camfile import format_camera, parse_camera, read_camera
 from camera.colmap_cameras import format_colmap, parse_colmap, text_of_binary
-from camera.conversion import AnyCamera, Converted, convert_to_camera, convert_to_foreign
+from camera.conversion import (
+    AnyCamera,
+    Converted,
+    contains,
+    convert_to_camera,
+    convert_to_foreign,
+)
 from camera.conversion_models import ForeignCamera, Model
 from camera.convert_yaml import parse_yaml, read_content, text_of
 from camera.errors import ConversionError
@@ -24,8 +30,8 @@ MODELS: dict[str, tuple[Model, ...]] = {
     "kalibr": ("radtan", "fisheye"),
     "colmap": ("radtan", "rational", "fisheye"),
 }
-# k1 k2 p1 p2, without k3.
-_FREE_RADTAN = {"kalibr": 4, "colmap": 4}
+# k1 k2 p1 p2, without k3; and the rational model without the thin prism.
+_FREE = {("kalibr", "radtan"): 4, ("colmap", "radtan"): 4, ("colmap", "rational"): 8}
 
 
 def perform(options: Convert) -> int:
@@ -187,7 +193,10 @@ def format_of(camera: AnyCamera, to_format: Format, camera_name: str = "") -> st
 
 
 def convert(source: AnyCamera, to_format: Format, options: Convert) -> Converted:
-    """Convert to the first model of a format that is within the limit, or the nearest one."""
+    """Convert to a model of a format that holds the camera as it is, if there is one.
+
+    Else to the first one that is within the limit, or the nearest one.
+    """
     if to_format == "cam":
         pose = read_camera(options.pose_from) if options.pose_from is not None else None
         return convert_to_camera(source, options.rows, pose)
@@ -198,13 +207,17 @@ def convert(source: AnyCamera, to_format: Format, options: Convert) -> Converted
                 f"{to_format} has no {options.model} model: expected {' or '.join(models)}"
             )
         models = (options.model,)
-    elif isinstance(source, ForeignCamera) and source.model in models:
-        # Its own model first: that is a copy.
-        models = (source.model, *(model for model in models if model != source.model))
+
+    def free(model: Model) -> int:
+        return _FREE.get((to_format, model), -1)
+
+    own = source.model if isinstance(source, ForeignCamera) else None
+    order = sorted(
+        models, key=lambda model: (not contains(model, source, free=free(model)), model != own)
+    )
     best: Converted | None = None
-    for model in models:
-        free = _FREE_RADTAN.get(to_format, -1) if model == "radtan" else -1
-        converted = convert_to_foreign(source, model, options.rows, free=free)
+    for model in order:
+        converted = convert_to_foreign(source, model, options.rows, free=free(model))
         if best is None or converted.deviation_px < best.deviation_px:
             best = converted
         if best.deviation_px <= options.limit_px:

@@ -47,6 +47,11 @@ def parse_kalibr(text: str, name: str = "<text>", camera_name: str = "") -> Fore
     label = model if isinstance(model, str) else excerpt(model)
     d = numbers(entry.get("distortion_coeffs", []), "distortion_coeffs", where)
     if label == "none":
+        if any(d):
+            raise ConversionError(
+                f"{where}: distortion_coeffs without a distortion_model: expected one of "
+                f"{', '.join(_MODELS)}"
+            )
         label, d = "radtan", [0.0] * _COEFFICIENTS
     if label not in _MODELS:
         raise ConversionError(

@@ -35,6 +35,7 @@ def pauses_of(odometry: PlanarPoses) -> list[tuple[float, float]]:
     Parameters
     ----------
     odometry : PlanarPoses
+        No two samples of one time.
 
     Returns
     -------

@@ -19,7 +19,7 @@ from groundtruth.fusion.controls import pauses_of
 from groundtruth.fusion.learning import likeliest_noise, looser_over_seconds, noise_of
 from groundtruth.fusion.movement import movement_problem
 from groundtruth.fusion.settings import FuseSettings
-from groundtruth.trajectories.streams import PlanarPoses
+from groundtruth.trajectories.streams import PlanarPoses, last_of_each_time
 from landmarks import wrap_angle
 
 __all__ = ["FuseSettings", "Fusion", "OdometryErrors", "Rejected", "fuse"]
@@ -176,6 +176,8 @@ def fuse(
         repaired=problem.repaired,
         repeated=problem.repeated,
         pauses_s=tuple(
-            (begin, end) for begin, end in pauses_of(odometry) if end > first and begin < last
+            (begin, end)
+            for begin, end in pauses_of(last_of_each_time(odometry))
+            if end > first and begin < last
         ),
     )

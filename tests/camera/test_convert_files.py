@@ -6,6 +6,7 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -14,12 +15,12 @@ from camera import Camera
 from camera.cli import main
 from camera.colmap_cameras import text_of_binary
 from camera.conversion import convert_to_camera
-from camera.conversion_models import ForeignCamera
-from camera.convert_command import format_of, format_of_text, parse, read_text
+from camera.conversion_models import ForeignCamera, Model
+from camera.convert_command import convert, format_of, format_of_text, parse, read_text
 from camera.convert_yaml import parse_yaml
 from camera.errors import ConversionError
-from camera.kalibr_camchain import format_kalibr
-from camera.options import Format
+from camera.kalibr_camchain import format_kalibr, parse_kalibr
+from camera.options import Convert, Format
 from camera.ros_camera_info import format_ros, parse_ros
 
 RADTAN = ForeignCamera(
@@ -133,3 +134,48 @@ def test_what_cannot_be_converted_names_its_file(
     source.write_text(format_kalibr(wide))
     assert main(["convert", str(source), str(tmp_path / "b.cam")]) == 1
     assert f"error: {source}: pixel (0, 0) sees nothing" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("model", "distortion", "formats"),
+    [
+        ("radtan", (-0.3, 0.1, 1e-3, -5e-4, -0.02), ("opencv", "ros", "colmap")),
+        ("rational", (0.2, -0.1, 1e-3, -5e-4, 0.01, 0.3, 0.02, 0.0, 2e-3, 1e-4, -1e-3, 0.0),
+         ("opencv", "ros")),
+    ],
+)  # fmt: skip
+def test_what_a_format_holds_is_taken_over(
+    model: Model, distortion: tuple[float, ...], formats: tuple[Format, ...]
+) -> None:
+    source = ForeignCamera(model, 640, 480, 500.0, 505.0, 318.5, 241.0, distortion)
+    rays = np.random.default_rng(3).uniform(-0.5, 0.5, size=(50, 2))
+    for to_format in formats:
+        # However much the loss of a term would be allowed to show.
+        options = Convert(Path("source"), Path("target"), limit_px=100.0)
+        found = convert(source, to_format, options).camera
+        back = parse(format_of(found, to_format), to_format, "back")
+        np.testing.assert_allclose(back.distort(rays), source.distort(rays), rtol=0, atol=1e-9)
+
+
+def test_a_polynomial_of_three_terms_stays_whole_in_colmaps_format() -> None:
+    source = replace(RADTAN, distortion=(-0.3, 0.1, 1e-3, -5e-4, -0.02))
+    camera = convert_to_camera(source).camera
+    options = Convert(Path("source"), Path("cameras.txt"), limit_px=100.0)
+    back = parse(format_of(convert(camera, "colmap", options).camera, "colmap"), "colmap", "back")
+    assert isinstance(back, ForeignCamera)
+    assert back.distortion[:5] == source.distortion
+    assert not any(back.distortion[5:])
+
+
+def test_kalibrs_coefficients_of_no_model_are_refused() -> None:
+    text = format_kalibr(RADTAN).replace("  distortion_model: radtan\n", "")
+    with pytest.raises(ConversionError, match="cam0: distortion_coeffs without a distortion_model"):
+        parse_kalibr(text, "chain")
+    none = text.replace("-0.3, 0.1, 0.001, -0.0005", "0.0, 0.0, 0.0, 0.0")
+    assert not any(parse_kalibr(none, "chain").distortion)
+
+
+def test_two_cameras_of_one_number_are_refused() -> None:
+    text = "1 PINHOLE 640 480 500 500 320 240\n1 PINHOLE 64 48 50 50 32 24\n"
+    with pytest.raises(ConversionError, match="list:2: camera 1 a second time, after line 1"):
+        parse(text, "colmap", "list", "1")

@@ -72,3 +72,14 @@ def test_where_odometry_pauses_the_way_is_not_known() -> None:
     both = PlanarPoses(still.times_s[[0, -1]], stood[:2], np.tile(LASER_COVARIANCE, (2, 1, 1)))
     problem = movement_problem(still, {"laser": both}, FuseSettings())
     assert not np.any(problem.unseen)
+
+
+def test_a_buffer_read_every_other_second_makes_no_pauses() -> None:
+    """What is told of pauses is what the estimate takes for them."""
+    rng = np.random.default_rng(23)
+    truth, odometry = drive(rng, 30.0, FuseSettings())
+    coarse = PlanarPoses(np.floor(odometry.times_s / 2.0) * 2.0, odometry.poses)
+    laser = measure(rng, truth, np.arange(2.5, 27.0, 0.5), LASER_COVARIANCE)
+    settings = FuseSettings(learn_noise=False)
+    assert not np.any(movement_problem(coarse, {"laser": laser}, settings).unseen)
+    assert fuse(coarse, {"laser": laser}, settings).pauses_s == ()
