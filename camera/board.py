@@ -72,9 +72,15 @@ class Board:
                 f"marker_m is {self.marker_m:g}: a ChArUco board needs the side of its markers, "
                 f"between 0 and square_m ({self.square_m:g})"
             )
-        if not 0.0 <= self.circle_m < 2.0 * self.square_m:
+        if self.circle_m and self.kind not in _NEIGHBOURS_SQUARES:
             raise CalibrationError(
-                f"circle_m is {self.circle_m:g}: expected a diameter below the circles' distance"
+                f"circle_m is {self.circle_m:g}: a {self.kind} board has no circles; expected none"
+            )
+        distance_m = self.square_m * _NEIGHBOURS_SQUARES.get(self.kind, 1.0)
+        if not 0.0 <= self.circle_m < distance_m:
+            raise CalibrationError(
+                f"circle_m is {self.circle_m:g}: expected a diameter below the circles' distance, "
+                f"{distance_m:g}"
             )
 
     @property
@@ -103,6 +109,9 @@ class Board:
         counted = _WHAT_IS_COUNTED[self.kind]
         return f"{self.kind} board of {self.columns} x {self.rows} {counted}"
 
+
+# How far apart neighbouring circles are, in `square_m`; those of an asymmetric grid across.
+_NEIGHBOURS_SQUARES: dict[str, float] = {"circles": 1.0, "asymmetric-circles": 2.0**0.5}
 
 _WHAT_IS_COUNTED: dict[str, str] = {
     "checkerboard": "inner corners",

@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Iterable
+from errno import ENOENT
 from math import degrees, radians
+from os import strerror
 from pathlib import Path
 from typing import Any
 
@@ -51,6 +53,11 @@ def perform(options: Calibrate) -> int:
     for path in (options.output, report, *names.values()):
         if path.exists() and not options.force:
             raise OutputExistsError(path)
+    # What would be told only after minutes of work.
+    if not options.output.parent.exists():
+        raise FileNotFoundError(ENOENT, strerror(ENOENT), str(options.output))
+    if options.floor is not None and not options.floor.exists():
+        raise CalibrationError(f"{options.floor}: no such picture or .csv of the floor")
     board = Board(
         kind=options.board,
         columns=options.columns,
@@ -69,22 +76,20 @@ def perform(options: Calibrate) -> int:
     )
     images = calibration_images(options.images, options.every, options.max_images)
     views, size = find_views(images, board)
+    on_the_floor: tuple[FloatArray, FloatArray, float] | None = None
+    if options.floor is not None:
+        on_the_floor = (
+            *floor_points(options.floor, board, options.floor_origin, options.floor_yaw, size),
+            radius_on_floor(options.floor, board),
+        )
     calibration = calibrate(views, board, size, settings)
     camera = camera_of(calibration)
     print(describe(calibration, camera))
 
     placed: FloorPose | None = None
-    if options.floor is not None:
-        pixels, floor_xy = floor_points(
-            options.floor, board, options.floor_origin, options.floor_yaw, size
-        )
-        placed = place_on_floor(
-            camera,
-            pixels,
-            floor_xy,
-            calibration.adjusted.covariance,
-            radius_on_floor(options.floor, board),
-        )
+    if on_the_floor is not None:
+        pixels, floor_xy, radius_m = on_the_floor
+        placed = place_on_floor(camera, pixels, floor_xy, calibration.adjusted.covariance, radius_m)
         camera = with_pose(camera, placed.robot_from_camera)
         print(describe_pose(placed))
     else:

@@ -29,11 +29,12 @@ def calibration_images(
     Parameters
     ----------
     inputs : sequence of Path
-        Images, folders of images, videos.
+        Images, folders of images, videos. A file that is named twice is taken once: the same
+        picture again tells nothing more.
     every : int
         Of a video every so many-th frame is taken.
     most : int
-        At most so many pictures are taken, evenly over all.
+        At most so many images are taken, evenly over all, and so many frames of each video.
 
     Raises
     ------
@@ -58,9 +59,9 @@ def calibration_images(
             f"no pictures in {', '.join(str(path) for path in inputs)}: expected files ending in "
             f"{' '.join(IMAGE_SUFFIXES)}, or a video"
         )
-    for path in _evenly(images, most):
+    for path in _evenly(_each_once(images), most):
         yield path.name, read_grey(path)
-    for path in videos:
+    for path in _each_once(videos):
         yield from _frames(path, every, most)
 
 
@@ -75,8 +76,6 @@ def read_grey(path: Path) -> GreyImage:
     CalibrationError
         If it cannot be read.
     """
-    import cv2
-
     try:
         content = read_bounded(path, _LARGEST_FILE_BYTES)
     except OSError as error:
@@ -86,25 +85,48 @@ def read_grey(path: Path) -> GreyImage:
         raise CalibrationError(
             f"{path}: claims {size[0]}x{size[1]} px: expected at most {MOST_PIXELS} pixels"
         )
+    if size is None:
+        raise _not_an_image(path)
+    return grey_of_content(content, path)
+
+
+def grey_of_content(content: bytes, name: object) -> GreyImage:
+    """What `read_grey` reads, of a file's content; `name` is what messages call it.
+
+    How much memory the image takes is not looked at: `storage.image_header` says it beforehand.
+
+    Raises
+    ------
+    CalibrationError
+        If it cannot be read.
+    """
+    import cv2
+
     image = None
-    if size is not None:
-        data = np.frombuffer(content, np.uint8)
-        with suppress(cv2.error):
-            image = cv2.imdecode(
-                data,
-                cv2.IMREAD_ANYDEPTH | cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION,
-            )
-    if image is None:
-        raise CalibrationError(
-            f"{path}: not an image that can be read: expected JPEG, PNG, PNM, BMP or TIFF"
+    with suppress(cv2.error):
+        image = cv2.imdecode(
+            np.frombuffer(content, np.uint8),
+            cv2.IMREAD_ANYDEPTH | cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION,
         )
+    if image is None:
+        raise _not_an_image(name)
     if image.dtype not in (np.uint8, np.uint16):
-        raise CalibrationError(f"{path}: holds {image.dtype}: expected images of 8 or 16 bits")
+        raise CalibrationError(f"{name}: holds {image.dtype}: expected images of 8 or 16 bits")
     if image.dtype == np.uint8:
         return np.asarray(image)
     # Cameras of 10 to 16 bits leave the upper part of the range unused: by the brightest pixel.
     brightest = max(float(image.max()), 1.0)
     return np.asarray(np.rint(image.astype(np.float64) * (255.0 / brightest)), dtype=np.uint8)
+
+
+def _not_an_image(name: object) -> CalibrationError:
+    return CalibrationError(
+        f"{name}: not an image that can be read: expected JPEG, PNG, PNM, BMP or TIFF"
+    )
+
+
+def _each_once(paths: list[Path]) -> list[Path]:
+    return list({path.resolve(): path for path in reversed(paths)}.values())[::-1]
 
 
 def _evenly(paths: list[Path], most: int) -> list[Path]:
@@ -120,6 +142,8 @@ def _frames(path: Path, every: int, most: int) -> Iterator[tuple[str, GreyImage]
     try:
         if not video.isOpened():
             raise CalibrationError(f"{path}: not a video that OpenCV can read")
+        # The sensor's pixels, as of photographs: a telephone's note of how it was held turns none.
+        video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
         count = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
         # A long video is thinned, so that the frames taken are from all of it.
         step = max(every, -(-count // most)) if count > 0 else every

@@ -219,3 +219,13 @@ def _check(pixels: FloatArray, floor: FloatArray) -> None:
                 f"the points lie in a line {what}: add some beside it, or the camera's tilt about "
                 "the line stays open"
             )
+        away = values - values.mean(axis=0)
+        spreads = np.linalg.eigvalsh(
+            # Of all but one, each in turn.
+            away.T @ away - len(away) / (len(away) - 1) * away[:, :, None] * away[:, None, :]
+        )
+        if np.any(spreads[:, 0] < 1e-6 * spreads[:, 1]):
+            raise CalibrationError(
+                f"all but one of the points lie in a line {what}: add another beside it, or poses "
+                "can't be told apart"
+            )

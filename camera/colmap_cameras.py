@@ -67,7 +67,7 @@ def parse_colmap(text: str, name: str = "<text>", camera_name: str = "") -> Fore
     ConversionError
         If it lacks something, holds several cameras and none is chosen, or has another model.
     """
-    rows = {}
+    rows: dict[str, tuple[int, list[str]]] = {}
     for number, line in enumerate(text.splitlines(), start=1):
         fields = line.split()
         if fields and not line.lstrip().startswith("#"):

@@ -107,6 +107,8 @@ def _opened(path: Path) -> Iterator[cv2.VideoCapture]:
                 f"{path}: no video that OpenCV can read: expected a run folder, images, a video "
                 "(avi, mp4, mkv), or a bag (.bag, .mcap, or the folder of a ROS 2 bag)"
             )
+        # A calibration is of the sensor's pixels, whichever way up a telephone would show them.
+        capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
         yield capture
     finally:
         capture.release()

@@ -24,6 +24,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera, read_camera
+from camera.calibrate_images import grey_of_content
+from camera.errors import CalibrationError
 from groundtruth.errors import GeometryError, GroundTruthError
 from groundtruth.json_file import read_json
 from groundtruth.markers.calibration import parse_covariance, parse_pose
@@ -141,31 +143,27 @@ def find_boards(image: BoardImage, board: Checkerboard, camera: Camera) -> Board
     GroundTruthError
         If the image cannot be read, has another size than the calibration, or shows no board.
     """
-    import cv2
-
     if image.corners is not None:
         return BoardView(image.camera, image.board, image.corners)
     assert image.image is not None
     try:
-        content = np.frombuffer(read_bounded(image.image, _LARGEST_IMAGE_BYTES), np.uint8)
+        content = read_bounded(image.image, _LARGEST_IMAGE_BYTES)
     except OSError as error:
         raise GroundTruthError(f"{image.image}: cannot be read: {error.strerror}") from None
-    size = claimed_size(content.tobytes())
+    size = claimed_size(content)
     # What claims more is not decoded: memory is taken only for what there should be.
     if size is not None and sorted(size) != sorted((camera.width, camera.height)):
         raise _other_size(image.image, size, camera)
-    # A calibration is of the sensor's pixels, whichever way up a telephone would show them (Exif).
-    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
-    try:
-        grey = None if size is None else cv2.imdecode(content, flags)
-    except cv2.error:
-        grey = None
-    if grey is None:
+    if size is None:
         raise GroundTruthError(f"{image.image}: cannot be decoded: expected an image")
+    try:
+        grey = grey_of_content(content, image.image)
+    except CalibrationError as error:
+        raise GroundTruthError(str(error)) from None
     if grey.shape != (camera.height, camera.width):
         raise _other_size(image.image, (grey.shape[1], grey.shape[0]), camera)
     try:
-        corners = find_checkerboard(np.asarray(grey, dtype=np.uint8), board)
+        corners = find_checkerboard(grey, board)
     except GeometryError as error:
         raise GroundTruthError(f"{image.image}: {error}") from None
     return BoardView(image.camera, image.board, corners)

@@ -245,6 +245,18 @@ def test_points_in_a_line_are_told(published_camera: Camera) -> None:
         place_on_floor(published_camera, published_camera.project_floor(floor_xy), floor_xy)
 
 
+def test_a_line_and_a_point_beside_it_are_told(published_camera: Camera) -> None:
+    """Two that are one point, too: three places see the camera at several poses."""
+    line = np.column_stack([np.zeros(3), np.linspace(-2.0, -1.0, 3)])
+    for floor_xy in ([*line, [0.5, -1.5]], [*line[:2], [0.5, -1.5], [0.5, -1.5]]):
+        pixels = published_camera.project_floor(floor_xy)
+        with pytest.raises(CalibrationError, match="all but one of the points lie in a line"):
+            place_on_floor(published_camera, pixels, np.array(floor_xy))
+    square = np.array([[-0.5, -2.0], [0.5, -2.0], [0.5, -1.0], [-0.5, -1.0]])
+    found = place_on_floor(published_camera, published_camera.project_floor(square), square)
+    np.testing.assert_allclose(found.robot_from_camera[:, 3], published_camera.centre, atol=1e-3)
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -269,6 +281,12 @@ def test_what_a_newcomer_gets_wrong(
         assert main(list(arguments)) == 1
         return capsys.readouterr().err
 
+    lost = ["-o", str(tmp_path / "none" / "my.cam")]
+    assert "no such folder" in error("calibrate", str(tmp_path), *FLAGS, *lost)
+    floor = ["--floor", str(tmp_path / "floor.png")]
+    assert "floor.png: no such picture" in error(
+        "calibrate", str(tmp_path), *FLAGS, *output, *floor
+    )
     assert "no such picture" in error("calibrate", str(tmp_path / "none"), *FLAGS, *output)
     assert "no pictures in" in error("calibrate", str(tmp_path), *FLAGS, *output)
     empty = np.full((240, 320), 128, dtype=np.uint8)

@@ -8,10 +8,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from camera import Camera
-from camera.calibrate_images import read_grey
+from camera.calibrate_images import calibration_images, read_grey
 from detect.sources.gray import decode_gray
+from detect.sources.video import VideoFile
 from groundtruth.errors import GroundTruthError
 from groundtruth.markers.boards_file import BoardImage, find_boards
 from groundtruth.markers.checkerboard import Checkerboard
@@ -52,3 +54,62 @@ def test_a_board_is_looked_for_in_the_sensors_pixels(tmp_path: Path) -> None:
         find_boards(BoardImage("a", "b", 0, path, None), Checkerboard(4, 5, 0.1), camera)
     # None is in it, but it has the calibration's size.
     assert "expected 32x24" not in str(refused.value)
+
+
+def filmed(path: Path, pictures: list[NDArray[np.uint8]]) -> None:
+    """A video that asks to be shown turned by 90 degrees, as of a telephone held upright."""
+    height, width = pictures[0].shape
+    codec = cv2.VideoWriter.fourcc(*"mp4v")
+    writer = cv2.VideoWriter(str(path), codec, 10.0, (width, height), isColor=True)
+    assert writer.isOpened()
+    for picture in pictures:
+        writer.write(cv2.cvtColor(picture, cv2.COLOR_GRAY2BGR))
+    writer.release()
+    content = bytearray(path.read_bytes())
+    # The track's header, version 0: the matrix is 40 bytes behind its flags (ISO/IEC 14496-12).
+    place = content.index(b"tkhd") + 4 + 40
+    one = 1 << 16
+    assert struct.unpack_from(">9i", content, place) == (one, 0, 0, 0, one, 0, 0, 0, 1 << 30)
+    struct.pack_into(">9i", content, place, 0, one, 0, -one, 0, 0, height * one, 0, 1 << 30)
+    path.write_bytes(content)
+
+
+def test_how_a_telephone_was_held_turns_no_video(tmp_path: Path) -> None:
+    picture = np.zeros((48, 64), np.uint8)
+    picture[:16, :16] = 250
+    path = tmp_path / "a.mp4"
+    filmed(path, [picture, picture])
+    reader = cv2.VideoCapture(str(path))
+    turned = reader.read()[1]
+    reader.release()
+    assert turned.shape[:2] == (64, 48)  # what OpenCV does unless told
+    frames = [image for _, image in calibration_images([path], 1, 9)]
+    assert len(frames) == 2
+    for frame in (*frames, *(image.content for image in VideoFile(path).images())):
+        assert isinstance(frame, np.ndarray)
+        np.testing.assert_allclose(frame, picture, atol=30)
+
+
+def test_a_file_that_is_named_twice_is_taken_once(tmp_path: Path) -> None:
+    for name in ("a.png", "b.png"):
+        cv2.imwrite(str(tmp_path / name), np.zeros((8, 8), np.uint8))
+    named = [tmp_path, tmp_path / "a.png", tmp_path / "." / "b.png"]
+    assert [name for name, _ in calibration_images(named, 1, 9)] == ["a.png", "b.png"]
+
+
+def test_a_board_in_a_picture_of_ten_bits_is_found(tmp_path: Path) -> None:
+    """Of 16 bits such a camera fills the lowest, which makes a dark picture."""
+    squares = np.add.outer(np.arange(6), np.arange(7)) % 2
+    board = np.kron(squares, np.full((16, 16), 900.0)) + 50.0
+    sharp = np.pad(board, 24, constant_values=1000.0)
+    height, width = sharp.shape
+    picture = cv2.GaussianBlur(sharp, (0, 0), 1.5) * np.linspace(1.0, 0.5, width)
+    path = tmp_path / "a.png"
+    cv2.imwrite(str(path), picture.astype(np.uint16))
+    camera = Camera(width, height, 300.0, 300.0, 80.0, 70.0, (0.0,) * 5, IDENTITY)
+    found = find_boards(BoardImage("a", "b", 0, path, None), Checkerboard(6, 5, 0.1), camera)
+    columns, rows = np.meshgrid(np.arange(6) * 16 + 39.5, np.arange(5) * 16 + 39.5)
+    corners = np.stack([columns, rows], axis=-1).reshape(-1, 2)
+    away = np.linalg.norm(found.corners[:, None] - corners, axis=-1)
+    # Of the highest eight bits alone, which hold four grey values, 0.9.
+    assert away.min(axis=1).max() < 0.12

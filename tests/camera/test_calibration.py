@@ -371,6 +371,15 @@ def test_residuals_that_no_board_leaves_are_told(published_camera: Camera) -> No
         (("checkerboard", 9, 6, 0.0), "metres above 0"),
         (("charuco", 9, 6, 0.04), "marker_m is 0"),
         (("circles", 9, 6, 0.04, 0.0, "DICT_5X5_100", 0.1), "below the circles' distance"),
+        (("circles", 9, 6, 0.04, 0.0, "DICT_5X5_100", 0.05), "below the circles' distance, 0.04"),
+        (
+            ("asymmetric-circles", 4, 11, 0.04, 0.0, "DICT_5X5_100", 0.06),
+            "below the circles' distance, 0.0565685",
+        ),
+        (
+            ("checkerboard", 9, 6, 0.04, 0.0, "DICT_5X5_100", 0.02),
+            "a checkerboard board has no circles",
+        ),
     ],
 )
 def test_impossible_boards(arguments: tuple[object, ...], message: str) -> None:
