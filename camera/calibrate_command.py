@@ -54,6 +54,8 @@ def perform(options: Calibrate) -> int:
         if path.exists() and not options.force:
             raise OutputExistsError(path)
     # What would be told only after minutes of work.
+    if report == options.output:
+        raise CalibrationError(f"{report}: the report is written there: expected a name in .cam")
     if not options.output.parent.exists():
         raise FileNotFoundError(ENOENT, strerror(ENOENT), str(options.output))
     if options.floor is not None and not options.floor.exists():

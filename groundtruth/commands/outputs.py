@@ -11,14 +11,24 @@ from pathlib import Path
 from typing import Any
 
 from groundtruth import __version__
+from groundtruth.errors import GroundTruthError
 from storage import OutputExistsError, write_whole
 
 
 def check_outputs(paths: Sequence[Path | None], force: bool) -> None:
-    """Refuse to begin where an output exists, unless it may be replaced."""
+    """Refuse to begin where an output exists, unless it may be replaced, or two are one file."""
+    places: set[Path] = set()
     for path in paths:
-        if path is not None and path.exists() and not force:
+        if path is None:
+            continue
+        if path.exists() and not force:
             raise OutputExistsError(path)
+        if path.resolve() in places:
+            raise GroundTruthError(
+                f"{path}: two of the outputs would be written there: expected another name or "
+                "ending"
+            )
+        places.add(path.resolve())
 
 
 def provenance(settings: Any, files: Sequence[Path] = ()) -> dict[str, Any]:

@@ -131,6 +131,7 @@ def _markers(
     if not (np.isfinite(command.width_m) and command.width_m > 0.0):
         raise GroundTruthError(f"width_m is {command.width_m:g}: expected metres above 0")
     widths = dict.fromkeys(ids, command.width_m)
+    named: dict[int, float] = {}
     for word in command.widths:
         marker, _, width = word.partition("=")
         try:
@@ -139,6 +140,10 @@ def _markers(
             number, metres = -1, float("nan")
         if number < 0 or not (np.isfinite(metres) and metres > 0.0):
             raise GroundTruthError(f"widths: {word!r}: expected a marker and metres, as 31=0.15")
+        if number in named:
+            raise GroundTruthError(f"widths: marker {number} twice: expected one width")
+        named[number] = metres
+    for number, metres in named.items():
         if number in widths:
             widths[number] = metres
         else:

@@ -283,6 +283,8 @@ def test_what_a_newcomer_gets_wrong(
 
     lost = ["-o", str(tmp_path / "none" / "my.cam")]
     assert "no such folder" in error("calibrate", str(tmp_path), *FLAGS, *lost)
+    report = ["-o", str(tmp_path / "my.json")]
+    assert "expected a name in .cam" in error("calibrate", str(tmp_path), *FLAGS, *report)
     floor = ["--floor", str(tmp_path / "floor.png")]
     assert "floor.png: no such picture" in error(
         "calibrate", str(tmp_path), *FLAGS, *output, *floor

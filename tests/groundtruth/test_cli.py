@@ -230,6 +230,7 @@ def test_a_rig_from_a_session(tmp_path: Path, capsys: Captured) -> None:
         (["--width-m", "0"], "width_m is 0"),
         (["--width-m", "0.2", "--widths", "31:0.2"], "'31:0.2': expected a marker and metres"),
         (["--width-m", "0.2", "--widths", "31=inf"], "'31=inf': expected a marker and metres"),
+        (["--width-m", "0.2", "--widths", "31=0.1", "31=0.2"], "marker 31 twice"),
         (["--width-m", "0.2", "--ids", "99"], "no markers of the dictionary"),
         (["--width-m", "0.2", "--dictionary", "aruco"], "no markers of the dictionary aruco"),
         (["--width-m", "0.2", "--reference-poses", "x.csv"], "needs --network"),
@@ -242,6 +243,20 @@ def test_rigs_that_cannot_be_made_are_refused(
     output = tmp_path / "rig.json"
     refused(["rig", str(session / "a"), *options, "-o", str(output)], names, capsys)
     assert not output.exists()
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["fuse", "odometry.csv", "--laser", "laser.csv", "-o", "{}/fused.json"],
+        ["sync", "odometry.csv", "laser.csv", "-o", "{}/clock", "--apply", "{}/x/../clock"],
+    ],
+)
+def test_two_outputs_in_one_place_are_refused(
+    tmp_path: Path, capsys: Captured, words: list[str]
+) -> None:
+    refused([word.format(tmp_path) for word in words], "two of the outputs", capsys)
+    assert not list(tmp_path.iterdir())
 
 
 def test_settings_that_cannot_be_are_a_wrong_command_line(capsys: Captured) -> None:
