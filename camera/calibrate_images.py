@@ -47,7 +47,7 @@ def calibration_images(
     videos: list[Path] = []
     for path in inputs:
         if path.is_dir():
-            images += sorted(p for p in path.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES)
+            images += sorted(p for p in path.iterdir() if _is_image(p))
         elif not path.exists():
             raise CalibrationError(f"{path}: no such picture, folder or video")
         elif path.suffix.lower() in VIDEO_SUFFIXES:
@@ -123,6 +123,11 @@ def _not_an_image(name: object) -> CalibrationError:
     return CalibrationError(
         f"{name}: not an image that can be read: expected JPEG, PNG, PNM, BMP or TIFF"
     )
+
+
+def _is_image(path: Path) -> bool:
+    # Hidden files are none: some systems keep notes, named ._ and the picture's name, beside it.
+    return path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".")
 
 
 def _each_once(paths: list[Path]) -> list[Path]:

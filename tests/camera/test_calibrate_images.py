@@ -93,6 +93,8 @@ def test_how_a_telephone_was_held_turns_no_video(tmp_path: Path) -> None:
 def test_a_file_that_is_named_twice_is_taken_once(tmp_path: Path) -> None:
     for name in ("a.png", "b.png"):
         cv2.imwrite(str(tmp_path / name), np.zeros((8, 8), np.uint8))
+    # As some systems leave them on memory cards.
+    (tmp_path / "._a.png").write_bytes(b"notes")
     named = [tmp_path, tmp_path / "a.png", tmp_path / "." / "b.png"]
     assert [name for name, _ in calibration_images(named, 1, 9)] == ["a.png", "b.png"]
 
