@@ -126,8 +126,15 @@ def _markers(
     dictionary = command.dictionary if command.dictionary is not None else dictionaries[0]
     found = {marker.id for marker in markers if marker.dictionary == dictionary}
     ids = sorted(found & set(command.ids)) if command.ids else sorted(found)
-    if not ids:
+    if not found:
         raise GroundTruthError(f"no markers of the dictionary {dictionary} in any of the runs")
+    if not ids:
+        raise GroundTruthError(
+            "ids: none of these markers in any of the runs: "
+            f"expected some of {_listed(sorted(found))}"
+        )
+    if missing := sorted(set(command.ids or ()) - found):
+        print(f"warning: ids: not in any of the runs: {_listed(missing)}", file=sys.stderr)
     if not (np.isfinite(command.width_m) and command.width_m > 0.0):
         raise GroundTruthError(f"width_m is {command.width_m:g}: expected metres above 0")
     widths = dict.fromkeys(ids, command.width_m)

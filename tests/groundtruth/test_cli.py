@@ -213,11 +213,13 @@ def test_a_rig_from_a_session(tmp_path: Path, capsys: Captured) -> None:
     write_planar_poses(reference, PlanarPoses(times[::3], planar[::3]))
     together = [
         "rig", *runs, *options, "--force", "--network", str(session / "network.json"),
-        "--reference-poses", str(reference), "--ids", *map(str, rig.ids[:4]),
+        "--reference-poses", str(reference), "--ids", *map(str, rig.ids[:4]), "199",
         "--widths", "31=0.24", "13=0.24",
     ]  # fmt: skip
     assert main(together) == 0
-    assert "widths: marker 13 is not among those found" in capsys.readouterr().err
+    told = capsys.readouterr().err
+    assert "widths: marker 13 is not among those found" in told
+    assert "ids: not in any of the runs: 199" in told
     found = read_rig(output)
     assert found.ids == rig.ids[:4]
     error = log_se3(inverse(rig.robot_from_marker[:4]) @ found.robot_from_marker)
@@ -231,7 +233,7 @@ def test_a_rig_from_a_session(tmp_path: Path, capsys: Captured) -> None:
         (["--width-m", "0.2", "--widths", "31:0.2"], "'31:0.2': expected a marker and metres"),
         (["--width-m", "0.2", "--widths", "31=inf"], "'31=inf': expected a marker and metres"),
         (["--width-m", "0.2", "--widths", "31=0.1", "31=0.2"], "marker 31 twice"),
-        (["--width-m", "0.2", "--ids", "99"], "no markers of the dictionary"),
+        (["--width-m", "0.2", "--ids", "99"], "ids: none of these markers in any of the runs"),
         (["--width-m", "0.2", "--dictionary", "aruco"], "no markers of the dictionary aruco"),
         (["--width-m", "0.2", "--reference-poses", "x.csv"], "needs --network"),
     ],
