@@ -56,7 +56,7 @@ def _circles(command: Circles) -> int:
     from detect.sources.opening import open_calibrated
 
     run = open_calibrated(command.run, command.camera, command.source)
-    output = command.output if command.output is not None else run.output("circles")
+    output = _output(command, run, "circles")
     conduct = _conduct(command, log_place(output))
     _demand_new([output, command.json], command.force, run, conduct)
     tilts = None
@@ -65,7 +65,7 @@ def _circles(command: Circles) -> int:
 
         tilts = TiltsByImage(command.tilt)
     if command.draw is not None:
-        command.draw.mkdir(parents=True, exist_ok=True)
+        _make_folder(command.draw)
     with progress_bar("discs", run.frames.expected) as advance:
         summary = detect_circles_run(
             run,
@@ -92,7 +92,7 @@ def _lines(command: Lines) -> int:
     from detect.sources.opening import open_calibrated
 
     run = open_calibrated(command.run, command.camera, command.source)
-    output = command.output if command.output is not None else run.output("lines")
+    output = _output(command, run, "lines")
     tilt = command.tilt if command.tilt is not None else output.with_suffix(".tilt")
     conduct = _conduct(command, log_place(output))
     _demand_new([output, tilt], command.force, run, conduct)
@@ -104,7 +104,7 @@ def _lines(command: Lines) -> int:
     if command.ids_from is not None:
         reference = LinesByImage(command.ids_from)
     if command.draw is not None:
-        command.draw.mkdir(parents=True, exist_ok=True)
+        _make_folder(command.draw)
     with progress_bar("lines", run.frames.expected) as advance:
         summary = detect_lines_run(
             run,
@@ -133,11 +133,11 @@ def _markers(command: Markers) -> int:
     from detect.sources.opening import open_source
 
     run = open_source(command.run, command.camera, command.source)
-    output = command.output if command.output is not None else run.output("markers")
+    output = _output(command, run, "markers")
     conduct = _conduct(command, log_place(output))
     _demand_new([output], command.force, run, conduct)
     if command.draw is not None:
-        command.draw.mkdir(parents=True, exist_ok=True)
+        _make_folder(command.draw)
     with progress_bar("markers", run.frames.expected) as advance:
         summary = detect_markers_run(
             run,
@@ -169,7 +169,7 @@ def _all(command: All) -> int:
         for kind in ("lines", "tilt", "circles")
     )
     if command.output is not None:
-        command.output.mkdir(parents=True, exist_ok=True)
+        _make_folder(command.output)
     conduct = _conduct(command, log_place(lines.with_suffix("")))
     _demand_new([lines, tilt, circles], command.force, run, conduct)
     with progress_bar("lines, tilt and discs", run.frames.expected) as advance:
@@ -190,6 +190,24 @@ def _all(command: All) -> int:
     print(f"{tilt}: the tilt of {summary.tilts} frames")
     print(f"{circles}: {summary.discs} discs in {summary.frames} frames")
     return _exit_code(summary, run)
+
+
+def _output(command: DetectorFlags, run: ImageRun, kind: str) -> Path:
+    """The file that a command's result is written to."""
+    output = command.output if command.output is not None else run.output(kind)
+    if not output.name:  # what an empty word becomes, too
+        raise DetectError(f"{output}: is a folder: expected the file to write")
+    return output
+
+
+def _make_folder(folder: Path) -> None:
+    """A folder for results, if there is none yet."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError):
+        raise DetectError(
+            f"{folder}: is no folder: expected one, or the name of a new one"
+        ) from None
 
 
 def _workers(command: DetectorFlags, run: ImageRun) -> Workers:

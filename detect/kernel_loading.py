@@ -5,15 +5,21 @@ Python, NumPy and SciPy, and registers all of it, which takes a third of the tim
 has before its first landmark. Machine code needs none of that. So the cache is looked into first,
 and Numba gets ready where there is something to compile.
 
+What is compiled is kept as Numba keeps it, but for one thing: it names machine code in the index of
+a kernel before it writes it. A process that is killed in between, or finds no room, would leave an
+index that vouches for what an earlier version of the kernel left under that name, and another one
+that looks at that moment would take it. So such files are removed first.
+
 Attributes of Numba that are not public are used for it; where they have changed, everything is done
 as Numba does it.
 """
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cache
 from importlib import import_module
 from typing import Any
@@ -43,13 +49,17 @@ def load_kernels_alone() -> bool:
     Returns whether it will.
     """
     try:
-        cache_class: Any = import_module("numba.core.caching").Cache
+        caching: Any = import_module("numba.core.caching")
+        cache_class, file_class = caching.Cache, caching.IndexDataCacheFile
         environment: Any = import_module("numba.core.environment")
         runtime: Any = import_module("numba.core.runtime").rtsys
         numbas_own = cache_class.load_overload
+        numbas_save_index = file_class._save_index
         for holder, name in (
             (cache_class, "_load_overload"),
             (cache_class, "_guard_against_spurious_io_errors"),
+            (file_class, "_load_index"),
+            (file_class, "_data_path"),
             (environment, "_rebuild_env"),
             (environment, "lookup_environment"),
             (environment.Environment, "_memo"),
@@ -74,7 +84,14 @@ def load_kernels_alone() -> bool:
         except Exception:
             return None  # whatever it is: Numba itself will tell
 
+    def save_index(self: Any, overloads: dict[Any, str]) -> None:
+        for name in {*overloads.values()} - {*self._load_index().values()}:
+            with suppress(OSError):
+                os.unlink(self._data_path(name))  # noqa: PTH108 - a string, as Numba has it
+        numbas_save_index(self, overloads)
+
     cache_class.load_overload = load_overload
+    file_class._save_index = save_index
     return True
 
 

@@ -16,7 +16,7 @@ from detect.drawing.detections import circle_on_floor
 from detect.drawing.frame import ends_of, floor_projection, line_curves, sigma_bars
 from detect.drawing.inputs import SeenRows, find_files, open_rows
 from detect.drawing.selection import select_frames
-from detect.errors import DetectError, FrameError
+from detect.errors import EXIT_FRAMES_FAILED, DetectError, FrameError
 from detect.run import Run, read_image
 from detect.runs.progress import print_failures, progress_bar
 from detect.settings import CircleSettings
@@ -28,7 +28,6 @@ from storage import OutputExistsError, write_whole
 
 FloatArray = NDArray[np.float64]
 
-_FRAMES_FAILED = 3
 _EDGE, _LINE, _SIGMA, _MAP = (255, 170, 0), (60, 220, 60), (255, 170, 0), (80, 140, 220)
 # Times of this and more are taken for UNIX time: no recording is three years long.
 _EARLIEST_DATE_S = 1e8
@@ -94,7 +93,7 @@ def perform(options: View) -> int:
                 shutil.copyfileobj(content, stream)
             print(f"{options.output}: open it by: rerun {options.output}")
     print_failures(len(failures), failures)
-    return _FRAMES_FAILED if failures else 0
+    return EXIT_FRAMES_FAILED if failures else 0
 
 
 def summed_steps(steps: Iterable[Step]) -> FloatArray:

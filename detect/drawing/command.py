@@ -16,7 +16,7 @@ from detect.comparison.lines_result import LineCompareOptions
 from detect.drawing.frame import draw_rows
 from detect.drawing.inputs import find_files, open_rows, picture_name
 from detect.drawing.selection import select_frames
-from detect.errors import DetectError, FrameError
+from detect.errors import EXIT_FRAMES_FAILED, DetectError, FrameError
 from detect.run import Run, read_image
 from detect.runs.progress import print_failures, progress_bar
 from detect.runs.stream import KEPT_FAILURES
@@ -24,8 +24,6 @@ from detect.settings import CircleSettings
 from detect.sources.opening import demand_recording, open_source
 from detect.viewing_options import Draw
 from storage import OutputExistsError, write_whole
-
-_FRAMES_FAILED = 3
 
 
 def perform(options: Draw) -> int:
@@ -84,7 +82,7 @@ def perform(options: Draw) -> int:
         if where is not None:
             print(f"{where}: {drawn} pictures of {', '.join(files.detected)}")
     print_failures(failed, failures)
-    return _FRAMES_FAILED if failed else 0
+    return EXIT_FRAMES_FAILED if failed else 0
 
 
 def png(picture: NDArray[np.uint8]) -> bytes:

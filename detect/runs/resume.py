@@ -100,6 +100,7 @@ class RunFiles:
         return self
 
     def _open(self) -> None:
+        self._demand_a_place_each()
         log = self._conduct.log
         left = None if log is None else left_journal(journal_place(log))
         if left is not None:
@@ -120,6 +121,15 @@ class RunFiles:
             file.part = new_part(file.path)
             file.write(file.head)
         self._begin_journal()
+
+    def _demand_a_place_each(self) -> None:
+        """Refuse to write two results to the same file: the last one would be all there is."""
+        taken = set()
+        for file in self._files:
+            place = Path(os.path.realpath(file.path.parent), file.path.name)
+            if place in taken:
+                raise DetectError(f"{file.path}: named for two results: expected a file for each")
+            taken.add(place)
 
     def _demand_new(self) -> None:
         """Refuse to replace what must not be, or cannot be."""

@@ -8,7 +8,7 @@ from typing import Any
 
 from detect.comparison.lines_result import LineCompareOptions
 from detect.drawing.selection import select_frames
-from detect.errors import DetectError
+from detect.errors import EXIT_FRAMES_FAILED, DetectError
 from detect.line_settings import PRESETS, LineSettings
 from detect.runs.by_image import FramesByImage, TiltsByImage
 from detect.runs.progress import print_failures, progress_bar
@@ -20,8 +20,6 @@ from detect.tune.table import curve_picture, records_csv, records_json, trial_re
 from detect.viewing_options import Tune
 from landmarks import LandmarkFileError
 from storage import OutputExistsError, write_whole
-
-_FRAMES_FAILED = 3
 
 
 def perform(options: Tune) -> int:
@@ -116,7 +114,7 @@ def perform(options: Tune) -> int:
             )
     failures = sorted({failure for trial in trials for failure in trial.failures})
     print_failures(len(failures), failures)
-    return _FRAMES_FAILED if failures else 0
+    return EXIT_FRAMES_FAILED if failures else 0
 
 
 def _reference(path: Path) -> FramesByImage:

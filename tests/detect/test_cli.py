@@ -240,6 +240,42 @@ def test_outputs_into_no_folder(small_run: Path, capsys: Captured, flag: str) ->
 
 
 @pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["circles", "RUN", "-o", "X/rows", "--json", "X/rows"], "rows: named for two results"),
+        (["circles", "RUN", "-o", "X/rows", "--json", "X/./rows"], "rows: named for two results"),
+        (["circles", "RUN", "-o", "X/r", "--json", "X/r.log.json"], "r.log.json: named for two"),
+        (["lines", "RUN", "-o", "X/rows.tilt"], "rows.tilt: named for two results"),
+        (["circles", "RUN", "-o", ""], "is a folder: expected the file to write"),
+        (["lines", "RUN", "-o", "."], "is a folder: expected the file to write"),
+        (["all", "RUN", "-o", "RUN/s.cam"], "s.cam: is no folder"),
+        (["circles", "RUN", "-o", "X/rows", "--draw", "RUN/s.cam"], "s.cam: is no folder"),
+        (["circles", "RUN", "-o", "X/rows", "--draw", "RUN/s.cam/x"], "x: is no folder"),
+    ],
+)
+@pytest.mark.parametrize("force", [(), ("--force",)])
+def test_places_where_nothing_can_be_written(
+    small_run: Path,
+    tmp_path: Path,
+    capsys: Captured,
+    arguments: list[str],
+    told: str,
+    force: tuple[str, ...],
+) -> None:
+    (tmp_path / "new").mkdir()
+    places = {"RUN": str(small_run), "X": str(tmp_path / "new")}
+    words = ["/".join(places.get(part, part) for part in word.split("/")) for word in arguments]
+    before = files_in(tmp_path)
+    assert main([*words, *force]) == 1
+    shown = capsys.readouterr()
+    assert shown.out == ""
+    last = shown.err.splitlines()[-1]  # tables and kernels may be made first
+    assert last.startswith("error: ")
+    assert told in last
+    assert files_in(tmp_path) == before
+
+
+@pytest.mark.parametrize(
     "wrong",
     [
         ["circles"],

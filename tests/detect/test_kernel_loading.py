@@ -64,6 +64,19 @@ print(len(waited), sum(spread.stats.cache_misses.values()))
 """
 
 
+KILLED_PROGRAM = """
+import os, sys
+from detect.kernel_loading import load_kernels_alone
+load_kernels_alone()
+from numba.core.caching import IndexDataCacheFile
+from kernels import doubled
+IndexDataCacheFile._save_data = lambda *_: os._exit(0)  # as if killed
+doubled(1.0)
+"""
+
+DOUBLED = "from numba import njit\n\n@njit(cache=True)\ndef doubled(x):\n    return {} * x\n"
+
+
 def said(folder: Path, *arguments: str, program: str = PROGRAM) -> list[str]:
     root = Path(__file__).resolve().parents[2]
     process = subprocess.run(
@@ -99,6 +112,18 @@ def test_what_another_process_compiles_meanwhile_is_loaded(tmp_path: Path) -> No
     assert compiled_there == [f"True {deviation} 1", "1 0", "1 1"]
     cached = said(tmp_path, PROGRAM, program=WAITING_PROGRAM)  # nothing to wait for
     assert cached == [f"True {deviation} 0", "1 0", "0 0"]
+
+
+def test_a_process_killed_while_it_keeps_a_kernel_vouches_for_no_earlier_one(
+    tmp_path: Path,
+) -> None:
+    program = "from kernels import doubled; print(doubled(1.0))"
+    (tmp_path / "kernels.py").write_text(DOUBLED.format("3.0"))
+    assert said(tmp_path, program=program) == ["3.0"]
+    (tmp_path / "kernels.py").write_text(DOUBLED.format("2.00"))
+    said(tmp_path, program=KILLED_PROGRAM)
+    assert [path.suffix for path in (tmp_path / "cache").rglob("*.nb?")] == [".nbi"]
+    assert said(tmp_path, program=program) == ["2.0"]
 
 
 def test_a_numba_without_the_attributes_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
