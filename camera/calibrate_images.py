@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from camera.errors import CalibrationError
 from storage.bounded import read_bounded
-from storage.image_header import MOST_PIXELS, claimed_size
+from storage.image_header import MOST_PIXELS, claimed_size, without_orientation
 
 GreyImage = NDArray[np.uint8]
 
@@ -105,7 +105,7 @@ def grey_of_content(content: bytes, name: object) -> GreyImage:
     image = None
     with suppress(cv2.error):
         image = cv2.imdecode(
-            np.frombuffer(content, np.uint8),
+            np.frombuffer(without_orientation(content), np.uint8),
             cv2.IMREAD_ANYDEPTH | cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION,
         )
     if image is None:

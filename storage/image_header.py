@@ -1,4 +1,4 @@
-"""What the header of an image file claims, without decoding it.
+"""What the header of an image file claims, without decoding it, and which way up it is shown.
 
 A file of some hundred bytes can claim an image of gigabytes; a decoder takes the memory before it
 notices. So the size is read from the header by itself, for the formats that runs are made of:
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 import struct
+from collections.abc import Iterator
 
 #: The largest image that there can be: it fills as many bytes as grey values.
 MOST_PIXELS = 1 << 27
@@ -20,7 +21,12 @@ _PNG = b"\x89PNG\r\n\x1a\n"
 _PNM = re.compile(rb"P[1-6](?:\s|#[^\n]*\n)+(\d{1,10})(?:\s|#[^\n]*\n)+(\d{1,10})(?=[\s#])")
 _PNM_HEADER_BYTES = 4096
 _TIFF_ENTRIES = 512
+_TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 _TIFF_SIZES = (256, 257, 322, 323)  # width, height, and those of a tile
+_TIFF_ORIENTATION = 274
+_TIFF_NUMBERS = {3: "H", 4: "I", 16: "Q"}
+# Tiles are padded: those of small images may be larger than these, and up to here are no fault.
+_ORDINARY_TILE = 1 << 22
 
 
 def claimed_size(content: bytes) -> tuple[int, int] | None:
@@ -34,8 +40,8 @@ def claimed_size(content: bytes) -> tuple[int, int] | None:
     Returns
     -------
     (int, int) or None
-        Pixels; of a TIFF with tiles that are larger than the image, those of a tile. None if this
-        is no JPEG, PNG, PNM, BMP or TIFF, or its header is damaged.
+        Pixels; of a TIFF with enormous tiles that are larger than the image, those of a tile. None
+        if this is no JPEG, PNG, PNM, BMP or TIFF, or its header is damaged.
     """
     try:
         if content.startswith(b"\xff\xd8"):
@@ -44,7 +50,7 @@ def claimed_size(content: bytes) -> tuple[int, int] | None:
             return _png_size(content)
         if content.startswith(b"BM"):
             return _bmp_size(content)
-        if content[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
+        if content.startswith(_TIFF):
             return _tiff_size(content)
         found = _PNM.match(content[:_PNM_HEADER_BYTES])
         return None if found is None else (int(found[1]), int(found[2]))
@@ -99,23 +105,63 @@ def _bmp_size(content: bytes) -> tuple[int, int]:
 
 
 def _tiff_size(content: bytes) -> tuple[int, int] | None:
+    sizes = dict.fromkeys(_TIFF_SIZES, 0)
+    for tag, number, place in _tiff_numbers(content):
+        if tag in sizes:
+            if number is None:
+                return None
+            (sizes[tag],) = struct.unpack_from(number, content, place)
+    image, tile = (sizes[256], sizes[257]), (sizes[322], sizes[323])
+    if not all(image):
+        return None
+    taken = tile[0] * tile[1]
+    return image if taken <= max(_ORDINARY_TILE, image[0] * image[1]) else tile
+
+
+def _tiff_numbers(content: bytes) -> Iterator[tuple[int, str | None, int]]:
+    """The tags of the first directory: each with how its number is packed, None for others, and
+    where it stands.
+    """
     order = "<" if content.startswith(b"II") else ">"
     big = content[2:4] in (b"+\0", b"\0+")
     offset_type, count_type, entry_bytes = ("Q", "Q", 20) if big else ("I", "H", 12)
     (directory,) = struct.unpack_from(order + offset_type, content, 8 if big else 4)
     (count,) = struct.unpack_from(order + count_type, content, directory)
     first = directory + struct.calcsize(order + count_type)
-    value_place = 12 if big else 8
-    sizes = dict.fromkeys(_TIFF_SIZES, 0)
     for entry in range(min(count, _TIFF_ENTRIES)):
         place = first + entry * entry_bytes
         tag, kind = struct.unpack_from(order + "HH", content, place)
-        if tag in sizes:
-            number_type = {3: "H", 4: "I", 16: "Q"}.get(kind)
-            if number_type is None:
-                return None
-            (sizes[tag],) = struct.unpack_from(order + number_type, content, place + value_place)
-    image, tile = (sizes[256], sizes[257]), (sizes[322], sizes[323])
-    if not all(image):
-        return None
-    return max(image, tile, key=lambda size: size[0] * size[1])
+        number_type = _TIFF_NUMBERS.get(kind)
+        number = None if number_type is None else order + number_type
+        yield tag, number, place + (12 if big else 8)
+
+
+def without_orientation(content: bytes) -> bytes:
+    """An image file that decoders do not turn, whichever way up its camera was held.
+
+    OpenCV leaves the pixels of JPEG and PNG as they are if it is told to, those of TIFF it turns
+    nevertheless.
+
+    Parameters
+    ----------
+    content : bytes
+        The file.
+
+    Returns
+    -------
+    bytes
+        The same; of a TIFF that says that it is to be turned, one that does not.
+    """
+    if not content.startswith(_TIFF):
+        return content
+    changed = None
+    try:
+        for tag, number, place in _tiff_numbers(content):
+            if tag == _TIFF_ORIENTATION and number is not None:
+                (turn,) = struct.unpack_from(number, content, place)
+                if turn != 1:
+                    changed = changed if changed is not None else bytearray(content)
+                    struct.pack_into(number, changed, place, 1)
+    except (struct.error, OverflowError):  # damaged: the decoder will tell
+        pass
+    return content if changed is None else bytes(changed)

@@ -78,8 +78,7 @@ def demand_bounded(content: bytes, name: object, size: tuple[int, int] | None) -
     name : object
         What messages call it.
     size : (int, int) or None
-        Width and height that are expected. Those of the file may be exchanged: it may say that it
-        is to be turned.
+        Width and height that are expected.
 
     Raises
     ------
@@ -96,7 +95,7 @@ def demand_bounded(content: bytes, name: object, size: tuple[int, int] | None) -
             f"{name}: cannot be decoded: claims {width}x{height} px: "
             f"expected at most {MOST_PIXELS} pixels"
         )
-    if size is not None and size not in ((width, height), (height, width)):
+    if size is not None and size != (width, height):
         raise FrameError(
             f"{name}: is {width}x{height} px: "
             f"expected {size[0]}x{size[1]}, the calibration's size: "

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from detect.errors import FrameError
 from detect.runs.image_bounds import bounded_content, demand_bounded
+from storage.image_header import without_orientation
 
 #: What an image of 16 bits may hold.
 BIT_DEPTHS = (8, 10, 12, 14, 16)
@@ -136,7 +137,7 @@ def _decoded(content: bytes, *, deep: bool) -> NDArray[Any] | None:
     flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
     flags |= cv2.IMREAD_ANYDEPTH if deep else 0
     try:
-        image = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
+        image = cv2.imdecode(np.frombuffer(without_orientation(content), np.uint8), flags)
     except cv2.error:  # sizes beyond OpenCV's bounds are no None
         return None
     return image

@@ -152,7 +152,7 @@ def find_boards(image: BoardImage, board: Checkerboard, camera: Camera) -> Board
         raise GroundTruthError(f"{image.image}: cannot be read: {error.strerror}") from None
     size = claimed_size(content)
     # What claims more is not decoded: memory is taken only for what there should be.
-    if size is not None and sorted(size) != sorted((camera.width, camera.height)):
+    if size is not None and size != (camera.width, camera.height):
         raise _other_size(image.image, size, camera)
     if size is None:
         raise GroundTruthError(f"{image.image}: cannot be decoded: expected an image")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -17,6 +18,7 @@ from detect.sources.video import VideoFile
 from groundtruth.errors import GroundTruthError
 from groundtruth.markers.boards_file import BoardImage, find_boards
 from groundtruth.markers.checkerboard import Checkerboard
+from storage.image_header import without_orientation
 
 IDENTITY = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
 ON_ITS_HEAD, PORTRAIT = 3, 6
@@ -43,6 +45,46 @@ def test_how_a_telephone_was_held_turns_no_picture(tmp_path: Path, orientation: 
     np.testing.assert_array_equal(read_grey(path), upright)
     for bits in (12, 16):
         np.testing.assert_array_equal(decode_gray(path.read_bytes(), path, bits), upright)
+
+
+def held_tiff(picture: NDArray[Any], orientation: int, order: str, kind: int = 3) -> bytes:
+    """A TIFF with a tag that says how the camera was held."""
+    height, width = picture.shape
+    pixels = (picture if order == "<" else picture.byteswap()).tobytes()  # of this machine: "<"
+    tags = {
+        256: width, 257: height, 258: 8 * picture.itemsize, 259: 1, 262: 1, 273: 8,
+        274: orientation, 277: 1, 278: height, 279: len(pixels),
+    }  # fmt: skip
+    entries = b"".join(
+        struct.pack(order + ("HHIHxx" if size == 3 else "HHII"), tag, size, 1, value)
+        for tag, value in tags.items()
+        for size in [kind if tag == 274 else 4 if tag in (273, 279) else 3]
+    )
+    mark = b"II" if order == "<" else b"MM"
+    head = mark + struct.pack(order + "HI", 42, 8 + len(pixels))
+    return head + pixels + struct.pack(order + "H", len(tags)) + entries + bytes(4)
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("deep", [False, True])
+def test_nor_does_what_a_tiff_says_of_it(
+    tmp_path: Path, orientation: int, order: str, deep: bool
+) -> None:
+    grey = np.add.outer(np.arange(24) * 4, np.arange(32) * 5).astype(np.uint8)
+    picture = grey.astype(np.uint16) * 256 if deep else grey
+    path = tmp_path / "a.tif"
+    path.write_bytes(held_tiff(picture, orientation, order))
+    np.testing.assert_array_equal(decode_gray(path.read_bytes(), path, 16, (32, 24)), grey)
+    if not deep:  # those are brought to the full range
+        np.testing.assert_array_equal(read_grey(path), grey)
+
+
+def test_damaged_words_of_a_tiff_stay() -> None:
+    content = held_tiff(np.zeros((24, 32), np.uint8), 3, "<", kind=7)
+    assert without_orientation(content) == content  # no number
+    ends = [without_orientation(content[:length]) for length in range(len(content))]
+    assert ends == [content[:length] for length in range(len(content))]
 
 
 def test_a_board_is_looked_for_in_the_sensors_pixels(tmp_path: Path) -> None:
