@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,7 +25,7 @@ def levelled(found: CircleDetections, camera: Camera, tilt: FrameTilt) -> Circle
     all_down = level_discs(
         np.ascontiguousarray(found.floor_xy),
         np.ascontiguousarray(found.covariance),
-        np.array(camera.centre),
+        _centre_of(camera),
         (tilt.pitch, tilt.roll, tilt.cpp, tilt.cpr, tilt.crr),
         floor_xy,
         covariance,
@@ -64,7 +66,7 @@ def level_positions(
     return np.asarray(
         level_floor(
             np.ascontiguousarray(floor_xy, dtype=np.float64),
-            np.array(camera.centre),
+            _centre_of(camera),
             pitch_rad,
             roll_rad,
         )
@@ -100,9 +102,15 @@ def level_covariances(
         level_floor_covariances(
             np.ascontiguousarray(floor_xy, dtype=np.float64),
             np.ascontiguousarray(covariance, dtype=np.float64),
-            np.array(camera.centre),
+            _centre_of(camera),
             pitch_rad,
             roll_rad,
             np.ascontiguousarray(tilt_covariance, dtype=np.float64),
         )
     )
+
+
+@lru_cache(maxsize=4)
+def _centre_of(camera: Camera) -> FloatArray:
+    """In memory of its own: a camera that came from another process has arrays of another kind."""
+    return np.array(camera.centre)

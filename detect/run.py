@@ -387,4 +387,5 @@ def _odometry(folder: Path) -> Path | None:
 
 
 def _standing_still(prefix: str) -> Step:
-    return Step(re.sub(r"\s", "_", prefix), *[0.0] * 9)
+    # What would part the word, begin a comment or continue the row.
+    return Step(re.sub(r"\s|\A#|\\\Z", "_", prefix), *[0.0] * 9)

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera
-from detect.drawing.strokes import Colour, draw_curve, draw_text, enlargement
+from detect.drawing.strokes import Colour, draw_curve, draw_text, enlargement, with_legend
 from detect.lines import ACCEPTED, JOINED, LineDetections
 from detect.verticals.tracks import LineTracks
 from lut.verticals import VerticalTable
@@ -106,8 +106,6 @@ def draw_tracks(
     (H + h, W, 3) uint8
         In OpenCV's order blue, green, red; h is the height of the legend.
     """
-    import cv2
-
     canvas = np.repeat(image[:, :, None], 3, axis=2)
     counts: dict[str, int] = {}
     for t, fate in enumerate(found.fate):
@@ -118,16 +116,8 @@ def draw_tracks(
         canvas[points[:, 1], np.clip(points[:, 0], 0, image.shape[1] - 1)] = _colour(fate)
     if not reasons:
         return canvas
-    per_row = max(1, image.shape[1] // 190)
-    rows = -(-len(counts) // per_row)
-    legend = np.zeros((14 * rows + 4, image.shape[1], 3), np.uint8)
-    for k, fate in enumerate(sorted(counts)):
-        origin = (4 + 190 * (k % per_row), 13 + 14 * (k // per_row))
-        cv2.putText(
-            legend, f"{fate}: {counts[fate]}", origin, cv2.FONT_HERSHEY_SIMPLEX, 0.38,
-            _colour(fate), 1, cv2.LINE_AA,
-        )  # fmt: skip
-    return np.concatenate([canvas, legend])
+    words = [(f"{fate}: {counts[fate]}", _colour(fate)) for fate in sorted(counts)]
+    return with_legend(canvas, words, 190, 0.38)
 
 
 def draw_response(response: NDArray[np.float32], table: VerticalTable) -> NDArray[np.uint8]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -42,3 +44,18 @@ def draw_text(
     times = enlargement(canvas)
     font = cv2.FONT_HERSHEY_SIMPLEX
     cv2.putText(canvas, plain, at, font, times * size, colour, times, cv2.LINE_AA)
+
+
+def with_legend(
+    canvas: NDArray[np.uint8], words: Sequence[tuple[str, Colour]], column_px: int, size: float
+) -> NDArray[np.uint8]:
+    """The picture, and below it words in columns of some width."""
+    times = enlargement(canvas)
+    width = int(canvas.shape[1])
+    per_row = max(1, width // (column_px * times))
+    rows = -(-len(words) // per_row)
+    legend = np.zeros(((14 * rows + 4) * times, width, 3), np.uint8)
+    for k, (text, colour) in enumerate(words):
+        at = (4 + column_px * (k % per_row)) * times, (13 + 14 * (k // per_row)) * times
+        draw_text(legend, text, at, colour, size)
+    return np.concatenate([canvas, legend])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.drawing.strokes import Colour, draw_curve, draw_text, enlargement
+from detect.drawing.strokes import Colour, draw_curve, draw_text, enlargement, with_legend
 from detect.markers.detections import ACCEPTED, SAME_MARKER, MarkerDetections
 
 FloatArray = NDArray[np.float64]
@@ -42,8 +42,6 @@ def draw_markers(
     (H + h, W, 3) uint8
         In OpenCV's order blue, green, red; h is the height of the legend.
     """
-    import cv2
-
     canvas = np.repeat(image[:, :, None], 3, axis=2)
     if rejected:
         for candidate in found.candidates:
@@ -51,17 +49,9 @@ def draw_markers(
                 draw_curve(canvas, candidate.outline, _CANDIDATE_COLOUR, closed=True)
     for number, corners, covariance in zip(found.ids, found.corners, found.covariance):
         mark_marker(canvas, number, corners, covariance)
-    per_row = max(1, image.shape[1] // 210)
     causes = sorted(found.rejected.items())
-    rows = -(-len(causes) // per_row)
-    legend = np.zeros((14 * rows + 4, image.shape[1], 3), np.uint8)
-    for k, (cause, count) in enumerate(causes):
-        origin = (4 + 210 * (k % per_row), 13 + 14 * (k // per_row))
-        cv2.putText(
-            legend, f"{cause}: {count}", origin, cv2.FONT_HERSHEY_SIMPLEX, 0.36,
-            _CANDIDATE_COLOUR, 1, cv2.LINE_AA,
-        )  # fmt: skip
-    return np.concatenate([canvas, legend])
+    words = [(f"{cause}: {count}", _CANDIDATE_COLOUR) for cause, count in causes]
+    return with_legend(canvas, words, 210, 0.36)
 
 
 def mark_marker(

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from detect.drawing.strokes import draw_curve, draw_text, enlargement
+from detect.drawing.strokes import draw_curve, draw_text, enlargement, with_legend
 
 WHITE = (255, 255, 255)
 HALF = 127
@@ -31,3 +31,15 @@ def test_strokes_and_words_grow_with_the_picture(columns: int, times: int) -> No
     draw_text(small, "0.98", (20, 100), WHITE)
     for large, usual in zip(marked(canvas), marked(small)):
         assert large == pytest.approx(times * usual, rel=0.15)
+
+
+def test_so_do_legends() -> None:
+    words = [("found: 4", WHITE), ("left out: 12", WHITE), ("alone: 1", WHITE)]
+    small = with_legend(np.zeros((9, 400, 3), np.uint8), words, 190, 0.38)
+    assert small.shape == (9 + 2 * 14 + 4, 400, 3)  # two columns of words
+    assert np.any(small[9 : 9 + 16, 190:])
+    assert not np.any(small[9 + 16 :, 190:])
+    large = with_legend(np.zeros((9, 4000, 3), np.uint8), words, 190, 0.38)
+    assert large.shape == (9 + 3 * (14 + 4), 4000, 3)  # one row of them, three times as large
+    assert marked(large)[0] == pytest.approx(3 * marked(small[:25])[0], rel=0.15)
+    assert with_legend(np.zeros((9, 50, 3), np.uint8), [], 190, 0.38).shape == (13, 50, 3)
