@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, nullcontext
+from concurrent.futures import Executor
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -79,7 +80,8 @@ def tune_run(
     gate : CompareOptions for discs, LineCompareOptions for verticals
         What counts as the same landmark.
     workers : Workers
-        Who does the work. They are started once for all settings.
+        Who does the work. They are started once for all settings,
+        and again where some of them have died.
     tilts : mapping, optional
         Tilts by image prefix: positions of discs are corrected for them.
     on_progress : callable, optional
@@ -103,12 +105,11 @@ def tune_run(
         for frame in frames
     ]
     tables_of(plans[0])
-    with workers.start(plans[0]) as crew:
-        same = replace(workers, start=lambda _: nullcontext(crew))
+    with _kept(workers, plans[0]) as same:
         for plan in plans:
             found: list[Frame] = []
             failures: list[str] = []
-            with closing(detect_frames(tasks, plan, same)) as rows:
+            with closing(detect_frames(tasks, plan, same())) as rows:
                 for each in rows:
                     text = each.circles if plan.circles is not None else each.lines
                     found += frames_of_rows(parse_rows(io.BytesIO(text)))
@@ -116,6 +117,33 @@ def tune_run(
                     if on_progress is not None:
                         on_progress()
             yield _trial(reference, found, gate, tuple(failures))
+
+
+@contextmanager
+def _kept(workers: Workers, plan: FramePlan) -> Iterator[Callable[[], Workers]]:
+    """Workers that stay from setting to setting; gives what tells those of the next setting.
+
+    Where some of them have died, they are asked for once more during a setting: then they are
+    replaced.
+    """
+    crew: Executor | None = None
+
+    def of_next_setting() -> Workers:
+        asked_before = False
+
+        @contextmanager
+        def start(_: FramePlan) -> Iterator[Executor]:
+            nonlocal crew, asked_before
+            if crew is None or asked_before:
+                started.close()
+                crew = started.enter_context(workers.start(plan))
+            asked_before = True
+            yield crew
+
+        return replace(workers, start=start)
+
+    with ExitStack() as started:
+        yield of_next_setting
 
 
 def _plan(run: Run, settings: Settings) -> FramePlan:

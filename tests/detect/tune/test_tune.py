@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import csv
 import json
+from collections.abc import Callable, Iterator
+from concurrent.futures import BrokenExecutor, Executor, Future
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -14,13 +18,19 @@ from hypothesis import strategies as st
 
 from detect.cli import main
 from detect.comparison.circles import compare_runs
+from detect.comparison.result import CompareOptions
 from detect.errors import DetectError
 from detect.line_settings import LineSettings
+from detect.run import open_run
+from detect.runs.dispatch import Workers
+from detect.runs.frame import FramePlan
+from detect.runs.workers import local_workers
 from detect.settings import CircleSettings
 from detect.tune.curve import f1_score, knee, pareto_front
 from detect.tune.grid import combinations, parameter_values, settings_with
-from detect.tune.run import Trial
+from detect.tune.run import Trial, tune_run
 from detect.tune.table import curve_picture, trial_records
+from landmarks import read_frames
 from tests.detect.conftest import SMALL_RUN_DISCS
 from tests.detect.test_cli import assert_refused
 
@@ -198,6 +208,45 @@ def test_processes_give_the_same_bytes(small_run: Path, tmp_path: Path) -> None:
         assert main([*arguments, "--jobs", jobs, "-o", str(tmp_path / jobs)]) == 0
     for name in ("table.csv", "table.json", "curve.png"):
         assert (tmp_path / "1" / name).read_bytes() == (tmp_path / "2" / name).read_bytes()
+
+
+class Mortal(Executor):
+    """Does its tasks at once, until it dies of the so manieth."""
+
+    def __init__(self, tasks: int) -> None:
+        self.left = tasks
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        future: Future[Any] = Future()
+        self.left -= 1
+        if self.left < 0:
+            future.set_exception(BrokenExecutor("killed"))
+        else:
+            future.set_result(fn(*args, **kwargs))
+        return future
+
+
+@pytest.mark.parametrize("lives", [[9], [0, 9], [1, 9], [3, 9], [4, 0, 1, 9]])
+def test_workers_that_died_are_replaced(small_run: Path, lives: list[int]) -> None:
+    run = open_run(small_run)
+    frames = list(run.frames)
+    write_reference(small_run, SMALL_RUN_DISCS)
+    reference = list(read_frames(small_run / "map.circles"))
+    settings = [CircleSettings(), CircleSettings(threshold=0.999)]
+    crews: list[Mortal] = []
+
+    @contextmanager
+    def start(_: FramePlan) -> Iterator[Executor]:
+        crews.append(Mortal(lives[len(crews)]))
+        yield crews[-1]
+
+    def trials(workers: Workers) -> list[Trial]:
+        return list(tune_run(run, frames, reference, settings, CompareOptions(), workers))
+
+    found = trials(Workers(start, chunk=1, window=lambda: 1))
+    assert found == trials(local_workers(1))
+    assert all(trial.failures == () for trial in found)
+    assert len(crews) == len(lives)
 
 
 def test_verticals_are_tuned_as_well(small_run: Path, tmp_path: Path) -> None:
