@@ -247,6 +247,8 @@ def rehearse(plan: FramePlan) -> None:
         detect_markers(specimen_image(plan.markers), plan.markers)
     if plan.camera is None:
         return
+    from detect.runs.row_text import unknown_circles, unknown_rows
+
     column = np.arange(plan.camera.width)
     bars = np.where(column // 40 % 2, 180, 60).astype(np.uint8)
     image = np.repeat(bars[None, :], plan.camera.height, axis=0)
@@ -258,8 +260,14 @@ def rehearse(plan: FramePlan) -> None:
         image[floor] = np.where(off < plan.circles.radius_m, 200, 60)
         from detect.circles import detect_circles
 
-        detect_circles(image, plan.camera, tables.discs, plan.circles)
+        discs = detect_circles(image, plan.camera, tables.discs, plan.circles)
+        unknown_circles(discs.floor_xy, discs.quality, discs.covariance)
+        if plan.lines is not None:
+            from detect.levelling import levelled
+
+            levelled(discs, plan.camera, FrameTilt("rehearsal", 0.0, 0.0, 1e-6, 0.0, 1e-6, 0))
     if plan.lines is not None and tables.verticals is not None:
         from detect.lines import detect_lines
 
-        detect_lines(image, tables.verticals, plan.lines)
+        lines = detect_lines(image, tables.verticals, plan.lines)
+        unknown_rows("LANDMARK_L", lines.row_numbers())

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import pickle
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -45,6 +47,45 @@ def test_frames_have_the_same_rows_together_and_alone(
     for rows, task in zip(together, tasks):
         assert rows.circles.startswith(f"STEP {task.frame.step.prefix} ".encode())
         assert rows.disc_count == rows.circles.count(b"LANDMARK_C")
+
+
+REHEARSAL = """
+import sys
+from pathlib import Path
+from detect.kernel_loading import load_kernels_alone
+from detect.line_settings import LineSettings
+from detect.run import open_run
+from detect.runs.frame import FramePlan, rehearse, tables_of
+from detect.runs.frame_rows import FrameTask, rows_of_frames
+from detect.settings import CircleSettings
+
+load_kernels_alone()
+run = open_run(Path(sys.argv[1]))
+plan = FramePlan(run.camera, lines=LineSettings(), circles=CircleSettings())
+rehearse(plan)
+from numba.core.caching import Cache
+numbas_own = Cache.load_overload
+def told(cache, *others):
+    print(cache.cache_path, cache._impl.filename_base)
+    return numbas_own(cache, *others)
+Cache.load_overload = told
+frame = next(iter(run.frames))
+(rows,) = rows_of_frames([FrameTask(frame)], plan, tables_of(plan))
+print(rows.error, rows.disc_count > 0, rows.line_count > 0, rows.has_tilt)
+"""
+
+
+def test_after_a_rehearsal_no_kernel_is_missing(project_root: Path) -> None:
+    """Else every worker would compile it for itself."""
+    run = project_root / "images" / "e"
+    said = subprocess.run(
+        [sys.executable, "-c", REHEARSAL, str(run)],
+        cwd=project_root,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert said.stdout.splitlines() == ["None True True True"]
 
 
 def test_tasks_travel_whole(tasks_and_plan: tuple[list[FrameTask], FramePlan]) -> None:
