@@ -91,6 +91,8 @@ def lens_of(camera: Camera | None, image: NDArray[np.uint8]) -> Lens:
 def _cached_lens(camera: Camera) -> Lens:
     if not (any(camera.coef[:2]) or any(camera.brown)):
         return NO_LENS
+    if min(camera.width, camera.height) < 2:
+        return NO_LENS  # a row of pixels shows no marker
     # The last cell may reach past the border, where the distortion need not be defined.
     u = np.minimum(np.arange(0, camera.width - 1 + _STEP_PX, _STEP_PX), camera.width - 1.0)
     v = np.minimum(np.arange(0, camera.height - 1 + _STEP_PX, _STEP_PX), camera.height - 1.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from scipy.stats import multivariate_normal, norm
 from camera import Camera
 from detect.markers import pattern_model_kernels as model
 from detect.markers.candidates import Layer, closing, dark_pixels
+from detect.markers.detect import detect_markers
 from detect.markers.homography_kernels import (
     corners_by_homography,
     inverse_3x3,
@@ -24,6 +26,7 @@ from detect.markers.polygon_kernels import is_convex, pixel_area, same_corners, 
 from detect.markers.quadrangle import rough_corners
 from detect.markers.quadrangle_kernels import largest_quadrangle
 from detect.markers.robust_kernels import robust_sigma
+from detect.markers.settings import MarkerSettings
 from detect.markers.solve_kernels import invert_positive, solve_positive
 from detect.markers.templates import templates_of
 from detect.noise import estimate_noise
@@ -153,6 +156,15 @@ def test_small_systems_are_solved_or_refused() -> None:
     matrix[5, :] = matrix[0, :]
     assert not solve_positive(matrix, right, solution)
     assert not invert_positive(-np.eye(6), inverse)
+
+
+@pytest.mark.parametrize(("width", "height"), [(1, 1), (1, 60), (60, 1), (2, 2)])
+def test_pictures_of_a_pixel_show_no_marker(
+    published_camera: Camera, width: int, height: int
+) -> None:
+    camera = replace(published_camera, width=width, height=height)
+    found = detect_markers(np.full((height, width), 90, np.uint8), MarkerSettings(), camera)
+    assert len(found) == 0
 
 
 def test_the_lens_is_the_cameras_distortion(published_camera: Camera) -> None:
