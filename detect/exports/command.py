@@ -23,7 +23,8 @@ def perform(command: Export) -> int:
     Raises
     ------
     DetectError
-        If times are needed and there are none, or a package is not installed.
+        If times are needed and there are none, the output is the file itself, or a package is not
+        installed.
     landmarks.LandmarkFileError
         If the file cannot be read.
     storage.OutputExistsError
@@ -50,12 +51,15 @@ def perform(command: Export) -> int:
     tables = rows.tables()
     if not tables:
         raise DetectError(f"{command.file}: no rows in it: expected STEP, LANDMARK or TILT rows")
+    places = {tables[0]: output} if command.to == "mcap" else table_files(output, tables)
+    for path in places.values():
+        if path.exists() and path.samefile(command.file):
+            raise DetectError(f"{path}: is what is exported: expected another place for the rows")
     if command.to == "mcap":
         with write_whole(output, overwrite=command.force) as stream:
             count = write_mcap(stream, tables, rows, str(command.file))
         print(f"{output}: {count} messages")
         return 0
-    places = table_files(output, tables)
     for path in places.values():
         if path.exists() and not command.force:
             raise OutputExistsError(path)
