@@ -11,7 +11,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test check lint docs package lowest lowest-more lowest-setup audit clean setup
+.PHONY: demo kernels test check lint docs package lowest lowest-more lowest-setup audit clean setup
 
 # The environment is made anew whenever it is not complete, was moved, or pyproject.toml has changed.
 setup:
@@ -20,6 +20,11 @@ setup:
 demo: setup
 	$(BIN)/detect circles images/e --force
 	$(BIN)/detect compare images/e
+
+# Kernels are compiled beforehand: processes of tests that need the same one at once would each compile it.
+kernels: setup
+	$(BIN)/detect all images/e --output build/kernels --force
+	$(BIN)/detect markers images/m --output build/kernels/m.markers --force
 
 # The files with the longest tests come first (tests/conftest.py), so that no worker is alone at the end.
 test: setup
