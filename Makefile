@@ -24,7 +24,7 @@ demo: setup
 # Kernels are compiled beforehand: processes of tests that need the same one at once would each compile it.
 kernels: setup
 	$(BIN)/detect all images/e --output build/kernels --force
-	$(BIN)/detect markers images/m --output build/kernels/m.markers --force
+	$(BIN)/detect markers images/m/a --output build/kernels/m.markers --force
 
 # The files with the longest tests come first (tests/conftest.py), so that no worker is alone at the end.
 test: setup
