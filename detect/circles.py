@@ -10,7 +10,6 @@ neighbours in the floor plane and refines the position.
 from __future__ import annotations
 
 import math
-import threading
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
@@ -26,9 +25,7 @@ from detect.discs.candidate_kernels import strong_and_alone
 from detect.discs.centres import best_centres
 from detect.discs.centres import quality_of_centres as quality_of_centres
 from detect.discs.covariance_kernels import refined_covariances
-from detect.discs.descent_kernels import WORK_INDICES, WORK_MEMORY
-from detect.discs.fit import blur_ratio_of, fit_settings
-from detect.discs.model_kernels import CAPACITY
+from detect.discs.fit import blur_ratio_of, fit_settings, working_space
 from detect.discs.pixel_floor_kernels import published_positions as pixel_positions
 from detect.discs.search_kernels import DiscSearch, search_discs
 from detect.errors import FrameError
@@ -139,7 +136,7 @@ def detect_circles(
         fit_settings(noise, kernel.blur_ratio),
         kernel.numbers,
         kernel.centre,
-        *_working_space(),
+        *working_space(),
     )
     pixels = pixels[index]
     if not settings.refine:
@@ -167,24 +164,6 @@ def _disc_search(settings: CircleSettings, weakest: float) -> DiscSearch:
         pixel_variance=settings.systematic_px**2,
         tilt_variance=math.radians(settings.tilt_sigma_deg) ** 2,
     )
-
-
-#: Memory that is new for every image has to be fetched first.
-_kept = threading.local()
-
-
-def _working_space() -> tuple[NDArray[np.float32], NDArray[np.uint32], NDArray[np.uint8]]:
-    """What the calling thread's fits work in."""
-    space: tuple[NDArray[np.float32], NDArray[np.uint32], NDArray[np.uint8]] | None
-    space = getattr(_kept, "space", None)
-    if space is None:
-        space = (
-            np.zeros(WORK_MEMORY, np.float32),
-            np.zeros(WORK_INDICES, np.uint32),
-            np.zeros(CAPACITY, np.uint8),
-        )
-        _kept.space = space
-    return space
 
 
 def disc_shape(settings: CircleSettings) -> DiscShape:

@@ -79,8 +79,8 @@ class Work(NamedTuple):
     best: NDArray[np.float64]
 
 
-#: Sizes of the arrays that `work_in` takes.
 _MOST_WEIGHTS = 64
+#: Sizes of the arrays that `work_in` takes.
 WORK_MEMORY = PATCH_MEMORY + (2 * FIELDS + 1) * CAPACITY + _MOST_WEIGHTS + SECTOR_SUMS
 WORK_INDICES = PATCH_INDICES
 
@@ -89,10 +89,10 @@ WORK_INDICES = PATCH_INDICES
 def work_in(
     memory: NDArray[np.float32], indices: NDArray[np.uint32], marks: NDArray[np.uint8]
 ) -> Work:
-    """Working space in arrays that may be used again, for the next image: all of it is written
-    before it is read.
+    """Working space in arrays that may be used again, for the next image.
 
-    They are of the sizes above, and those of `detect.discs.patch_kernels.patch_in`.
+    Whatever is in them does not matter: all is written before it is read. They are of the sizes
+    above, and those of `detect.discs.patch_kernels.patch_in`.
     """
     n = normal.ROWS
     shares = PATCH_MEMORY + FIELDS * CAPACITY

@@ -7,6 +7,7 @@ evidence that there is a disc at all.
 
 from __future__ import annotations
 
+import threading
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,7 +15,9 @@ from numpy.typing import NDArray
 
 from camera import Camera
 from detect.discs import fit_kernels as kernels
+from detect.discs.descent_kernels import WORK_INDICES, WORK_MEMORY
 from detect.discs.evidence_kernels import evidence_of_all
+from detect.discs.model_kernels import CAPACITY
 from detect.discs.patch_kernels import FitSettings
 
 FloatArray = NDArray[np.float64]
@@ -152,6 +155,24 @@ def fit_settings(noise: float, blur_ratio: float) -> FitSettings:
         blur_sigma=_BLUR_SIGMA,
         blur_ratio=blur_ratio,
     )
+
+
+#: Memory that is new for every image has to be fetched first.
+_kept = threading.local()
+
+
+def working_space() -> tuple[NDArray[np.float32], NDArray[np.uint32], NDArray[np.uint8]]:
+    """What the calling thread's fits work in (see `detect.discs.descent_kernels.work_in`)."""
+    space: tuple[NDArray[np.float32], NDArray[np.uint32], NDArray[np.uint8]] | None
+    space = getattr(_kept, "space", None)
+    if space is None:
+        space = (
+            np.zeros(WORK_MEMORY, np.float32),
+            np.zeros(WORK_INDICES, np.uint32),
+            np.zeros(CAPACITY, np.uint8),
+        )
+        _kept.space = space
+    return space
 
 
 def fitted_positions(results: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import builtins
+import json
 import multiprocessing
 import os
 import shutil
@@ -190,6 +191,25 @@ def test_processes_end_with_the_one_that_started_them(run_folder: Path) -> None:
 # -- a cluster ------------------------------------------------------------------------------
 
 
+def address_in(contact: Path) -> str:
+    """A scheduler's address in the file that it writes; nothing as long as that is not whole."""
+    try:
+        return str(json.loads(contact.read_text())["address"])
+    except (FileNotFoundError, ValueError):
+        return ""
+
+
+def test_the_address_in_a_file_that_is_still_written(tmp_path: Path) -> None:
+    whole = json.dumps({"type": "Scheduler", "address": "tcp://127.0.0.1:8786"}, indent=2)
+    contact = tmp_path / "scheduler.json"
+    assert address_in(contact) == ""
+    for length in range(len(whole)):
+        contact.write_text(whole[:length])
+        assert address_in(contact) == ""
+    contact.write_text(whole)
+    assert address_in(contact) == "tcp://127.0.0.1:8786"
+
+
 @contextmanager
 def cluster(folder: Path, workers: int) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]]]:
     """A scheduler and workers, each a process of its own; yields address and workers."""
@@ -204,10 +224,9 @@ def cluster(folder: Path, workers: int) -> Iterator[tuple[str, list[subprocess.P
         for _ in range(workers):
             alone = ["--nthreads", "1", "--no-nanny", "--local-directory", str(folder)]
             processes.append(subprocess.Popen([*dask, "worker", *local, *alone], **quiet))
-        wait_until(contact.is_file, "the scheduler")
-        import json
-
-        yield json.loads(contact.read_text())["address"], processes[1:]
+        # It is there before what it says is in it.
+        wait_until(lambda: bool(address_in(contact)), "the scheduler")
+        yield address_in(contact), processes[1:]
     finally:
         for process in reversed(processes):
             process.kill()

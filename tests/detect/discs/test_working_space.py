@@ -1,0 +1,34 @@
+"""Memory that is kept from image to image: what an earlier one left there changes nothing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from camera import read_camera
+from detect.circles import detect_circles, disc_shape
+from detect.discs.fit import working_space
+from detect.settings import CircleSettings
+from lut import cached_disc_table
+
+
+@pytest.mark.parametrize("left", [np.nan, 1e30, -7.0])
+def test_what_is_left_in_the_memory_of_fits_does_not_matter(
+    project_root: Path, left: float
+) -> None:
+    camera, settings = read_camera(project_root / "images" / "e" / "e.cam"), CircleSettings()
+    table = cached_disc_table(camera, disc_shape(settings))
+    file = project_root / "images" / "e" / "images" / "e.0010.jpg"
+    image = np.asarray(cv2.imread(str(file), cv2.IMREAD_GRAYSCALE), np.uint8)
+    numbers, indices, marks = working_space()
+    found = []
+    for number, index, mark in ((0.0, 0, 0), (left, 12345, 77)):
+        numbers[:], indices[:], marks[:] = number, index, mark
+        found.append(detect_circles(image, camera, table, settings))
+    clean, dirty = found
+    assert len(clean) > 0
+    for name in ("pixels", "floor_xy", "covariance", "evidence"):
+        assert getattr(clean, name).tobytes() == getattr(dirty, name).tobytes()
