@@ -35,6 +35,7 @@ from camera.calibration_model import INTRINSICS
 from camera.calibration_projection import projection_sigma
 from camera.calibration_settings import CalibrationSettings
 from camera.camfile import format_camera
+from camera.charuco_corners import dictionary_of
 from camera.errors import CalibrationError, CameraError
 from camera.model import Camera
 from camera.options import Calibrate
@@ -123,8 +124,10 @@ def find_views(
     Raises
     ------
     CalibrationError
-        If the pictures are not of one size, or none shows the board.
+        If the pictures are not of one size, or none shows the board, or its markers are unknown.
     """
+    if board.kind == "charuco":
+        dictionary_of(board)
     views: list[BoardView] = []
     size: tuple[int, int] | None = None
     count = 0

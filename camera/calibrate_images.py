@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -164,5 +165,8 @@ def _frames(path: Path, every: int, most: int) -> Iterator[tuple[str, GreyImage]
             number += 1
         if taken == 0:
             raise CalibrationError(f"{path}: a video without frames")
+        if taken < most and number < count:
+            told = f"{path}: {number} of the {count} frames it speaks of are there"
+            print(told, file=sys.stderr)
     finally:
         video.release()

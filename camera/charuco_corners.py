@@ -8,11 +8,16 @@ oblique or cut off by the image's border, are looked for where their neighbours 
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from numpy.typing import NDArray
 
 from camera.board import Board
 from camera.errors import CalibrationError
+
+if TYPE_CHECKING:
+    import cv2
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -55,7 +60,7 @@ def find_charuco(image: GreyImage, board: Board) -> tuple[IntArray, FloatArray]:
     Raises
     ------
     CalibrationError
-        If the board's dictionary is unknown.
+        If the board's dictionary is unknown, or too small for it.
     """
     rows, columns = board.rows - 1, board.columns - 1
     grid = np.full((rows, columns, 2), np.nan)
@@ -68,10 +73,13 @@ def find_charuco(image: GreyImage, board: Board) -> tuple[IntArray, FloatArray]:
     return found, grid.reshape(-1, 2)[found]
 
 
-def _interpolated(image: GreyImage, board: Board) -> tuple[IntArray, FloatArray]:
-    """Corners between the markers that OpenCV reads, in the image or in one of twice the height.
+def dictionary_of(board: Board) -> cv2.aruco.Dictionary:
+    """The dictionary that a ChArUco board's markers are of.
 
-    Half-height images flatten the markers, until their cells are less than a pixel high.
+    Raises
+    ------
+    CalibrationError
+        If OpenCV has none of that name, or its markers are fewer than the board's.
     """
     import cv2
 
@@ -81,11 +89,25 @@ def _interpolated(image: GreyImage, board: Board) -> tuple[IntArray, FloatArray]
             f"dictionary {board.dictionary!r} is unknown: expected a name of OpenCV's, such as "
             "DICT_5X5_100"
         )
+    dictionary = cv2.aruco.getPredefinedDictionary(number)
+    markers, most = board.columns * board.rows // 2, len(dictionary.bytesList)
+    if markers > most:
+        raise CalibrationError(
+            f"dictionary {board.dictionary} has {most} markers, and a {board} {markers}: expected "
+            "the dictionary that the board was printed with"
+        )
+    return dictionary
+
+
+def _interpolated(image: GreyImage, board: Board) -> tuple[IntArray, FloatArray]:
+    """Corners between the markers that OpenCV reads, in the image or in one of twice the height.
+
+    Half-height images flatten the markers, until their cells are less than a pixel high.
+    """
+    import cv2
+
     pattern = cv2.aruco.CharucoBoard(
-        (board.columns, board.rows),
-        board.square_m,
-        board.marker_m,
-        cv2.aruco.getPredefinedDictionary(number),
+        (board.columns, board.rows), board.square_m, board.marker_m, dictionary_of(board)
     )
     detector = cv2.aruco.CharucoDetector(pattern)
     best = np.empty(0, dtype=np.int64), np.empty((0, 2))

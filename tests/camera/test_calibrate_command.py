@@ -299,6 +299,10 @@ def test_what_a_newcomer_gets_wrong(
     R, t = board_poses(rays.camera, BOARD, 1, 3, distances_m=(0.4, 0.6), margin_px=5.0)[0]
     cv2.imwrite(str(tmp_path / "a.png"), render_board(rays, BOARD, R, t))
     assert "1 pictures" in error("calibrate", str(tmp_path), *FLAGS, *output)
+    markers = ["--board", "charuco", "--marker-m", "0.03"]
+    told = error("calibrate", str(tmp_path), *FLAGS, *markers, "--dictionary", "NONE", *output)
+    assert told.count("'NONE' is unknown") == 1
+    assert "a.png" not in told
     cv2.imwrite(str(tmp_path / "b.png"), empty[:200])
     assert "pictures before" in error("calibrate", str(tmp_path), *FLAGS, *output)
     (tmp_path / "b.png").write_bytes(b"no picture")

@@ -157,3 +157,24 @@ def test_a_board_in_a_picture_of_ten_bits_is_found(tmp_path: Path) -> None:
     away = np.linalg.norm(found.corners[:, None] - corners, axis=-1)
     # Of the highest eight bits alone, which hold four grey values, 0.9.
     assert away.min(axis=1).max() < 0.12
+
+
+def test_a_video_that_is_cut_off_gives_what_it_has_and_says_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "a.avi"
+    rng = np.random.default_rng(4)
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, (64, 48))
+    for _ in range(20):
+        writer.write(rng.integers(0, 255, (48, 64, 3), np.uint8))
+    writer.release()
+    assert len(list(calibration_images([path], 1, 99))) == 20
+    assert capsys.readouterr().err == ""
+    path.write_bytes(path.read_bytes()[: path.stat().st_size * 3 // 5])
+    found = len(list(calibration_images([path], 1, 99)))
+    assert 5 < found < 20
+    told = f"{path}: {found} of the 20 frames it speaks of are there\n"
+    assert capsys.readouterr().err == told
+    # Every fourth, and one of them is not there.
+    assert len(list(calibration_images([path], 1, 5))) == -(-found // 4)
+    assert capsys.readouterr().err == told

@@ -99,3 +99,9 @@ def test_an_unknown_dictionary_is_named() -> None:
     board = Board("charuco", 7, 6, 0.05, marker_m=0.036, dictionary="DICT_NONE")
     with pytest.raises(CalibrationError, match="'DICT_NONE' is unknown"):
         find_charuco(np.zeros((240, 320), dtype=np.uint8), board)
+
+
+def test_a_dictionary_too_small_for_the_board_is_told() -> None:
+    board = Board("charuco", 12, 9, 0.05, marker_m=0.036, dictionary="DICT_5X5_50")
+    with pytest.raises(CalibrationError, match=r"DICT_5X5_50 has 50 markers, and a charuco .* 54"):
+        find_charuco(np.zeros((240, 320), dtype=np.uint8), board)
