@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING
 from detect.announcing import show_announcements
 from detect.cli import Command
 from detect.errors import EXIT_FRAMES_FAILED, DetectError, WorkerError
-from detect.kernel_loading import load_kernels_alone
 from detect.options import All, Circles, Compare, DetectorFlags, Lines, Markers
 from detect.runs.progress import print_failures, progress_bar
 from detect.viewing_options import PERFORMED_BY
 from storage.exit_codes import EXIT_ERROR
+from storage.kernel_loading import load_kernels_alone
 
 if TYPE_CHECKING:
     from rich.console import Group

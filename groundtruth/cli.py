@@ -31,6 +31,7 @@ from groundtruth.commands.options import (
     Validate,
 )
 from storage.exit_codes import exit_code_of
+from storage.kernel_loading import load_kernels_alone
 
 #: The module whose `perform` carries a command out.
 PERFORMED_BY: dict[type, str] = {
@@ -45,6 +46,8 @@ PERFORMED_BY: dict[type, str] = {
     Validate: "groundtruth.commands.validate",
     Report: "groundtruth.commands.report",
 }
+#: Those that run compiled kernels.
+COMPILED: tuple[type, ...] = (Lasers, Laser, Sync, Fuse, Validate)
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -56,6 +59,8 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _perform(arguments: Sequence[str]) -> int:
     command = parsed(arguments)
+    if isinstance(command, COMPILED):
+        load_kernels_alone()
     code: int = import_module(PERFORMED_BY[type(command)]).perform(command)
     return code
 

@@ -19,6 +19,7 @@ from tyro.conf import arg, subcommand
 
 from slam.options import Associate, Command, Ekf, Export, Import, Localize, Map, Noise
 from storage.exit_codes import exit_code_of
+from storage.kernel_loading import load_kernels_alone
 
 #: The module whose `perform` carries a command out.
 PERFORMED_BY: dict[type, str] = {
@@ -30,6 +31,8 @@ PERFORMED_BY: dict[type, str] = {
     Export: "slam.export_command",
     Import: "slam.export_command",
 }
+#: Those that run compiled kernels.
+COMPILED: tuple[type, ...] = (Map, Localize, Ekf, Associate)
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -41,6 +44,8 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _perform(arguments: Sequence[str]) -> int:
     command = parsed(arguments)
+    if isinstance(command, COMPILED):
+        load_kernels_alone()
     code: int = import_module(PERFORMED_BY[type(command)]).perform(command)
     return code
 

@@ -33,10 +33,10 @@ from detect.announcing import (
     show_announcements,
 )
 from detect.errors import WorkerError
-from detect.kernel_loading import load_kernels_alone, waiting_before_compiling
 from detect.runs.dispatch import Workers
 from detect.runs.frame import FramePlan, rehearse
 from detect.runs.interrupts import interrupts_deferred
+from storage.kernel_loading import load_kernels_alone, waiting_before_compiling
 
 if TYPE_CHECKING:
     from distributed import Client

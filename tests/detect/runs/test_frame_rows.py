@@ -52,7 +52,7 @@ def test_frames_have_the_same_rows_together_and_alone(
 REHEARSAL = """
 import sys
 from pathlib import Path
-from detect.kernel_loading import load_kernels_alone
+from storage.kernel_loading import load_kernels_alone
 from detect.line_settings import LineSettings
 from detect.run import open_run
 from detect.runs.frame import FramePlan, rehearse, tables_of

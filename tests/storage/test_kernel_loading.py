@@ -29,7 +29,7 @@ def spread_of_two(values):
 
 PROGRAM = """
 import sys
-from detect.kernel_loading import load_kernels_alone
+from storage.kernel_loading import load_kernels_alone
 load_kernels_alone()
 import numpy as np
 from kernels import spread, spread_of_two
@@ -47,7 +47,7 @@ if "more" in sys.argv:
 
 WAITING_PROGRAM = """
 import subprocess, sys
-from detect.kernel_loading import waiting_before_compiling
+from storage.kernel_loading import waiting_before_compiling
 
 def another_compiles():
     waited.append(True)
@@ -66,7 +66,7 @@ print(len(waited), sum(spread.stats.cache_misses.values()))
 
 KILLED_PROGRAM = """
 import os, sys
-from detect.kernel_loading import load_kernels_alone
+from storage.kernel_loading import load_kernels_alone
 load_kernels_alone()
 from numba.core.caching import IndexDataCacheFile
 from kernels import doubled
@@ -130,7 +130,7 @@ def test_a_numba_without_the_attributes_is_left_alone(monkeypatch: pytest.Monkey
     from numba.core import environment
     from numba.core.caching import Cache
 
-    from detect.kernel_loading import load_kernels_alone
+    from storage.kernel_loading import load_kernels_alone
 
     own = Cache.load_overload
     monkeypatch.setattr(Cache, "load_overload", own)  # put back afterwards
