@@ -15,7 +15,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,7 +25,18 @@ import pytest
 if TYPE_CHECKING:
     from detect.runs.frame_rows import FrameRows
 
-PATIENCE_S = 120.0
+#: Nothing takes that long, but to compile kernels on a slow machine.
+PATIENCE_S = 600.0
+
+#: `python -m detect`, but stopped as `StopAfter` does: the first argument says when.
+STOPPING_PROGRAM = """
+import runpy, sys
+from tests.detect.forked_runs import StopAfter
+
+if __name__ == "__main__":
+    StopAfter(int(sys.argv.pop(1)))()
+    runpy.run_module("detect", run_name="__main__", alter_sys=True)
+"""
 
 Preparation = Callable[[], None]
 
@@ -104,18 +115,15 @@ class ForkedRun:
         return self.returncode
 
     def wait_until_stopped(self) -> None:
-        end = time.monotonic() + PATIENCE_S
-        while _state(self.pid) != "T":
-            assert self.poll() is None, self.said()
-            assert time.monotonic() < end, "the run does not stop"
-            time.sleep(0.002)
+        wait_until_stopped(self.pid, lambda: self.poll() is None)
 
     def go_on(self) -> None:
         os.kill(self.pid, signal.SIGCONT)
 
     def kill(self) -> None:
         if self.poll() is None:
-            os.kill(self.pid, signal.SIGKILL)
+            with suppress(ProcessLookupError):  # it has just ended, and is not told of yet
+                os.kill(self.pid, signal.SIGKILL)
 
     def wait(self) -> int:
         if self.returncode is None:
@@ -128,6 +136,15 @@ class ForkedRun:
         """What stands on its standard error once it has ended."""
         self.wait()
         return self._said
+
+
+def wait_until_stopped(pid: int, runs: Callable[[], bool]) -> None:
+    """Wait for a process that stops itself, as long as it runs."""
+    end = time.monotonic() + PATIENCE_S
+    while _state(pid) != "T":
+        assert runs(), "the run has ended"
+        assert time.monotonic() < end, "the run does not stop"
+        time.sleep(0.002)
 
 
 def _state(pid: int) -> str:
@@ -193,9 +210,7 @@ def _serve(connection: Connection, sample: str, folder: str) -> None:
     warmed.mkdir()
     main(["all", sample, "-o", str(warmed)])
     shutil.rmtree(warmed)
-    # A fork takes over one thread only; of others it would take over the locks.
-    threads = [(task / "comm").read_text() for task in Path("/proc/self/task").iterdir()]
-    assert len(threads) == 1, threads
+    _wait_until_alone()
     connection.send("ready")
     while True:
         try:
@@ -217,6 +232,17 @@ def _serve(connection: Connection, sample: str, folder: str) -> None:
             said = b""
         os.close(reading)
         connection.send((os.waitstatus_to_exitcode(status), said.decode()))
+
+
+def _wait_until_alone() -> None:
+    """A fork takes over one thread only; of others it would take over the locks.
+
+    A thread that was waited for may be on its way out still.
+    """
+    end = time.monotonic() + PATIENCE_S
+    while len(threads := [*Path("/proc/self/task").iterdir()]) > 1:
+        assert time.monotonic() < end, threads
+        time.sleep(0.002)
 
 
 def _run(main: Callable[..., Any], arguments: list[str], said: int, prepare: Any) -> None:

@@ -12,7 +12,9 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from concurrent.futures import Executor
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,12 +26,16 @@ from detect.line_settings import LineSettings
 from detect.run import open_run
 from detect.runs.all_run import detect_all_run
 from detect.runs.dispatch import Workers
+from detect.runs.frame import FramePlan
 from detect.runs.workers import FRAMES_PER_PROCESS, cluster_workers, default_jobs, local_workers
 from detect.settings import CircleSettings
 
 KINDS = ("lines", "tilt", "circles")
 FRAMES = 48
-PATIENCE_S = 120.0
+#: Of a run that is killed or interrupted: it does not end before, however fast the machine is.
+MANY_FRAMES = 6000
+#: Nothing takes that long, but to compile kernels on a slow machine.
+PATIENCE_S = 600.0
 
 
 @pytest.fixture
@@ -93,15 +99,24 @@ def test_no_workers_are_refused() -> None:
 @pytest.mark.long
 def test_a_killed_process_costs_nothing(run_folder: Path, tmp_path: Path) -> None:
     expected = detected(run_folder, tmp_path / "one", local_workers(1))
+    plain = local_workers(2)
     killed: list[int | None] = []
+    starts: list[FramePlan] = []
+
+    def start(plan: FramePlan) -> AbstractContextManager[Executor]:
+        starts.append(plan)
+        return plain.start(plan)
 
     def kill() -> None:
         victim = multiprocessing.active_children()[0]
         victim.kill()
         killed.append(victim.pid)
 
-    found = detected(run_folder, tmp_path / "two", local_workers(2), at_frame(20, kill))
+    # Most of the frames are not yet given to anybody then, in whatever order the two work.
+    two = Workers(start, chunk=4, window=lambda: 2)
+    found = detected(run_folder, tmp_path / "two", two, at_frame(8, kill))
     assert len(killed) == 1
+    assert len(starts) == 2  # others took the place of those that the killed one belonged to
     assert found == expected
     assert multiprocessing.active_children() == []
 
@@ -130,6 +145,14 @@ def wait_until(condition: Callable[[], bool], what: str) -> None:
         time.sleep(0.05)
 
 
+def make_long(run: Path) -> None:
+    shutil.rmtree(run / "images")
+    (run / "images").mkdir()
+    for number in range(MANY_FRAMES):
+        image = run / "images" / f"e.{number:04d}.jpg"
+        image.symlink_to(run / "few" / "e.0000.jpg")
+
+
 @contextmanager
 def started(run: Path, jobs: int, mark: str) -> Iterator[subprocess.Popen[str]]:
     """`detect all` at work in a process group of its own, as a shell starts it."""
@@ -156,11 +179,7 @@ def started(run: Path, jobs: int, mark: str) -> Iterator[subprocess.Popen[str]]:
 def test_an_interrupt_ends_everything(run_folder: Path, jobs: int, delay_s: float) -> None:
     """Control-C reaches the whole group of processes, at whatever they are."""
     mark = f"REDETECT_TEST={run_folder}"
-    shutil.rmtree(run_folder / "images")
-    (run_folder / "images").mkdir()
-    source = run_folder / "few" / "e.0000.jpg"
-    for number in range(2000):
-        (run_folder / "images" / f"e.{number:04d}.jpg").symlink_to(source)
+    make_long(run_folder)
     before = sorted(path.name for path in run_folder.iterdir())
     with started(run_folder, jobs, mark) as process:
         wait_until(lambda: bool(list(run_folder.glob(".*.part"))), "the run to begin")
@@ -182,8 +201,10 @@ def test_an_interrupt_ends_everything(run_folder: Path, jobs: int, delay_s: floa
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="looks for processes in /proc")
 def test_processes_end_with_the_one_that_started_them(run_folder: Path) -> None:
     mark = f"REDETECT_TEST={run_folder}"
+    make_long(run_folder)
     with started(run_folder, 2, mark) as process:
-        wait_until(lambda: len(processes_with(mark)) >= 3, "the workers")
+        # Itself, both workers, and the one that Python has look after semaphores.
+        wait_until(lambda: len(processes_with(mark)) >= 4, "the workers")
         process.kill()
     wait_until(lambda: not processes_with(mark), "its processes to end")
 
@@ -236,11 +257,15 @@ def cluster(folder: Path, workers: int) -> Iterator[tuple[str, list[subprocess.P
 @pytest.mark.long
 def test_a_cluster_writes_what_one_process_does(run_folder: Path, tmp_path: Path) -> None:
     """Also when one of its workers is killed half-way."""
-    pytest.importorskip("distributed")
+    distributed = pytest.importorskip("distributed")
     expected = detected(run_folder, tmp_path / "one", local_workers(1))
     with cluster(tmp_path, workers=2) as (address, workers):
+        with distributed.Client(address, set_as_default=False) as client:
+            client.wait_for_workers(2, timeout=PATIENCE_S)
         kill = at_frame(FRAMES // 2, workers[0].kill)
-        found = detected(run_folder, tmp_path / "cluster", cluster_workers(address), kill)
+        # Small tasks, so that both have some when one is killed.
+        small = replace(cluster_workers(address), chunk=2)
+        found = detected(run_folder, tmp_path / "cluster", small, kill)
         assert workers[0].wait(PATIENCE_S) == -signal.SIGKILL
         assert workers[1].poll() is None
     assert found == expected

@@ -34,7 +34,7 @@ class Played:
 
     def read(self) -> tuple[bool, NDArray[Any] | None]:
         assert not self.released.is_set()
-        time.sleep(self.pause_s)
+        self.released.wait(self.pause_s)
         if self.given == self.last:
             return False, None
         image = self.images[self.given % len(self.images)]
@@ -85,11 +85,16 @@ def test_so_many_frames_and_their_times(plugged: Plugged) -> None:
 
 
 def test_what_there_is_no_time_for_is_passed_over(plugged: Plugged) -> None:
-    plugged([blank(value) for value in range(200)], pause_s=0.001)
+    # Each image has its number in two pixels; so many that none comes twice.
+    images = [np.array([divmod(number, 256)], np.uint8) for number in range(1 << 16)]
+    opened = plugged(images, pause_s=0.001)
     seen = []
     for frame in open_source(Path("camera:0"), None, SourceOptions(frames=4)).frames:
-        seen.append(int(read_image(frame, None)[0, 0]))
-        time.sleep(0.02)
+        high, low = read_image(frame, None)[0]
+        seen.append(256 * int(high) + int(low))
+        shown = opened[-1].given
+        while opened[-1].given < shown + 3:
+            time.sleep(0.001)
     assert np.all(np.diff(seen) > 1)
 
 
@@ -105,7 +110,7 @@ def test_a_silent_camera(
     plugged: Plugged, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(live, "PATIENCE_S", 0.3)
-    plugged([blank(1)], pause_s=1.0)
+    plugged([blank(1)], pause_s=60.0)
     with caplog.at_level("INFO", logger="redetect"):
         assert list(open_source(Path("camera:0")).frames) == []
     assert "no image came within 0.3 s" in caplog.text
