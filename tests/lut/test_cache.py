@@ -11,6 +11,7 @@ import os
 import pickle
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -370,9 +371,10 @@ def test_concurrent_writers_all_get_right_tables(
     ]
     while not all((tmp_path / f"ready{k}").exists() for k in range(4)):
         assert all(process.poll() is None for process in processes), "a writer died at its start"
+        time.sleep(0.01)
     (tmp_path / "go").touch()
     for process in processes:
-        out, err = process.communicate(timeout=60)
+        out, err = process.communicate(timeout=600)
         assert err == ""
         assert process.returncode == 0
         assert out.split() == [right]

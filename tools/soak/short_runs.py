@@ -8,6 +8,7 @@ import os
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
 from dataclasses import dataclass
@@ -18,6 +19,7 @@ from tools.soak.processes import marked
 
 _FRAMES = 8
 _SHARED_MEMORY = Path("/dev/shm")
+_TRACKER_S = 10.0
 
 
 @dataclass(frozen=True)
@@ -116,7 +118,7 @@ def repeat_short_runs(
     return ShortRuns(
         runs=runs,
         processes=len(marked(mark)),
-        shared=len(in_nobodys_use(_shared() - shared)),
+        shared=len(_left_for_good(_shared() - shared)),
         temporary=len(_names(temporary)),
         hidden=sum(name.startswith(".") for name in _names(output)),
         caches=len(_names(caches)) - cached,
@@ -200,6 +202,20 @@ def in_nobodys_use(names: set[str]) -> set[str]:
         with suppress(FileNotFoundError):
             if (_SHARED_MEMORY / name).stat().st_ino not in mapped:
                 left.add(name)
+    return left
+
+
+def _left_for_good(names: set[str]) -> set[str]:
+    """Which pieces of shared memory stay in nobody's use.
+
+    Those of a program that was killed do for a moment only, until Python's process that looks after
+    them has removed them: others may run, and be killed, at the same time.
+    """
+    left = in_nobodys_use(names)
+    latest_s = time.monotonic() + _TRACKER_S
+    while left and time.monotonic() < latest_s:
+        time.sleep(0.05)
+        left &= in_nobodys_use(left)
     return left
 
 

@@ -56,13 +56,16 @@ def peaks_mib(arguments: list[str], program: Path) -> tuple[float, float]:
     """Peak memory of the command and of its largest worker."""
     root = Path(__file__).resolve().parents[3]
     program.write_text(PROGRAM)
-    done = subprocess.run(
-        [sys.executable, str(program), *arguments],
-        env={**os.environ, "PYTHONPATH": str(root)},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+    for _ in range(3):
+        done = subprocess.run(
+            [sys.executable, str(program), *arguments, "--force"],
+            env={**os.environ, "PYTHONPATH": str(root)},
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        if "compiling kernels" not in done.stderr:
+            break  # it takes more memory than any run
     code, own, largest = done.stdout.splitlines()[-1].split()
     assert code == "0", done.stderr
     return float(own), float(largest)

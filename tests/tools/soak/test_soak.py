@@ -22,6 +22,10 @@ from tools.soak.short_runs import ShortRuns
 
 pytestmark = pytest.mark.skipif(not Path("/proc").is_dir(), reason="reads Linux's /proc")
 
+shared_memory = pytest.mark.skipif(
+    not Path("/dev/shm").is_dir(), reason="looks for shared memory in /dev/shm"
+)
+
 PATIENCE_S = 60.0
 
 GOOD = SoakResult(
@@ -65,13 +69,16 @@ def test_processes_are_found_and_measured() -> None:
     program = (
         "import subprocess, sys; block = bytearray(b'1') * (40 << 20);"
         "files = [open('/dev/null') for _ in range(30)];"
-        "subprocess.Popen([sys.executable, '-c', 'input()']); print('ready', flush=True); input()"
+        # The child says so, once it is all there.
+        "say = 'print(\"ready\", flush=True); input()';"
+        "subprocess.Popen([sys.executable, '-c', say]); input()"
     )
+    mark = f"soak-test-{os.getpid()}"  # other tests of this sort may run at the same time
     with subprocess.Popen(
         [sys.executable, "-c", program],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
-        env={**os.environ, "REDETECT_MARK": "soak-test"},
+        env={**os.environ, "REDETECT_MARK": mark},
     ) as process:
         assert process.stdout is not None
         process.stdout.readline()
@@ -81,14 +88,14 @@ def test_processes_are_found_and_measured() -> None:
             assert len(found) == 2
             assert found[0].resident_bytes > 40 << 20
             assert found[0].descriptors >= 33
-            assert sorted(marked("REDETECT_MARK=soak-test")) == sorted(s.pid for s in found)
+            assert sorted(marked(f"REDETECT_MARK={mark}")) == sorted(s.pid for s in found)
         finally:
             for state in reversed(found):
                 os.kill(state.pid, 9)
     end = time.monotonic() + PATIENCE_S  # one that is nobody's child any more ends when it is let
-    while marked("REDETECT_MARK=soak-test") and time.monotonic() < end:
+    while marked(f"REDETECT_MARK={mark}") and time.monotonic() < end:
         time.sleep(0.01)
-    assert marked("REDETECT_MARK=soak-test") == []
+    assert marked(f"REDETECT_MARK={mark}") == []
 
 
 def test_demands() -> None:
@@ -127,7 +134,7 @@ def test_a_soak_of_some_seconds(
     assert [path.name for path in tmp_path.iterdir()] == ["soak.json"]  # the run is removed
 
 
-@pytest.mark.skipif(not Path("/dev/shm").is_dir(), reason="looks for shared memory in /dev/shm")
+@shared_memory
 def test_shared_memory_in_use_was_not_left_behind() -> None:
     lock: Any = multiprocessing.get_context("spawn").Lock()  # of a program that goes on
     in_use = f"sem.{lock._semlock.name.strip('/')}"
@@ -139,3 +146,20 @@ def test_shared_memory_in_use_was_not_left_behind() -> None:
         assert short_runs.in_nobodys_use(names) == {orphan.name}
     finally:
         orphan.unlink()
+
+
+@shared_memory
+def test_shared_memory_that_is_still_removed_was_not_left_behind(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    late, left = (Path(f"/dev/shm/psm_redetect_{os.getpid()}_{name}") for name in ("late", "left"))
+    late.touch()
+    left.touch()
+    try:
+        monkeypatch.setattr(time, "sleep", lambda _: late.unlink(missing_ok=True))
+        ticks = iter(range(1000))
+        monkeypatch.setattr(time, "monotonic", lambda: next(ticks))
+        assert short_runs._left_for_good({late.name, left.name}) == {left.name}
+    finally:
+        late.unlink(missing_ok=True)
+        left.unlink()
