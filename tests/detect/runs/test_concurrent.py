@@ -73,10 +73,9 @@ def folder_of(path: Path) -> Path:
     return path
 
 
-def wait_until(condition: Callable[[], bool], process: subprocess.Popen[str]) -> None:
+def wait_until(condition: Callable[[], bool]) -> None:
     end = time.monotonic() + PATIENCE_S
     while not condition():
-        assert process.poll() is None
         assert time.monotonic() < end
         time.sleep(0.01)
 
@@ -150,7 +149,8 @@ def test_of_two_runs_that_may_overwrite_one_is_the_last(
             started([*arguments, "--circles.threshold", "0.5", "--lines.alpha", "published"])
             for _ in range(2)
         ]
-        wait_until(lambda: len(parts_in(output)) > len(own), others[0])
+        # At work, or done already where this process was not given any time.
+        wait_until(lambda: len(parts_in(output)) > len(own) or others[0].poll() is not None)
         first.go_on()
         assert first.wait() == 0, first.said()
         for process in others:
@@ -168,21 +168,28 @@ def test_cold_kernels_compiled_by_two_at_once(run_folder: Path, tmp_path: Path) 
     caches = {
         "NUMBA_CACHE_DIR": str(tmp_path / "kernels"),
         "REDETECT_CACHE": str(tmp_path / "tables"),
+        "NUMBA_DEBUG_CACHE": "1",
     }
+
+    def kept_by(process: subprocess.Popen[str]) -> int:
+        """How many kernels a run compiled and kept."""
+        out, said = process.communicate(timeout=PATIENCE_S)
+        assert process.returncode == 0, said
+        kept = out.count("data saved to")
+        assert ("compiling kernels" in said) == (kept > 0)
+        return kept
+
     processes = [
         started([*arguments, "-o", str(cold / f"{number}.circles")], **caches)
         for number in range(2)
     ]
-    for process in processes:
-        code, said = ended(process)
-        assert code == 0, said
-        assert "compiling kernels" in said
+    kept = [kept_by(process) for process in processes]
+    assert min(kept) > 0
+    assert max(kept) > 10
+    # Of two variants of a kernel that are kept at the same moment, Numba may forget one.
+    assert kept_by(started([*arguments, "-o", str(cold / "2.circles")], **caches)) <= 1
     rows = (warm / "0.circles").read_bytes()
-    assert [(cold / f"{number}.circles").read_bytes() for number in range(2)] == [rows, rows]
-    code, said = ended(started([*arguments, "-o", str(cold / "2.circles")], **caches))
-    assert code == 0, said
-    assert "compiling kernels" not in said
-    assert (cold / "2.circles").read_bytes() == rows
+    assert [(cold / f"{number}.circles").read_bytes() for number in range(3)] == [rows] * 3
 
 
 @pytest.mark.skipif(not Path("/dev/shm").is_dir(), reason="looks for shared memory in /dev/shm")
