@@ -85,6 +85,9 @@ class _LinklessDisk:
             finally:
                 os._exit(0)
         os.close(handle)
+        # Until Linux has asked for it, it takes user 0 for the owner, who is unknown in a namespace
+        # that is an ordinary user's, and refuses whatever is to be written.
+        Path(self.place).stat()
 
 
 def _in_own_process(mount: Callable[[], None], work: Work, arguments: tuple[Any, ...]) -> None:

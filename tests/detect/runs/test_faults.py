@@ -208,7 +208,7 @@ def public_run(small_run: Path) -> Iterator[Path]:
     for path in (folder, *folder.rglob("*")):
         path.chmod(0o755 if path.is_dir() else 0o644)
     yield run
-    folder.chmod(0o755)
+    run.chmod(0o755)
     shutil.rmtree(folder)
 
 
