@@ -167,8 +167,10 @@ class ForkedRuns:
         try:
             yield run
         finally:
-            run.kill()
-            run.wait()
+            try:
+                run.kill()
+            finally:
+                run.wait()  # else the next run would be told how this one ended
 
     def ended(
         self, arguments: Sequence[str], prepare: Preparation | None = None
