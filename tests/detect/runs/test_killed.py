@@ -7,6 +7,7 @@ Whatever happens, the previous files are there or the new ones are, never a mixt
 from __future__ import annotations
 
 import json
+import multiprocessing
 import os
 import random
 import resource
@@ -26,6 +27,7 @@ from tests.detect.forked_runs import (
     STOPPING_PROGRAM,
     DieAfter,
     DieAtPlacing,
+    ForkedRun,
     ForkedRuns,
     Room,
     StopAfter,
@@ -155,6 +157,16 @@ def resumed(run: Path, output: Path, capsys: Captured, *flags: str) -> int:
     assert f"{FRAMES} frames" in shown.out
     taken = [line for line in shown.err.splitlines() if "are taken over" in line]
     return int(taken[0].split()[0]) if taken else 0
+
+
+def test_a_run_that_has_ended_and_is_not_told_of_yet() -> None:
+    here, there = multiprocessing.Pipe()
+    no_such_process = 1 << 30
+    ForkedRun(here, no_such_process).kill()
+    there.send((3, "ended"))
+    run = ForkedRun(here, no_such_process)
+    run.kill()
+    assert (run.wait(), run.said()) == (3, "ended")
 
 
 # -- killed -----------------------------------------------------------------------------------
