@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
@@ -51,6 +52,11 @@ def write_account(path: Path, content: dict[str, Any], *, overwrite: bool) -> No
 @contextmanager
 def progress(label: str) -> Iterator[tuple[Callable[[int], None], Callable[[], None]]]:
     """A progress bar on a terminal; yields what to tell the total to, and what to call on."""
+    # Asked of the file: variables of the environment have rich take a log for a terminal, and of a
+    # disabled bar, older versions of it print the line's end.
+    if not sys.stderr.isatty():
+        yield lambda total: None, lambda: None
+        return
     from rich.console import Console
     from rich.progress import (
         BarColumn,
@@ -60,16 +66,12 @@ def progress(label: str) -> Iterator[tuple[Callable[[int], None], Callable[[], N
         TimeRemainingColumn,
     )
 
-    console = Console(stderr=True)
-    if not console.is_terminal:  # of a disabled bar, older versions of rich print the line's end
-        yield lambda total: None, lambda: None
-        return
     bar = Progress(
         TextColumn("{task.description}"),
         BarColumn(),
         MofNCompleteColumn(),
         TimeRemainingColumn(),
-        console=console,
+        console=Console(stderr=True),
     )
     with bar:
         task = bar.add_task(label, total=None)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from camera import write_camera
 from groundtruth.cli import main
+from groundtruth.commands.outputs import progress
 from groundtruth.geometry.transforms import exp_se3, inverse, log_se3, planar_transform
 from groundtruth.markers.calibration import (
     Network,
@@ -315,6 +316,18 @@ def test_a_network_from_corners(tmp_path: Path, capsys: Captured) -> None:
         sigmas = np.sqrt(np.diagonal(network.covariance)).reshape(4, 6)
         assert np.all(np.abs(error) < 5.0 * sigmas)
     refused(["network", str(folder), "-o", str(output)], "exists already", capsys)
+
+
+def test_a_log_gets_no_progress_bar(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Not even where variables of the environment say that it is as good as a terminal."""
+    for name in ("FORCE_COLOR", "TTY_COMPATIBLE", "TTY_INTERACTIVE"):
+        monkeypatch.setenv(name, "1")
+    with progress("poses") as (total, advance):
+        total(2)
+        advance()
+    assert capsys.readouterr() == ("", "")
 
 
 def test_help_needs_nothing_heavy() -> None:
