@@ -217,24 +217,25 @@ def growth_powers(points: Sequence[GrowthPoint]) -> dict[str, float]:
     """The power of the amount that each function's median time grows as (least squares of logs)."""
     amounts = np.log([point.amount for point in points])
     return {
-        times.name: float(
-            np.polynomial.Polynomial.fit(
-                amounts, np.log([p.functions[i].ms.median for p in points]), 1
-            ).convert().coef[1]
-        )
+        times.name: _line(amounts, np.log([p.functions[i].ms.median for p in points]))[1]
         for i, times in enumerate(points[0].functions)
-    }  # fmt: skip
+    }
 
 
 def costs_per_landmark(points: Sequence[GrowthPoint]) -> dict[str, tuple[float, float]]:
     """Each function's median time without landmarks, and for each of them (least squares; ms)."""
-    amounts = [point.amount for point in points]
-    costs = {}
-    for i, times in enumerate(points[0].functions):
-        medians = [point.functions[i].ms.median for point in points]
-        bare, each = np.polynomial.Polynomial.fit(amounts, medians, 1).convert().coef
-        costs[times.name] = (float(bare), float(each))
-    return costs
+    amounts = np.array([point.amount for point in points])
+    return {
+        times.name: _line(amounts, np.array([p.functions[i].ms.median for p in points]))
+        for i, times in enumerate(points[0].functions)
+    }
+
+
+def _line(x: FloatArray, y: FloatArray) -> tuple[float, float]:
+    """Where a line of least squares begins, and its slope."""
+    # `Polynomial.fit` would leave out a slope of exactly 0.
+    slope, begin = np.polyfit(x, y, 1)
+    return float(begin), float(slope)
 
 
 def format_json(result: Result) -> str:

@@ -138,6 +138,10 @@ def test_growth_is_that_of_known_laws() -> None:
     bare, each = costs_per_landmark(points(lambda n: 5.0 + 0.25 * n))[DECODING]
     assert bare == pytest.approx(5.0)
     assert each == pytest.approx(0.25)
+    # What does not grow: a slope of exactly 0, on some processors at least.
+    assert growth_powers(points(lambda n: 1.0)) == {DECODING: 0.0}
+    _, each = costs_per_landmark(points(lambda n: 5.0))[DECODING]
+    assert each == pytest.approx(0.0, abs=1e-12)
 
 
 def test_the_headline_is_medians_alone() -> None:
