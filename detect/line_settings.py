@@ -122,7 +122,8 @@ class LineSettings:
     soft_evidence : float
         Unless they have this evidence.
     largest_horizon_gap_px : float
-        How far a line may end from the horizon.
+        How far a line may end from the horizon (or from what stands for it where the camera does
+        not see it: `lut.verticals`).
     largest_scatter_px : float
         Largest root-mean-square distance of the points from the line.
     largest_shift_px : float

@@ -3,7 +3,7 @@
 The path of an image, each step a function of its own:
 
     response        how well a step along the local vertical explains the grey values
-    starts          its maxima on the horizon
+    starts          its maxima on the horizon (or what stands for it: `lut.verticals`)
     tracks          the edges through them, followed up and down
     fits            straight lines, refined on the grey values
     consensus       the tilt that most of them agree with; the others are no verticals
@@ -128,7 +128,7 @@ def _told_beforehand(table: VerticalTable, settings: LineSettings) -> tuple[Any,
     lean = _LAG_PX * settings.guided_pull / table.row_aspect
     doubt = np.array([_FIRST_LINES, _FIRST_VOTES, _FIRST_LEAN_RAD, *of_chains, lean])
     return (
-        table.elevation_tan, table.bearing_rad, table.horizon_row, table.first_row,
+        table.elevation_tan, table.bearing_rad, table.anchor_row, table.first_row,
         table.last_row, table.robot_from_camera, strip.column, strip.ends, strip.rise,
         strip.lean_by_pitch, strip.lean_by_roll, band.row, band.pixel, band.runs, band.part,
         band.scale, band.visible, band.weights, window.weights_between, window.along, filters.half,

@@ -5,6 +5,8 @@ The loops check nothing: a table that came from a file is looked through once, b
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from camera import Camera
@@ -93,7 +95,7 @@ def check_vertical_table(table: VerticalTable, camera: Camera) -> None:
     """
     height, width = camera.height, camera.width
     for name, dtype, shape in (
-        ("horizon_row", np.float64, (width,)),
+        ("anchor_row", np.float64, (width,)),
         ("bearing_rad", np.float64, (width,)),
         ("first_row", np.int32, (width,)),
         ("last_row", np.int32, (width,)),
@@ -108,13 +110,15 @@ def check_vertical_table(table: VerticalTable, camera: Camera) -> None:
         _demand(bool(getattr(table, name).flags.f_contiguous), name)
     _demand(np.array_equal(table.robot_from_camera, camera.rotation), "robot_from_camera")
     _demand(table.row_aspect == camera.scale_x / camera.scale_y, "row_aspect")
-    with_horizon = np.isfinite(table.horizon_row)
-    inside = (table.horizon_row >= 0.0) & (table.horizon_row <= height - 1.0)
-    _demand(bool(np.all(inside | np.isnan(table.horizon_row))), "horizon_row")
-    _demand(bool(np.all(np.isfinite(table.bearing_rad[with_horizon]))), "bearing_rad")
+    elevation = table.anchor_elevation_rad
+    _demand(isinstance(elevation, float) and abs(elevation) < 0.5 * math.pi, "anchor_elevation_rad")
+    with_anchor = np.isfinite(table.anchor_row)
+    inside = (table.anchor_row >= 0.0) & (table.anchor_row <= height - 1.0)
+    _demand(bool(np.all(inside | np.isnan(table.anchor_row))), "anchor_row")
+    _demand(bool(np.all(np.isfinite(table.bearing_rad[with_anchor]))), "bearing_rad")
 
     usable = table.usable
-    _demand(bool(np.all(with_horizon[usable])), "first_row")
+    _demand(bool(np.all(with_anchor[usable])), "first_row")
     _demand(bool(np.all((table.first_row >= 0) & (table.last_row < height))), "last_row")
     row = np.arange(height)[:, None]
     followed = usable & (row >= table.first_row) & (row <= table.last_row)

@@ -18,11 +18,12 @@ _TOLERANCE_PX = 1e-9
 def trace_verticals(
     numbers: NDArray[np.float64],
     bearing: NDArray[np.float64],
-    horizon_row: NDArray[np.float64],
+    anchor_row: NDArray[np.float64],
+    anchor_elevation: float,
     column: NDArray[np.float64],
     elevation: NDArray[np.float64],
 ) -> None:
-    """Follow verticals from the horizon up and down, row by row.
+    """Follow verticals from the anchor up and down, row by row.
 
     In each row the elevation at which it shows the vertical is found by Newton's method, from where
     the row before showed it.
@@ -33,11 +34,13 @@ def trace_verticals(
         `camera.kernels.camera_numbers`.
     bearing : (N,) float64
         Bearings of the verticals (rad); NaN for none.
-    horizon_row : (N,) float64
-        Rows at which they cross the horizon.
+    anchor_row : (N,) float64
+        Rows at which they cross the anchor.
+    anchor_elevation : float
+        Its elevation above the horizon (rad).
     column : (H, N) float64
         Result: column of each vertical at each row; NaN where the vertical is not seen, or not
-        without a break from the horizon on.
+        without a break from the anchor on.
     elevation : (H, N) float64
         Result: elevation above the horizon of that point (rad); NaN as above.
     """
@@ -51,7 +54,7 @@ def trace_verticals(
         for v in range(height):
             column[v, n] = math.nan
             elevation[v, n] = math.nan
-        if not (math.isfinite(bearing[n]) and math.isfinite(horizon_row[n])):
+        if not (math.isfinite(bearing[n]) and math.isfinite(anchor_row[n])):
             continue
         sine = math.sin(bearing[n])
         cosine = math.cos(bearing[n])
@@ -60,8 +63,8 @@ def trace_verticals(
         level_y = numbers[13] * sine - numbers[14] * cosine
         level_z = numbers[16] * sine - numbers[17] * cosine
         for direction in (-1, 1):
-            angle = 0.0
-            first = math.floor(horizon_row[n])
+            angle = anchor_elevation
+            first = math.floor(anchor_row[n])
             v = first if direction < 0 else first + 1
             orientation = 0.0
             while 0 <= v < height:

@@ -4,10 +4,14 @@ A vertical plane through the camera's centre is seen as one curve in the image. 
 share their bearing, so the curve is named by the one pixel at which it crosses the horizon: for
 each image column the table holds the row of the horizon and the vertical through that point, as a
 column for each row, through the distortion (DLR Spatial Cognition data set report, line detection).
+
+A camera that looks down so far that it does not see the horizon still sees verticals. There a line
+of constant elevation near the border of the image stands for the horizon; both are called *anchor*.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,17 +24,26 @@ from lut.vertical_kernels import trace_verticals
 #: Verticals farther than this from the image's vertical are not followed: du/dv of 45 deg.
 STEEPEST_SLOPE = 1.0
 
-_HORIZON_STEPS = 12
+_ROOT_STEPS = 12
+
+#: The horizon is the anchor where at least this share of the columns see it.
+_LEAST_SEEN = 0.5
+#: Else the anchor is, in most columns, at least this share of the height from the border,
+_MARGIN = 1.0 / 12.0
+#: and no farther from the horizon than this: who looks so far down sees the floor alone.
+_LARGEST_ELEVATION = math.radians(45.0)
 
 
 @dataclass(frozen=True, eq=False)
 class VerticalTable:
-    """The horizon and the verticals of a calibration; hashed and compared by identity.
+    """The anchor and the verticals of a calibration; hashed and compared by identity.
 
     Attributes
     ----------
-    horizon_row : (W,) float64
-        Row at which the horizon crosses each column; NaN where it does so outside the image or not
+    anchor_elevation_rad : float
+        Elevation of the anchor: 0 where that is the horizon.
+    anchor_row : (W,) float64
+        Row at which the anchor crosses each column; NaN where it does so outside the image or not
         at all.
     bearing_rad : (W,) float64
         Bearing of that point, 0 forward, positive to the left; NaN as above.
@@ -48,7 +61,8 @@ class VerticalTable:
         Height of a row in widths of a column (2 for single fields of interlaced frames).
     """
 
-    horizon_row: NDArray[np.float64]
+    anchor_elevation_rad: float
+    anchor_row: NDArray[np.float64]
     bearing_rad: NDArray[np.float64]
     first_row: NDArray[np.int32]
     last_row: NDArray[np.int32]
@@ -63,7 +77,7 @@ class VerticalTable:
         return self.first_row <= self.last_row
 
     def columns_at(self, bearing_rad: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(N,) columns at which (N,) bearings lie on the horizon; at its ends for those outside.
+        """(N,) columns at which (N,) bearings lie on the anchor; at its ends for those outside.
 
         NaN where the table has no verticals.
         """
@@ -76,7 +90,7 @@ class VerticalTable:
 
 
 def build_vertical_table(camera: Camera) -> VerticalTable:
-    """Compute the horizon and the verticals through it.
+    """Compute the anchor and the verticals through it.
 
     Parameters
     ----------
@@ -86,21 +100,23 @@ def build_vertical_table(camera: Camera) -> VerticalTable:
     Returns
     -------
     VerticalTable
-        Columns whose horizon lies outside the image have no vertical; a camera that does not see
-        the horizon gets a table without verticals.
+        Columns whose anchor lies outside the image have no vertical; a camera that looks more than
+        45 deg past the horizon gets a table without verticals.
     """
     height, width = camera.height, camera.width
     v, u = np.mgrid[0:height, 0:width].astype(np.float64)
     normalised = camera.undistort(np.stack([u, v], axis=-1))
-    row = horizon_rows(camera, normalised)
-    on_horizon = camera.directions_robot(np.stack([np.arange(width, dtype=np.float64), row], -1))
-    bearing = np.arctan2(on_horizon[:, 0], -on_horizon[:, 1])
+    elevation_rad = anchor_elevation(camera, normalised)
+    row = anchor_rows(camera, normalised, elevation_rad)
+    on_anchor = camera.directions_robot(np.stack([np.arange(width, dtype=np.float64), row], -1))
+    bearing = np.arctan2(on_anchor[:, 0], -on_anchor[:, 1])
     column = np.empty((height, width))
     elevation = np.empty_like(column)
-    trace_verticals(camera_numbers(camera), bearing, row, column, elevation)
+    trace_verticals(camera_numbers(camera), bearing, row, elevation_rad, column, elevation)
     first, last, seen = _unbroken(column, row)
     return VerticalTable(
-        horizon_row=row,
+        anchor_elevation_rad=elevation_rad,
+        anchor_row=row,
         bearing_rad=bearing,
         first_row=first,
         last_row=last,
@@ -114,8 +130,8 @@ def build_vertical_table(camera: Camera) -> VerticalTable:
     )
 
 
-def horizon_rows(camera: Camera, normalised: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Row at which the horizon crosses each column.
+def anchor_elevation(camera: Camera, normalised: NDArray[np.float64]) -> float:
+    """Elevation of the line that stands for the horizon, rad: 0 where the camera sees that.
 
     Parameters
     ----------
@@ -123,46 +139,88 @@ def horizon_rows(camera: Camera, normalised: NDArray[np.float64]) -> NDArray[np.
         The calibrated camera.
     normalised : (H, W, 2) float64
         `camera.undistort` of all pixels.
+    """
+    above = _above(camera, normalised, 0.0)
+    some_above, some_below = (above > 0.0).any(axis=0), (above <= 0.0).any(axis=0)
+    if np.mean(some_above & some_below) >= _LEAST_SEEN:
+        return 0.0
+    margin = math.ceil(_MARGIN * camera.height)
+    nearest = math.inf
+    for border in (margin, camera.height - 1 - margin):
+        ray = normalised[min(max(border, 0), camera.height - 1)]
+        sine = _above(camera, ray, 0.0) / np.sqrt(1.0 + np.sum(ray * ray, axis=-1))
+        sine = sine[np.isfinite(sine)]
+        if not len(sine):
+            continue
+        # Farther from the horizon is farther inside the image.
+        past = float(np.quantile(sine, 0.1 if np.median(sine) < 0.0 else 0.9))
+        if abs(past) < abs(nearest):
+            nearest = past
+    elevation = math.asin(nearest) if abs(nearest) <= 1.0 else math.inf
+    return elevation if abs(elevation) <= _LARGEST_ELEVATION else 0.0
+
+
+def anchor_rows(
+    camera: Camera, normalised: NDArray[np.float64], elevation_rad: float
+) -> NDArray[np.float64]:
+    """Row at which a line of constant elevation crosses each column.
+
+    Parameters
+    ----------
+    camera : Camera
+        The calibrated camera.
+    normalised : (H, W, 2) float64
+        `camera.undistort` of all pixels.
+    elevation_rad : float
+        0 for the horizon.
 
     Returns
     -------
     (W,) float64
-        NaN where the horizon does not cross the column inside the image; where it does so more than
+        NaN where the line does not cross the column inside the image; where it does so more than
         once (a camera rolled far over), the crossing nearest to the image's middle row.
     """
     height, width = camera.height, camera.width
-    toward_up = camera.rotation[2]
-    rise = normalised @ toward_up[:2] + toward_up[2]
+    above = _above(camera, normalised, math.sin(elevation_rad))
     row = np.full(width, np.nan)
     if height > 1:
-        crosses = (rise[:-1] > 0.0) != (rise[1:] > 0.0)
-        crosses &= np.isfinite(rise[:-1]) & np.isfinite(rise[1:])
+        crosses = (above[:-1] > 0.0) != (above[1:] > 0.0)
+        crosses &= np.isfinite(above[:-1]) & np.isfinite(above[1:])
         distance = np.abs(np.arange(height - 1) + 0.5 - 0.5 * (height - 1))
-        above = np.where(crosses, distance[:, None], np.inf).argmin(axis=0)
+        nearest = np.where(crosses, distance[:, None], np.inf).argmin(axis=0)
         some = np.flatnonzero(crosses.any(axis=0))
-        row[some] = _roots(camera, toward_up, some, above[some], rise)
+        row[some] = _roots(camera, math.sin(elevation_rad), some, nearest[some], above)
     return row
+
+
+def _above(camera: Camera, normalised: NDArray[np.float64], sine: float) -> NDArray[np.float64]:
+    """How far rays (x, y, 1) end above the cone whose elevation has this sine."""
+    toward_up = camera.rotation[2]
+    rise = normalised @ toward_up[:2] + toward_up[2]
+    if sine == 0.0:
+        return np.asarray(rise)
+    return np.asarray(rise - sine * np.sqrt(1.0 + np.sum(normalised * normalised, axis=-1)))
 
 
 def _roots(
     camera: Camera,
-    toward_up: NDArray[np.float64],
+    sine: float,
     columns: NDArray[np.intp],
-    above: NDArray[np.intp],
-    rise: NDArray[np.float64],
+    before: NDArray[np.intp],
+    above: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Rows between `above` and the next at which columns see the horizon.
+    """Rows between `before` and the next at which columns see the elevation of this sine.
 
     Regula falsi (the Illinois variant): it needs no derivative through the distortion and does not
     leave the interval; where the rise is as smooth as here, a few steps reach 1e-13 px.
     """
-    low, high = above.astype(np.float64), above + 1.0
-    at_low, at_high = rise[above, columns], rise[above + 1, columns]
+    low, high = before.astype(np.float64), before + 1.0
+    at_low, at_high = above[before, columns], above[before + 1, columns]
     middle = low
-    for _ in range(_HORIZON_STEPS):
+    for _ in range(_ROOT_STEPS):
         middle = high - at_high * (high - low) / (at_high - at_low)
         at = camera.undistort(np.stack([columns.astype(np.float64), middle], axis=-1))
-        value = at @ toward_up[:2] + toward_up[2]
+        value = _above(camera, at, sine)
         crossed = (value > 0.0) != (at_high > 0.0)
         # The end that stays counts half, so that it does not stay for long.
         low = np.where(crossed, high, low)
@@ -174,9 +232,9 @@ def _roots(
 
 
 def _unbroken(
-    column: NDArray[np.float64], horizon_row: NDArray[np.float64]
+    column: NDArray[np.float64], anchor_row: NDArray[np.float64]
 ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.bool_]]:
-    """First and last of the rows round the horizon over which verticals are seen; those rows."""
+    """First and last of the rows round the anchor over which verticals are seen; those rows."""
     height, width = column.shape
     with np.errstate(invalid="ignore"):
         seen = (column >= 0.0) & (column <= width - 1.0)
@@ -185,8 +243,8 @@ def _unbroken(
     first = np.ones(width, np.int32)
     last = np.zeros(width, np.int32)
     kept = np.zeros(column.shape, np.bool_)
-    for c in np.flatnonzero(np.isfinite(horizon_row)):
-        start = round(float(horizon_row[c]))
+    for c in np.flatnonzero(np.isfinite(anchor_row)):
+        start = round(float(anchor_row[c]))
         if not seen[start, c]:
             continue
         above = np.flatnonzero(~seen[:start, c])

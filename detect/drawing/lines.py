@@ -141,7 +141,7 @@ def draw_response(response: NDArray[np.float32], table: VerticalTable) -> NDArra
     canvas[..., 0] = np.where(response < 0.0, shade, 0)
     canvas[..., 2] = np.where(response > 0.0, shade, 0)
     columns = np.flatnonzero(table.usable)
-    canvas[np.rint(table.horizon_row[columns]).astype(np.intp), columns, 1] = 160
+    canvas[np.rint(table.anchor_row[columns]).astype(np.intp), columns, 1] = 160
     return canvas
 
 
@@ -162,7 +162,7 @@ def _horizon_crossing(
     bearing = found.fits.reference_rad[track] + np.arctan(found.fits.line[track, 0])
     u = float(table.columns_at(np.array([bearing]))[0])
     columns = np.flatnonzero(table.usable)
-    return u, float(np.interp(u, columns, table.horizon_row[columns]))
+    return u, float(np.interp(u, columns, table.anchor_row[columns]))
 
 
 def _colour(fate: str) -> Colour:

@@ -45,10 +45,11 @@ class LineFilter:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StartBand:
-    """The rows parallel to the horizon on which tracks start, and what the filter needs there.
+    """The rows parallel to the anchor on which tracks start, and what the filter needs there.
 
-    Rows of the band are counted from the horizon: row i is `first_offset` + i rows below it. The
-    filter is evaluated on its row s (half the filter's length) and every `spacing` from there.
+    The anchor is the horizon, or what stands for it (`lut.verticals`). Rows of the band are counted
+    from there: row i is `first_offset` + i rows below it. The filter is evaluated on its row s
+    (half the filter's length) and every `spacing` from there.
 
     Attributes
     ----------
@@ -171,10 +172,10 @@ def start_band(table: VerticalTable, settings: LineSettings) -> StartBand:
     height, width = table.column.shape
     steps = settings.start_band_rows // settings.start_spacing_rows
     reach = steps * settings.start_spacing_rows + s
-    horizon = np.where(table.usable, np.floor(table.horizon_row + 0.5), 0.0).astype(np.intp)
+    anchor = np.where(table.usable, np.floor(table.anchor_row + 0.5), 0.0).astype(np.intp)
     columns = np.arange(width)
 
-    row = horizon + np.arange(-reach, reach + 1)[:, None]
+    row = anchor + np.arange(-reach, reach + 1)[:, None]
     on_vertical = (row >= table.first_row) & (row <= table.last_row)
     x = np.where(on_vertical, table.column[np.where(on_vertical, row, 0), columns], 0.0)
     left = np.minimum(x.astype(np.int32), max(width - 2, 0))

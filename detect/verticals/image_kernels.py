@@ -25,7 +25,7 @@ def find_lines(
     pixels: NDArray[np.uint8],
     elevation_tan: NDArray[np.float32],
     bearing: NDArray[np.float64],
-    horizon_row: NDArray[np.float64],
+    anchor_row: NDArray[np.float64],
     first_row: NDArray[np.int32],
     last_row: NDArray[np.int32],
     robot_from_camera: NDArray[np.float64],
@@ -65,7 +65,7 @@ def find_lines(
         Grey values.
     pixels : (N,) uint8
         See `detect.verticals.follow_kernels.follow_edges`.
-    elevation_tan, bearing, horizon_row, first_row, last_row, robot_from_camera
+    elevation_tan, bearing, anchor_row, first_row, last_row, robot_from_camera
         The table (see `lut.verticals.VerticalTable`).
     strip, ends, rise, lean_by_pitch, lean_by_roll
         See `detect.verticals.strip.Strip`.
@@ -143,7 +143,7 @@ def find_lines(
         )  # fmt: skip
         few = not complete
         fits, evidence, fate, tilt = fit_and_judge(
-            image, strip, rise, bearing, horizon_row, row_aspect, polarity, bounds, row, column,
+            image, strip, rise, bearing, anchor_row, row_aspect, polarity, bounds, row, column,
             score, few_half if few else half, few_begin_of if few else begin_of, height_weights,
             first_weights, second_weights, few_farthest if few else farthest, limits,
         )  # fmt: skip

@@ -105,7 +105,7 @@ def judge_tracks(
     filters, farthest = refinement_of(settings, steps)
     strip = strip_of(table)
     fits, evidence, fate, tilt = fit_and_judge(
-        image, strip.column, strip.rise, table.bearing_rad, table.horizon_row,
+        image, strip.column, strip.rise, table.bearing_rad, table.anchor_row,
         table.row_aspect, tracks.polarity, tracks.bounds, tracks.row, tracks.column, tracks.score,
         filters.half, filters.begin, filters.height, filters.first, filters.second, farthest,
         limits_of(settings, table.row_aspect),

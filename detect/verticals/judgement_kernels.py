@@ -63,7 +63,7 @@ def judge_tracks(
     row: NDArray[np.int32],
     column: NDArray[np.float64],
     score: NDArray[np.float32],
-    horizon_row: NDArray[np.float64],
+    anchor_row: NDArray[np.float64],
     row_aspect: float,
     pixel: NDArray[np.float64],
     line: NDArray[np.float64],
@@ -87,7 +87,7 @@ def judge_tracks(
     ----------
     bounds, row, column, score
         The tracks (see `detect.verticals.tracks.LineTracks`).
-    horizon_row, row_aspect
+    anchor_row, row_aspect
         The table.
     pixel, line, covariance, scatter_px, shift_px, contrast, sharpness
         Their lines (see `detect.verticals.fit.LineFits`).
@@ -102,7 +102,7 @@ def judge_tracks(
     fate : (T,) int8
         Accepted, or the first reason why not.
     """
-    width = len(horizon_row)
+    width = len(anchor_row)
     count = len(bounds) - 1
     evidence = np.empty(count)
     fate = np.empty(count, np.int8)
@@ -113,7 +113,7 @@ def judge_tracks(
             total += score[i]
         evidence[t] = total * row_aspect * sharpness[t] * sharpness[t]
         near = min(max(int(np.rint(column[begin])), 0), width - 1)
-        gap = max(horizon_row[near] - row[end - 1], row[begin] - horizon_row[near]) * row_aspect
+        gap = max(anchor_row[near] - row[end - 1], row[begin] - anchor_row[near]) * row_aspect
         if end - begin < least_points:
             fate[t] = SHORT
         elif not evidence[t] >= least_evidence:

@@ -133,7 +133,7 @@ def fit_and_judge(
     strip: NDArray[np.float32],
     elevation: NDArray[np.float32],
     bearing: NDArray[np.float64],
-    horizon_row: NDArray[np.float64],
+    anchor_row: NDArray[np.float64],
     row_aspect: float,
     polarity: NDArray[np.float64],
     bounds: NDArray[np.int64],
@@ -156,7 +156,7 @@ def fit_and_judge(
         Grey values.
     strip, elevation
         See `detect.verticals.strip.Strip`: its columns and its rise.
-    bearing, horizon_row, row_aspect
+    bearing, anchor_row, row_aspect
         The table (see `lut.verticals.VerticalTable`).
     polarity, bounds, row, column, score
         The tracks (see `detect.verticals.tracks.LineTracks`).
@@ -196,7 +196,7 @@ def fit_and_judge(
         contrast = np.full(count, np.nan)
         sharpness = np.ones(count)
     evidence, fate = judge_tracks(
-        bounds, row, column, score, horizon_row, row_aspect, pixel, line, covariance, scatter_px,
+        bounds, row, column, score, anchor_row, row_aspect, pixel, line, covariance, scatter_px,
         shift_px, contrast, sharpness, int(limits[0]), limits[2], limits[3], limits[4], limits[5],
         limits[6], limits[7], limits[8],
     )  # fmt: skip

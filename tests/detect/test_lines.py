@@ -65,6 +65,29 @@ def test_bearings_and_tilt_of_a_tilted_camera(tilt_deg: tuple[float, float]) -> 
         assert np.abs(raw - truth()).max() > 1e-3
 
 
+@pytest.mark.parametrize("upside_down", [False, True])
+@pytest.mark.parametrize("pitch_deg", [-33.0, 28.0, 40.0])
+def test_cameras_that_do_not_see_the_horizon_see_verticals(
+    pitch_deg: float, upside_down: bool
+) -> None:
+    roll_deg = 181.0 if upside_down else 1.0
+    camera = pinhole(240, 160, 200.0, pitch_deg=pitch_deg, roll_deg=roll_deg, coef=BARREL)
+    table = build_vertical_table(camera)
+    assert abs(table.anchor_elevation_rad) > 0.1
+    pitch, roll = np.radians([0.8, -0.5])
+    found = detect_lines(scene(tilted(camera, pitch, roll)), table)
+    order = np.argsort(-found.alpha_rad)
+    off = found.alpha_rad[order] - truth()
+    assert np.all(np.abs(off) < 3.0 * found.sigma_rad[order])
+    assert np.abs(off).max() < 2e-3
+    assert found.tilt is not None
+    deviation = np.sqrt(np.diag(found.tilt.covariance))
+    assert np.all(deviation < np.radians(0.1))
+    assert np.all(
+        np.abs([found.tilt.pitch_rad - pitch, found.tilt.roll_rad - roll]) < 4 * deviation
+    )
+
+
 def test_rows_hold_ends_beta_and_sigma() -> None:
     found = detect_lines(scene(tilted(CAMERA, 0.02, -0.01)), TABLE)
     rows = found.landmarks()

@@ -41,9 +41,10 @@ def strip_points(table: VerticalTable, c: int) -> np.ndarray:
 def test_horizon_is_where_directions_are_level(
     published_camera: Camera, published_table: VerticalTable
 ) -> None:
+    assert published_table.anchor_elevation_rad == 0.0
     columns = np.arange(published_camera.width, dtype=np.float64)
     seen = published_camera.directions_robot(
-        np.stack([columns, published_table.horizon_row], axis=-1)
+        np.stack([columns, published_table.anchor_row], axis=-1)
     )
     np.testing.assert_allclose(seen[:, 2] / np.hypot(*seen[:, :2].T), 0.0, atol=1e-9)
     np.testing.assert_allclose(
@@ -82,7 +83,7 @@ def test_vertical_passes_through_its_column_on_the_horizon(
 ) -> None:
     for c in np.flatnonzero(published_table.usable)[5:-5:37]:
         points = strip_points(published_table, int(c))
-        at_horizon = np.interp(published_table.horizon_row[c], points[:, 1], points[:, 0])
+        at_horizon = np.interp(published_table.anchor_row[c], points[:, 1], points[:, 0])
         # A straight line between rows, on a curve.
         assert at_horizon == pytest.approx(c, abs=2e-3)
         bearing = published_table.bearing_rad[c : c + 1]
@@ -112,8 +113,8 @@ def test_any_pose_gives_verticals_inside_the_image(
     rows = np.arange(camera.height)[:, None]
     assert np.array_equal(shown, (rows >= table.first_row) & (rows <= table.last_row))
     assert np.all((table.column[shown] >= 0.0) & (table.column[shown] <= camera.width - 1))
-    assert np.all(np.isfinite(table.horizon_row[table.usable]))
-    assert np.all(shown[np.rint(table.horizon_row[table.usable]).astype(int), table.usable])
+    assert np.all(np.isfinite(table.anchor_row[table.usable]))
+    assert np.all(shown[np.rint(table.anchor_row[table.usable]).astype(int), table.usable])
     steep = np.abs(np.diff(table.column.astype(np.float64), axis=0))
     assert not np.any(steep > STEEPEST_SLOPE + 0.02)
     for c in np.flatnonzero(table.usable)[::11]:
@@ -129,30 +130,56 @@ def test_any_pose_gives_verticals_inside_the_image(
         )
 
 
-def test_camera_that_sees_no_horizon_has_no_verticals() -> None:
+@pytest.mark.parametrize("pitch", [-32.0, 28.0, 45.0])
+@pytest.mark.parametrize("roll", [0.0, 8.0, 180.0])
+@pytest.mark.parametrize("coef", [(0.0,) * 5, BARREL])
+def test_camera_that_sees_no_horizon_has_a_line_parallel_to_it(
+    pitch: float, roll: float, coef: tuple[float, float, float, float, float]
+) -> None:
+    camera = pinhole(90, 60, 80.0, pitch_deg=pitch, roll_deg=roll, coef=coef)
+    table = build_vertical_table(camera)
+    # Turned over, it looks up where it looked down.
+    looks_down = (pitch > 0.0) == (roll < 90.0)
+    assert (table.anchor_elevation_rad < 0.0) == looks_down
+    columns = np.flatnonzero(np.isfinite(table.anchor_row))
+    assert len(columns) >= 80
+    seen = camera.directions_robot(np.stack([columns, table.anchor_row[columns]], axis=-1))
+    elevation = np.arctan2(seen[:, 2], np.hypot(seen[:, 0], seen[:, 1]))
+    np.testing.assert_allclose(elevation, table.anchor_elevation_rad, atol=1e-9)
+    np.testing.assert_allclose(
+        np.arctan2(seen[:, 0], -seen[:, 1]), table.bearing_rad[columns], atol=1e-12
+    )
+    # Inside the image, near the border that is nearer to the horizon.
+    border = 0.0 if pitch > 0.0 else camera.height - 1.0
+    gap = np.abs(table.anchor_row[columns] - border)
+    assert np.median(gap) < 0.25 * camera.height
+    assert np.mean(gap >= camera.height / 12.0) >= 0.85
+
+
+def test_camera_that_looks_far_past_the_horizon_has_no_verticals() -> None:
     for pitch in (-70.0, 70.0):
         table = build_vertical_table(pinhole(90, 60, 80.0, pitch_deg=pitch))
         assert not table.usable.any()
-        assert np.all(np.isnan(table.horizon_row))
+        assert np.all(np.isnan(table.anchor_row))
         assert np.all(np.isnan(table.column))
 
 
 def test_horizon_that_leaves_the_image_on_one_side_gives_part_of_a_table() -> None:
     camera = pinhole(160, 60, 120.0, pitch_deg=8.0, roll_deg=15.0)
     table = build_vertical_table(camera)
-    inside = np.isfinite(table.horizon_row)
+    inside = np.isfinite(table.anchor_row)
     assert 0 < inside.sum() < camera.width
     # One stretch of columns, at one side.
     assert np.count_nonzero(np.diff(inside.astype(int))) == 1
     level = camera.directions_robot(
-        np.stack([np.flatnonzero(inside), table.horizon_row[inside]], axis=-1)
+        np.stack([np.flatnonzero(inside), table.anchor_row[inside]], axis=-1)
     )
     np.testing.assert_allclose(level[:, 2], 0.0, atol=1e-10)
 
 
 def test_verticals_beyond_45_degrees_are_marked() -> None:
     rolled = build_vertical_table(pinhole(90, 60, 80.0, roll_deg=50.0))
-    assert np.isfinite(rolled.horizon_row).any()
+    assert np.isfinite(rolled.anchor_row).any()
     assert not rolled.usable.any()
 
 
@@ -168,7 +195,7 @@ def test_mirrored_camera_gives_the_mirrored_table() -> None:
     camera = pinhole(91, 60, 80.0, pitch_deg=12.0, roll_deg=6.0, coef=BARREL)
     table = build_vertical_table(camera)
     other = build_vertical_table(mirrored(camera))
-    np.testing.assert_allclose(other.horizon_row[::-1], table.horizon_row, atol=1e-9)
+    np.testing.assert_allclose(other.anchor_row[::-1], table.anchor_row, atol=1e-9)
     np.testing.assert_allclose(other.bearing_rad[::-1], -table.bearing_rad, atol=1e-12)
     np.testing.assert_array_equal(other.first_row[::-1], table.first_row)
     np.testing.assert_allclose(90.0 - other.column[:, ::-1], table.column, atol=2e-5)

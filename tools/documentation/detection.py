@@ -72,7 +72,7 @@ def draw_verticals(figure: Any, run: Path, frame: int) -> None:
         panels[1].plot(*place.T, color=_LINE if fate == "accepted" else "#3498db", lw=1.2)
         if fate == "accepted":
             panels[2].plot(*place.T, color=_LINE, lw=1.4)
-    panels[1].plot(np.arange(camera.width), table.horizon_row, "--", color="white", lw=0.7)
+    panels[1].plot(np.arange(camera.width), table.anchor_row, "--", color="white", lw=0.7)
 
 
 def draw_tables(figure: Any, run: Path) -> None:
@@ -95,7 +95,7 @@ def draw_tables(figure: Any, run: Path) -> None:
     rows = np.arange(camera.height)
     for column in range(0, camera.width, 48):
         panels[1].plot(verticals.column[:, column], rows, color=_LINE, lw=1)
-    panels[1].plot(np.arange(camera.width), verticals.horizon_row, "--", color=_RINGS, lw=1)
+    panels[1].plot(np.arange(camera.width), verticals.anchor_row, "--", color=_RINGS, lw=1)
 
 
 def draw_markers(figure: Any, run: Path, frame: int) -> None:

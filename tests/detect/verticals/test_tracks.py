@@ -89,11 +89,11 @@ def test_starts_lie_on_the_horizon_band_highest_first() -> None:
     image = render(CAMERA, [Edge(0.2, 40.0), Edge(-0.1, 90.0)], grey=60.0)
     on_horizon = line_starts(image, TABLE, replace(DEFAULT, start_band_rows=0))
     np.testing.assert_array_equal(
-        on_horizon.row, np.rint(TABLE.horizon_row[on_horizon.column]).astype(int)
+        on_horizon.row, np.rint(TABLE.anchor_row[on_horizon.column]).astype(int)
     )
     assert len(on_horizon.row) == 2
     band = line_starts(image, TABLE, replace(DEFAULT, start_band_rows=8))
-    assert set(np.unique(band.row - np.rint(TABLE.horizon_row[band.column]))) == {-8, -4, 0, 4, 8}
+    assert set(np.unique(band.row - np.rint(TABLE.anchor_row[band.column]))) == {-8, -4, 0, 4, 8}
     assert np.all(np.diff(band.score) <= 0.0)
     assert np.all(band.score >= DEFAULT.threshold)
 
@@ -131,7 +131,7 @@ def test_starts_need_company_only_where_lines_cross_several_rows(spacing: int) -
 @pytest.mark.parametrize("gap", [5, 25])
 def test_tracks_bridge_gaps_up_to_a_length(gap: int) -> None:
     image = step_image(60, 160)
-    below = int(TABLE.horizon_row[48]) + 6
+    below = int(TABLE.anchor_row[48]) + 6
     # A bright block hides the edge; the filter sees it from a few rows away.
     image[below : below + gap] = 110
     starts = line_starts(image, TABLE, replace(DEFAULT, start_band_rows=0))
