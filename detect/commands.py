@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from rich.console import Group
 
     from detect.comparison.result import Rates
-    from detect.run import ImageRun
+    from detect.run import ImageRun, Run
     from detect.runs.conduct import Conduct
     from detect.runs.dispatch import Workers
     from detect.runs.stream import RunSummary
@@ -123,6 +123,7 @@ def _lines(command: Lines) -> int:
         )
     print(f"{output}: {summary.lines} lines in {summary.frames} frames")
     print(f"{tilt}: the tilt of {summary.tilts} frames")
+    _tell_blind_to_verticals(summary, run)
     return _exit_code(summary, run)
 
 
@@ -189,7 +190,20 @@ def _all(command: All) -> int:
     print(f"{lines}: {summary.lines} lines in {summary.frames} frames")
     print(f"{tilt}: the tilt of {summary.tilts} frames")
     print(f"{circles}: {summary.discs} discs in {summary.frames} frames")
+    _tell_blind_to_verticals(summary, run)
     return _exit_code(summary, run)
+
+
+def _tell_blind_to_verticals(summary: RunSummary, run: Run) -> None:
+    """Say so where there are no lines for no line can be seen."""
+    from lut import cached_vertical_table
+
+    if summary.lines == 0 and not cached_vertical_table(run.camera).usable.any():
+        print(
+            "no verticals: as it is calibrated, the camera looks too far past the horizon, or lies "
+            "on its side",
+            file=sys.stderr,
+        )
 
 
 def _output(command: DetectorFlags, run: ImageRun, kind: str) -> Path:

@@ -6,15 +6,18 @@ import json
 import shutil
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
+from camera import write_camera
 from detect.cli import main
 from detect.line_settings import LineSettings
 from detect.run import open_run
 from detect.runs.lines_run import detect_lines_run
 from detect.verticals.identity import carry_ids
 from landmarks import LineLandmark, read_frames, read_tilts
+from tests.detect.line_scene import pinhole
 
 
 def line(alpha: float, ids: tuple[int, ...] = (-1,), sigma: float = 0.003) -> LineLandmark:
@@ -91,3 +94,22 @@ def test_existing_outputs_are_kept(short_run: Path, capsys: pytest.CaptureFixtur
     assert "detected.tilt: exists already" in capsys.readouterr().err
     assert (short_run / "detected.tilt").read_text() == "mine"
     assert not (short_run / "detected.lines").exists()
+
+
+@pytest.mark.parametrize(
+    ("pitch_deg", "roll_deg", "blind"), [(80.0, 0.0, True), (0.0, 90.0, True), (30.0, 5.0, False)]
+)
+def test_a_camera_that_can_see_no_verticals_is_told(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    pitch_deg: float,
+    roll_deg: float,
+    blind: bool,
+) -> None:
+    camera = pinhole(90, 60, 80.0, pitch_deg=pitch_deg, roll_deg=roll_deg)
+    write_camera(camera, tmp_path / "a.cam", overwrite=False)
+    cv2.imwrite(str(tmp_path / "0.png"), np.full((60, 90), 99, np.uint8))
+    for command in ("lines", "all"):
+        capsys.readouterr()
+        assert main([command, str(tmp_path), "--force"]) == 0
+        assert ("no verticals: " in capsys.readouterr().err) == blind
