@@ -16,6 +16,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -252,6 +253,10 @@ def _run(main: Callable[..., Any], arguments: list[str], said: int, prepare: Any
     os.dup2(ignored, sys.stdout.fileno())
     os.dup2(said, sys.stderr.fileno())
     code = 70  # never given by the program itself
+    # As a program of its own has it: what a killed one leaves is removed when its workers end, not
+    # when the tests do, one of which may be counting semaphores.
+    tracker: Any = resource_tracker._resource_tracker
+    tracker._fd = tracker._pid = None
     try:
         if prepare is not None:
             prepare()

@@ -208,6 +208,26 @@ def test_a_resumed_run_may_be_killed_again(
 
 
 @pytest.mark.long
+@pytest.mark.skipif(not Path("/dev/shm").is_dir(), reason="looks for shared memory in /dev/shm")
+def test_workers_of_a_killed_run_leave_no_shared_memory(
+    runs: ForkedRuns, run_folder: Path, output: Path
+) -> None:
+    def there() -> set[str]:
+        return {path.name for path in Path("/dev/shm").iterdir()}
+
+    before = there()
+    with runs.started(command(run_folder, output, "--jobs", "2"), StopAfter(8)) as process:
+        process.wait_until_stopped()
+        own = there() - before
+        process.kill()
+    assert len(own) > 4
+    end = time.monotonic() + PATIENCE_S
+    while own & there():
+        assert time.monotonic() < end, "what the run shared with its workers stays"
+        time.sleep(0.01)
+
+
+@pytest.mark.long
 def test_killed_at_any_moment(
     runs: ForkedRuns,
     run_folder: Path,
