@@ -106,8 +106,7 @@ def build_vertical_table(camera: Camera) -> VerticalTable:
     height, width = camera.height, camera.width
     v, u = np.mgrid[0:height, 0:width].astype(np.float64)
     normalised = camera.undistort(np.stack([u, v], axis=-1))
-    elevation_rad = anchor_elevation(camera, normalised)
-    row = anchor_rows(camera, normalised, elevation_rad)
+    elevation_rad, row = _anchor(camera, normalised)
     on_anchor = camera.directions_robot(np.stack([np.arange(width, dtype=np.float64), row], -1))
     bearing = np.arctan2(on_anchor[:, 0], -on_anchor[:, 1])
     column = np.empty((height, width))
@@ -130,24 +129,14 @@ def build_vertical_table(camera: Camera) -> VerticalTable:
     )
 
 
-def anchor_elevation(camera: Camera, normalised: NDArray[np.float64]) -> float:
-    """Elevation of the line that stands for the horizon, rad: 0 where the camera sees that.
-
-    Parameters
-    ----------
-    camera : Camera
-        The calibrated camera.
-    normalised : (H, W, 2) float64
-        `camera.undistort` of all pixels.
-    """
-    above = _above(camera, normalised, 0.0)
-    some_above, some_below = (above > 0.0).any(axis=0), (above <= 0.0).any(axis=0)
-    if np.mean(some_above & some_below) >= _LEAST_SEEN:
-        return 0.0
-    margin = math.ceil(_MARGIN * camera.height)
-    nearest = math.inf
-    for border in (margin, camera.height - 1 - margin):
-        ray = normalised[min(max(border, 0), camera.height - 1)]
+def _anchor(camera: Camera, normalised: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+    """Elevation of the anchor, rad, and the (W,) rows at which it crosses the columns."""
+    row = anchor_rows(camera, normalised, 0.0)
+    if np.mean(np.isfinite(row)) >= _LEAST_SEEN:
+        return 0.0, row
+    margin = min(math.ceil(_MARGIN * camera.height), camera.height - 1)
+    nearest = 1.0
+    for ray in (normalised[margin], normalised[camera.height - 1 - margin]):
         sine = _above(camera, ray, 0.0) / np.sqrt(1.0 + np.sum(ray * ray, axis=-1))
         sine = sine[np.isfinite(sine)]
         if not len(sine):
@@ -156,8 +145,10 @@ def anchor_elevation(camera: Camera, normalised: NDArray[np.float64]) -> float:
         past = float(np.quantile(sine, 0.1 if np.median(sine) < 0.0 else 0.9))
         if abs(past) < abs(nearest):
             nearest = past
-    elevation = math.asin(nearest) if abs(nearest) <= 1.0 else math.inf
-    return elevation if abs(elevation) <= _LARGEST_ELEVATION else 0.0
+    elevation_rad = math.asin(nearest)
+    if abs(elevation_rad) > _LARGEST_ELEVATION:
+        return 0.0, row
+    return elevation_rad, anchor_rows(camera, normalised, elevation_rad)
 
 
 def anchor_rows(
@@ -197,8 +188,6 @@ def _above(camera: Camera, normalised: NDArray[np.float64], sine: float) -> NDAr
     """How far rays (x, y, 1) end above the cone whose elevation has this sine."""
     toward_up = camera.rotation[2]
     rise = normalised @ toward_up[:2] + toward_up[2]
-    if sine == 0.0:
-        return np.asarray(rise)
     return np.asarray(rise - sine * np.sqrt(1.0 + np.sum(normalised * normalised, axis=-1)))
 
 

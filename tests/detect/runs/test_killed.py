@@ -6,7 +6,6 @@ Whatever happens, the previous files are there or the new ones are, never a mixt
 
 from __future__ import annotations
 
-import json
 import multiprocessing
 import os
 import random
@@ -16,7 +15,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -34,45 +33,19 @@ from tests.detect.forked_runs import (
     forked_runs,
     wait_until_stopped,
 )
-
-Captured = pytest.CaptureFixture[str]
-
-KINDS = ("lines", "tilt", "circles", "log.json")
-FRAMES = 24
-PREVIOUS = b"what was there before\n"
+from tests.detect.interrupted_runs import (
+    FRAMES,
+    KINDS,
+    PREVIOUS,
+    Captured,
+    command,
+    hidden,
+    journalled,
+    results,
+    resumed,
+)
 
 pytestmark = pytest.mark.skipif(not Path("/proc").is_dir(), reason="kills as Linux does")
-
-
-def a_run(project_root: Path, run: Path) -> Path:
-    source = project_root / "images" / "e"
-    (run / "images").mkdir(parents=True)
-    shutil.copy(source / "e.cam", run)
-    for number in range(FRAMES):
-        image = source / "images" / f"e.{number % 8:04d}.jpg"
-        shutil.copy(image, run / "images" / f"e.{number:04d}.jpg")
-    (run / "images" / "e.0011.jpg").write_bytes(b"no image")  # a bad frame is resumed as well
-    return run
-
-
-@pytest.fixture(scope="module")
-def run_folder(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run that is not to be changed."""
-    return a_run(project_root, tmp_path_factory.mktemp("run") / "e")
-
-
-@pytest.fixture
-def own_run(project_root: Path, tmp_path: Path) -> Path:
-    """A run that may be changed."""
-    return a_run(project_root, tmp_path / "e")
-
-
-@pytest.fixture(scope="module")
-def undisturbed(run_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
-    """What the run writes when nothing happens to it."""
-    output = tmp_path_factory.mktemp("undisturbed")
-    assert main(["all", str(run_folder), "-o", str(output)]) == 3
-    return results(output)
 
 
 @pytest.fixture(scope="module")
@@ -83,34 +56,10 @@ def runs(
         yield started_runs
 
 
-@pytest.fixture
-def output(tmp_path: Path) -> Path:
-    folder = tmp_path / "output"
-    folder.mkdir()
-    return folder
-
-
-def results(folder: Path) -> dict[str, bytes]:
-    """The files of a folder that are not hidden."""
-    return {
-        path.name: path.read_bytes()
-        for path in sorted(folder.iterdir())
-        if not path.name.startswith(".")
-    }
-
-
-def hidden(folder: Path) -> set[str]:
-    return {path.name for path in folder.iterdir() if path.name.startswith(".")}
-
-
 def lay_previous(folder: Path) -> dict[str, bytes]:
     for kind in KINDS:
         (folder / f"detected.{kind}").write_bytes(PREVIOUS)
     return results(folder)
-
-
-def command(run: Path, output: Path, *flags: str) -> list[str]:
-    return ["all", str(run), "-o", str(output), "--force", *flags]
 
 
 def started(arguments: list[str]) -> subprocess.Popen[str]:
@@ -126,14 +75,6 @@ def started(arguments: list[str]) -> subprocess.Popen[str]:
     )
 
 
-def journalled(folder: Path) -> int:
-    """How many frames the journal has; 0 where there is none."""
-    try:
-        return (folder / ".detected.journal").read_bytes().count(b"\n") - 1
-    except OSError:
-        return 0
-
-
 def killed(runs: ForkedRuns, run: Path, output: Path, frames: int, *flags: str) -> int:
     """Kill a run once it has done so many frames; gives how many are done."""
     with runs.started(command(run, output, *flags), StopAfter(frames)) as process:
@@ -147,16 +88,6 @@ def processor_s_of(arguments: list[str]) -> float:
     begun = time.process_time()
     assert main(arguments) == 3
     return time.process_time() - begun
-
-
-def resumed(run: Path, output: Path, capsys: Captured, *flags: str) -> int:
-    """Resume a run; gives how many frames were taken over."""
-    capsys.readouterr()
-    assert main(command(run, output, "--resume", *flags)) == 3
-    shown = capsys.readouterr()
-    assert f"{FRAMES} frames" in shown.out
-    taken = [line for line in shown.err.splitlines() if "are taken over" in line]
-    return int(taken[0].split()[0]) if taken else 0
 
 
 def test_a_run_that_has_ended_and_is_not_told_of_yet() -> None:
@@ -329,200 +260,6 @@ def test_files_that_must_stay_do_not_cost_what_was_kept(
     assert results(output) == undisturbed
 
 
-# -- journals that do not fit -----------------------------------------------------------------
-
-
-class Kept:
-    """A run that was interrupted after half of its frames."""
-
-    def __init__(self, run: Path, output: Path) -> None:
-        self.run, self.output = run, output
-        self.frames = self.interrupt_after(FRAMES // 2)
-
-    def interrupt_after(self, frames: int) -> int:
-        def interrupt() -> None:
-            if journalled(self.output) >= frames:
-                raise KeyboardInterrupt
-
-        from detect import commands
-
-        with pytest.MonkeyPatch.context() as patch:
-            from contextlib import contextmanager
-
-            @contextmanager
-            def progress(*_: object) -> Iterator[Callable[[], None]]:
-                yield interrupt
-
-            patch.setattr(commands, "progress_bar", progress)
-            assert main(command(self.run, self.output)) == 130
-        return journalled(self.output)
-
-
-@pytest.fixture
-def kept(run_folder: Path, output: Path) -> Kept:
-    return Kept(run_folder, output)
-
-
-@pytest.fixture
-def own(own_run: Path, output: Path) -> Kept:
-    return Kept(own_run, output)
-
-
-def test_an_interrupted_run_is_resumed(
-    kept: Kept, undisturbed: dict[str, bytes], capsys: Captured
-) -> None:
-    assert resumed(kept.run, kept.output, capsys) == kept.frames == FRAMES // 2
-    assert results(kept.output) == undisturbed
-    assert hidden(kept.output) == set()
-
-
-@pytest.mark.parametrize("flags", [["--circles.threshold", "0.45"], ["--lines.alpha", "published"]])
-def test_other_settings_begin_anew(kept: Kept, capsys: Captured, flags: list[str]) -> None:
-    assert main(command(kept.run, kept.output, *flags)) == 3
-    expected = results(kept.output)
-    Kept(kept.run, kept.output)
-    capsys.readouterr()
-    assert resumed(kept.run, kept.output, capsys, *flags) == 0
-    assert results(kept.output) == expected
-
-
-def test_another_camera_begins_anew(own: Kept, tmp_path: Path, capsys: Captured) -> None:
-    camera = (own.run / "e.cam").read_text().replace("1.50354", "1.51354")
-    (own.run / "e.cam").write_text(camera)
-    assert main(command(own.run, own.output, "--resume")) == 3
-    assert "another camera" in capsys.readouterr().err
-    other = tmp_path / "other"
-    other.mkdir()
-    assert main(command(own.run, other)) == 3
-    assert results(own.output) == results(other)
-
-
-def test_frames_after_one_that_changed_are_done_again(
-    own: Kept, tmp_path: Path, capsys: Captured
-) -> None:
-    """The bad image was mended: its row, and those after it, are those of the run as it is now."""
-    bad = own.run / "images" / "e.0011.jpg"
-    shutil.copy(own.run / "images" / "e.0003.jpg", bad)
-    other = tmp_path / "other"
-    other.mkdir()
-    assert main(command(own.run, other)) == 0
-    capsys.readouterr()
-    assert main(command(own.run, own.output, "--resume")) == 0
-    assert "11 frames of an unfinished run are taken over" in capsys.readouterr().err
-    assert results(own.output) == results(other)
-
-
-def test_a_new_image_in_between_is_seen(own: Kept, tmp_path: Path, capsys: Captured) -> None:
-    shutil.copy(own.run / "images" / "e.0003.jpg", own.run / "images" / "e.0005a.jpg")
-    other = tmp_path / "other"
-    other.mkdir()
-    assert main(command(own.run, other)) == 3
-    capsys.readouterr()
-    assert main(command(own.run, own.output, "--resume")) == 3
-    assert "6 frames of an unfinished run are taken over" in capsys.readouterr().err
-    assert results(own.output) == results(other)
-
-
-@pytest.mark.parametrize(
-    ("kind", "damage"),
-    [("lines", "changed"), ("circles", "shorter"), ("tilt", "missing"), ("log.json", "changed")],
-)
-def test_damaged_rows_are_not_taken_over(
-    kept: Kept, undisturbed: dict[str, bytes], capsys: Captured, kind: str, damage: str
-) -> None:
-    part = kept.output / f".detected.{kind}.part"
-    content = bytearray(part.read_bytes())
-    if damage == "changed":
-        content[-5] ^= 1
-    elif damage == "shorter":
-        del content[-20:]
-    if damage == "missing":
-        part.unlink()
-    else:
-        part.write_bytes(content)
-    assert resumed(kept.run, kept.output, capsys) < kept.frames
-    assert results(kept.output) == undisturbed
-    assert hidden(kept.output) == set()
-
-
-@pytest.mark.parametrize("seed", range(9))
-def test_damaged_journals(
-    kept: Kept, undisturbed: dict[str, bytes], capsys: Captured, seed: int
-) -> None:
-    """Torn, changed, or something else altogether: only what is proven to be right is used."""
-    chance = random.Random(seed)
-    journal = kept.output / ".detected.journal"
-    content = bytearray(journal.read_bytes())
-    if seed % 3 == 0:
-        del content[chance.randrange(len(content)) :]
-    elif seed % 3 == 1:
-        content[chance.randrange(len(content))] ^= 1 << chance.randrange(8)
-    else:
-        content = bytearray([b"", b"[" * 100_000, b"null\n" * 9][seed // 3])
-    journal.write_bytes(content)
-    assert resumed(kept.run, kept.output, capsys) <= kept.frames
-    assert results(kept.output) == undisturbed
-    assert hidden(kept.output) == set()
-
-
-def test_rows_of_a_journal_that_were_swapped(kept: Kept, undisturbed: dict[str, bytes]) -> None:
-    """Each line is in order by itself, but they belong to other frames."""
-    journal = kept.output / ".detected.journal"
-    lines = journal.read_bytes().splitlines(keepends=True)
-    lines[3], lines[4] = lines[4], lines[3]
-    journal.write_bytes(b"".join(lines))
-    assert main(command(kept.run, kept.output, "--resume")) == 3
-    assert results(kept.output) == undisturbed
-
-
-@pytest.mark.parametrize("name", [".detected.journal", ".detected.lines.part"])
-def test_links_in_the_place_of_a_part_are_not_followed(
-    run_folder: Path, output: Path, tmp_path: Path, undisturbed: dict[str, bytes], name: str
-) -> None:
-    precious = tmp_path / "precious"
-    precious.write_bytes(PREVIOUS)
-    (output / name).symlink_to(precious)
-    main(command(run_folder, output))
-    assert precious.read_bytes() == PREVIOUS
-    assert results(output) == undisturbed
-
-
-def test_resuming_what_was_never_begun(
-    run_folder: Path, output: Path, undisturbed: dict[str, bytes], capsys: Captured
-) -> None:
-    assert resumed(run_folder, output, capsys) == 0
-    assert results(output) == undisturbed
-
-
-def test_pictures_of_the_frame_under_way(run_folder: Path, tmp_path: Path) -> None:
-    """A killed run may have drawn a frame that it had not noted yet."""
-    drawings = tmp_path / "drawn"
-    arguments = ["circles", str(run_folder), "-o", str(tmp_path / "rows"), "--draw", str(drawings)]
-    assert main(arguments) == 3
-    whole = results(drawings)
-    rows = (tmp_path / "rows").read_bytes()
-    shutil.rmtree(drawings)
-    (tmp_path / "rows").unlink()
-
-    from detect.runs.resume import RunFiles
-
-    add, count = RunFiles.add, [0]
-
-    def fail(self: RunFiles, found: object) -> None:
-        count[0] += 1
-        if count[0] == 7:
-            raise KeyboardInterrupt
-        add(self, found)  # type: ignore[arg-type]
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(RunFiles, "add", fail)
-        assert main(arguments) == 130
-    assert len(results(drawings)) == 7
-    assert main([*arguments, "--resume"]) == 3
-    assert results(drawings) == whole
-    assert (tmp_path / "rows").read_bytes() == rows
-
-
 # -- disks and folders --------------------------------------------------------------------------
 
 
@@ -599,13 +336,3 @@ def test_a_folder_in_the_place_of_a_result(
     assert main(command(run_folder, output)) == 1
     assert f"Is a directory: '{output / f'detected.{kind}'}'" in capsys.readouterr().err
     assert [path.name for path in output.iterdir()] == [f"detected.{kind}"]
-
-
-def test_the_log_says_nothing_of_the_interruption(
-    kept: Kept, undisturbed: dict[str, bytes], capsys: Captured
-) -> None:
-    resumed(kept.run, kept.output, capsys)
-    log = json.loads(results(kept.output)["detected.log.json"])
-    assert [failure["prefix"] for failure in log["failures"]] == ["e.0011"]
-    assert log["failures"][0]["frame"] == 11
-    assert log["frames"] == FRAMES

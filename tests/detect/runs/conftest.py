@@ -1,0 +1,37 @@
+"""A run that ends early, and what it writes when nothing happens to it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from detect.cli import main
+from tests.detect.interrupted_runs import a_run, results
+
+
+@pytest.fixture(scope="module")
+def run_folder(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run that is not to be changed."""
+    return a_run(project_root, tmp_path_factory.mktemp("run") / "e")
+
+
+@pytest.fixture
+def own_run(project_root: Path, tmp_path: Path) -> Path:
+    """A run that may be changed."""
+    return a_run(project_root, tmp_path / "e")
+
+
+@pytest.fixture(scope="module")
+def undisturbed(run_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    """What the run writes when nothing happens to it."""
+    output = tmp_path_factory.mktemp("undisturbed")
+    assert main(["all", str(run_folder), "-o", str(output)]) == 3
+    return results(output)
+
+
+@pytest.fixture
+def output(tmp_path: Path) -> Path:
+    folder = tmp_path / "output"
+    folder.mkdir()
+    return folder
