@@ -65,8 +65,9 @@ class CircleSettings:
     systematic_px : float
         Systematic error of a refined position, pixels: added to its covariance.
     tilt_sigma_deg : float
-        Uncertainty of the robot's pitch and roll, degrees: added to a refined position's
-        covariance.
+        Standard deviation of the robot's pitch and of its roll about level, degrees: added to a
+        refined position's covariance. Where the frame's verticals tell the tilt, both are put
+        together instead (`detect.levelling.with_prior`).
     """
 
     radius_m: float = 0.10

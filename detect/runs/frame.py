@@ -5,6 +5,8 @@ The way of one frame, top to bottom, is `detect_frame`, and of its image `detect
 
 from __future__ import annotations
 
+import dataclasses
+import math
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -158,11 +160,15 @@ def detect_in_image(
 
         assert tables.discs is not None
         assert plan.camera is not None
-        discs = detect_circles(image, plan.camera, tables.discs, plan.circles)
-        if tilt is not None:
-            from detect.levelling import levelled
+        if tilt is None:
+            discs = detect_circles(image, plan.camera, tables.discs, plan.circles)
+        else:
+            from detect.levelling import levelled, with_prior
 
-            discs = levelled(discs, plan.camera, tilt)
+            settings = _without_tilt(plan.circles)
+            prior_rad = math.radians(plan.circles.tilt_sigma_deg)
+            discs = detect_circles(image, plan.camera, tables.discs, settings)
+            discs = levelled(discs, plan.camera, with_prior(tilt, prior_rad))
 
     markers = None
     if plan.markers is not None:
@@ -171,6 +177,12 @@ def detect_in_image(
         markers = detect_markers(image, plan.markers, plan.camera)
 
     return FrameDetections(image, lines, tilt, discs, markers)
+
+
+@lru_cache(maxsize=4)
+def _without_tilt(settings: CircleSettings) -> CircleSettings:
+    """The same, but the tilt adds nothing to covariances: levelling does."""
+    return dataclasses.replace(settings, tilt_sigma_deg=0.0)
 
 
 def lines_in_image(

@@ -119,9 +119,12 @@ class Tilt:
     ----------
     run : Path
         Run made by `python -m tools.simulator`.
+    tilt_sigma_deg : float
+        What is known of the tilt beforehand: its standard deviation about level, degrees.
     """
 
     run: Positional[Path] = Path("images/e")
+    tilt_sigma_deg: float = 0.0
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -248,18 +251,27 @@ def _tilt(command: Tilt) -> int:
         _detect_lines(command.run, LINE_PRESETS["default"], output)
         tilts = read_tilts(output.with_suffix(".tilt"))
         _print_tilt_errors(command.run, tilts)
-        settings = replace(CircleSettings(), polarity="light", far_limit_m_per_px=0.05)
+        settings = replace(
+            CircleSettings(),
+            polarity="light",
+            far_limit_m_per_px=0.05,
+            tilt_sigma_deg=command.tilt_sigma_deg,
+        )
         for label, known in (("without", None), ("with", tilts)):
             discs = Path(folder) / f"{label}.circles"
             _detect(command.run, settings, discs, known)
             result = compare_runs(command.run, detected=discs, options=options)
+            if result.error_median_m is None:
+                print(f"discs {label} the tilt: none is near one of {result.reference_name}")
+                continue
             far = [b for b in result.bins if b.from_m is not None and b.from_m >= 3.0]
             errors = ", ".join(
                 f"{b.error_median_m:.4f}" for b in far if b.error_median_m is not None
             )
             print(
                 f"discs {label} the tilt: median error {result.error_median_m:.4f} m, "
-                f"from 3 m on, by bin: {errors} m"
+                f"from 3 m on, by bin: {errors} m, "
+                f"normalised error^2 / dof {result.normalised_error.per_dof:.2f}"
             )
     return 0
 

@@ -88,6 +88,18 @@ def test_all_corrects_discs_for_the_tilt(short_run: Path) -> None:
     assert max(moved) > 0.005
 
 
+def test_what_is_known_of_the_tilt_beforehand_makes_no_disc_less_certain(short_run: Path) -> None:
+    variances = []
+    for sigma in ("0", "0.5"):
+        assert main(["all", str(short_run), "--force", "--circles.tilt-sigma-deg", sigma]) == 0
+        frames = list(read_frames(short_run / "detected.circles"))
+        variances.append([disc.cxx + disc.cyy for frame in frames for disc in frame.circles])
+    without, known = map(np.array, variances)
+    assert len(without) == len(known) > 10
+    # The verticals tell the tilt of all these frames: it is not in the covariances twice.
+    assert np.all(known <= without * 1.001)
+
+
 def test_existing_outputs_are_kept(short_run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (short_run / "detected.tilt").write_text("mine")
     assert main(["lines", str(short_run)]) == 1
