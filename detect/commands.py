@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from detect.runs.conduct import Conduct
     from detect.runs.dispatch import Workers
     from detect.runs.stream import RunSummary
+    from detect.settings import CircleSettings
 
 
 def carry_out(command: Command) -> int:
@@ -188,10 +189,20 @@ def _all(command: All) -> int:
             conduct=conduct,
         )
     print(f"{lines}: {summary.lines} lines in {summary.frames} frames")
-    print(f"{tilt}: the tilt of {summary.tilts} frames")
+    print(f"{tilt}: the tilt of {summary.tilts} frames{_other_frames(summary, command.circles)}")
     print(f"{circles}: {summary.discs} discs in {summary.frames} frames")
     _tell_blind_to_verticals(summary, run)
     return _exit_code(summary, run)
+
+
+def _other_frames(summary: RunSummary, settings: CircleSettings) -> str:
+    """What is done with the discs of frames that have no tilt, if there are any."""
+    others = summary.frames - summary.failed - summary.tilts
+    if others == 0:
+        return ""
+    if settings.tilt_sigma_deg == 0.0:
+        return f"; the other {others} count as level beyond doubt (see --circles.tilt-sigma-deg)"
+    return f"; the other {others} count as level within {settings.tilt_sigma_deg:g} degrees"
 
 
 def _tell_blind_to_verticals(summary: RunSummary, run: Run) -> None:

@@ -100,6 +100,19 @@ def test_what_is_known_of_the_tilt_beforehand_makes_no_disc_less_certain(short_r
     assert np.all(known <= without * 1.001)
 
 
+def test_frames_that_count_as_level_are_told(
+    short_run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["all", str(short_run)]) == 0
+    assert "the tilt of 4 frames\n" in capsys.readouterr().out
+    (short_run / "images" / "e.0001.jpg").write_bytes(b"not an image")
+    cv2.imwrite(str(short_run / "images" / "e.0002.jpg"), np.full((288, 768), 90, np.uint8))
+    assert main(["all", str(short_run), "--force"]) == 3
+    assert "the tilt of 2 frames; the other 1 count as level beyond" in capsys.readouterr().out
+    assert main(["all", str(short_run), "--force", "--circles.tilt-sigma-deg", "0.5"]) == 3
+    assert "the other 1 count as level within 0.5 degrees\n" in capsys.readouterr().out
+
+
 def test_existing_outputs_are_kept(short_run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (short_run / "detected.tilt").write_text("mine")
     assert main(["lines", str(short_run)]) == 1
