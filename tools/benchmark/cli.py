@@ -9,6 +9,7 @@ from pathlib import Path
 import tyro
 from tyro.conf import OmitArgPrefixes
 
+from storage.exit_codes import exit_code_of
 from tools.benchmark.suite import Settings
 
 _FILE_WIDTH = 110
@@ -45,11 +46,7 @@ class Benchmark:
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
     command = tyro.cli(Benchmark, prog="python -m tools.benchmark", args=arguments)
-    try:
-        return _carry_out(command)
-    except (ValueError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
+    return exit_code_of(lambda: _carry_out(command))
 
 
 def _carry_out(command: Benchmark) -> int:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from importlib import import_module
 
-from camera.errors import CameraError
+from storage.exit_codes import exit_code_of
 
 #: The module whose `main` carries a study out.
 STUDIES = {
@@ -23,11 +23,8 @@ def main(arguments: list[str]) -> int:
             f"usage: python -m tools.camera_evaluation {{{','.join(STUDIES)}}} ...", file=sys.stderr
         )
         return 2
-    try:
-        return int(import_module(STUDIES[arguments[0]]).main(arguments[1:]) or 0)
-    except (CameraError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
+    study = import_module(STUDIES[arguments[0]])
+    return exit_code_of(lambda: int(study.main(arguments[1:]) or 0))
 
 
 if __name__ == "__main__":

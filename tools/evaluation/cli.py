@@ -18,6 +18,7 @@ from detect.line_settings import PRESETS as LINE_PRESETS
 from detect.line_settings import LineSettings
 from detect.settings import CircleSettings
 from landmarks import FrameTilt
+from storage.exit_codes import exit_code_of
 from tools.evaluation.markers_command import Markers, MarkersCommand
 from tools.evaluation.markers_command import perform as evaluate_markers
 
@@ -141,6 +142,12 @@ def main(arguments: list[str] | None = None) -> int:
         description="Prints the figures in the README.",
         args=arguments,
     )
+    return exit_code_of(lambda: _carry_out(command))
+
+
+def _carry_out(
+    command: Accuracy | Photographs | Rendered | Buildings | RenderedLines | Tilt | Markers,
+) -> int:
     if isinstance(command, Markers):
         return evaluate_markers(command)
     if isinstance(command, Accuracy):

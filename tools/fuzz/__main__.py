@@ -20,6 +20,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+from storage.exit_codes import exit_code_of
 from tools.fuzz.readers import READERS
 
 _FAULTS = (
@@ -138,4 +139,4 @@ def add_figures(path: Path, found: Round) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(exit_code_of(main))

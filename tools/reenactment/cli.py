@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
+
+from storage.exit_codes import exit_code_of
 
 if TYPE_CHECKING:
     from tools.reenactment.prepare import Quality
@@ -52,20 +53,10 @@ def main(arguments: list[str] | None = None) -> int:
     command = tyro.extras.subcommand_cli_from_dict(
         {"prepare": Prepare}, prog="python -m tools.reenactment", args=arguments
     )
-    from camera import CameraError
-    from landmarks import LandmarkError
-    from tools.reenactment.recording import RecordingError
-    from tools.reenactment.refit import RefitError
-
-    try:
-        prepare(command)
-    except (OSError, CameraError, LandmarkError, RecordingError, RefitError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
-    return 0
+    return exit_code_of(lambda: prepare(command))
 
 
-def prepare(command: Prepare) -> None:
+def prepare(command: Prepare) -> int:
     """Read a run, fit its world and write it; the table goes to stdout as it grows."""
     from camera import read_camera
     from landmarks import read_frames
@@ -96,6 +87,7 @@ def prepare(command: Prepare) -> None:
         print(_table_row(stage.quality), flush=True)
     write_world(command.output, world_of_stage(stage), overwrite=command.force)
     print(f"written to {command.output}")
+    return 0
 
 
 def _table_row(quality: Quality) -> str:

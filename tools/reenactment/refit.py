@@ -26,7 +26,7 @@ _LEAST_DAMPING = 1e-12
 _LARGEST_DAMPING = 1e6
 
 
-class RefitError(RuntimeError):
+class RefitError(ValueError):
     """A fit that cannot begin, or does not settle."""
 
 

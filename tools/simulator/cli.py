@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -11,7 +10,7 @@ from typing import Annotated, TypeVar
 
 import tyro
 
-from storage import OutputExistsError
+from storage.exit_codes import exit_code_of
 from tools.simulator.drive import DriveStyle
 from tools.simulator.laser.commands import LaserSession
 from tools.simulator.laser.commands import perform as perform_laser
@@ -165,11 +164,7 @@ def main(arguments: list[str] | None = None) -> int:
         description="Rendered runs with known truth.",
         args=arguments,
     )
-    try:
-        return _perform(command)
-    except (OutputExistsError, ValueError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
+    return exit_code_of(lambda: _perform(command))
 
 
 def _perform(

@@ -5,6 +5,8 @@ from __future__ import annotations
 import sys
 from importlib import import_module
 
+from storage.exit_codes import exit_code_of
+
 #: The module whose `main` carries a study out.
 STUDIES = {
     "map": "tools.slam_evaluation.map_study",
@@ -24,7 +26,8 @@ def main(arguments: list[str]) -> int:
             f"usage: python -m tools.slam_evaluation {{{','.join(STUDIES)}}} ...", file=sys.stderr
         )
         return 2
-    return int(import_module(STUDIES[arguments[0]]).main(arguments[1:]) or 0)
+    study = import_module(STUDIES[arguments[0]])
+    return exit_code_of(lambda: int(study.main(arguments[1:]) or 0))
 
 
 if __name__ == "__main__":

@@ -12,7 +12,8 @@ from typing import Annotated, Optional
 import tyro
 
 from storage import OutputExistsError, write_whole
-from tools.soak.long_run import SoakError, link_run, soak
+from storage.exit_codes import exit_code_of
+from tools.soak.long_run import link_run, soak
 from tools.soak.short_runs import repeat_short_runs
 
 # For `X | None` tyro imports another library that takes a tenth of a second.
@@ -61,28 +62,28 @@ class Soak:
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
     command = tyro.cli(Soak, prog="python -m tools.soak", args=arguments)
-    try:
-        if command.json is not None and command.json.exists() and not command.force:
-            raise OutputExistsError(command.json)
-        with tempfile.TemporaryDirectory(dir=command.scratch, prefix="soak-") as name:
-            folder = Path(name)
-            if command.short:
-                short = repeat_short_runs(
-                    command.source, folder, command.short, command.jobs, warm=command.warm
-                )
-                figures, unmet = asdict(short), short.unmet()
-                print(short)
-            else:
-                run = link_run(command.source, folder / "soak", command.frames)
-                result = soak(run, folder / "results", command.frames, command.jobs)
-                figures, unmet = asdict(result), result.unmet()
-                print(result)
-        if command.json is not None:
-            with write_whole(command.json, overwrite=command.force) as stream:
-                stream.write(f"{json.dumps(figures, indent=1)}\n".encode())
-    except (SoakError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
+    return exit_code_of(lambda: _carry_out(command))
+
+
+def _carry_out(command: Soak) -> int:
+    if command.json is not None and command.json.exists() and not command.force:
+        raise OutputExistsError(command.json)
+    with tempfile.TemporaryDirectory(dir=command.scratch, prefix="soak-") as name:
+        folder = Path(name)
+        if command.short:
+            short = repeat_short_runs(
+                command.source, folder, command.short, command.jobs, warm=command.warm
+            )
+            figures, unmet = asdict(short), short.unmet()
+            print(short)
+        else:
+            run = link_run(command.source, folder / "soak", command.frames)
+            result = soak(run, folder / "results", command.frames, command.jobs)
+            figures, unmet = asdict(result), result.unmet()
+            print(result)
+    if command.json is not None:
+        with write_whole(command.json, overwrite=command.force) as stream:
+            stream.write(f"{json.dumps(figures, indent=1)}\n".encode())
     for sentence in unmet:
         print(sentence, file=sys.stderr)
     return 1 if unmet else 0

@@ -29,7 +29,7 @@ MOST_GROWTH_MIB = 8.0
 MOST_SLOWER = 0.05
 
 
-class SoakError(RuntimeError):
+class SoakError(ValueError):
     """A run that did not end well, or too short a one."""
 
 
