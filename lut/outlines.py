@@ -120,6 +120,15 @@ class DiscTable:
     floor_xy: NDArray[np.float32]
 
     @cached_property
+    def first_source(self) -> int:
+        """The first pixel, in scan order, that is copied for any block; H * W without blocks.
+
+        In the rows above, the camera sees no floor, or none that is near enough.
+        """
+        height, width = self.floor_xy.shape[:2]
+        return int(self.copies.min(initial=height * width << ADVANCE_BITS)) >> ADVANCE_BITS
+
+    @cached_property
     def usable(self) -> NDArray[np.bool_]:
         """(H, W) the usable centres."""
         return np.asarray(self.votes_inner > 0)

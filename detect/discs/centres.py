@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.discs.maxima_kernels import maxima
+from detect.discs.maxima_kernels import highest
 from detect.discs.quality_kernels import centres_above, quality_map, working_memory
 from detect.errors import FrameError
 from detect.settings import Polarity
@@ -64,26 +64,21 @@ def best_centres(
     space = _working_space(image.size, table.samples)
     arguments = _kernel_arguments(image, table, space.pixels)
     room = space.columns, space.rows, space.quality, space.contrast
-    parts: list[tuple[NDArray[Any], ...]] = []
-    block, blocks = 0, len(table.block_row)
+    full: list[tuple[NDArray[Any], ...]] = []
+    block, count = 0, 0
     while True:
         block, count = centres_above(
             *arguments, threshold, sign, *space.memory, block,
             space.columns, space.rows, space.quality, space.contrast,
         )  # fmt: skip
-        found: tuple[NDArray[Any], ...] = tuple([values[:count] for values in room])
-        if block == blocks and not parts:
+        if block == len(table.block_row):
             break
-        parts.append(tuple([values.copy() for values in found]))
-        if block == blocks:
-            found = tuple(np.concatenate(values) for values in zip(*parts))
-            break
-    columns, rows, quality, contrast = found
-    index = maxima(columns, rows, quality)
-    pixels = np.empty((len(index), 2), np.int64)
-    pixels[:, 0] = columns[index]
-    pixels[:, 1] = rows[index]
-    return pixels, quality[index], contrast[index]
+        full.append(tuple([values[:count].copy() for values in room]))
+    if full:
+        full.append(tuple([values[:count] for values in room]))
+        columns, rows, quality, contrast = (np.concatenate(values) for values in zip(*full))
+        return highest(columns, rows, quality, contrast, len(columns))
+    return highest(*room, count)
 
 
 def quality_of_centres(
@@ -155,7 +150,8 @@ def _kernel_arguments(
 ) -> _Arguments:
     """The image's pixels, with the zeros that the table wants behind them, and the table.
 
-    `pixels` are as many as the image's, and those zeros: they become the image's.
+    `pixels` are as many as the image's, and those zeros: where the table looks at them, they become
+    the image's.
     """
     expected = table.floor_xy.shape[:2]
     if image.shape != expected or image.dtype != np.uint8:
@@ -163,7 +159,8 @@ def _kernel_arguments(
             f"the image is {image.dtype} of shape {image.shape}: the table is for uint8 of shape "
             f"{expected}"
         )
-    pixels[: image.size].reshape(image.shape)[...] = image
+    first = table.first_source
+    pixels[first : image.size] = image.reshape(-1)[first:]
     return (
         pixels,
         table.samples,

@@ -52,6 +52,28 @@ def maxima(
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
+def highest(
+    columns: NDArray[np.int64],
+    rows: NDArray[np.int64],
+    quality: NDArray[np.float64],
+    contrast: NDArray[np.float32],
+    count: int,
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float32]]:
+    """The `maxima` among the first `count` of some pixels: (M, 2) u and v, quality, contrast."""
+    index = maxima(columns[:count], rows[:count], quality[:count])
+    pixels = np.empty((len(index), 2), np.int64)
+    own_quality = np.empty(len(index))
+    own_contrast = np.empty(len(index), np.float32)
+    for k in range(len(index)):
+        i = index[k]
+        pixels[k, 0] = columns[i]
+        pixels[k, 1] = rows[i]
+        own_quality[k] = quality[i]
+        own_contrast[k] = contrast[i]
+    return pixels, own_quality, own_contrast
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
 def _compare_neighbours(
     columns: NDArray[np.int64],
     rows: NDArray[np.int64],
