@@ -29,6 +29,7 @@ from detect.discs.fit import blur_ratio_of, fit_settings, working_space
 from detect.discs.pixel_floor_kernels import published_positions as pixel_positions
 from detect.discs.search_kernels import DiscSearch, search_discs
 from detect.errors import FrameError
+from detect.latest import kept_for_latest
 from detect.noise import estimate_noise
 from detect.settings import CircleSettings
 from lut import DiscShape, DiscTable
@@ -219,6 +220,7 @@ class _KernelCamera(NamedTuple):
     blur_ratio: float
 
 
+@kept_for_latest
 @lru_cache(maxsize=4)
 def _kernel_camera(camera: Camera) -> _KernelCamera:
     pinhole = [camera.scale_x, camera.scale_y, camera.offset_x, camera.offset_y]

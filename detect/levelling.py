@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 from camera import Camera
 from detect.circles import CircleDetections
 from detect.discs.levelling_kernels import level_discs, level_floor, level_floor_covariances
+from detect.latest import kept_for_latest
 from landmarks import FrameTilt
 
 FloatArray = NDArray[np.float64]
@@ -75,13 +75,14 @@ def with_prior(tilt: FrameTilt, sigma_rad: float) -> FrameTilt:
     if squares > _CONTRADICTION * determinant:
         return tilt
     weight = prior / determinant
-    return replace(
-        tilt,
+    return FrameTilt(
+        tilt.prefix,
         pitch=weight * (crr * tilt.pitch - cpr * tilt.roll),
         roll=weight * (cpp * tilt.roll - cpr * tilt.pitch),
         cpp=prior - prior * weight * crr,
         cpr=prior * weight * cpr,
         crr=prior - prior * weight * cpp,
+        lines=tilt.lines,
     )
 
 
@@ -153,6 +154,7 @@ def level_covariances(
     )
 
 
+@kept_for_latest
 @lru_cache(maxsize=4)
 def _centre_of(camera: Camera) -> FloatArray:
     """In memory of its own: a camera that came from another process has arrays of another kind."""

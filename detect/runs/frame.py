@@ -1,6 +1,6 @@
 """One frame of a run: its image in, its verticals, its tilt, its discs and its markers out.
 
-The way of one frame, top to bottom, is `detect_frame`, and of its image `detect_in_image`.
+The way of one frame, top to bottom, is `detect_frame`.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera
+from detect.latest import kept_for_latest
 from detect.run import RunFrame, read_image
 from landmarks import FrameTilt, tilt_as_written
 from lut import DiscShape, DiscTable, VerticalTable, cached_disc_table, cached_vertical_table
@@ -121,68 +122,11 @@ def detect_frame(
         If there is no such image, or none of the calibration's size.
     """
     image = read_image(frame, plan.camera, plan.working_folder)
-    return detect_in_image(image, frame.step.prefix, plan, tables, tilt)
-
-
-def detect_in_image(
-    image: NDArray[np.uint8],
-    prefix: str,
-    plan: FramePlan,
-    tables: Tables,
-    tilt: FrameTilt | None = None,
-    lines: LineDetections | None = None,
-) -> FrameDetections:
-    """Find what a plan asks for in a grey image of the calibration's size.
-
-    Parameters
-    ----------
-    image : (H, W) uint8
-        See `detect.run.read_image`.
-    prefix : str
-        What the frame's rows call it.
-    plan, tables, tilt
-        As for `detect_frame`.
-    lines : LineDetections, optional
-        Of `lines_in_image`, where they have been looked for already.
-
-    Returns
-    -------
-    FrameDetections
-    """
-    if lines is None:
-        lines = lines_in_image(image, plan, tables)
-    if lines is not None:
-        tilt = tilt_of_lines(prefix, lines)
-
-    discs = None
-    if plan.circles is not None:
-        from detect.circles import detect_circles
-
-        assert tables.discs is not None
-        assert plan.camera is not None
-        if tilt is None:
-            discs = detect_circles(image, plan.camera, tables.discs, plan.circles)
-        else:
-            from detect.levelling import levelled, with_prior
-
-            settings = _without_tilt(plan.circles)
-            prior_rad = math.radians(plan.circles.tilt_sigma_deg)
-            discs = detect_circles(image, plan.camera, tables.discs, settings)
-            discs = levelled(discs, plan.camera, with_prior(tilt, prior_rad))
-
-    markers = None
-    if plan.markers is not None:
-        from detect.markers.detect import detect_markers
-
-        markers = detect_markers(image, plan.markers, plan.camera)
-
-    return FrameDetections(image, lines, tilt, discs, markers)
-
-
-@lru_cache(maxsize=4)
-def _without_tilt(settings: CircleSettings) -> CircleSettings:
-    """The same, but the tilt adds nothing to covariances: levelling does."""
-    return dataclasses.replace(settings, tilt_sigma_deg=0.0)
+    lines = lines_in_image(image, plan, tables)
+    tilt = tilt_of_frame(frame.step.prefix, lines, tilt)
+    discs = discs_in_image(image, plan, tables, tilt)
+    markers = markers_in_image(image, plan)
+    return seen_together(image, plan, lines, tilt, discs, markers)
 
 
 def lines_in_image(
@@ -197,24 +141,90 @@ def lines_in_image(
     return detect_lines(image, tables.verticals, plan.lines)
 
 
+def tilt_of_frame(
+    prefix: str, lines: LineDetections | None, known: FrameTilt | None
+) -> FrameTilt | None:
+    """The tilt of the frame of an image: what its lines show, or else what is known of it."""
+    return known if lines is None else tilt_of_lines(prefix, lines)
+
+
+def discs_in_image(
+    image: NDArray[np.uint8], plan: FramePlan, tables: Tables, tilt: FrameTilt | None
+) -> CircleDetections | None:
+    """The discs of an image, if a plan asks for discs, where they would be on a level robot.
+
+    If there is a tilt, `seen_together` corrects them for it and adds what it leaves in doubt.
+    """
+    if plan.circles is None:
+        return None
+    from detect.circles import detect_circles
+
+    assert tables.discs is not None
+    assert plan.camera is not None
+    settings = plan.circles if tilt is None else _without_tilt(plan.circles)
+    return detect_circles(image, plan.camera, tables.discs, settings)
+
+
+@kept_for_latest
+def _without_tilt(settings: CircleSettings) -> CircleSettings:
+    """The same, but the tilt adds nothing to covariances: levelling does."""
+    return dataclasses.replace(settings, tilt_sigma_deg=0.0)
+
+
+def markers_in_image(image: NDArray[np.uint8], plan: FramePlan) -> MarkerDetections | None:
+    """The markers of an image, if a plan asks for markers."""
+    if plan.markers is None:
+        return None
+    from detect.markers.detect import detect_markers
+
+    return detect_markers(image, plan.markers, plan.camera)
+
+
+def seen_together(
+    image: NDArray[np.uint8],
+    plan: FramePlan,
+    lines: LineDetections | None,
+    tilt: FrameTilt | None,
+    discs: CircleDetections | None,
+    markers: MarkerDetections | None,
+) -> FrameDetections:
+    """What was found in an image, its discs corrected for the tilt.
+
+    Parameters
+    ----------
+    image : (H, W) uint8
+        See `detect.run.read_image`.
+    plan : FramePlan
+        What was looked for.
+    lines, tilt, discs, markers
+        Of `lines_in_image`, `tilt_of_frame`, `discs_in_image` and `markers_in_image`.
+
+    Returns
+    -------
+    FrameDetections
+    """
+    if discs is not None and tilt is not None:
+        from detect.levelling import levelled, with_prior
+
+        assert plan.camera is not None
+        assert plan.circles is not None
+        prior_rad = math.radians(plan.circles.tilt_sigma_deg)
+        discs = levelled(discs, plan.camera, with_prior(tilt, prior_rad))
+    return FrameDetections(image, lines, tilt, discs, markers)
+
+
 def tilt_of_lines(prefix: str, lines: LineDetections) -> FrameTilt | None:
     """The tilt that lines show, in the digits of its file: one pass finds what two passes do."""
-    if lines.tilt is None:
+    tilt = lines.tilt
+    if tilt is None:
         return None
-    c = lines.tilt.covariance
+    (cpp, cpr), (_, crr) = tilt.covariance.tolist()
     return tilt_as_written(
-        FrameTilt(
-            prefix,
-            lines.tilt.pitch_rad,
-            lines.tilt.roll_rad,
-            float(c[0, 0]),
-            float(c[0, 1]),
-            float(c[1, 1]),
-            lines.tilt.lines,
-        )
+        FrameTilt(prefix, tilt.pitch_rad, tilt.roll_rad, cpp, cpr, crr, tilt.lines)
     )
 
 
+@kept_for_latest
 def tables_of(plan: FramePlan) -> Tables:
     """The tables that a plan needs: a process makes them or takes them from the cache once.
 
@@ -223,20 +233,12 @@ def tables_of(plan: FramePlan) -> Tables:
     lut.TableError
         If there can be none for the camera and the settings.
     """
-    global _latest
-    if _latest is None or _latest[0] is not plan:
-        # Whether two plans are equal takes longer to tell.
-        shape = None
-        if plan.circles is not None:
-            from detect.circles import disc_shape
+    shape = None
+    if plan.circles is not None:
+        from detect.circles import disc_shape
 
-            shape = disc_shape(plan.circles)
-        _latest = plan, _tables(plan.camera, plan.lines is not None, shape)
-    return _latest[1]
-
-
-#: The plan that this process was asked about last, and its tables.
-_latest: tuple[FramePlan, Tables] | None = None
+        shape = disc_shape(plan.circles)
+    return _tables(plan.camera, plan.lines is not None, shape)
 
 
 @lru_cache(maxsize=4)
@@ -259,7 +261,7 @@ def rehearse(plan: FramePlan) -> None:
         detect_markers(specimen_image(plan.markers), plan.markers)
     if plan.camera is None:
         return
-    from detect.runs.row_text import unknown_circles, unknown_rows
+    from detect.runs.row_text import unknown_circles, unknown_lines
 
     column = np.arange(plan.camera.width)
     bars = np.where(column // 40 % 2, 180, 60).astype(np.uint8)
@@ -282,4 +284,4 @@ def rehearse(plan: FramePlan) -> None:
         from detect.lines import detect_lines
 
         lines = detect_lines(image, tables.verticals, plan.lines)
-        unknown_rows("LANDMARK_L", lines.row_numbers())
+        unknown_lines(lines.line_numbers)

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import islice
 from pathlib import Path
 from textwrap import indent
-from typing import TYPE_CHECKING, NamedTuple, ParamSpec, TypeVar
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,10 +21,13 @@ from detect.runs.frame import (
     FrameDetections,
     FramePlan,
     Tables,
-    detect_in_image,
+    discs_in_image,
     lines_in_image,
+    markers_in_image,
+    seen_together,
+    tilt_of_frame,
 )
-from detect.runs.row_text import unknown_circles, unknown_rows
+from detect.runs.row_text import unknown_circles, unknown_lines
 from detect.sources.times import format_time
 from landmarks import (
     Frame,
@@ -42,7 +45,6 @@ if TYPE_CHECKING:
     from detect.circles import CircleDetections
     from detect.lines import LineDetections
 
-P = ParamSpec("P")
 R = TypeVar("R")
 
 #: So many pixels are decoded before any of them is looked at.
@@ -105,9 +107,9 @@ class FrameRows(NamedTuple):
 def rows_of_frames(tasks: Sequence[FrameTask], plan: FramePlan, tables: Tables) -> list[FrameRows]:
     """Work on some frames; an image that cannot be worked on costs its frame only.
 
-    As many images are decoded, then looked at by one detector, then by the other, then written
-    about, as fit into the processor's caches: a decoder, the detectors and Python drive each
-    other's instructions and tables out of them.
+    As many images are decoded, then looked at by one detector after the other, then written about,
+    as fit into the processor's caches: a decoder, the detectors and Python drive each other's
+    instructions and tables out of them.
 
     Parameters
     ----------
@@ -131,45 +133,45 @@ def rows_of_frames(tasks: Sequence[FrameTask], plan: FramePlan, tables: Tables) 
     source = iter(tasks)
     while some := tuple(islice(source, max(1, at_once))):
         images = [
-            _attempt(task, read_image, task.frame, plan.camera, plan.working_folder)
-            for task in some
+            _attempt(task, read_image, task.frame, camera, plan.working_folder) for task in some
         ]
         lines = [
-            image if isinstance(image, str) else _attempt(task, lines_in_image, image, plan, tables)
-            for image, task in zip(images, some)
+            _attempt(task, lines_in_image, image, plan, tables) for task, image in zip(some, images)
+        ]
+        tilts = [
+            _attempt(task, tilt_of_frame, task.frame.step.prefix, seen, task.tilt)
+            for task, seen in zip(some, lines)
+        ]
+        discs = [
+            _attempt(task, discs_in_image, image, plan, tables, tilt)
+            for task, image, tilt in zip(some, images, tilts)
+        ]
+        markers = [
+            _attempt(task, markers_in_image, image, plan) for task, image in zip(some, images)
         ]
         found = [
-            _found_in(image, seen, task, plan, tables)
-            for image, seen, task in zip(images, lines, some)
+            _attempt(task, seen_together, image, plan, *seen)
+            for task, image, *seen in zip(some, images, lines, tilts, discs, markers)
         ]
         rows += [_rows_of(what, task, plan, tables) for what, task in zip(found, some)]
     return rows
 
 
-def _attempt(
-    task: FrameTask, work: Callable[P, R], /, *args: P.args, **kwargs: P.kwargs
-) -> R | str:
-    """The result of something done for a frame, or why it could not be done."""
+class _Failed(NamedTuple):
+    """In the place of what could not be done for a frame."""
+
+    reason: str
+
+
+def _attempt(task: FrameTask, work: Callable[..., R], /, *given: object) -> R | _Failed:
+    """The result of something done for a frame, or why it, or what it is given, could not be."""
+    for value in given:
+        if isinstance(value, _Failed):
+            return value
     try:
-        return work(*args, **kwargs)
+        return work(*given)
     except _COSTS_THE_FRAME as error:
-        return _reason(error, task)
-
-
-def _found_in(
-    image: NDArray[np.uint8] | str,
-    lines: LineDetections | str | None,
-    task: FrameTask,
-    plan: FramePlan,
-    tables: Tables,
-) -> FrameDetections | str:
-    """What there is in an image whose lines are known, or why it could not be looked for."""
-    if isinstance(image, str):
-        return image
-    if isinstance(lines, str):
-        return lines
-    prefix = task.frame.step.prefix
-    return _attempt(task, detect_in_image, image, prefix, plan, tables, task.tilt, lines)
+        return _Failed(_reason(error, task))
 
 
 def _reason(error: Exception, task: FrameTask) -> str:
@@ -180,10 +182,10 @@ def _reason(error: Exception, task: FrameTask) -> str:
 
 
 def _rows_of(
-    found: FrameDetections | str, task: FrameTask, plan: FramePlan, tables: Tables
+    found: FrameDetections | _Failed, task: FrameTask, plan: FramePlan, tables: Tables
 ) -> FrameRows:
-    if isinstance(found, str):
-        return rows_of_failure(task, found)
+    if isinstance(found, _Failed):
+        return rows_of_failure(task, found.reason)
     step = task.frame.step
     head = _line(format_record(step))
     circles = lines = tilt = markers = record = b""
@@ -236,7 +238,7 @@ def _line_rows(found: LineDetections, reference: tuple[LineLandmark, ...] | None
         from detect.verticals.identity import carry_ids
 
         return _rows(carry_ids(found.landmarks(), reference))
-    rows = unknown_rows("LANDMARK_L", found.row_numbers())
+    rows = unknown_lines(found.line_numbers)
     return _rows(found.landmarks()) if rows is None else rows
 
 

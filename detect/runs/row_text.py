@@ -2,48 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.runs.row_text_kernels import LONGEST, write_circle_rows, write_rows
+from detect.runs.row_text_kernels import LONGEST, write_circle_rows, write_line_rows
 
-_TAIL = np.frombuffer(b" -1\n", np.uint8)
-_HEADS = {
-    keyword: np.frombuffer(keyword.encode(), np.uint8) for keyword in ("LANDMARK_C", "LANDMARK_L")
-}
-
-
-def unknown_rows(
-    keyword: Literal["LANDMARK_C", "LANDMARK_L"], numbers: NDArray[np.float64]
-) -> bytes | None:
-    """Rows of landmarks with the identifier -1, as `landmarks.format_record` lays them out.
-
-    Parameters
-    ----------
-    keyword : str
-        What the rows begin with.
-    numbers : (N, K) float64
-        What follows.
-
-    Returns
-    -------
-    bytes or None
-        None where a number is not finite or one cannot be rounded with certainty: in some one of a
-        million rows. Records will tell.
-    """
-    head = _HEADS[keyword]
-    numbers = np.ascontiguousarray(numbers)  # for other layouts the kernel would be compiled again
-    text = _room(len(numbers), len(head), numbers.shape[1])
-    length = write_rows(head, numbers, _TAIL, text)
-    return None if length < 0 else text[:length].tobytes()
+_CIRCLE, _LINE, _TAIL = (
+    np.frombuffer(text, np.uint8) for text in (b"LANDMARK_C", b"LANDMARK_L", b" -1\n")
+)
 
 
 def unknown_circles(
     floor_xy: NDArray[np.float64], quality: NDArray[np.float64], covariance: NDArray[np.float64]
 ) -> bytes | None:
-    """Rows of discs with the identifier -1.
+    """Rows of discs with the identifier -1, as `landmarks.format_record` lays them out.
 
     Parameters
     ----------
@@ -53,18 +25,37 @@ def unknown_circles(
     Returns
     -------
     bytes or None
-        As of `unknown_rows`.
+        None where a number is not finite or one cannot be rounded with certainty: in some one of a
+        million rows. Records will tell.
     """
-    head = _HEADS["LANDMARK_C"]
-    text = _room(len(quality), len(head), 6)
+    text = _room(len(quality), len(_CIRCLE), 6)
+    # For other layouts the kernel would be compiled again.
     length = write_circle_rows(
-        head,
+        _CIRCLE,
         np.ascontiguousarray(floor_xy),
         np.ascontiguousarray(quality),
         np.ascontiguousarray(covariance),
         _TAIL,
         text,
     )
+    return None if length < 0 else text[:length].tobytes()
+
+
+def unknown_lines(lines: NDArray[np.float64]) -> bytes | None:
+    """Rows of lines with the identifier -1 and, as in the data set's own files, quality 0.
+
+    Parameters
+    ----------
+    lines : (8, N) float64
+        See `detect.verticals.detections.LineDetections.line_numbers`.
+
+    Returns
+    -------
+    bytes or None
+        As of `unknown_circles`.
+    """
+    text = _room(lines.shape[1], len(_LINE), 8)
+    length = write_line_rows(_LINE, lines, _TAIL, text)
     return None if length < 0 else text[:length].tobytes()
 
 

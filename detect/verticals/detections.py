@@ -61,42 +61,43 @@ class LineDetections:
         return parts
 
     @cached_property
-    def _lines(self) -> FloatArray:
+    def line_numbers(self) -> FloatArray:
+        """(8, N) ends, bearings, inclinations and deviations, as told below, one after the other.
+
+        The leftmost line is the first, here and elsewhere.
+        """
         count = self._counts[2]
         at = COUNTS + TILT_NUMBERS
         return self.numbers[at : at + _LINE_NUMBERS * count].reshape(_LINE_NUMBERS, count)
 
-    def _line_numbers(self, which: int) -> FloatArray:
-        numbers: FloatArray = self._lines[which]
-        return numbers
-
     @property
     def ends(self) -> FloatArray:
-        """(N, 4) xtop, ytop, xbottom, ybottom: undistorted normalised coordinates.
-
-        The leftmost line is the first, here and elsewhere.
-        """
-        return self._lines[:4].T
+        """(N, 4) xtop, ytop, xbottom, ybottom: undistorted normalised coordinates."""
+        return self.line_numbers[:4].T
 
     @property
     def alpha_rad(self) -> FloatArray:
         """(N,) bearings."""
-        return self._line_numbers(4)
+        return self._of_lines(4)
 
     @property
     def beta_rad(self) -> FloatArray:
         """(N,) inclinations."""
-        return self._line_numbers(5)
+        return self._of_lines(5)
 
     @property
     def sigma_rad(self) -> FloatArray:
         """(N,) standard deviations of the bearings."""
-        return self._line_numbers(6)
+        return self._of_lines(6)
 
     @property
     def noise_rad(self) -> FloatArray:
         """(N,) the part of them that is due to noise in the grey values."""
-        return self._line_numbers(7)
+        return self._of_lines(7)
+
+    def _of_lines(self, which: int) -> FloatArray:
+        numbers: FloatArray = self.line_numbers[which]
+        return numbers
 
     @cached_property
     def members(self) -> tuple[tuple[int, ...], ...]:
@@ -137,13 +138,6 @@ class LineDetections:
             score.astype(np.float32),
             complete=True,
         )
-
-    def row_numbers(self) -> FloatArray:
-        """(N, 8) the numbers of `landmarks`, in the order of a file's rows."""
-        numbers = np.zeros((len(self), 8))
-        numbers[:, :6] = self._lines[:6].T
-        numbers[:, 7] = self._lines[6]
-        return numbers
 
     def landmarks(self) -> tuple[LineLandmark, ...]:
         """Rows for a landmark file, without identifiers; quality is 0 as in the data set's own."""
