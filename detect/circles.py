@@ -127,36 +127,36 @@ def detect_circles(
 
     noise = estimate_noise(image, _NOISE_ROWS)
     kernel = _kernel_camera(camera)
-    index, floor_xy, covariance, evidence = search_discs(
+    pixels, found_quality, floor_xy, covariance, evidence = search_discs(
         image,
         table.floor_xy,
         pixels,
         found_quality,
         contrast,
-        _disc_search(settings, settings.noise_floor * max(noise, _LEAST_NOISE)),
+        _disc_search(settings),
+        settings.noise_floor * max(noise, _LEAST_NOISE),
         fit_settings(noise, kernel.blur_ratio),
         kernel.numbers,
         kernel.centre,
         *working_space(),
     )
-    pixels = pixels[index]
     if not settings.refine:
         floor_xy, covariance = published_positions(camera, pixels)
     return CircleDetections(
         pixels=pixels,
         floor_xy=floor_xy,
         covariance=covariance,
-        quality=found_quality[index],
+        quality=found_quality,
         evidence=evidence,
     )
 
 
-def _disc_search(settings: CircleSettings, weakest: float) -> DiscSearch:
+@kept_for_latest
+def _disc_search(settings: CircleSettings) -> DiscSearch:
     return DiscSearch(
         radius=settings.radius_m,
         inner=settings.inner_radius_m,
         outer=settings.outer_radius_m,
-        weakest=weakest,
         separation=settings.separation_m,
         verify=settings.verify,
         refine=settings.refine,

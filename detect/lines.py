@@ -19,7 +19,7 @@ leave none.
 from __future__ import annotations
 
 import math
-from functools import lru_cache
+from functools import cache, lru_cache
 from typing import Any
 
 import numpy as np
@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from detect.errors import FrameError
 from detect.line_settings import DEFAULT, LineSettings
 from detect.verticals.detections import LineDetections
-from detect.verticals.filter import line_filter, start_band
+from detect.verticals.filter import LineFilter, line_filter, start_band
 from detect.verticals.fit import LineFits
 from detect.verticals.judgement import (
     ACCEPTED,
@@ -92,16 +92,24 @@ def detect_lines(
             f"image is {image.dtype} of shape {image.shape}: expected uint8 of the table's shape "
             f"{table.column.shape}"
         )
+    image = np.ascontiguousarray(image)
+    window, told = _told_beforehand(table, settings)
+    return LineDetections(_kernel()(image, padded_pixels(image, window), *told))
+
+
+@cache
+def _kernel() -> Any:
+    """What does it all, loaded when it is first asked for."""
     from detect.verticals.image_kernels import find_lines
 
-    image = np.ascontiguousarray(image)
-    pixels = padded_pixels(image, line_filter(settings))
-    return LineDetections(find_lines(image, pixels, *_told_beforehand(table, settings)))
+    return find_lines
 
 
 @lru_cache(maxsize=16)
-def _told_beforehand(table: VerticalTable, settings: LineSettings) -> tuple[Any, ...]:
-    """What `find_lines` takes besides the image."""
+def _told_beforehand(
+    table: VerticalTable, settings: LineSettings
+) -> tuple[LineFilter, tuple[Any, ...]]:
+    """The filter, and what `find_lines` takes besides the image."""
     window, band, strip = line_filter(settings), start_band(table, settings), strip_of(table)
     filters, farthest = refinement_of(settings)
     few = [*range(len(farthest))[:_FIRST_STEPS], -2, -1]
@@ -127,7 +135,7 @@ def _told_beforehand(table: VerticalTable, settings: LineSettings) -> tuple[Any,
     # A track follows a lean that is wrong by so much that what it yields in a row makes up for it.
     lean = _LAG_PX * settings.guided_pull / table.row_aspect
     doubt = np.array([_FIRST_LINES, _FIRST_VOTES, _FIRST_LEAN_RAD, *of_chains, lean])
-    return (
+    told = (
         table.elevation_tan, table.bearing_rad, table.anchor_row, table.first_row,
         table.last_row, table.robot_from_camera, strip.column, strip.ends, strip.rise,
         strip.lean_by_pitch, strip.lean_by_roll, band.row, band.pixel, band.runs, band.part,
@@ -136,6 +144,7 @@ def _told_beforehand(table: VerticalTable, settings: LineSettings) -> tuple[Any,
         filters.begin[few], farthest[:_FIRST_STEPS], np.array(following, np.float64),
         limits_of(settings, table.row_aspect), doubt, grouping_of(settings),
     )  # fmt: skip
+    return window, told
 
 
 def tilt_beyond_doubt(

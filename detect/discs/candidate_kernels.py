@@ -1,4 +1,7 @@
-"""Compiled: which of the maxima of the quality are looked at, and where the looks start."""
+"""Compiled: which of the maxima of the quality are looked at, and where the looks start.
+
+Rows of arrays are never taken as arrays of their own here: their references would be counted.
+"""
 
 from __future__ import annotations
 
@@ -49,7 +52,8 @@ def strong_and_alone(
     index = np.flatnonzero(np.abs(contrast) >= weakest)
     place = np.empty((len(index), 2))
     for k in range(len(index)):
-        u, v = pixels[index[k]]
+        i = index[k]
+        u, v = pixels[i, 0], pixels[i, 1]
         place[k, 0] = floor_xy[v, u, 0]
         place[k, 1] = floor_xy[v, u, 1]
     return index[suppress_neighbours(place, quality[index], separation)]
@@ -89,13 +93,13 @@ def middles(
     weight = np.empty(len(strong))
     for m in range(len(strong)):
         i = strong[m]
-        u, v = pixels[i]
+        u, v = pixels[i, 0], pixels[i, 1]
         place[m, 0] = floor_xy[v, u, 0]
         place[m, 1] = floor_xy[v, u, 1]
         weight[m] = quality[i] * quality[i] * contrast[i]
     middle = np.empty((len(keep), 2), np.int64)
     for k in range(len(keep)):
-        u0, v0 = pixels[keep[k]]
+        u0, v0 = pixels[keep[k], 0], pixels[keep[k], 1]
         x0, y0 = floor_xy[v0, u0, 0], floor_xy[v0, u0, 1]
         own = contrast[keep[k]]
         total = 0.0
@@ -182,7 +186,7 @@ def share_of_steps(
     seen = 0
     steps = 0
     for k in range(len(_DIRECTIONS)):
-        x, y = _DIRECTIONS[k]
+        x, y = _DIRECTIONS[k, 0], _DIRECTIONS[k, 1]
         du = (yv * x - xv * y) * per_area
         dv = (xu * y - yu * x) * per_area
         # Half a pixel up, and rounded down: nearest pixels.

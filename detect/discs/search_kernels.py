@@ -40,8 +40,6 @@ class DiscSearch(NamedTuple):
     """Nominal radius, and those of the outlines, metres."""
     inner: float
     outer: float
-    weakest: float
-    """Least contrast, grey levels."""
     separation: float
     """Metres."""
     verify: bool
@@ -64,13 +62,20 @@ def search_discs(
     quality: NDArray[np.float64],
     contrast: NDArray[np.float32],
     search: DiscSearch,
+    weakest: float,
     settings: FitSettings,
     camera_numbers: NDArray[np.float64],
     centre: NDArray[np.float64],
     memory: NDArray[np.float32],
     indices: NDArray[np.uint32],
     marks: NDArray[np.uint8],
-) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[
+    NDArray[np.int64],
+    NDArray[np.float64],
+    NDArray[np.float64],
+    NDArray[np.float64],
+    NDArray[np.float64],
+]:
     """Fit discs at the best centres, weigh the evidence, and keep the best of those that are one.
 
     Parameters
@@ -81,6 +86,8 @@ def search_discs(
     pixels, quality, contrast : (N, 2) int64, (N,) float64, (N,) float32
         See `detect.discs.centres.best_centres`.
     search : DiscSearch
+    weakest : float
+        Least contrast, grey levels.
     settings : FitSettings
     camera_numbers, centre : (K,) float64, (3,) float64
         See `detect.discs.covariance_kernels.refined_covariances`.
@@ -89,8 +96,8 @@ def search_discs(
 
     Returns
     -------
-    index : (M,) int64
-        Which of the best centres are discs, ascending.
+    own_pixels, own_quality : (M, 2) int64, (M,) float64
+        Those of the best centres that are discs, in their order.
     found_xy : (M, 2) float64
         Their fitted places, metres.
     covariance : (M, 2, 2) float64
@@ -99,17 +106,23 @@ def search_discs(
     """
     # Each disc has several best centres: of those in the middle of it one is enough.
     near = 0.5 * search.separation
-    keep = strong_and_alone(pixels, quality, contrast, floor_xy, search.weakest, near)
-    starts = middles(pixels, quality, contrast, floor_xy, search.weakest, near, keep)
+    keep = strong_and_alone(pixels, quality, contrast, floor_xy, weakest, near)
+    starts = middles(pixels, quality, contrast, floor_xy, weakest, near, keep)
     results, evidence, found = _fit_all(
         image, floor_xy, starts, quality[keep], contrast[keep], search, settings,
         work_in(memory, indices, marks),
     )  # fmt: skip
+    own_pixels = np.empty((len(found), 2), np.int64)
+    own_quality = np.empty(len(found))
     found_xy = np.empty((len(found), 2))
     covariance = np.empty((len(found), 2, 2))
     told = np.empty(len(found))
     for k in range(len(found)):
         result = results[found[k]]
+        i = keep[found[k]]
+        own_pixels[k, 0] = pixels[i, 0]
+        own_pixels[k, 1] = pixels[i, 1]
+        own_quality[k] = quality[i]
         found_xy[k, 0] = result[fit.X]
         found_xy[k, 1] = result[fit.Y]
         covariance[k, 0, 0] = result[fit.COV_XX]
@@ -119,7 +132,7 @@ def search_discs(
     covariance = refined_covariances(
         camera_numbers, centre, found_xy, covariance, search.pixel_variance, search.tilt_variance
     )
-    return keep[found], found_xy, covariance, told
+    return own_pixels, own_quality, found_xy, covariance, told
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
@@ -154,7 +167,7 @@ def _next_to_look_at(
     within_2 = (_WITHIN * search.separation) ** 2
     for at in range(begin, len(order)):
         i = order[at]
-        u, v = pixels[i]
+        u, v = pixels[i, 0], pixels[i, 1]
         seen = False
         for k in range(len(clear)):
             dx = clear[k, 0] - floor_xy[v, u, 0]

@@ -75,10 +75,13 @@ class ImageNames:
     def find(self, name: str) -> int | None:
         """The place of the image of a name, with or without its ending; the first of several."""
         stem = name.encode("utf-8", "surrogateescape")
-        found = [self._index.find(stem + suffix) for suffix in self._suffixes]
+        names = [stem + suffix for suffix in self._suffixes]
         if stem.endswith(self._suffixes):  # else there is nothing of that name as it stands
-            found.append(self._index.find(stem))
-        return min((place for place in found if place is not None), default=None)
+            names.append(stem)
+        if len(names) == 1:
+            return self._index.find(names[0])
+        places = [self._index.find(name) for name in names]
+        return min((place for place in places if place is not None), default=None)
 
 
 def _natural_order(name: str) -> str:

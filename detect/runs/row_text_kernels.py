@@ -8,6 +8,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from detect.discs.uncounted import uncounted
+
 #: Powers of ten that a double holds exactly.
 _POWERS = np.array([10.0**k for k in range(23)])
 _DIGITS = 6
@@ -25,7 +27,7 @@ _TEN, _HUNDRED, _MYRIAD = np.uint32(10), np.uint32(100), np.uint32(10_000)
 LONGEST = 14
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@uncounted
 def _significant_digits(size: float) -> tuple[int, int]:
     """The 6 digits of a number above 0 as an integer, and the exponent of the first; -1 if unsure.
 
@@ -53,7 +55,7 @@ def _significant_digits(size: float) -> tuple[int, int]:
     return number, exponent
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@uncounted
 def _write_number(value: float, text: NDArray[np.uint8], at: int) -> int:
     """Write a number; returns where it ends, -1 if its digits are not sure."""
     if math.copysign(1.0, value) < 0.0:
@@ -138,7 +140,7 @@ def line_numbers(lines: NDArray[np.float64]) -> NDArray[np.float64]:
     return numbers
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@uncounted
 def write_rows(
     head: NDArray[np.uint8],
     numbers: NDArray[np.float64],
