@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import wraps
 from typing import TypeVar
 
 T = TypeVar("T")
@@ -27,6 +28,7 @@ def kept_for_latest(make: Callable[[T], R]) -> Callable[[T], R]:
     """
     latest: tuple[T, R] | None = None
 
+    @wraps(make)
     def made_of(value: T) -> R:
         nonlocal latest
         kept = latest  # another thread may replace it meanwhile

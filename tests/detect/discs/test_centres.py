@@ -313,6 +313,19 @@ def test_threads_do_not_disturb_each_other() -> None:
                 assert_same(found, right)
 
 
+def test_only_what_comes_before_the_first_source_does_not_matter() -> None:
+    table, _ = both(PUBLISHED_CAMERA, disc_shape(PUBLISHED))
+    image = image_of("random", (288, 768))
+    first = table.first_source
+    assert first > 768
+    before, at = image.copy(), image.copy()
+    before.reshape(-1)[:first] ^= 255
+    at.reshape(-1)[first] ^= 128
+    expected = quality_of_centres(image, table)[0]
+    np.testing.assert_array_equal(quality_of_centres(before, table)[0], expected)
+    assert not np.array_equal(quality_of_centres(at, table)[0], expected)
+
+
 def test_an_empty_table_finds_nothing() -> None:
     nothing = build_disc_table(SMALL_CAMERA, DiscShape(far_limit_m_per_px=1e-9))
     pixels, quality, contrast = best_centres(image_of("random", (36, 96)), nothing, 0.1)
