@@ -8,7 +8,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Literal
 
 from detect.errors import DetectError
-from storage.bounds import ABOVE_0, LIMIT_OR_0, NOT_NEGATIVE, SHARE_ABOVE_0, demand, whole
+from storage.bounds import ABOVE_0, LIMIT_OR_0, NOT_NEGATIVE, SHARE_ABOVE_0, demand, from_to, whole
 
 if TYPE_CHECKING:
     from detect.verticals.tilt import ConsensusSettings
@@ -39,6 +39,7 @@ _BOUNDS = {
             "least_sharpness",
             "soft_evidence",
             "bend_px",
+            "lean_noise",
             "same_edge_px",
             "join_px",
             "join_share",
@@ -64,6 +65,7 @@ _BOUNDS = {
     "start_spacing_rows": whole(1),
     "least_rows": whole(5),
     "least_lines": whole(2),
+    "stray_share": from_to(0.0, 0.5),
     "proposers": whole(2, 1000),
 }
 
@@ -132,6 +134,9 @@ class LineSettings:
         Largest standard deviation of a line's place at the horizon due to noise.
     bend_px : float
         Standard deviation of a line's lean over its length due to all but noise.
+    lean_noise : float
+        Variance of a line's lean due to noise, relative to that of noise which differs from row to
+        row: what stands beside an edge, and what its blur makes of it, is alike on many.
     largest_lean_deg, largest_lean_sigmas, largest_lean_px : float
         How far a line may lean from the vertical: its angle, standard deviations due to noise, and
         pixels over its length, added in squares.
@@ -145,6 +150,9 @@ class LineSettings:
         The tilt is looked for among those that pairs of this many lines, the strongest, agree with.
     least_lines : int
         With fewer lines that agree there is no tilt.
+    stray_share : float
+        Share of edges that agree on the tilt and are no verticals: its covariance covers the tilts
+        without any one of them as far as that one may be such.
     weight_limit : float
         Votes of a line in the consensus grow with its evidence up to this.
     same_edge_px : float
@@ -191,15 +199,17 @@ class LineSettings:
     largest_scatter_px: float = 1.0
     largest_shift_px: float = 1.0
     largest_noise_px: float = 0.3
-    bend_px: float = 0.125
+    bend_px: float = 0.06
+    lean_noise: float = 3.0
     largest_lean_deg: float = 0.7
     largest_lean_sigmas: float = 8.0
     largest_lean_px: float = 1.5
     largest_tilt_deg: float = 5.0
     tilt_prior_deg: float = 2.0
-    building_deg: float = 0.036
+    building_deg: float = 0.025
     proposers: int = 24
     least_lines: int = 3
+    stray_share: float = 0.06
     weight_limit: float = 3.0
     same_edge_px: float = 2.0
     join_px: float = 2.7
@@ -239,6 +249,7 @@ class LineSettings:
             building_rad=math.radians(self.building_deg),
             proposers=self.proposers,
             least_lines=self.least_lines,
+            stray_share=self.stray_share,
         )
 
 
@@ -261,6 +272,9 @@ PUBLISHED = LineSettings(
     largest_shift_px=math.inf,
     largest_noise_px=math.inf,
     bend_px=0.7,
+    lean_noise=1.0,
+    building_deg=0.036,
+    stray_share=0.0,
     join_share=0.0,
     sigma_px=1.0,
     alpha="published",

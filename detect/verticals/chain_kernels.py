@@ -23,6 +23,9 @@ _SCATTER_PX = 0.3
 #: How far a chain may lean from the vertical over its length, pixels (see
 #: `detect.line_settings.LineSettings.largest_lean_px`).
 _LEAN_PX = 0.5
+#: Standard deviation of its lean over its length due to all but noise, pixels: more than that of
+#: lines, which are refined on the grey values.
+_BEND_PX = 0.125
 
 
 @njit(cache=True, error_model="numpy")
@@ -146,8 +149,9 @@ def tilt_of_chains(
         evidence[t] = limits[13] * 10.0
         fate[t] = ACCEPTED if scatter_px[t] <= _SCATTER_PX else NOT_STRAIGHT
     _, normal, inclination, tolerance, weight = weigh_verticals(
-        reference, pixel, line, covariance, spread, evidence, fate, limits[9], limits[10],
-        limits[11], _LEAN_PX, limits[13],
+        reference, pixel, line, covariance, spread, evidence, fate, limits[14], _BEND_PX, 1.0,
+        limits[10], limits[11], _LEAN_PX, limits[13],
     )  # fmt: skip
-    tilt, _ = agreed_tilt(bearing, normal, inclination, tolerance, weight, limits)
+    edge = np.arange(len(weight))
+    tilt, _ = agreed_tilt(bearing, normal, inclination, tolerance, weight, edge, 0.0, limits)
     return tilt

@@ -13,7 +13,7 @@ from detect.line_settings import LineSettings
 from detect.verticals.fit import LineFits
 from detect.verticals.step_filters import StepFilters, step_filters
 from detect.verticals.strip import strip_of
-from detect.verticals.tilt import REFINEMENTS, SOFTENING, TiltEstimate, tilt_of_numbers
+from detect.verticals.tilt import REFINEMENTS, SOFTENING, STRAY_RAD, TiltEstimate, tilt_of_numbers
 from detect.verticals.tracks import LineTracks
 from lut.verticals import VerticalTable
 
@@ -152,6 +152,10 @@ def limits_of(settings: LineSettings, row_aspect: float) -> FloatArray:
             SOFTENING,
             REFINEMENTS,
             consensus.least_lines,
+            settings.lean_noise,
+            consensus.stray_share,
+            STRAY_RAD,
+            settings.same_edge_px,
         ],
         np.float64,
     )

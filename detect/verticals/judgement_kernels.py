@@ -151,7 +151,9 @@ def weigh_verticals(
     spread: NDArray[np.float64],
     evidence: NDArray[np.float64],
     fate: NDArray[np.int8],
+    building_variance: float,
     bend_px: float,
+    lean_noise: float,
     largest_lean_rad: float,
     largest_lean_sigmas: float,
     largest_lean_px: float,
@@ -171,6 +173,8 @@ def weigh_verticals(
         The lines (see `detect.verticals.fit.LineFits`).
     evidence, fate
         Of each track.
+    building_variance : float
+        Of real verticals about the vertical (rad^2).
     bend_px, ..., weight_limit
         See `detect.line_settings.LineSettings`.
 
@@ -202,7 +206,7 @@ def weigh_verticals(
         # One pixel from end to end: 12 = (length / standard deviation of its points)^2.
         per_length = pixel[t] / math.sqrt(12.0 * spread[t])
         noise = covariance[t, 1, 1]
-        variance[k] = noise + (bend_px * per_length) ** 2
+        variance[k] = building_variance + lean_noise * noise + (bend_px * per_length) ** 2
         tolerance[k] = math.sqrt(
             largest_lean_rad**2
             + largest_lean_sigmas**2 * noise
@@ -210,6 +214,70 @@ def weigh_verticals(
         )
         weight[k] = min(0.1 * evidence[t], weight_limit)
     return accepted, normal, variance, tolerance, weight
+
+
+@njit(cache=True, error_model="numpy")
+def share_edges(
+    reference: NDArray[np.float64],
+    pixel: NDArray[np.float64],
+    line: NDArray[np.float64],
+    polarity: NDArray[np.float64],
+    evidence: NDArray[np.float64],
+    accepted: NDArray[np.int64],
+    same_edge_px: float,
+    variance: NDArray[np.float64],
+    weight: NDArray[np.float64],
+) -> NDArray[np.int64]:
+    """Let the lines of one edge say together as much about the tilt as one.
+
+    Parameters
+    ----------
+    reference, pixel, line
+        The lines (see `detect.verticals.fit.LineFits`).
+    polarity, evidence
+        Of each track.
+    accepted : (N,) int64
+        Tracks that may be verticals.
+    same_edge_px : float
+        See `detect.line_settings.LineSettings`.
+    variance, weight : (N,) float64
+        Of the accepted tracks (see `weigh_verticals`); changed where an edge has several.
+
+    Returns
+    -------
+    (N,) int64
+        The first of the accepted tracks that are of the same edge.
+    """
+    count = len(accepted)
+    place = np.empty(count)
+    strength = np.empty(count)
+    for k in range(count):
+        t = accepted[k]
+        place[k] = reference[t] + math.atan(line[t, 0])
+        strength[k] = evidence[t]
+    edge = np.full(count, -1, np.int64)
+    lines = np.zeros(count, np.int64)
+    # From the strongest on, as `group_tracks` does.
+    for strongest in descending(strength):
+        if edge[strongest] >= 0:
+            continue
+        near = same_edge_px * pixel[accepted[strongest]]
+        sign = polarity[accepted[strongest]]
+        first = -1
+        for k in range(count):
+            if (
+                edge[k] < 0
+                and polarity[accepted[k]] == sign
+                and abs(place[k] - place[strongest]) < near
+            ):
+                if first < 0:
+                    first = k
+                edge[k] = first
+                lines[first] += 1
+    for k in range(count):
+        variance[k] *= lines[edge[k]]
+        weight[k] /= lines[edge[k]]
+    return edge
 
 
 @njit(cache=True, error_model="numpy")

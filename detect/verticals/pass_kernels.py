@@ -20,6 +20,7 @@ from detect.verticals.judgement_kernels import (
     group_tracks,
     join_tracks,
     judge_tracks,
+    share_edges,
     weigh_verticals,
 )
 from detect.verticals.tilt import TILT_NUMBERS
@@ -84,6 +85,8 @@ def agreed_tilt(
     inclination: NDArray[np.float64],
     tolerance: NDArray[np.float64],
     weight: NDArray[np.float64],
+    edge: NDArray[np.int64],
+    stray_share: float,
     limits: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """The tilt that most lines agree with, if they are enough.
@@ -94,6 +97,10 @@ def agreed_tilt(
         The table.
     normal, inclination, tolerance, weight
         The lines (see `weigh_verticals`).
+    edge : (N,) int64
+        The first line of the edge that each belongs to.
+    stray_share
+        See `detect.verticals.tilt.ConsensusSettings`.
     limits
         See `detect.verticals.judgement.limits_of`.
 
@@ -105,8 +112,8 @@ def agreed_tilt(
         Lines that agree with the best tilt, that of too few lines included.
     """
     pitch, roll, covariance, agrees = agree_on_tilt(
-        normal, inclination + limits[14], tolerance, weight, int(limits[15]), limits[16],
-        limits[17], limits[18], int(limits[19]),
+        normal, inclination, tolerance, weight, edge, int(limits[15]), limits[16], limits[17],
+        limits[18], int(limits[19]), stray_share, limits[23],
     )  # fmt: skip
     lines = 0
     votes = 0.0
@@ -165,7 +172,7 @@ def fit_and_judge(
     farthest : (K,) float64
         How far its steps may go; of length 0 for none: the covariance is then that of independent
         points with the scatter that the track shows.
-    limits : (21,) float64
+    limits : (25,) float64
         See `detect.verticals.judgement.limits_of`.
 
     Returns
@@ -201,10 +208,15 @@ def fit_and_judge(
         limits[6], limits[7], limits[8],
     )  # fmt: skip
     accepted, normal, inclination, tolerance, weight = weigh_verticals(
-        reference, pixel, line, covariance, spread, evidence, fate, limits[9], limits[10],
-        limits[11], limits[12], limits[13],
+        reference, pixel, line, covariance, spread, evidence, fate, limits[14], limits[9],
+        limits[21], limits[10], limits[11], limits[12], limits[13],
     )  # fmt: skip
-    tilt, agrees = agreed_tilt(bearing, normal, inclination, tolerance, weight, limits)
+    edge = share_edges(
+        reference, pixel, line, polarity, evidence, accepted, limits[24], inclination, weight
+    )
+    tilt, agrees = agreed_tilt(
+        bearing, normal, inclination, tolerance, weight, edge, limits[22], limits
+    )
     sure = not np.isnan(tilt[0])
     for k in range(len(accepted)):
         if not (agrees[k] if sure else abs(normal[k, 2]) <= tolerance[k]):

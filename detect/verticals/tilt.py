@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from detect.errors import DetectError
-from storage.bounds import ABOVE_0, demand, whole
+from storage.bounds import ABOVE_0, demand, from_to, whole
 
 FloatArray = NDArray[np.float64]
 
@@ -33,6 +33,8 @@ TILT_NUMBERS = 9
 REFINEMENTS = 6
 #: Standard deviations from which on a line's pull no longer grows.
 SOFTENING = 2.0
+#: Half of the edges that are no verticals, but nearly, lean less than this (rad).
+STRAY_RAD = math.radians(1.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,6 +82,9 @@ class ConsensusSettings:
         The tilt is looked for among those that pairs of this many lines, the strongest, agree with.
     least_lines : int
         With fewer lines that agree there is no estimate.
+    stray_share : float
+        Share of edges that agree and are no verticals. The covariance covers the tilts without any
+        one of the edges as far as that one may be such.
     """
 
     largest_rad: float = np.radians(5.0)
@@ -87,6 +92,7 @@ class ConsensusSettings:
     building_rad: float = np.radians(0.045)
     proposers: int = 24
     least_lines: int = 3
+    stray_share: float = 0.06
 
     def __post_init__(self) -> None:
         demand(
@@ -97,6 +103,7 @@ class ConsensusSettings:
             building_rad=ABOVE_0,
             proposers=whole(2, 1000),
             least_lines=whole(2),
+            stray_share=from_to(0.0, 0.5),
         )
 
 
@@ -137,11 +144,14 @@ def consensus(
         settings.building_rad**2 + inclination_variance,
         tolerance,
         weight,
+        np.arange(len(weight)),
         settings.proposers,
         limit,
         settings.prior_rad,
         SOFTENING,
         REFINEMENTS,
+        settings.stray_share,
+        STRAY_RAD,
     )
     lines = int(np.count_nonzero(consistent))
     if lines < settings.least_lines or abs(pitch) > limit or abs(roll) > limit:

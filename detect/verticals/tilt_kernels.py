@@ -195,21 +195,167 @@ def refine_tilt(
 
 
 @njit(cache=True, error_model="numpy")
+def cover_strays(
+    normal: NDArray[np.float64],
+    variance: NDArray[np.float64],
+    edge: NDArray[np.int64],
+    agrees: NDArray[np.bool_],
+    pitch: float,
+    roll: float,
+    prior: float,
+    softening: float,
+    share: float,
+    stray: float,
+) -> NDArray[np.float64]:
+    """Covariance of a tilt when any one of the edges may be no vertical.
+
+    A stray edge that alone tells a part of the tilt is not seen by the others: it pulls the tilt
+    until it agrees. The tilt is therefore taken for a mixture: of that of all edges and those of
+    all but one, weighed by how well the others predict the edge left out and how well a stray
+    would be. Where the others tell the tilt as well, nothing changes.
+
+    Parameters
+    ----------
+    normal, variance, pitch, roll, prior, softening
+        See `refine_tilt`.
+    edge : (N,) int64
+        The first line of the edge that each belongs to.
+    agrees : (N,) bool
+        Lines that the tilt is of.
+    share : float
+        Of edges that are strays, less than 1.
+    stray : float
+        Half width at half height of the inclinations of strays, distributed as Cauchy's (rad).
+
+    Returns
+    -------
+    (2, 2) float64
+        Mean square deviation from the given tilt (rad^2).
+    """
+    count = len(variance)
+    rotation = level_matrix(pitch, roll)
+    by_pitch = np.empty(count)
+    by_roll = np.empty(count)
+    off = np.empty(count)
+    weight = np.empty(count)
+    pp = 1.0 / (prior * prior)
+    pr = 0.0
+    rr = pp
+    gradient_p = pitch / (prior * prior)
+    gradient_r = roll / (prior * prior)
+    for i in range(count):
+        if not agrees[i]:
+            continue
+        x = 0.0
+        y = 0.0
+        z = 0.0
+        for k in range(3):
+            x += rotation[0, k] * normal[i, k]
+            y += rotation[1, k] * normal[i, k]
+            z += rotation[2, k] * normal[i, k]
+        by_pitch[i] = y
+        by_roll[i] = -x
+        off[i] = z
+        weight[i] = 1.0 / (variance[i] + (z / softening) ** 2)
+        pp += weight[i] * y * y
+        pr -= weight[i] * y * x
+        rr += weight[i] * x * x
+        gradient_p += weight[i] * y * z
+        gradient_r -= weight[i] * x * z
+    total = 1.0
+    determinant = pp * rr - pr * pr
+    cover_pp = rr / determinant
+    cover_pr = -pr / determinant
+    cover_rr = pp / determinant
+    for first in range(count):
+        # All but this edge.
+        lines = 0
+        other_pp = pp
+        other_pr = pr
+        other_rr = rr
+        other_p = gradient_p
+        other_r = gradient_r
+        mean_p = 0.0
+        mean_r = 0.0
+        mean_off = 0.0
+        mean_variance = 0.0
+        for i in range(first, count):
+            if edge[i] != first or not agrees[i]:
+                continue
+            lines += 1
+            other_pp -= weight[i] * by_pitch[i] * by_pitch[i]
+            other_pr -= weight[i] * by_pitch[i] * by_roll[i]
+            other_rr -= weight[i] * by_roll[i] * by_roll[i]
+            other_p -= weight[i] * by_pitch[i] * off[i]
+            other_r -= weight[i] * by_roll[i] * off[i]
+            mean_p += by_pitch[i]
+            mean_r += by_roll[i]
+            mean_off += off[i]
+            mean_variance += variance[i]
+        if lines == 0:
+            continue
+        mean_p /= lines
+        mean_r /= lines
+        mean_off /= lines
+        # The lines of an edge share what it tells.
+        mean_variance /= lines * lines
+        determinant = other_pp * other_rr - other_pr * other_pr
+        own_pp = other_rr / determinant
+        own_pr = -other_pr / determinant
+        own_rr = other_pp / determinant
+        change_p = -(own_pp * other_p + own_pr * other_r)
+        change_r = -(own_pr * other_p + own_rr * other_r)
+        # How the others predict the inclination of this one.
+        left = mean_off + mean_p * change_p + mean_r * change_r
+        predicted = (
+            mean_variance
+            + mean_p * mean_p * own_pp
+            + 2.0 * mean_p * mean_r * own_pr
+            + mean_r * mean_r * own_rr
+        )
+        # Beyond that it is a stray.
+        exponent = min(0.5 * left * left / predicted, 50.0)
+        as_stray = 1.0 / (math.pi * stray * (1.0 + (left / stray) ** 2))
+        odds = share / (1.0 - share) * as_stray
+        odds *= math.sqrt(2.0 * math.pi * predicted) * math.exp(exponent)
+        total += odds
+        cover_pp += odds * (own_pp + change_p * change_p)
+        cover_pr += odds * (own_pr + change_p * change_r)
+        cover_rr += odds * (own_rr + change_r * change_r)
+    covariance = np.empty((2, 2))
+    covariance[0, 0] = cover_pp / total
+    covariance[0, 1] = cover_pr / total
+    covariance[1, 0] = covariance[0, 1]
+    covariance[1, 1] = cover_rr / total
+    return covariance
+
+
+@njit(cache=True, error_model="numpy")
 def agree_on_tilt(
     normal: NDArray[np.float64],
     variance: NDArray[np.float64],
     tolerance: NDArray[np.float64],
     weight: NDArray[np.float64],
+    edge: NDArray[np.int64],
     proposers: int,
     limit: float,
     prior: float,
     softening: float,
     repetitions: int,
+    stray_share: float,
+    stray: float,
 ) -> tuple[float, float, NDArray[np.float64], NDArray[np.bool_]]:
-    """The tilt that most lines vote for, refined; parameters and results as of these two.
+    """The tilt that most lines vote for, refined; parameters and results as of these three.
 
     Pairs of the `proposers` lines of the largest weight propose.
     """
     strongest = descending(weight)[:proposers]
     pitch, roll = vote_for_tilt(normal, tolerance, weight, strongest, limit, prior)
-    return refine_tilt(normal, variance, tolerance, pitch, roll, prior, softening, repetitions)
+    pitch, roll, covariance, agrees = refine_tilt(
+        normal, variance, tolerance, pitch, roll, prior, softening, repetitions
+    )
+    if stray_share > 0.0:
+        covariance = cover_strays(
+            normal, variance, edge, agrees, pitch, roll, prior, softening, stray_share, stray
+        )
+    return pitch, roll, covariance, agrees

@@ -6,10 +6,25 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.ndimage import gaussian_filter
 
-from detect.verticals.tilt import ConsensusSettings, TiltEstimate, consensus, lean, level_rotation
+from detect.line_settings import DEFAULT
+from detect.lines import detect_lines
+from detect.verticals.judgement_kernels import share_edges
+from detect.verticals.tilt import (
+    STRAY_RAD,
+    ConsensusSettings,
+    TiltEstimate,
+    consensus,
+    lean,
+    level_rotation,
+)
+from detect.verticals.tilt_kernels import agree_on_tilt, cover_strays
+from lut.verticals import build_vertical_table
+from tests.detect.line_scene import Edge, pinhole, render, tilted
 
 SETTINGS = ConsensusSettings()
+PRIOR_RAD, SOFTENING = SETTINGS.prior_rad, 2.0
 
 
 def seen_normals(
@@ -124,6 +139,172 @@ def test_lines_that_no_small_tilt_explains_give_none() -> None:
     )
     assert tilt is None or tilt.lines < len(normal)
     assert not consistent.all()
+
+
+def test_normalised_error_is_one_where_some_edges_are_strays() -> None:
+    """Of few edges one is often all that tells a part of the tilt, and now and then a stray."""
+    rng = np.random.default_rng(6)
+    count, tolerance = 6, np.radians(0.9)
+    known: list[float] = []
+    taken: list[float] = []
+    for _ in range(1500):
+        inclination = rng.normal(0.0, np.radians(0.05), count)
+        stray = rng.random(count) < SETTINGS.stray_share
+        leans = STRAY_RAD * rng.standard_cauchy(count)
+        inclination[stray] = np.where(np.abs(leans) < tolerance, leans, 0.0)[stray]
+        bearing = np.append(rng.uniform(-0.1, 0.1, count - 1), rng.uniform(0.3, 0.6))
+        normal = np.stack([np.cos(bearing), np.sin(bearing), inclination], axis=-1)
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        for share, squared in ((SETTINGS.stray_share, known), (0.0, taken)):
+            tilt, _ = consensus(
+                normal,
+                np.full(count, np.radians(0.03) ** 2),
+                np.full(count, tolerance),
+                np.full(count, 2.0),
+                ConsensusSettings(stray_share=share, building_rad=np.radians(0.04)),
+            )
+            assert tilt is not None
+            error = np.array([tilt.pitch_rad, tilt.roll_rad])
+            squared.append(error @ np.linalg.solve(tilt.covariance, error) / 2.0)
+    assert 0.7 < np.mean(known) < 1.5
+    assert np.quantile(known, 0.98) < 8.0
+    # What it would be if all were taken for verticals.
+    assert np.quantile(taken, 0.98) > 16.0
+
+
+def test_a_stray_that_others_contradict_changes_little() -> None:
+    """Where verticals stand all over the image, none of them is missed."""
+    rng = np.random.default_rng(7)
+    normal = seen_normals(rng, 20, (0.02, -0.01), np.full(20, np.radians(0.05)))
+    given = (
+        normal,
+        np.full(20, np.radians(0.05) ** 2),
+        np.full(20, np.radians(0.9)),
+        np.full(20, 2.0),
+    )
+    tilt, _ = consensus(*given, SETTINGS)
+    without, _ = consensus(*given, ConsensusSettings(stray_share=0.0))
+    assert tilt is not None
+    assert without is not None
+    assert (tilt.pitch_rad, tilt.roll_rad) == (without.pitch_rad, without.roll_rad)
+    ratio = np.linalg.det(tilt.covariance) / np.linalg.det(without.covariance)
+    assert 0.9 < ratio < 1.3
+
+
+@given(seed=st.integers(0, 2**31), share=st.floats(0.001, 0.4))
+@settings(max_examples=25, deadline=None)
+def test_covariance_with_strays_is_that_of_the_mixture(seed: int, share: float) -> None:
+    """Against sums over all edges but one, solved by themselves."""
+    rng = np.random.default_rng(seed)
+    count = 9
+    normal = seen_normals(rng, count, (0.03, 0.01), np.full(count, 2e-3))
+    variance = rng.uniform(1e-6, 9e-6, count)
+    edge = np.array([0, 0, 2, 3, 3, 5, 3, 7, 8])
+    agrees = rng.random(count) < 0.8
+    pitch, roll = 0.028, 0.012
+    turned = normal @ level_rotation(pitch, roll).T
+    slope = np.stack([turned[:, 1], -turned[:, 0]], axis=-1)
+    off, weight = turned[:, 2], 1.0 / (variance + (turned[:, 2] / SOFTENING) ** 2)
+
+    def solve(chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        h = slope[chosen]
+        information = (h.T * weight[chosen]) @ h + np.eye(2) / PRIOR_RAD**2
+        gradient = (h.T * weight[chosen]) @ off[chosen] + np.array([pitch, roll]) / PRIOR_RAD**2
+        covariance = np.linalg.inv(information)
+        return -covariance @ gradient, covariance
+
+    odds, deviations = [1.0], [solve(agrees)[1]]
+    for first in np.unique(edge[agrees]):
+        own = agrees & (edge == first)
+        change, covariance = solve(agrees & ~own)
+        mean = slope[own].mean(axis=0)
+        left = off[own].mean() + mean @ change
+        predicted = variance[own].sum() / own.sum() ** 2 + mean @ covariance @ mean
+        as_vertical = np.exp(-0.5 * left**2 / predicted) / np.sqrt(2.0 * np.pi * predicted)
+        as_stray = 1.0 / (np.pi * STRAY_RAD * (1.0 + (left / STRAY_RAD) ** 2))
+        odds.append(share / (1.0 - share) * as_stray / as_vertical)
+        deviations.append(covariance + np.outer(change, change))
+    expected = np.average(deviations, axis=0, weights=odds)
+    covered = cover_strays(
+        normal, variance, edge, agrees, pitch, roll, PRIOR_RAD, SOFTENING, share, STRAY_RAD
+    )
+    np.testing.assert_allclose(covered, expected, rtol=1e-6)
+
+
+def test_lines_of_one_edge_tell_as_much_as_one() -> None:
+    rng = np.random.default_rng(8)
+    bearing = rng.uniform(-0.6, 0.6, 8)
+    lean_ = rng.normal(0.0, 1e-3, 8)
+    twice = np.repeat(np.arange(8), 2)
+    place = bearing[twice] + np.tile([0.0, 1e-3], 8)
+
+    def told(place: np.ndarray, which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        count = len(place)
+        variance, weight = np.full(count, 1e-6), np.full(count, 2.0)
+        edge = share_edges(
+            place,
+            np.full(count, 1e-3),
+            np.zeros((count, 2)),
+            np.ones(count),
+            rng.uniform(10.0, 20.0, count),
+            np.arange(count),
+            DEFAULT.same_edge_px,
+            variance,
+            weight,
+        )
+        normal = np.stack([np.cos(bearing), np.sin(bearing), -lean_], axis=-1)[which]
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        tolerance = np.full(count, 0.015)
+        pitch, roll, covariance, _ = agree_on_tilt(
+            normal, variance, tolerance, weight, edge, 24, 0.1, PRIOR_RAD, SOFTENING, 6,
+            SETTINGS.stray_share, STRAY_RAD,
+        )  # fmt: skip
+        assert weight.sum() == pytest.approx(16.0)
+        return np.array([pitch, roll]), covariance
+
+    once, covariance = told(bearing, np.arange(8))
+    both, of_both = told(place, twice)
+    # Softened, lines of twice the variance pull a little more evenly.
+    np.testing.assert_allclose(both, once, atol=0.2 * np.sqrt(covariance[1, 1]))
+    np.testing.assert_allclose(np.sqrt(np.diag(of_both)), np.sqrt(np.diag(covariance)), rtol=0.2)
+
+
+def test_edges_of_other_polarity_or_farther_away_are_not_the_same() -> None:
+    variance, weight = np.full(5, 1e-6), np.full(5, 3.0)
+    edge = share_edges(
+        np.array([0.0, 1e-3, 1e-3, 4e-3, 4.5e-3]),
+        np.full(5, 1e-3),
+        np.zeros((5, 2)),
+        np.array([1.0, 1.0, -1.0, 1.0, 1.0]),
+        np.array([10.0, 12.0, 30.0, 9.0, 8.0]),
+        np.arange(5),
+        DEFAULT.same_edge_px,
+        variance,
+        weight,
+    )
+    np.testing.assert_array_equal(edge, [0, 0, 2, 3, 3])
+    np.testing.assert_allclose(variance, [2e-6, 2e-6, 1e-6, 2e-6, 2e-6])
+    np.testing.assert_allclose(weight, [1.5, 1.5, 3.0, 1.5, 1.5])
+
+
+def test_blurred_edges_among_texture_do_not_overstate_the_tilt() -> None:
+    """What stands beside an edge is alike on several rows, and pulls at all of them."""
+    camera = pinhole(320, 160, 200.0, pitch_deg=10.0, row_aspect=2.0)
+    table = build_vertical_table(camera)
+    rng = np.random.default_rng(9)
+    squared = []
+    for _ in range(24):
+        true = np.radians(rng.uniform(-1.5, 1.5, 2))
+        bearings = np.linspace(-0.55, 0.55, 7) + rng.uniform(-0.05, 0.05, 7)
+        edges = [Edge(b, 60.0 * (-1.0) ** i) for i, b in enumerate(bearings)]
+        image = render(tilted(camera, true[0], true[1]), edges, blur_px=2.5)
+        texture = gaussian_filter(rng.normal(0.0, 1.0, image.shape), (1.0, 0.7))
+        texture *= 2.5 / texture.std()
+        found = detect_lines(np.clip(np.rint(image + texture), 0, 255).astype(np.uint8), table)
+        assert found.tilt is not None
+        error = np.array([found.tilt.pitch_rad, found.tilt.roll_rad]) - true
+        squared.append(error @ np.linalg.solve(found.tilt.covariance, error) / 2.0)
+    assert 0.4 < np.mean(squared) < 1.6
 
 
 def test_lean_is_what_a_tilted_camera_sees() -> None:
