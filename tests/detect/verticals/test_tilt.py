@@ -165,7 +165,7 @@ def test_normalised_error_is_one_where_some_edges_are_strays() -> None:
             )
             assert tilt is not None
             error = np.array([tilt.pitch_rad, tilt.roll_rad])
-            squared.append(error @ np.linalg.solve(tilt.covariance, error) / 2.0)
+            squared.append(float(error @ np.linalg.solve(tilt.covariance, error)) / 2.0)
     assert 0.7 < np.mean(known) < 1.5
     assert np.quantile(known, 0.98) < 8.0
     # What it would be if all were taken for verticals.
