@@ -234,10 +234,8 @@ def cover_strays(
     """
     count = len(variance)
     rotation = level_matrix(pitch, roll)
-    by_pitch = np.empty(count)
-    by_roll = np.empty(count)
-    off = np.empty(count)
-    weight = np.empty(count)
+    # What the lines of each edge add to the information, and sums over them.
+    sums = np.zeros((count, 10))
     pp = 1.0 / (prior * prior)
     pr = 0.0
     rr = pp
@@ -253,52 +251,45 @@ def cover_strays(
             x += rotation[0, k] * normal[i, k]
             y += rotation[1, k] * normal[i, k]
             z += rotation[2, k] * normal[i, k]
-        by_pitch[i] = y
-        by_roll[i] = -x
-        off[i] = z
-        weight[i] = 1.0 / (variance[i] + (z / softening) ** 2)
-        pp += weight[i] * y * y
-        pr -= weight[i] * y * x
-        rr += weight[i] * x * x
-        gradient_p += weight[i] * y * z
-        gradient_r -= weight[i] * x * z
+        weight = 1.0 / (variance[i] + (z / softening) ** 2)
+        own = sums[edge[i]]
+        own[0] += weight * y * y
+        own[1] -= weight * y * x
+        own[2] += weight * x * x
+        own[3] += weight * y * z
+        own[4] -= weight * x * z
+        own[5] += y
+        own[6] -= x
+        own[7] += z
+        own[8] += variance[i]
+        own[9] += 1.0
+    for first in range(count):
+        pp += sums[first, 0]
+        pr += sums[first, 1]
+        rr += sums[first, 2]
+        gradient_p += sums[first, 3]
+        gradient_r += sums[first, 4]
     total = 1.0
     determinant = pp * rr - pr * pr
     cover_pp = rr / determinant
     cover_pr = -pr / determinant
     cover_rr = pp / determinant
     for first in range(count):
-        # All but this edge.
-        lines = 0
-        other_pp = pp
-        other_pr = pr
-        other_rr = rr
-        other_p = gradient_p
-        other_r = gradient_r
-        mean_p = 0.0
-        mean_r = 0.0
-        mean_off = 0.0
-        mean_variance = 0.0
-        for i in range(first, count):
-            if edge[i] != first or not agrees[i]:
-                continue
-            lines += 1
-            other_pp -= weight[i] * by_pitch[i] * by_pitch[i]
-            other_pr -= weight[i] * by_pitch[i] * by_roll[i]
-            other_rr -= weight[i] * by_roll[i] * by_roll[i]
-            other_p -= weight[i] * by_pitch[i] * off[i]
-            other_r -= weight[i] * by_roll[i] * off[i]
-            mean_p += by_pitch[i]
-            mean_r += by_roll[i]
-            mean_off += off[i]
-            mean_variance += variance[i]
-        if lines == 0:
+        own = sums[first]
+        lines = own[9]
+        if lines == 0.0:
             continue
-        mean_p /= lines
-        mean_r /= lines
-        mean_off /= lines
+        # All but this edge.
+        other_pp = pp - own[0]
+        other_pr = pr - own[1]
+        other_rr = rr - own[2]
+        other_p = gradient_p - own[3]
+        other_r = gradient_r - own[4]
+        mean_p = own[5] / lines
+        mean_r = own[6] / lines
+        mean_off = own[7] / lines
         # The lines of an edge share what it tells.
-        mean_variance /= lines * lines
+        mean_variance = own[8] / (lines * lines)
         determinant = other_pp * other_rr - other_pr * other_pr
         own_pp = other_rr / determinant
         own_pr = -other_pr / determinant
