@@ -64,6 +64,7 @@ _BOUNDS = {
     **dict.fromkeys(("threshold", "guided_pull"), SHARE_ABOVE_0),
     "start_spacing_rows": whole(1),
     "least_rows": whole(5),
+    "blurred_sharpness": from_to(0.0, 1.0),
     "least_lines": whole(2),
     "stray_share": from_to(0.0, 0.5),
     "proposers": whole(2, 1000),
@@ -166,6 +167,11 @@ class LineSettings:
         dropped: they are what light does beside an edge.
     sigma_px : float
         Standard deviation of an edge about the line of the building that it stands for.
+    blurred_sharpness : float
+        Images whose edges have less sharpness than this (the median) are looked at once more,
+    blurred_widths : tuple of float
+        with a filter so many times as wide as it is set, whichever of these suits the blur (see
+        `detect.verticals.blur`); none: never.
     alpha : "level" or "published"
         Bearings compensated for the tilt, or with the sign that the data set's own rows have.
     """
@@ -217,6 +223,8 @@ class LineSettings:
     shoulder_px: float = 5.0
     shoulder_share: float = 0.5
     sigma_px: float = 0.9
+    blurred_sharpness: float = 0.64
+    blurred_widths: tuple[float, ...] = (1.5, 2.0, 3.0, 4.0, 6.0)
     alpha: BearingConvention = "level"
 
     def __post_init__(self) -> None:
@@ -224,6 +232,8 @@ class LineSettings:
         for scale, farthest in self.refine_steps_px:
             _expect(0.3 <= scale < 20.0, "refine_steps_px", scale, "a width of 0.3 to 20")
             _expect(farthest >= 0.0, "refine_steps_px", farthest, "a distance of 0 or more")
+        for width in self.blurred_widths:
+            _expect(1.0 < width <= 10.0, "blurred_widths", width, "a number above 1, at most 10")
 
     def least_points(self, row_aspect: float) -> int:
         """Least number of points of a line, given the height of a row in widths of a pixel."""
@@ -277,6 +287,7 @@ PUBLISHED = LineSettings(
     stray_share=0.0,
     join_share=0.0,
     sigma_px=1.0,
+    blurred_widths=(),
     alpha="published",
 )
 

@@ -12,7 +12,8 @@ The path of an image, each step a function of its own:
 
 The first time is left out where the starts themselves, of which an edge has one on each of several
 rows, leave no doubt about the tilt (`detect.verticals.chain_kernels`); a few edges will do if these
-leave none.
+leave none. Where all edges turn out to be blurred, everything is done again with filters as wide as
+the blur (`detect.verticals.blur`).
 `detect_lines` goes it in one compiled call (`detect.verticals.image_kernels`).
 """
 
@@ -27,6 +28,7 @@ from numpy.typing import NDArray
 
 from detect.errors import FrameError
 from detect.line_settings import DEFAULT, LineSettings
+from detect.verticals.blur import widened, width_for
 from detect.verticals.detections import LineDetections
 from detect.verticals.filter import LineFilter, line_filter, start_band
 from detect.verticals.fit import LineFits
@@ -94,7 +96,11 @@ def detect_lines(
         )
     image = np.ascontiguousarray(image)
     window, told = _told_beforehand(table, settings)
-    return LineDetections(_kernel()(image, padded_pixels(image, window), *told))
+    found = LineDetections(_kernel()(image, padded_pixels(image, window), *told))
+    if settings.blurred_widths and found.sharpness < settings.blurred_sharpness:
+        wider = widened(settings, width_for(found.sharpness, settings))
+        return detect_lines(image, table, wider)
+    return found
 
 
 @cache
@@ -130,6 +136,7 @@ def _told_beforehand(
         settings.consensus.building_rad if level else math.inf,
         band.supported,
         band.supported and 2.0 * settings.start_band_rows * table.row_aspect >= _BAND_PX,
+        settings.blurred_sharpness if settings.blurred_widths else 0.0,
     )
     of_chains = (_CHAINS, _FIRST_VOTES, _FIRST_LEAN_RAD)
     # A track follows a lean that is wrong by so much that what it yields in a row makes up for it.

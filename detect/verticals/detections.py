@@ -32,8 +32,8 @@ class LineDetections:
     numbers : (K,) float64
         Counts of tracks, points, lines and members; the tilt's numbers; then, as far as they are
         told below, lines, members and where those of each line begin, evidence, fates, fits,
-        polarities and bounds of tracks, rows, columns and scores of their points. Compiled code
-        returns one array in the time that it takes to return any.
+        polarities and bounds of tracks, rows, columns and scores of their points; last the
+        sharpness. Compiled code returns one array in the time that it takes to return any.
     """
 
     numbers: FloatArray
@@ -105,6 +105,11 @@ class LineDetections:
         own = self._parts[2].astype(np.int64).tolist()
         at = self._parts[3].astype(np.int64).tolist()
         return tuple(tuple(own[a:b]) for a, b in pairwise(at))
+
+    @property
+    def sharpness(self) -> float:
+        """Median sharpness of the edges (`detect.verticals.blur_kernels.median_sharpness`)."""
+        return float(self.numbers[-1])
 
     @cached_property
     def tilt(self) -> TiltEstimate | None:

@@ -10,6 +10,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from detect.verticals.blur_kernels import median_sharpness
 from detect.verticals.chain_kernels import tilt_of_chains
 from detect.verticals.detections import COUNTS
 from detect.verticals.follow_kernels import follow_edges
@@ -147,6 +148,10 @@ def find_lines(
             score, few_half if few else half, few_begin_of if few else begin_of, height_weights,
             first_weights, second_weights, few_farthest if few else farthest, limits,
         )  # fmt: skip
+        sharpness = median_sharpness(fits)
+        if sharpness < following[15]:
+            # All of it will be done again with wider filters.
+            break
         enough = every
         if few and not beyond_doubt(tilt, doubt):
             continue
@@ -164,7 +169,7 @@ def find_lines(
     )  # fmt: skip
     return _together(
         polarity, bounds, row, column, score, fits, evidence, fate, tilt, members, member_bounds,
-        lines,
+        lines, sharpness,
     )  # fmt: skip
 
 
@@ -204,11 +209,12 @@ def _together(
     members: NDArray[np.int64],
     member_bounds: NDArray[np.int64],
     lines: NDArray[np.float64],
+    sharpness: float,
 ) -> NDArray[np.float64]:
     tracks, points = len(polarity), len(row)
     total = (
         COUNTS + len(tilt) + 4 * tracks + 1 + len(fits) + 3 * points
-        + len(members) + len(member_bounds) + lines.size
+        + len(members) + len(member_bounds) + lines.size + 1
     )  # fmt: skip
     numbers = np.empty(total)
     numbers[0] = tracks
@@ -236,4 +242,5 @@ def _together(
         numbers[at + i] = row[i]
         numbers[at + points + i] = column[i]
         numbers[at + 2 * points + i] = score[i]
+    numbers[total - 1] = sharpness
     return numbers

@@ -1,0 +1,86 @@
+"""Images whose edges are all blurred: how much, and the settings that suit them.
+
+Turning robots and soft optics blur all edges of an image alike. Where the blur is wider than the
+filter, an edge has no one steepest place: what turning makes of a step is a ramp, the same all
+over, and tracks wander in it. A filter as wide as the blur finds the middle of it again.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from functools import lru_cache
+
+from detect.line_settings import LineSettings
+
+#: A filter of this share of the blur's width is wide enough.
+_WIDE_ENOUGH = 0.68
+#: Refinement has no steps wider than this, pixels.
+_WIDEST_STEP_PX = 19.0
+#: What grows with the width of the filter: pixels across an edge. A line's standard deviation is
+#: among it: what stands beside an edge within the blur draws it by some part of that.
+_ACROSS = (
+    "sigma_across_px", "guided_reach_px", "fine_scale_px", "coarse_scale_px",
+    "largest_scatter_px", "largest_shift_px", "largest_noise_px", "bend_px", "largest_lean_px",
+    "same_edge_px", "join_px", "shoulder_px", "sigma_px",
+)  # fmt: skip
+
+
+def blur_of_sharpness(sharpness: float, fine_px: float, coarse_px: float) -> float:
+    """Standard deviation of the Gaussian blur of a step edge that has some sharpness.
+
+    The derivative of a Gaussian of width s sees a step that is blurred by b with the contrast
+    s / sqrt(s^2 + b^2); sharpness is the ratio of that for two widths.
+
+    Parameters
+    ----------
+    sharpness : float
+        From fine_px / coarse_px, for endless blur, to 1.
+    fine_px, coarse_px : float
+        The widths, pixels.
+
+    Returns
+    -------
+    float
+        Pixels; infinite for less sharpness than endless blur leaves.
+    """
+    ratio = (sharpness * coarse_px / fine_px) ** 2
+    if ratio <= 1.0:
+        return math.inf
+    return math.sqrt(max(coarse_px**2 - ratio * fine_px**2, 0.0) / (ratio - 1.0))
+
+
+def width_for(sharpness: float, settings: LineSettings) -> float:
+    """How many times as wide as it is set the filter has to be for an image's edges.
+
+    Parameters
+    ----------
+    sharpness : float
+        Median sharpness of the edges (`detect.verticals.blur_kernels.median_sharpness`).
+    settings : LineSettings
+        By which they were found.
+
+    Returns
+    -------
+    float
+        The least of the settings' `blurred_widths` that suits the blur, or the largest.
+    """
+    blur_px = blur_of_sharpness(sharpness, settings.fine_scale_px, settings.coarse_scale_px)
+    enough = [
+        width
+        for width in settings.blurred_widths
+        if width * settings.sigma_across_px >= _WIDE_ENOUGH * blur_px
+    ]
+    return min(enough, default=max(settings.blurred_widths))
+
+
+@lru_cache(maxsize=32)
+def widened(settings: LineSettings, width: float) -> LineSettings:
+    """The same settings for edges so many times as wide, and what is wider still."""
+    across = {name: width * getattr(settings, name) for name in _ACROSS}
+    steps = tuple(
+        (min(width * scale, _WIDEST_STEP_PX), width * most)
+        for scale, most in settings.refine_steps_px
+    )
+    wider = tuple(other / width for other in settings.blurred_widths if other > width)
+    return dataclasses.replace(settings, refine_steps_px=steps, blurred_widths=wider, **across)
