@@ -223,7 +223,7 @@ class LineSettings:
     shoulder_px: float = 5.0
     shoulder_share: float = 0.5
     sigma_px: float = 0.9
-    blurred_sharpness: float = 0.64
+    blurred_sharpness: float = 0.62
     blurred_widths: tuple[float, ...] = (1.5, 2.0, 3.0, 4.0, 6.0)
     alpha: BearingConvention = "level"
 

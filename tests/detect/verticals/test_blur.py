@@ -67,7 +67,7 @@ def test_the_median_is_that_of_the_edges_that_were_refined() -> None:
 
 def test_filters_become_as_wide_as_the_blur() -> None:
     widths = DEFAULT.blurred_widths
-    told = [width_for(sharpness, DEFAULT) for sharpness in (0.63, 0.6, 0.56, 0.53, 0.51, 0.4)]
+    told = [width_for(sharpness, DEFAULT) for sharpness in (0.619, 0.6, 0.56, 0.53, 0.51, 0.4)]
     assert told == sorted(told)
     assert (told[0], told[-1]) == (widths[0], widths[-1])
     wider = widened(DEFAULT, 2.0)
