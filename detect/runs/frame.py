@@ -292,10 +292,10 @@ def rehearse(plan: FramePlan) -> None:
 
         discs = detect_circles(image, plan.camera, tables.discs, plan.circles)
         unknown_circles(discs.floor_xy, discs.quality, discs.covariance)
-        if plan.lines is not None:
-            from detect.levelling import levelled
+        # Tilts may come from a file as well.
+        from detect.levelling import levelled
 
-            levelled(discs, plan.camera, FrameTilt("rehearsal", 0.0, 0.0, 1e-6, 0.0, 1e-6, 0))
+        levelled(discs, plan.camera, FrameTilt("rehearsal", 0.0, 0.0, 1e-6, 0.0, 1e-6, 0))
     if plan.lines is not None and tables.verticals is not None:
         from detect.lines import detect_lines
 
