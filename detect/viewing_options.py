@@ -170,8 +170,8 @@ else:
             return Annotated[MaybeStr, arg(metavar="VALUES", help=f"Values of {name}.")]
 
         names = {f.name: None for kind in (CircleSettings, LineSettings) for f in fields(kind)}
-        # Pairs of numbers are no values of a grid.
-        del names["refine_steps_px"]
+        # Several numbers are no value of a grid.
+        del names["refine_steps_px"], names["blurred_widths"]
         return make_dataclass(
             "Grid",
             [(name, values_of(name), field(default=None)) for name in names],

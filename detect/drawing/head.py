@@ -17,7 +17,8 @@ from storage.messages import excerpt
 
 # The head is what stands before the first row; nobody writes so much.
 _LONGEST_BYTES = 1 << 16
-_STEPS = "refine_steps_px"
+#: Settings that are several numbers.
+_PAIRS, _LIST = "refine_steps_px", "blurred_widths"
 _NUMBERS = re.compile(r"[^(),]+")
 
 
@@ -105,15 +106,21 @@ def read_head(path: Path) -> FileHead:
 
 
 def _line_values(settings: Iterable[tuple[str, str]]) -> dict[str, Any]:
-    """As `_values`, of `LineSettings`; of its pairs of numbers, too."""
-    singles = [entry for entry in settings if entry[0] != _STEPS]
+    """As `_values`, of `LineSettings`; of those that are several numbers, too."""
+    entries = list(settings)
+    singles = [entry for entry in entries if entry[0] not in (_PAIRS, _LIST)]
     values = _values(LineSettings, singles)
-    for text in [text for name, text in settings if name == _STEPS]:
+    for name, text in entries:
+        if name not in (_PAIRS, _LIST):
+            continue
+        expected = "pairs of numbers" if name == _PAIRS else "numbers"
         try:
             numbers = [float(word) for word in _NUMBERS.findall(text)]
-            values[_STEPS] = tuple(zip(numbers[::2], numbers[1::2], strict=True))
+            values[name] = tuple(numbers)
+            if name == _PAIRS:
+                values[name] = tuple(zip(numbers[::2], numbers[1::2], strict=True))
         except ValueError:
-            raise DetectError(f"{_STEPS} is {excerpt(text)}: expected pairs of numbers") from None
+            raise DetectError(f"{name} is {excerpt(text)}: expected {expected}") from None
     return values
 
 

@@ -144,6 +144,7 @@ def test_settings_of_verticals_are_read_back(small_run: Path) -> None:
     assert settings.least_rows == 31
     assert settings.largest_shift_px == PUBLISHED_LINES.largest_shift_px
     assert settings.refine_steps_px == ()
+    assert settings.blurred_widths == ()
     assert main(["lines", str(small_run), "--force"]) == 0
     assert read_head(small_run / "detected.lines").line_settings == type(settings)()
 

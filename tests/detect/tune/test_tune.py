@@ -111,6 +111,7 @@ def test_values_of_a_parameter(name: str, text: str, expected: tuple[object, ...
         (CircleSettings, "least_rows", "1", "no parameter of CircleSettings"),
         (LineSettings, "radius_m", "1", "no parameter of LineSettings"),
         (LineSettings, "refine_steps_px", "1", "cannot be varied"),
+        (LineSettings, "blurred_widths", "2", "cannot be varied"),
         (CircleSettings, "threshold", "0.3:0.7", "FROM:TO:STEP"),
         (CircleSettings, "threshold", "0.7:0.3:0.1", "FROM:TO:STEP"),
         (CircleSettings, "threshold", "0.3:0.7:0", "FROM:TO:STEP"),
