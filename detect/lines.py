@@ -20,7 +20,7 @@ the blur (`detect.verticals.blur`).
 from __future__ import annotations
 
 import math
-from functools import cache, lru_cache
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -94,21 +94,15 @@ def detect_lines(
             f"image is {image.dtype} of shape {image.shape}: expected uint8 of the table's shape "
             f"{table.column.shape}"
         )
+    from detect.verticals.image_kernels import find_lines
+
     image = np.ascontiguousarray(image)
     window, told = _told_beforehand(table, settings)
-    found = LineDetections(_kernel()(image, padded_pixels(image, window), *told))
+    found = LineDetections(find_lines(image, padded_pixels(image, window), *told))
     if settings.blurred_widths and found.sharpness < settings.blurred_sharpness:
         wider = widened(settings, width_for(found.sharpness, settings))
         return detect_lines(image, table, wider)
     return found
-
-
-@cache
-def _kernel() -> Any:
-    """What does it all, loaded when it is first asked for."""
-    from detect.verticals.image_kernels import find_lines
-
-    return find_lines
 
 
 @lru_cache(maxsize=16)

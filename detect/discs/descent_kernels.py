@@ -34,7 +34,7 @@ from detect.discs.patch_kernels import (
     patch_in,
 )
 from detect.discs.step_kernels import gauss_newton_step, move
-from detect.discs.uncounted import uncounted
+from detect.uncounted import uncounted
 
 #: A step that promises less than this, in variances of the noise, is the last,
 _CONVERGED = 0.3

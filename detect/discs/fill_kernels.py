@@ -45,7 +45,7 @@ from detect.discs.patch_kernels import (
     Patch,
     padded,
 )
-from detect.discs.uncounted import uncounted
+from detect.uncounted import uncounted
 
 #: Numba knows them as types, the type checker as functions.
 _U32: Callable[[Any], Any] = np.uint32

@@ -36,7 +36,7 @@ from detect.discs.normal_kernels import factor_rows, solution
 from detect.discs.outline_kernels import correlated_area, outline_statistics, residuals
 from detect.discs.patch_kernels import FitSettings
 from detect.discs.step_kernels import gauss_newton_step, move
-from detect.discs.uncounted import uncounted
+from detect.uncounted import uncounted
 
 #: Columns of a result.
 X, Y, RADIUS, BLUR, CONTRAST = range(5)

@@ -11,7 +11,7 @@ from detect.discs.grid_kernels import gather_grid
 from detect.discs.list_kernels import gather_list, gather_sparse
 from detect.discs.model_kernels import CAPACITY
 from detect.discs.patch_kernels import COLUMNS, LIST, FitSettings, Patch, padded, view_of
-from detect.discs.uncounted import uncounted
+from detect.uncounted import uncounted
 
 #: How many pixels a fit uses.
 LOOK, EDGE, ALL = range(3)

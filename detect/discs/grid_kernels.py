@@ -39,7 +39,7 @@ from detect.discs.patch_kernels import (
     Patch,
     padded,
 )
-from detect.discs.uncounted import uncounted
+from detect.uncounted import uncounted
 
 _SMALLEST = F32(1e-6)
 _ONE, _TWO = np.uint64(1), np.uint64(2)

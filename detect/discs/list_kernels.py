@@ -21,8 +21,8 @@ from detect.discs.patch_kernels import (
     FitSettings,
     Patch,
 )
-from detect.discs.uncounted import uncounted
 from detect.discs.vector_kernels import lowest_bit
+from detect.uncounted import uncounted
 
 #: Numba knows them as types, the type checker as functions.
 _U8: Callable[[Any], Any] = np.uint8

@@ -115,10 +115,9 @@ def _line_values(settings: Iterable[tuple[str, str]]) -> dict[str, Any]:
             continue
         expected = "pairs of numbers" if name == _PAIRS else "numbers"
         try:
-            numbers = [float(word) for word in _NUMBERS.findall(text)]
-            values[name] = tuple(numbers)
-            if name == _PAIRS:
-                values[name] = tuple(zip(numbers[::2], numbers[1::2], strict=True))
+            numbers = tuple(float(word) for word in _NUMBERS.findall(text))
+            pairs = zip(numbers[::2], numbers[1::2], strict=True)
+            values[name] = tuple(pairs) if name == _PAIRS else numbers
         except ValueError:
             raise DetectError(f"{name} is {excerpt(text)}: expected {expected}") from None
     return values

@@ -7,9 +7,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache, lru_cache
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -23,7 +22,6 @@ from landmarks import FrameTilt, tilt_as_written
 from lut import DiscShape, DiscTable, VerticalTable, cached_disc_table, cached_vertical_table
 
 # Detectors are imported when they are asked for: loading them all takes a tenth of a second each.
-# And they are imported once: the statement by itself takes longer than what is done between them.
 if TYPE_CHECKING:
     from detect.circles import CircleDetections
     from detect.line_settings import LineSettings
@@ -131,32 +129,16 @@ def detect_frame(
     return seen_together(image, plan, lines, tilt, discs, markers)
 
 
-@cache
-def _detector_of_lines() -> Callable[
-    [NDArray[np.uint8], VerticalTable, LineSettings], LineDetections
-]:
-    from detect.lines import detect_lines
-
-    return detect_lines
-
-
-@cache
-def _detector_of_discs() -> Callable[
-    [NDArray[np.uint8], Camera, DiscTable, CircleSettings], CircleDetections
-]:
-    from detect.circles import detect_circles
-
-    return detect_circles
-
-
 def lines_in_image(
     image: NDArray[np.uint8], plan: FramePlan, tables: Tables
 ) -> LineDetections | None:
     """The lines of an image, if a plan asks for lines."""
     if plan.lines is None:
         return None
+    from detect.lines import detect_lines
+
     assert tables.verticals is not None
-    return _detector_of_lines()(image, tables.verticals, plan.lines)
+    return detect_lines(image, tables.verticals, plan.lines)
 
 
 def tilt_of_frame(
@@ -175,10 +157,12 @@ def discs_in_image(
     """
     if plan.circles is None:
         return None
+    from detect.circles import detect_circles
+
     assert tables.discs is not None
     assert plan.camera is not None
     settings = plan.circles if tilt is None else _without_tilt(plan.circles)
-    return _detector_of_discs()(image, plan.camera, tables.discs, settings)
+    return detect_circles(image, plan.camera, tables.discs, settings)
 
 
 @kept_for_latest

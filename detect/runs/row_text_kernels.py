@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from detect.discs.uncounted import uncounted
+from detect.uncounted import uncounted
 
 #: Powers of ten that a double holds exactly.
 _POWERS = np.array([10.0**k for k in range(23)])

@@ -12,7 +12,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from detect.verticals.group_kernels import MARGIN, STEP, respond, uncounted
+from detect.uncounted import uncounted_contracting
+from detect.verticals.group_kernels import MARGIN, STEP, respond
 from detect.verticals.vector_code import LANES
 
 #: Rows that are filtered ahead of a track.
@@ -26,7 +27,7 @@ def _top_of_parabola(left: np.float32, centre: np.float32, right: np.float32) ->
     return float(0.5 * (left - right) / bend) if bend < 0.0 else 0.0
 
 
-@uncounted
+@uncounted_contracting
 def _follow(
     pixels: NDArray[np.uint8],
     strip: NDArray[np.float32],

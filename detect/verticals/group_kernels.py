@@ -6,13 +6,10 @@ one of them. What the vectors do not reach, windows that are cut off, is done nu
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, TypeVar
-
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from detect.uncounted import uncounted_contracting
 from detect.verticals.filter_vector_kernels import (
     moments_across,
     moments_across_two,
@@ -26,27 +23,8 @@ from detect.verticals.vector_code import LANES, WORD
 STEP = 4
 MARGIN = 2
 
-_Kernel = TypeVar("_Kernel", bound=Callable[..., Any])
 
-
-def uncounted(kernel: _Kernel) -> _Kernel:
-    """Compile a kernel that makes no arrays, as a part of those that call it.
-
-    Else Numba counts references to each array in each call, even of a function that is inlined,
-    which takes longer than filtering a row.
-    """
-    options: Any = {
-        "cache": True,
-        "error_model": "numpy",
-        "fastmath": {"contract"},
-        "forceinline": True,
-        "_nrt": False,
-    }
-    compiled: _Kernel = njit(**options)(kernel)
-    return compiled
-
-
-@uncounted
+@uncounted_contracting
 def _cut_responses(
     strip: NDArray[np.float32],
     first_row: NDArray[np.int32],
@@ -87,7 +65,7 @@ def _cut_responses(
         response[to + lane] = cov * abs(cov) / (variance + regulariser)
 
 
-@uncounted
+@uncounted_contracting
 def _moments_of_rows(
     pixels: NDArray[np.uint8],
     strip: NDArray[np.float32],
@@ -117,7 +95,7 @@ def _moments_of_rows(
         )  # fmt: skip
 
 
-@uncounted
+@uncounted_contracting
 def respond(
     pixels: NDArray[np.uint8],
     strip: NDArray[np.float32],

@@ -11,7 +11,7 @@ from numba import njit
 from numba.core.errors import TypingError
 from numpy.typing import NDArray
 
-from detect.discs.uncounted import uncounted
+from detect.uncounted import uncounted
 
 
 class Pair(NamedTuple):
