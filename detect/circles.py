@@ -10,6 +10,7 @@ neighbours in the floor plane and refines the position.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
@@ -22,6 +23,7 @@ from camera.distortion import inverse_table
 from camera.kernels import camera_numbers, lens_numbers
 from camera.model import PUBLISHED_STEP_PX
 from detect.discs.candidate_kernels import strong_and_alone
+from detect.discs.centre_rows import CentreRows, centre_rows
 from detect.discs.centres import best_centres
 from detect.discs.centres import quality_of_centres as quality_of_centres
 from detect.discs.covariance_kernels import refined_covariances
@@ -104,8 +106,9 @@ def detect_circles(
             f"the image is {image.shape[1]}x{image.shape[0]} px: "
             f"the calibration is for {camera.width}x{camera.height}"
         )
+    centres = _looked_at(table)(settings)
     pixels, found_quality, contrast = best_centres(
-        image, table, settings.threshold, settings.polarity
+        image, centres.table, settings.threshold, settings.polarity, centres.rank
     )
     if not (settings.verify or settings.refine):
         weakest = 0.0
@@ -149,6 +152,23 @@ def detect_circles(
         quality=found_quality,
         evidence=evidence,
     )
+
+
+@kept_for_latest
+def _looked_at(table: DiscTable) -> Callable[[CircleSettings], CentreRows]:
+    """Which centres are looked at, by settings: all, unless whatever is found is fitted."""
+
+    def by_settings(settings: CircleSettings) -> CentreRows:
+        apart_m = 0.0
+        if settings.verify and settings.refine:
+            to_outline_m = min(
+                settings.radius_m - settings.inner_radius_m,
+                settings.outer_radius_m - settings.radius_m,
+            )
+            apart_m = settings.rows_apart * to_outline_m
+        return centre_rows(table, apart_m)
+
+    return kept_for_latest(by_settings)
 
 
 @kept_for_latest

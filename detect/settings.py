@@ -48,6 +48,10 @@ class CircleSettings:
         however far.
     polarity : {"any", "light", "dark"}
         Which discs to look for: lighter than the floor, darker, or both.
+    rows_apart : float
+        Where all that is found is fitted (`verify` and `refine`), so many rows of centres are left
+        out that none of a disc's is farther from one that is looked at than this share of the
+        distance between the disc's edge and the nearer outline; 0: every row is looked at.
     noise_floor : float
         Least contrast between the outlines, in standard deviations of the image's noise (or in
         grey levels, where the noise is less than one).
@@ -78,6 +82,7 @@ class CircleSettings:
     border_px: int = 12
     far_limit_m_per_px: float = 0.12
     polarity: Polarity = "any"
+    rows_apart: float = 0.75
     noise_floor: float = 3.0
     separation_m: float = 0.14
     verify: bool = True
@@ -98,6 +103,7 @@ class CircleSettings:
             samples=whole(3, 128),
             border_px=whole(0),
             far_limit_m_per_px=LIMIT,
+            rows_apart=from_to(0.0, 1.0),
             noise_floor=NOT_NEGATIVE,
             separation_m=NOT_NEGATIVE,
             evidence=FINITE,

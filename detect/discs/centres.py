@@ -6,6 +6,7 @@ Both functions say the same: one as a map, the other only its peaks above a thre
 from __future__ import annotations
 
 import threading
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -31,7 +32,11 @@ _ROOM = 4096
 
 
 def best_centres(
-    image: NDArray[np.uint8], table: DiscTable, threshold: float, polarity: Polarity = "any"
+    image: NDArray[np.uint8],
+    table: DiscTable,
+    threshold: float,
+    polarity: Polarity = "any",
+    rank: NDArray[np.int64] | None = None,
 ) -> tuple[NDArray[np.int64], FloatArray, NDArray[np.float32]]:
     """Local maxima of the quality: the peaks of `quality_of_centres`, without the map.
 
@@ -45,6 +50,9 @@ def best_centres(
         Least quality, above 0, at most 1.
     polarity : {"any", "light", "dark"}
         Centres of another polarity count as quality 0: they hide no maximum next to them.
+    rank : (H,) int64, optional
+        Of each row of the image: rows whose ranks differ by 1 are neighbours. By default each row
+        is the neighbour of the next one.
 
     Returns
     -------
@@ -64,6 +72,7 @@ def best_centres(
     space = _working_space(image.size, table.samples)
     arguments = _kernel_arguments(image, table, space.pixels)
     room = space.columns, space.rows, space.quality, space.contrast
+    rank = _all_rows(len(image)) if rank is None else rank
     full: list[tuple[NDArray[Any], ...]] = []
     block, count = 0, 0
     while True:
@@ -77,8 +86,8 @@ def best_centres(
     if full:
         full.append(tuple([values[:count] for values in room]))
         columns, rows, quality, contrast = (np.concatenate(values) for values in zip(*full))
-        return highest(columns, rows, quality, contrast, len(columns))
-    return highest(*room, count)
+        return highest(columns, rows, quality, contrast, len(columns), rank)
+    return highest(*room, count, rank)
 
 
 def quality_of_centres(
@@ -112,6 +121,11 @@ def quality_of_centres(
     contrast = np.zeros(image.shape, np.float32)
     quality_map(*arguments, *working_memory(table.samples), quality, contrast)
     return quality, contrast
+
+
+@lru_cache(maxsize=4)
+def _all_rows(height: int) -> NDArray[np.int64]:
+    return np.arange(height)
 
 
 class _WorkingSpace(NamedTuple):

@@ -58,9 +58,16 @@ def highest(
     quality: NDArray[np.float64],
     contrast: NDArray[np.float32],
     count: int,
+    rank: NDArray[np.int64],
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float32]]:
-    """The `maxima` among the first `count` of some pixels: (M, 2) u and v, quality, contrast."""
-    index = maxima(columns[:count], rows[:count], quality[:count])
+    """The `maxima` among the first `count` of some pixels: (M, 2) u and v, quality, contrast.
+
+    `rank` says which rows are neighbours: those whose ranks differ by 1.
+    """
+    ranks = np.empty(count, np.int64)
+    for i in range(count):
+        ranks[i] = rank[rows[i]]
+    index = maxima(columns[:count], ranks, quality[:count])
     pixels = np.empty((len(index), 2), np.int64)
     own_quality = np.empty(len(index))
     own_contrast = np.empty(len(index), np.float32)

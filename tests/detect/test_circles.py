@@ -438,7 +438,7 @@ def test_mirrored_discs_are_refined_alike(published_camera: Camera, seed: int) -
     largest = np.abs(found.covariance).max(axis=(1, 2))
     turned = np.abs(back.covariance[partner] - found.covariance).max(axis=(1, 2))
     assert np.all(turned < 0.2 * largest)
-    np.testing.assert_allclose(back.quality[partner], found.quality, rtol=0.0, atol=0.005)
+    np.testing.assert_allclose(back.quality[partner], found.quality, rtol=0.0, atol=0.02)
 
 
 def test_tilt_jacobian_is_how_positions_move(published_camera: Camera) -> None:

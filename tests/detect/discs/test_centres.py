@@ -217,12 +217,15 @@ def test_maps_and_best_centres_at_full_size(preset: CircleSettings, project_root
 def test_landmarks_are_those_of_plain_centres(
     preset: CircleSettings, project_root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    preset = dataclasses.replace(preset, rows_apart=0.0)
     table, outlines = both(PUBLISHED_CAMERA, disc_shape(preset))
     image = demo_images(project_root)[0]
     found = detect_circles(image, PUBLISHED_CAMERA, table, preset)
     assert len(found) > 5
 
-    def plain(image: GreyImage, table: DiscTable, threshold: float, polarity: Polarity) -> Found:
+    def plain(
+        image: GreyImage, table: DiscTable, threshold: float, polarity: Polarity, rank: object
+    ) -> Found:
         return plain_best_centres(image, outlines, threshold, polarity)
 
     monkeypatch.setattr(detect.circles, "best_centres", plain)

@@ -1,0 +1,111 @@
+"""Which rows of centres are looked at where whatever looks like a disc there is fitted anyway.
+
+The quality of a large disc's centre is also that of the centres round it: as long as one outline is
+on the disc and the other off it. A fit finds the same disc from each of them, so it is enough to
+look at some rows.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lut import DiscTable
+from lut.kernels import BLOCK
+
+
+class CentreRows(NamedTuple):
+    """Some rows of a table's centres.
+
+    Attributes
+    ----------
+    table : DiscTable
+        With the blocks of these rows alone.
+    rank : (H,) int64
+        Of each row of the image: which of the rows looked at it is. Neighbours differ by 1.
+    """
+
+    table: DiscTable
+    rank: NDArray[np.int64]
+
+
+@lru_cache(maxsize=4)
+def centre_rows(table: DiscTable, apart_m: float) -> CentreRows:
+    """Rows of centres that are so close that no centre between them is far from one of them.
+
+    Parameters
+    ----------
+    table : DiscTable
+        Of all centres.
+    apart_m : float
+        How far on the floor that may be, seen as a row of the image sees it, metres; 0 for all
+        rows.
+
+    Returns
+    -------
+    CentreRows
+    """
+    height = len(table.floor_xy)
+    rows = _rows_apart(_farthest_step(table, apart_m))
+    rank = np.zeros(height, np.int64)
+    rank[rows] = 1
+    rank = np.cumsum(rank)
+    looked_at = np.zeros(height, np.bool_)
+    looked_at[rows] = True
+    blocks = np.flatnonzero(looked_at[table.block_row])
+    if len(blocks) == len(table.block_row):
+        return CentreRows(table, rank)
+    first, end = table.block_copies[blocks], table.block_copies[blocks + 1]
+    bounds = np.concatenate([[0], np.cumsum(end - first)])
+    # Copy k of the blocks left is copy k + (where its block began - where it begins now).
+    source = np.arange(bounds[-1]) + np.repeat(first - bounds[:-1], end - first)
+    return CentreRows(
+        DiscTable(
+            samples=table.samples,
+            copies=table.copies[source],
+            block_copies=bounds,
+            block_row=table.block_row[blocks],
+            block_column=table.block_column[blocks],
+            block_pattern=table.block_pattern[blocks],
+            patterns=table.patterns,
+            floor_xy=table.floor_xy,
+        ),
+        rank,
+    )
+
+
+def _farthest_step(table: DiscTable, apart_m: float) -> NDArray[np.int64]:
+    """(H,) how far from one row to the next, by the usable centre where a circle is flattest."""
+    floor = table.floor_xy
+    height, width = floor.shape[:2]
+    step = np.ones(height, np.int64)
+    if apart_m <= 0.0:
+        return step
+    flattest = np.full(height, np.inf)
+    column = np.minimum(table.block_column[:, None] + np.arange(0, BLOCK, 8), width - 2)
+    row = np.broadcast_to(np.clip(table.block_row, 1, height - 2)[:, None], column.shape)
+    column = np.maximum(column, 1)
+    by_u = floor[row, column + 1].astype(np.float64) - floor[row, column - 1]
+    by_v = floor[row + 1, column].astype(np.float64) - floor[row - 1, column]
+    area = np.abs(by_u[..., 0] * by_v[..., 1] - by_u[..., 1] * by_v[..., 0])
+    half_height = 2.0 * apart_m * np.hypot(by_u[..., 0], by_u[..., 1]) / area
+    usable = np.isfinite(half_height)
+    np.minimum.at(flattest, row[usable], half_height[usable])
+    known = np.isfinite(flattest)
+    step[known] = np.maximum(1, np.floor(2.0 * flattest[known])).astype(np.int64)
+    return step
+
+
+def _rows_apart(step: NDArray[np.int64]) -> list[int]:
+    """Rows from the first on, none farther from the next than any row between them allows."""
+    rows = [0]
+    while rows[-1] < len(step) - 1:
+        row = rows[-1]
+        apart = 1
+        while row + apart + 1 < len(step) and step[row + 1 : row + apart + 2].min() > apart:
+            apart += 1
+        rows.append(row + apart)
+    return rows
