@@ -17,7 +17,7 @@ from detect.discs.quality_kernels import suppress_neighbours
 #: Candidates of a lower quality than this are looked at only if the grey value steps in this share
 #: of the directions, by this share of the contrast.
 CLEAR_QUALITY = 0.55
-_LEAST_STEPS = 0.85
+_LEAST_STEPS = 0.9
 _LEAST_STEP = 0.25
 _DIRECTIONS = np.array([[math.cos(k * math.pi / 8), math.sin(k * math.pi / 8)] for k in range(16)])
 
