@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future
-from contextlib import AbstractContextManager, ExitStack
+from contextlib import AbstractContextManager, ExitStack, closing
 from dataclasses import dataclass
 from itertools import islice
 
@@ -55,7 +55,16 @@ class Workers:
 def detect_frames(
     tasks: Iterable[FrameTask], plan: FramePlan, workers: Workers
 ) -> Generator[FrameRows, None, None]:
-    """Work on frames.
+    """The frames of `detect_chunks`, one by one."""
+    with closing(detect_chunks(tasks, plan, workers)) as chunks:
+        for chunk in chunks:
+            yield from chunk
+
+
+def detect_chunks(
+    tasks: Iterable[FrameTask], plan: FramePlan, workers: Workers
+) -> Generator[list[FrameRows], None, None]:
+    """Work on frames, some at a time.
 
     Parameters
     ----------
@@ -68,9 +77,10 @@ def detect_frames(
 
     Yields
     ------
-    FrameRows
-        One for each task, in their order. Close the generator (`contextlib.closing`) when it is not
-        asked for all of them: that ends the workers.
+    list of FrameRows
+        One for each task, in their order, as many at a time as a worker gives back. Close the
+        generator (`contextlib.closing`) when it is not asked for all of them: that ends the
+        workers.
 
     Raises
     ------
@@ -97,7 +107,7 @@ def detect_frames(
                 under_way.appendleft((chunk, None))
                 under_way = deque((c, None if crew.lost(f) else f) for c, f in under_way)
                 continue
-            yield from rows
+            yield rows
 
 
 def work_on_chunk(plan: FramePlan, chunk: Chunk) -> list[FrameRows]:

@@ -1,8 +1,9 @@
 """The files of a run while they grow, so that a run that ends early loses no finished frame.
 
-Every frame's rows are written at once to the parts of the files (`storage.parts`), then noted in
-the journal (`detect.runs.resume_journal`). However a run ends, by a signal, a full disk, workers
-that are gone, what is noted is there, and a run that resumes goes on after it:
+The rows of the frames that a worker gives back together are written at once to the parts of the
+files (`storage.parts`), then noted in the journal (`detect.runs.resume_journal`). However a run
+ends, by a signal, a full disk, workers that are gone, what is noted is there, and a run that
+resumes goes on after it:
 
     journal fits program, settings, camera  ->  its frames are those of the run  ->  the rows are
     those that it noted  ->  the parts are cut off after the last of them, and grow on
@@ -34,6 +35,7 @@ from detect.runs.resume_journal import (
     checked,
     journal_place,
     left_journal,
+    line_of_frame,
     made_by,
     new_journal,
     task_digest,
@@ -73,7 +75,7 @@ class RunFiles:
     ) -> None:
         self._conduct = conduct
         self._overwrite = overwrite
-        self._frames = self._failed = self._taken_over = 0
+        self._frames = self._failed = self._taken_over = self._noted = 0
         self._check = self._made_by = made_by(outputs, plan, conduct)
         self._journal: Journal | None = None
         self._kept: Iterator[JournalLine] = iter(())
@@ -248,7 +250,7 @@ class RunFiles:
             self._frames += 1
             self._failed += line.rows.error is not None
             yield line.rows
-        self._taken_over = self._frames
+        self._taken_over = self._noted = self._frames
         self._go_on_after(end)
 
     def _content_of(self, line: JournalLine) -> list[bytes] | None:
@@ -294,28 +296,37 @@ class RunFiles:
         """Whether the run that is resumed may have drawn the next frame before it ended."""
         return self._resumes and self._frames == self._taken_over
 
-    def add(self, rows: FrameRows) -> None:
-        """Write a frame.
+    def add(self, frames: Sequence[FrameRows]) -> None:
+        """Write frames, the next ones.
 
         Raises
         ------
         OSError
-            If it cannot be written; names the file.
+            If they cannot be written; names the file.
         FailedFrameError
-            If the frame could not be worked on, and every frame is demanded.
+            If one of them could not be worked on, and every frame is demanded.
         """
-        if rows.error is not None and self._conduct.strict:
-            self._discard()
-            raise FailedFrameError(rows.error)
-        prefix, task = self._under_way.popleft()
-        content = [file.rows(rows, prefix) for file in self._files]
-        for file, part in zip(self._files, content):
-            file.write(part)
+        content: list[list[bytes]] = [[] for _ in self._files]
+        noted = []
+        for rows in frames:
+            if rows.error is not None and self._conduct.strict:
+                self._discard()
+                raise FailedFrameError(rows.error)
+            prefix, task = self._under_way.popleft()
+            own = [file.rows(rows, prefix) for file in self._files]
+            for whole, part in zip(content, own):
+                whole.append(part)
+            if self._journal is not None:
+                lengths = tuple([len(part) for part in own])
+                self._check, line = line_of_frame(self._check, lengths, task, rows, own)
+                noted.append(line)
+            self._frames += 1
+            self._failed += rows.error is not None
+        for file, parts in zip(self._files, content):
+            file.write(b"".join(parts))
         if self._journal is not None:
-            lengths = tuple([len(part) for part in content])
-            self._check = self._journal.add(self._check, lengths, task, rows, content)
-        self._frames += 1
-        self._failed += rows.error is not None
+            self._journal.write(noted)
+            self._noted = self._frames
 
     def _rows_of(self, output: RunOutput) -> Callable[[FrameRows, str], bytes]:
         def rows_of(rows: FrameRows, _: str) -> bytes:
@@ -370,8 +381,8 @@ class RunFiles:
         for file in self._files:
             if file.part is not None:
                 file.part.close()
-        if self._frames:
-            _log.info("%d frames are kept: --resume goes on after them", self._frames)
+        if self._noted:
+            _log.info("%d frames are kept: --resume goes on after them", self._noted)
 
     def _is_worth_keeping(self, error: BaseException | None) -> bool:
         """Whether there is something, of this run or the one resumed, that can be gone on with."""
@@ -379,7 +390,7 @@ class RunFiles:
             return False  # somebody else was faster
         if not os.path.lexists(self._journal.place):
             return False  # it went with its folder
-        return self._frames > 0 or (self._resumes and not self._goes_on)
+        return self._noted > 0 or (self._resumes and not self._goes_on)
 
     def _discard(self) -> None:
         for file in self._files:

@@ -88,19 +88,9 @@ class Journal:
         """Write the first line."""
         self._write(_JSON.encode([head.made_by, list(head.parts), head.overwrite]).encode() + b"\n")
 
-    def add(
-        self,
-        before: str,
-        lengths: tuple[int, ...],
-        task: str,
-        rows: FrameRows,
-        content: list[bytes],
-    ) -> str:
-        """Write a line for a frame; returns its digest (see `checked`)."""
-        values = _encoded(lengths, task, rows)
-        check = _digest(before, values, content)
-        self._write(b'%b,"%b"]\n' % (values[:-1], check.encode()))
-        return check
+    def write(self, lines: list[bytes]) -> None:
+        """Write lines for frames (see `line_of_frame`)."""
+        self._write(b"".join(lines))
 
     def complete(self) -> None:
         """Note that the files are complete and on the disk: they only have to take their places."""
@@ -206,6 +196,15 @@ def made_by(outputs: Sequence[RunOutput], plan: FramePlan, conduct: Conduct) -> 
         [(output.part, output.head, output.tail, output.between) for output in outputs],
     )
     return hashlib.sha256(repr(values).encode("utf-8", "surrogateescape")).hexdigest()
+
+
+def line_of_frame(
+    before: str, lengths: tuple[int, ...], task: str, rows: FrameRows, content: list[bytes]
+) -> tuple[str, bytes]:
+    """The digest of a frame's line, as of `checked`, and the line."""
+    values = _encoded(lengths, task, rows)
+    check = _digest(before, values, content)
+    return check, b'%b,"%b"]\n' % (values[:-1], check.encode())
 
 
 def checked(

@@ -21,7 +21,7 @@ from typing import Literal, Protocol
 
 from detect.run import ImageRun
 from detect.runs.conduct import PLAIN, Conduct
-from detect.runs.dispatch import Workers, detect_frames
+from detect.runs.dispatch import Workers, detect_chunks
 from detect.runs.frame import FramePlan, tables_of
 from detect.runs.frame_rows import FrameRows, FrameTask
 from detect.runs.resume import RunFiles
@@ -188,17 +188,18 @@ def detect_run(
         left = files.left(tasks)
         if not run.frames.ships_images:
             left = stack.enter_context(closing(_ahead(left)))
-        found = stack.enter_context(closing(detect_frames(left, plan, workers)))
-        for rows in found:
-            if pictures is not None:
-                redraw = overwrite or files.may_be_drawn_already
-                for name, picture in rows.pictures:
-                    with write_whole(pictures / name, overwrite=redraw) as stream:
-                        stream.write(picture)
-            files.add(rows)
-            summary.add(rows)
-            if on_progress is not None:
-                on_progress()
+        found = stack.enter_context(closing(detect_chunks(left, plan, workers)))
+        for chunk in found:
+            # A frame whose picture is there is noted before the next picture is.
+            for frames in [chunk] if pictures is None else [[rows] for rows in chunk]:
+                if pictures is not None:
+                    redraw = overwrite or files.may_be_drawn_already
+                    _write_pictures(frames, pictures, overwrite=redraw)
+                files.add(frames)
+                for rows in frames:
+                    summary.add(rows)
+                    if on_progress is not None:
+                        on_progress()
         summary.images_without_step = run.images_without_step
         files.finish(summary)
     return summary
@@ -235,6 +236,13 @@ def _ahead(tasks: Iterable[FrameTask]) -> Generator[FrameTask, None, None]:
     source = iter(tasks)
     while batch := tuple(islice(source, _TASKS_AHEAD)):
         yield from batch
+
+
+def _write_pictures(frames: Sequence[FrameRows], folder: Path, *, overwrite: bool) -> None:
+    for rows in frames:
+        for name, picture in rows.pictures:
+            with write_whole(folder / name, overwrite=overwrite) as stream:
+                stream.write(picture)
 
 
 @contextmanager

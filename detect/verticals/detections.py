@@ -39,7 +39,7 @@ class LineDetections:
     numbers: FloatArray
 
     def __len__(self) -> int:
-        return self._counts[2]
+        return int(self.numbers[2])
 
     @cached_property
     def _counts(self) -> tuple[int, int, int, int]:
@@ -60,13 +60,13 @@ class LineDetections:
             at += size
         return parts
 
-    @cached_property
+    @property
     def line_numbers(self) -> FloatArray:
         """(8, N) ends, bearings, inclinations and deviations, as told below, one after the other.
 
         The leftmost line is the first, here and elsewhere.
         """
-        count = self._counts[2]
+        count = len(self)
         at = COUNTS + TILT_NUMBERS
         return self.numbers[at : at + _LINE_NUMBERS * count].reshape(_LINE_NUMBERS, count)
 

@@ -83,11 +83,12 @@ class StopAfter:
         if self.frames == 0:
             os.kill(os.getpid(), signal.SIGSTOP)
 
-        def stopped(files: RunFiles, rows: FrameRows) -> None:
-            add(files, rows)
-            count[0] += 1
-            if count[0] == self.frames:
-                os.kill(os.getpid(), signal.SIGSTOP)
+        def stopped(files: RunFiles, frames: Sequence[FrameRows]) -> None:
+            for rows in frames:
+                add(files, [rows])
+                count[0] += 1
+                if count[0] == self.frames:
+                    os.kill(os.getpid(), signal.SIGSTOP)
 
         RunFiles.add = stopped  # type: ignore[method-assign, assignment]
 

@@ -14,7 +14,7 @@ import pytest
 from detect.run import RunFrame, open_run
 from detect.runs.frame import FramePlan, tables_of
 from detect.runs.frame_rows import FrameRows, FrameTask, rows_of_frames
-from detect.runs.resume_journal import Journal, JournalHead, new_journal
+from detect.runs.resume_journal import Journal, JournalHead, line_of_frame, new_journal
 from detect.settings import PUBLISHED
 from landmarks import FrameTilt
 
@@ -111,7 +111,9 @@ def test_a_journal_gives_back_what_was_noted(tmp_path: Path, rows: FrameRows) ->
     journal = new_journal(place)
     assert isinstance(journal, Journal)
     journal.begin(JournalHead("program", (0, 1), overwrite=False))
-    check = journal.add("program", (120, 0), "0123456789abcdef", rows, [b"x" * 120, b""])
+    content = [b"x" * 120, b""]
+    check, noted = line_of_frame("program", (120, 0), "0123456789abcdef", rows, content)
+    journal.write([noted])
     head, lines = journal.read()
     (line,) = lines
     assert head == JournalHead("program", (0, 1), overwrite=False)

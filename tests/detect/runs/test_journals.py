@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 import random
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
 
 from detect.cli import main
+from detect.runs.frame_rows import FrameRows
 from tests.detect.interrupted_runs import (
     FRAMES,
     PREVIOUS,
@@ -31,20 +32,18 @@ class Kept:
         self.frames = self.interrupt_after(FRAMES // 2)
 
     def interrupt_after(self, frames: int) -> int:
-        def interrupt() -> None:
-            if journalled(self.output) >= frames:
-                raise KeyboardInterrupt
+        from detect.runs.resume import RunFiles
 
-        from detect import commands
+        add = RunFiles.add
+
+        def interrupted(files: RunFiles, found: Sequence[FrameRows]) -> None:
+            for rows in found:
+                add(files, [rows])
+                if journalled(self.output) >= frames:
+                    raise KeyboardInterrupt
 
         with pytest.MonkeyPatch.context() as patch:
-            from contextlib import contextmanager
-
-            @contextmanager
-            def progress(*_: object) -> Iterator[Callable[[], None]]:
-                yield interrupt
-
-            patch.setattr(commands, "progress_bar", progress)
+            patch.setattr(RunFiles, "add", interrupted)
             assert main(command(self.run, self.output)) == 130
         return journalled(self.output)
 
