@@ -1,4 +1,4 @@
-"""The files of a run while they grow, so that a run that ends early loses no finished frame.
+"""The files of a run while they grow, so that a run that ends early keeps what is done.
 
 The rows of the frames that a worker gives back together are written at once to the parts of the
 files (`storage.parts`), then noted in the journal (`detect.runs.resume_journal`). However a run
