@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 R = TypeVar("R")
 
 #: So many pixels are decoded before any of them is looked at.
-_PIXELS_AT_ONCE = 1 << 21
+_PIXELS_AT_ONCE = 1 << 23
 
 #: What is wrong with one frame, not with the run.
 _COSTS_THE_FRAME = (FrameError, ArithmeticError, np.linalg.LinAlgError, MemoryError)

@@ -36,7 +36,7 @@ LANDMARK_SUFFIXES = frozenset({".circles", ".lines", ".markers"})
 #: So many failures are kept word for word.
 KEPT_FAILURES = 100
 
-_TASKS_AHEAD = 16
+_TASKS_AHEAD = 32
 
 
 class TiltSource(Protocol):

@@ -47,7 +47,7 @@ R = TypeVar("R")
 #: Fewer frames than this are not worth another process's start.
 FRAMES_PER_PROCESS = 500
 
-_LOCAL_CHUNK = 8
+_LOCAL_CHUNK = 32
 _PROCESS_CHUNK = 16
 _CLUSTER_CHUNK = 16
 _WINDOW_PER_WORKER = 3
