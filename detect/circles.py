@@ -23,7 +23,7 @@ from camera.distortion import inverse_table
 from camera.kernels import camera_numbers, lens_numbers
 from camera.model import PUBLISHED_STEP_PX
 from detect.discs.candidate_kernels import strong_and_alone
-from detect.discs.centre_rows import CentreRows, centre_rows
+from detect.discs.centre_rows import CentreRows, rows_to_look_at
 from detect.discs.centres import best_centres
 from detect.discs.centres import quality_of_centres as quality_of_centres
 from detect.discs.covariance_kernels import refined_covariances
@@ -156,19 +156,7 @@ def detect_circles(
 
 @kept_for_latest
 def _looked_at(table: DiscTable) -> Callable[[CircleSettings], CentreRows]:
-    """Which centres are looked at, by settings: all, unless whatever is found is fitted."""
-
-    def by_settings(settings: CircleSettings) -> CentreRows:
-        apart_m = 0.0
-        if settings.verify and settings.refine:
-            to_outline_m = min(
-                settings.radius_m - settings.inner_radius_m,
-                settings.outer_radius_m - settings.radius_m,
-            )
-            apart_m = settings.rows_apart * to_outline_m
-        return centre_rows(table, apart_m)
-
-    return kept_for_latest(by_settings)
+    return kept_for_latest(lambda settings: rows_to_look_at(table, settings))
 
 
 @kept_for_latest

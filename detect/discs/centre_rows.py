@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from detect.settings import CircleSettings
 from lut import DiscTable
 from lut.kernels import BLOCK
 
@@ -30,6 +31,28 @@ class CentreRows(NamedTuple):
 
     table: DiscTable
     rank: NDArray[np.int64]
+
+
+def rows_to_look_at(table: DiscTable, settings: CircleSettings) -> CentreRows:
+    """The rows of centres that the detector looks at: all, unless whatever is found is fitted.
+
+    Parameters
+    ----------
+    table : DiscTable
+        For the settings.
+    settings : CircleSettings
+        `rows_apart` and the radii; `verify` and `refine`.
+
+    Returns
+    -------
+    CentreRows
+    """
+    if not (settings.verify and settings.refine):
+        return centre_rows(table, 0.0)
+    to_outline_m = min(
+        settings.radius_m - settings.inner_radius_m, settings.outer_radius_m - settings.radius_m
+    )
+    return centre_rows(table, settings.rows_apart * to_outline_m)
 
 
 @lru_cache(maxsize=4)

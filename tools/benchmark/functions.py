@@ -9,6 +9,7 @@ import numpy as np
 
 from camera import Camera
 from detect.circles import detect_circles, disc_shape
+from detect.discs.centre_rows import rows_to_look_at
 from detect.discs.centres import best_centres, quality_of_centres
 from detect.levelling import levelled
 from detect.line_settings import DEFAULT as LINES_DEFAULT
@@ -68,6 +69,7 @@ def circle_detectors(camera: Camera, *, parts: bool = True) -> list[Measured]:
     published = cached_disc_table(camera, disc_shape(PUBLISHED))
     settings = CircleSettings()
     default = cached_disc_table(camera, disc_shape(settings))
+    some, rank = rows_to_look_at(default, settings)
     pieces = [
         Measured(KERNEL, "circles", lambda p: quality_of_centres(p.grey, published)),
         Measured("quality map (default)", "circles", lambda p: quality_of_centres(p.grey, default)),
@@ -79,7 +81,7 @@ def circle_detectors(camera: Camera, *, parts: bool = True) -> list[Measured]:
         Measured(
             "best centres (default)",
             "circles",
-            lambda p: best_centres(p.grey, default, settings.threshold, settings.polarity),
+            lambda p: best_centres(p.grey, some, settings.threshold, settings.polarity, rank),
         ),
         Measured("noise estimate", "circles", lambda p: estimate_noise(p.grey)),
     ]
