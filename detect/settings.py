@@ -78,7 +78,7 @@ class CircleSettings:
     inner_radius_m: float = 0.06
     outer_radius_m: float = 0.14
     samples: int = 16
-    threshold: float = 0.4
+    threshold: float = 0.5
     border_px: int = 12
     far_limit_m_per_px: float = 0.12
     polarity: Polarity = "any"
