@@ -10,14 +10,14 @@ from numba import njit
 from numpy.typing import NDArray
 
 from detect.discs import normal_kernels as normal
+from detect.discs.blur_kernels import blur_across
+from detect.discs.chord_kernels import chord_shares
 from detect.discs.evidence_kernels import LEAST_EXPLAINED, evidence_of
 from detect.discs.gather_kernels import LEAST_BLUR, Gathered
 from detect.discs.model_kernels import (
     CAPACITY,
     FIELDS,
     PIXEL_VARIANCE,
-    blur_across,
-    chord_shares,
     edge_shares,
 )
 from detect.discs.normal_kernels import background_products, disc_products, factor_rows, left_over
@@ -164,7 +164,10 @@ def _evaluate(patch: Gathered, p: NDArray[np.float64], ratio: float, work: Work)
     # Scattered pixels: an even weight of the same variance stands for blur and pixel across.
     width = 1.0 if grid else math.sqrt(12.0) * sigma_of(across)
     shares = work.shares if grid else work.fields
-    chord_shares(geometry, padded(patch.n), p[0], p[1], p[2], along, width, shares)
+    chord_shares(
+        geometry, padded(patch.n), p[0], p[1], p[2], along, width, shares, work.patch.marks,
+        work.patch.mark_words,
+    )  # fmt: skip
     if grid:
         blur_across(work.shares, patch.n, patch.margin, across, work.weights, work.fields)
         _mask(patch.n, work.patch.terms, work.fields)
