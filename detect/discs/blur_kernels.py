@@ -93,10 +93,12 @@ def blur_across(
     shares: NDArray[np.float32],
     n: int,
     margin: int,
+    first: int,
+    last: int,
     blur: float,
     weights: NDArray[np.float32],
     fields: NDArray[np.float32],
-) -> None:
+) -> tuple[int, int]:
     """Blur `chord_shares` across the steep axis.
 
     Parameters
@@ -106,17 +108,25 @@ def blur_across(
         is longer than the blur reaches: blurred across the lines' ends, it gets wrong values.
     n, margin : int
         Pixels altogether, and of a margin.
+    first, last : int
+        Before the first and from the last on all shares are 0.
     blur : float
         Standard deviation, pixels.
     weights : (K,) float32
         Working space; K - 1 is the longest reach.
     fields : (5 * CAPACITY,) float32
         Result, in the same layout.
+
+    Returns
+    -------
+    int, int
+        The same for the result.
     """
     reach = min(blur_weights(blur, weights), margin - 2)
     # One pixel more on either side, for the second derivative.
-    begin = margin - 1
-    length = n - 2 * begin
+    begin = min(max(margin - 1, first - reach - 2), n - margin - 1)
+    end = max(min(n - margin + 1, last + reach + 2), begin + 2)
+    length = end - begin
     for field in range(FIELDS):
         at = field * CAPACITY + begin
         result = fields[at : at + length]
@@ -133,7 +143,8 @@ def blur_across(
         fields[at + length : field * CAPACITY + n] = _0
     # d/dlog(blur) of a Gaussian blur of variance t is t times the second derivative.
     _add_second_difference(
-        fields[begin : begin + length],
+        fields[begin:end],
         F32(blur * blur),
-        fields[BY_BLUR * CAPACITY + margin : BY_BLUR * CAPACITY + n - margin],
+        fields[BY_BLUR * CAPACITY + begin + 1 : BY_BLUR * CAPACITY + end - 1],
     )
+    return begin, end

@@ -98,14 +98,17 @@ def chord_shares(
     radius: float,
     blur_along: float,
     width: float,
+    everywhere: bool,
     fields: NDArray[np.float32],
     seen: NDArray[np.uint8],
     words: NDArray[np.uint64],
-) -> None:
+) -> tuple[int, int]:
     """W of pixels that are blurred along the steep axis and `width` pixels wide across it.
 
     The number of pixels, n, is a multiple of `BLOCK`. Those that may see something of the disc are
-    marked in `seen`, of which `words` are the same memory; blocks without any are 0 throughout.
+    marked in `seen`, of which `words` are the same memory; blocks without any are 0 throughout. If
+    the disc is seen `everywhere` in the patch, all are computed. Returns where the blocks that are
+    not 0 begin and end.
 
     Across, the pixel's width is integrated in the chords' angle theta (a chord at distance
     R sin(theta) from the centre has the half length R cos(theta)), in which also the disc's tips
@@ -118,7 +121,10 @@ def chord_shares(
     per_sigma = _1 / math.sqrt(variance)
     optics = F32(blur_along * blur_along) / variance
     pixels = F32(width)
-    _mark_near(geometry, n, x0, y0, r0, per_sigma, F32(0.5 * width), seen)
+    if everywhere:
+        seen[:n] = 1
+    else:
+        _mark_near(geometry, n, x0, y0, r0, per_sigma, F32(0.5 * width), seen)
     for block in range(n // BLOCK):
         if words[2 * block] | words[2 * block + 1] == 0:
             begin = block * BLOCK
@@ -128,10 +134,13 @@ def chord_shares(
                 fields[BY_RADIUS * CAPACITY + i] = _0
                 fields[BY_X * CAPACITY + i] = _0
                 fields[BY_Y * CAPACITY + i] = _0
+    seen_begin, seen_end = n, 0
     for block in range(n // BLOCK):
         if words[2 * block] | words[2 * block + 1] == 0:
             continue
         begin = block * BLOCK
+        seen_begin = min(seen_begin, begin)
+        seen_end = begin + BLOCK
         for i in range(begin, begin + BLOCK):
             x = geometry[CHORD_X * CAPACITY + i] - x0
             y = geometry[CHORD_Y * CAPACITY + i] - y0
@@ -189,3 +198,4 @@ def chord_shares(
             fields[BY_RADIUS * CAPACITY + i] = per_d * per_length * d_radius
             fields[BY_X * CAPACITY + i] = d_along * along_x + d_across * across_x
             fields[BY_Y * CAPACITY + i] = d_along * along_y + d_across * across_y
+    return seen_begin, seen_end

@@ -219,11 +219,11 @@ def chord_values(
     fields = np.zeros_like(shares)
     weights = np.zeros(64, np.float32)
     marks = np.zeros(CAPACITY, np.uint8)
-    chord_kernels.chord_shares(
+    first, last = chord_kernels.chord_shares(
         geometry, padded(n), centre_px[0] / half_u, centre_px[1] / half_v, radius, blur_v, 1.0,
-        shares, marks, marks.view(np.uint64),
+        False, shares, marks, marks.view(np.uint64),
     )  # fmt: skip
-    blur_across(shares, n, MARGIN, blur_u, weights, fields)
+    blur_across(shares, n, MARGIN, first, last, blur_u, weights, fields)
     result = fields.reshape(kernels.FIELDS, CAPACITY)[:, :n].reshape(-1, LINES, wide)
     return np.asarray(result[:, :, MARGIN:-MARGIN], np.float64)
 
