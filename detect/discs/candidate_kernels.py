@@ -12,13 +12,15 @@ from numba import njit
 from numpy.typing import NDArray
 
 from detect.discs.list_kernels import floor_steps
-from detect.discs.quality_kernels import suppress_neighbours
+from detect.discs.model_kernels import F32, FASTMATH
 
 #: Candidates of a lower quality than this are looked at only if the grey value steps in this share
 #: of the directions, by this share of the contrast.
 CLEAR_QUALITY = 0.55
 _LEAST_STEPS = 0.9
 _LEAST_STEP = 0.25
+#: Loops over pairs of centres work on so many at a time, or on single ones.
+_AT_ONCE = 16
 _DIRECTIONS = np.array([[math.cos(k * math.pi / 8), math.sin(k * math.pi / 8)] for k in range(16)])
 
 
@@ -49,14 +51,39 @@ def strong_and_alone(
     (M,) int64
         Indices, ascending.
     """
-    index = np.flatnonzero(np.abs(contrast) >= weakest)
-    place = np.empty((len(index), 2))
-    for k in range(len(index)):
-        i = index[k]
+    strong = np.flatnonzero(np.abs(contrast) >= weakest)
+    order = strong[np.argsort(-quality[strong], kind="mergesort")]
+    x = np.full(_whole(len(order)), np.inf)
+    y = np.full(_whole(len(order)), np.inf)
+    count = 0
+    alone = np.zeros(len(quality), np.bool_)
+    for i in order:
         u, v = pixels[i, 0], pixels[i, 1]
-        place[k, 0] = floor_xy[v, u, 0]
-        place[k, 1] = floor_xy[v, u, 1]
-    return index[suppress_neighbours(place, quality[index], separation)]
+        x0, y0 = floor_xy[v, u, 0], floor_xy[v, u, 1]
+        if not _near_any(x, y, _whole(count), x0, y0, separation * separation):
+            alone[i] = True
+            x[count], y[count] = x0, y0
+            count += 1
+    return np.flatnonzero(alone)
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _whole(count: int) -> int:
+    """So many, rounded up to what loops work on at once."""
+    return (count + _AT_ONCE - 1) // _AT_ONCE * _AT_ONCE
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _near_any(
+    x: NDArray[np.float64], y: NDArray[np.float64], count: int, x0: float, y0: float, near: float
+) -> bool:
+    """Whether a place is nearer than the root of `near` to one of the first `count`."""
+    found = 0
+    for k in range(count):
+        dx = x[k] - x0
+        dy = y[k] - y0
+        found |= 1 if dx * dx + dy * dy < near else 0
+    return found != 0
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -89,33 +116,59 @@ def middles(
     """
     strong = np.flatnonzero(np.abs(contrast) >= weakest)
     # Looked up once: there are as many pairs as centres, squared.
-    place = np.empty((len(strong), 2), np.float32)
-    weight = np.empty(len(strong))
+    centres = np.zeros((5, _whole(len(strong))), np.float32)
     for m in range(len(strong)):
         i = strong[m]
         u, v = pixels[i, 0], pixels[i, 1]
-        place[m, 0] = floor_xy[v, u, 0]
-        place[m, 1] = floor_xy[v, u, 1]
-        weight[m] = quality[i] * quality[i] * contrast[i]
+        centres[0, m] = floor_xy[v, u, 0]
+        centres[1, m] = floor_xy[v, u, 1]
+        centres[2, m] = quality[i] * quality[i] * contrast[i]
+        centres[3, m] = u
+        centres[4, m] = v
     middle = np.empty((len(keep), 2), np.int64)
+    near = F32(separation * separation)
     for k in range(len(keep)):
-        u0, v0 = pixels[keep[k], 0], pixels[keep[k], 1]
-        x0, y0 = floor_xy[v0, u0, 0], floor_xy[v0, u0, 1]
-        own = contrast[keep[k]]
-        total = 0.0
-        sum_u = 0.0
-        sum_v = 0.0
-        for m in range(len(strong)):
-            dx = place[m, 0] - x0
-            dy = place[m, 1] - y0
-            if dx * dx + dy * dy < separation * separation or strong[m] == keep[k]:
-                share = abs(weight[m]) if weight[m] * own >= 0.0 else 0.0
-                total += share
-                sum_u += share * (pixels[strong[m], 0] - u0)
-                sum_v += share * (pixels[strong[m], 1] - v0)
-        middle[k, 0] = u0 + round(sum_u / total)
-        middle[k, 1] = v0 + round(sum_v / total)
+        u, v = pixels[keep[k], 0], pixels[keep[k], 1]
+        along_u, along_v = _mean_offset(
+            centres, floor_xy[v, u, 0], floor_xy[v, u, 1], contrast[keep[k]], F32(u), F32(v), near
+        )
+        middle[k, 0] = u + round(along_u)
+        middle[k, 1] = v + round(along_v)
     return middle
+
+
+@njit(cache=True, error_model="numpy", nogil=True, fastmath=FASTMATH)
+def _mean_offset(
+    centres: NDArray[np.float32],
+    x0: float,
+    y0: float,
+    sign: float,
+    u0: float,
+    v0: float,
+    near: float,
+) -> tuple[float, float]:
+    """By how much the weighed mean of the pixels near a place is off one; 0 where there are none.
+
+    Rows of `centres` are their x, y, weight, u and v. `near` is a distance squared. Weights of
+    another sign than `sign` do not count.
+    """
+    zero = F32(0.0)
+    total = zero
+    sum_u = zero
+    sum_v = zero
+    # All pairs alike, without branches: so several are worked on at a time.
+    for m in range(centres.shape[1]):
+        dx = centres[0, m] - x0
+        dy = centres[1, m] - y0
+        weight = centres[2, m]
+        counts = (dx * dx + dy * dy < near) & (weight * sign >= zero)
+        share = abs(weight) if counts else zero
+        total += share
+        sum_u += share * (centres[3, m] - u0)
+        sum_v += share * (centres[4, m] - v0)
+    if total > zero:
+        return sum_u / total, sum_v / total
+    return zero, zero
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)

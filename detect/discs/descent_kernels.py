@@ -10,14 +10,14 @@ from numba import njit
 from numpy.typing import NDArray
 
 from detect.discs import normal_kernels as normal
+from detect.discs.blur_kernels import blur_across
+from detect.discs.chord_kernels import chord_shares
 from detect.discs.evidence_kernels import LEAST_EXPLAINED, evidence_of
 from detect.discs.gather_kernels import LEAST_BLUR, Gathered
 from detect.discs.model_kernels import (
     CAPACITY,
     FIELDS,
     PIXEL_VARIANCE,
-    blur_across,
-    chord_shares,
     edge_shares,
 )
 from detect.discs.normal_kernels import background_products, disc_products, factor_rows, left_over
@@ -152,22 +152,33 @@ def _mask(n: int, terms: NDArray[np.float32], fields: NDArray[np.float32]) -> No
 
 
 @uncounted
-def _evaluate(patch: Gathered, p: NDArray[np.float64], ratio: float, work: Work) -> None:
-    """The disc's fields at the parameters p (x, y, radius, log blur)."""
+def _evaluate(patch: Gathered, p: NDArray[np.float64], ratio: float, work: Work) -> tuple[int, int]:
+    """The disc's fields at the parameters p (x, y, radius, log blur).
+
+    Returns where those that are not 0 begin and end.
+    """
     blur = math.exp(p[3])
     geometry = work.patch.geometry
+    terms = work.patch.terms
     if patch.shape == LIST:
         edge_shares(geometry, patch.n, p[0], p[1], p[2], blur, blur * ratio, work.fields)
-        return
+        return 0, patch.n
     along, across = (blur, blur * ratio) if patch.shape == COLUMNS else (blur * ratio, blur)
     grid = patch.margin > 0
     # Scattered pixels: an even weight of the same variance stands for blur and pixel across.
     width = 1.0 if grid else math.sqrt(12.0) * sigma_of(across)
     shares = work.shares if grid else work.fields
-    chord_shares(geometry, padded(patch.n), p[0], p[1], p[2], along, width, shares)
-    if grid:
-        blur_across(work.shares, patch.n, patch.margin, across, work.weights, work.fields)
-        _mask(patch.n, work.patch.terms, work.fields)
+    first, last = chord_shares(
+        geometry, padded(patch.n), p[0], p[1], p[2], along, width, not grid, shares,
+        work.patch.marks, work.patch.mark_words,
+    )  # fmt: skip
+    if not grid:
+        return 0, patch.n
+    begin, end = blur_across(
+        work.shares, patch.n, patch.margin, first, last, across, work.weights, work.fields
+    )
+    _mask(end - begin, terms[begin:], work.fields[begin:])
+    return begin, end
 
 
 @uncounted
@@ -228,12 +239,12 @@ def descend(
     background_products(terms, n, products)
     _add_ridge(0, normal.BACKGROUND, patch.fitted, products)
     while True:
-        _evaluate(patch, p, settings.blur_ratio, work)
+        begin, end = _evaluate(patch, p, settings.blur_ratio, work)
         if done:
             # These were the best parameters' fields once more.
             break
         evaluations += 1
-        disc_products(terms, work.fields, n, products)
+        disc_products(terms[begin:], work.fields[begin:], end - begin, products)
         _add_ridge(normal.BACKGROUND, normal.UNKNOWNS, patch.fitted, products)
         if not factor_rows(products, 0, normal.LOG_BLUR, factor):
             return Descent(False, contrast, variance, evaluations)

@@ -78,28 +78,6 @@ def store_chord(
     geometry[GROWTH * CAPACITY + i] = F32(2.0) * (after - before) / (after + before + F32(1e-9))
 
 
-@njit(cache=True, error_model="numpy", forceinline=True, fastmath=FASTMATH)
-def finish_chords(count: int, terms: NDArray[np.float32], geometry: NDArray[np.float32]) -> None:
-    """The geometry for `chord_shares` of a list's pixels, from the floor's steps at them.
-
-    The steps (x, y) stand where later is what becomes of them: from the pixel before along the
-    steep axis in `ALONG_X` and `ALONG_Y`, to the next one in `ACROSS_X` and `ACROSS_Y`, along the
-    other axis in `PER_STEP_ACROSS` and `PER_LENGTH`.
-    """
-    half = F32(0.5)
-    for i in range(np.uint64(count)):
-        bx = geometry[ALONG_X * CAPACITY + i]
-        by = geometry[ALONG_Y * CAPACITY + i]
-        ax = geometry[ACROSS_X * CAPACITY + i]
-        ay = geometry[ACROSS_Y * CAPACITY + i]
-        store_chord(
-            terms[PLANE_X * CAPACITY + i], terms[PLANE_Y * CAPACITY + i],
-            half * (ax + bx), half * (ay + by),
-            geometry[PER_STEP_ACROSS * CAPACITY + i], geometry[PER_LENGTH * CAPACITY + i],
-            math.sqrt(bx * bx + by * by), math.sqrt(ax * ax + ay * ay), i, geometry,
-        )  # fmt: skip
-
-
 @uncounted
 def gather_grid(
     image: NDArray[np.uint8],

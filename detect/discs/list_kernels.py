@@ -10,10 +10,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from detect.discs.fill_kernels import fill_chords, fill_edges, fill_terms
+from detect.discs.fill_kernels import fill_list
 from detect.discs.model_kernels import CAPACITY, F32, FASTMATH, PIXEL_VARIANCE
 from detect.discs.patch_kernels import (
-    COLUMNS,
     LIST,
     NEAR,
     NEAR_PX,
@@ -21,7 +20,7 @@ from detect.discs.patch_kernels import (
     FitSettings,
     Patch,
 )
-from detect.discs.vector_kernels import lowest_bit
+from detect.discs.vector_kernels import copy_pair, lowest_bit
 from detect.uncounted import uncounted
 
 #: Numba knows them as types, the type checker as functions.
@@ -181,8 +180,7 @@ def gather_list(
                 count += _1 if (mark & (_AT_EDGE | _WITHIN)) == _WITHIN else _0
             phase = (phase + shift) % every
     n = int(np.int64(count))
-    fill_terms(image, floor_xy, u0, v0, radius, n, patch)
-    fill_edges(floor_xy, radius, n, patch)
+    fill_list(image, floor_xy, u0, v0, radius, LIST, n, patch)
     return n
 
 
@@ -215,22 +213,25 @@ def gather_sparse(
     most_in_row = _U64((last_u - first_u) // every + 1)
     count = _0
     phase = (u0 - first_u + shift * (first_v - v0)) % every
+    seen = patch.floor
+    step = _U64(every)
     for v in range(first_v, last_v + 1):
         if count + most_in_row > _U64(CAPACITY):
             break
-        row = v * width
-        for u in range(first_u + phase, last_u + 1, every):
-            index[count] = row + u
-            count += _1
+        pixel = _U64(v * width + first_u + phase)
+        last = _U64(v * width + last_u)
+        # In all rows as often, which a processor foresees; what is beyond a row is overwritten.
+        for _ in range(most_in_row):
+            index[count] = pixel
+            copy_pair(floor_line, _2 * pixel, seen, _2 * count)
+            count += _1 if pixel <= last else _0
+            pixel += step
         phase += shift
         phase -= every if phase >= every else 0
-    xs, ys, wanted = patch.floor[:CAPACITY], patch.floor[CAPACITY:], patch.terms[NEAR * CAPACITY :]
-    for i in range(count):
-        xs[i] = floor_line[_2 * _U64(index[i])]
-        ys[i] = floor_line[_2 * _U64(index[i]) + _1]
+    wanted = patch.terms[NEAR * CAPACITY :]
     xu, yu, xv, yv = floor_steps(floor_xy, u0, v0)
     _weigh(
-        patch.floor, int(np.int64(count)), floor_xy[v0, u0, 0], floor_xy[v0, u0, 1], radius,
+        seen, int(np.int64(count)), floor_xy[v0, u0, 0], floor_xy[v0, u0, 1], radius,
         settings.reach_radii * radius, xu, yu, xv, yv, settings.reach_px * settings.reach_px,
         float(every), patch.terms,
     )  # fmt: skip
@@ -241,11 +242,7 @@ def gather_sparse(
         index[_U64(CAPACITY) + kept] = _U32(max(weight, F32(0.0)))
         kept += _1 if weight >= F32(0.0) else _0
     n = int(np.int64(kept))
-    fill_terms(image, floor_xy, u0, v0, radius, n, patch)
-    if shape == LIST:
-        fill_edges(floor_xy, radius, n, patch)
-    else:
-        fill_chords(floor_xy, radius, shape == COLUMNS, n, patch)
+    fill_list(image, floor_xy, u0, v0, radius, shape, n, patch)
     return n
 
 
@@ -265,14 +262,14 @@ def _weigh(
     weight: float,
     terms: NDArray[np.float32],
 ) -> None:
-    """What each of n places on the floor stands for: -1 beyond reach, 0 too far from the disc."""
+    """What n places (x, y) on the floor stand for: -1 beyond reach, 0 too far from the disc."""
     x_middle, y_middle, r_disc, r_limit = F32(x0), F32(y0), F32(radius), F32(limit)
     x_u, y_u, x_v, y_v, px = F32(xu), F32(yu), F32(xv), F32(yv), F32(reach_2)
     near_px = F32(NEAR_PX * NEAR_PX)
     r_near, each = F32(NEAR_RADII * radius), F32(weight)
     for i in range(_U64(n)):
-        x = floor[i] - x_middle
-        y = floor[_U64(CAPACITY) + i] - y_middle
+        x = floor[_2 * i] - x_middle
+        y = floor[_2 * i + _1] - y_middle
         r_2 = x * x + y * y
         r = math.sqrt(r_2)
         off = r_2 - r * r_disc

@@ -8,9 +8,9 @@ itself), and of the optics alone, which is what a fit varies. Results are five r
     W, dW/dlog(blur), dW/dradius, dW/dx_centre, dW/dy_centre
 
 `edge_shares` is for discs that are large against the blur: what a pixel sees depends on how far the
-edge is from it, and on how curved the edge is there. `chord_shares` is for discs that are seen so
-flat that the blur reaches across them: along the steeper image axis the blurred chord is integrated
-exactly, along the other by quadrature.
+edge is from it, and on how curved the edge is there. `chord_shares`
+(`detect.discs.chord_kernels`) is for discs that are seen so flat that the blur reaches across them:
+along the steeper image axis the blurred chord is integrated exactly, along the other by quadrature.
 
 All is single precision, without branches and without library functions, so that the compiler can
 work on several pixels at a time.
@@ -74,7 +74,8 @@ _TWO_THIRDS = F32(2.0 / 3.0)
 _PER_32 = F32(0.5 / 32.0)
 _E2, _E3, _E4, _E5 = F32(1 / 2), F32(1 / 6), F32(1 / 24), F32(1 / 120)
 _PER_ROOT_2PI = F32(1.0 / math.sqrt(2.0 * math.pi))
-_FAR = F32(5.0)
+#: Where the normal distribution ends, deviations.
+FAR = F32(5.0)
 # Abramowitz and Stegun, 26.2.17: the normal distribution's tail, within 8e-8.
 _TAIL = F32(0.2316419)
 _B1, _B2, _B3 = F32(0.319381530), F32(-0.356563782), F32(1.781477937)
@@ -84,7 +85,7 @@ _B4, _B5 = F32(-1.821255978), F32(1.330274429)
 @njit(cache=True, error_model="numpy", inline="always", fastmath=FASTMATH)
 def normal(x: float) -> tuple[float, float]:
     """Density and distribution function of a standard normal variable, within 2e-6."""
-    a = min(abs(x), _FAR)
+    a = min(abs(x), FAR)
     y = a * a * _PER_32
     e = _1 - y * (_1 - y * (_E2 - y * (_E3 - y * (_E4 - y * _E5))))
     e *= e
@@ -164,232 +165,3 @@ def edge_shares(
         fields[BY_RADIUS * CAPACITY + i] = -per_radius - by_t * t * per_r0
         fields[BY_X * CAPACITY + i] = -per_radius * nx
         fields[BY_Y * CAPACITY + i] = -per_radius * ny
-
-
-# asin(x) = pi / 2 - sqrt(1 - x) * polynomial(x) for x from 0 to 1 (Abramowitz and Stegun, 4.4.45).
-_A0, _A1, _A2, _A3 = F32(1.5707288), F32(-0.2121144), F32(0.0742610), F32(-0.0187293)
-_HALF_PI = F32(0.5 * math.pi)
-_S3, _S5, _S7, _S9 = F32(-1 / 6), F32(1 / 120), F32(-1 / 5040), F32(1 / 362880)
-_C2, _C4, _C6, _C8 = F32(-1 / 2), F32(1 / 24), F32(-1 / 720), F32(1 / 40320)
-_C10 = F32(-1 / 3628800)
-#: The two nodes of the Gauss-Legendre quadrature, each of weight one half of the interval.
-_NODE = F32(0.5 / math.sqrt(3.0))
-_MOST_BEND = F32(0.7)
-
-
-@njit(cache=True, error_model="numpy", inline="always", fastmath=FASTMATH)
-def _arcsine(x: float) -> float:
-    """Arc sine of x, which is cut to [-1, 1], within 7e-5."""
-    a = min(abs(x), _1)
-    angle: float = _HALF_PI - math.sqrt(_1 - a) * (_A0 + a * (_A1 + a * (_A2 + a * _A3)))
-    signed: float = angle if x > _0 else -angle
-    return signed
-
-
-@njit(cache=True, error_model="numpy", forceinline=True, fastmath=FASTMATH)
-def chord_shares(
-    geometry: NDArray[np.float32],
-    n: int,
-    x_centre: float,
-    y_centre: float,
-    radius: float,
-    blur_along: float,
-    width: float,
-    fields: NDArray[np.float32],
-) -> None:
-    """W of pixels that are blurred along the steep axis and `width` pixels wide across it.
-
-    Across, the pixel's width is integrated in the chords' angle theta (a chord at distance
-    R sin(theta) from the centre has the half length R cos(theta)), in which also the disc's tips
-    are smooth. What the optics blur across is left to `blur_across`, or
-    to a width of the same variance.
-    """
-    x0, y0, r0 = F32(x_centre), F32(y_centre), F32(radius)
-    per_r0 = _1 / r0
-    variance = F32(blur_along * blur_along + PIXEL_VARIANCE)
-    per_sigma = _1 / math.sqrt(variance)
-    optics = F32(blur_along * blur_along) / variance
-    pixels = F32(width)
-    for i in range(n):
-        x = geometry[CHORD_X * CAPACITY + i] - x0
-        y = geometry[CHORD_Y * CAPACITY + i] - y0
-        along_x = geometry[ALONG_X * CAPACITY + i]
-        along_y = geometry[ALONG_Y * CAPACITY + i]
-        across_x = geometry[ACROSS_X * CAPACITY + i]
-        across_y = geometry[ACROSS_Y * CAPACITY + i]
-        per_length = geometry[PER_LENGTH * CAPACITY + i]
-        across = x * across_x + y * across_y
-        along = x * along_x + y * along_y
-        step = geometry[PER_STEP_ACROSS * CAPACITY + i]
-        slant = geometry[PER_STEP_ALONG * CAPACITY + i] / step
-        step *= pixels
-        first = _arcsine((across - _HALF * step) * per_r0)
-        last = _arcsine((across + _HALF * step) * per_r0)
-        middle = _HALF * (first + last)
-        aside = _NODE * (last - first)
-        # Of each node: half of the interval's length, over the pixel's width.
-        weight = _HALF * (last - first) * r0 / step
-        growth = geometry[GROWTH * CAPACITY + i]
-        w = _0
-        d_blur = _0
-        d_along = _0
-        d_across = _0
-        d_radius = _0
-        for node in range(2):
-            theta = middle + aside if node == 1 else middle - aside
-            square = theta * theta
-            sine = theta * (_1 + square * (_S3 + square * (_S5 + square * (_S7 + square * _S9))))
-            cosine = _1 + square * (
-                _C2 + square * (_C4 + square * (_C6 + square * (_C8 + square * _C10)))
-            )
-            half = r0 * cosine * per_length
-            centre = (r0 * sine - across) * slant - along
-            for end in range(2):
-                d = centre + half if end == 1 else centre - half
-                bend = min(max(growth * d, -_MOST_BEND), _MOST_BEND)
-                z = d * (_1 - _HALF * bend) * per_sigma
-                density, below = normal(z)
-                sign = _1 if end == 1 else -_1
-                w += sign * cosine * below
-                d_blur -= sign * cosine * density * z
-                # The end of the chord at distance rho moves by -rho / sqrt(R^2 - rho^2) = -tan.
-                per_d = density * (_1 - bend)
-                d_along += sign * cosine * per_d
-                d_across += sine * per_d
-                d_radius += per_d
-        per_d = weight * per_sigma
-        d_across *= per_d * per_length
-        d_along *= per_d
-        fields[SHARE * CAPACITY + i] = weight * w
-        fields[BY_BLUR * CAPACITY + i] = weight * d_blur * optics
-        fields[BY_RADIUS * CAPACITY + i] = per_d * per_length * d_radius
-        fields[BY_X * CAPACITY + i] = d_along * along_x + d_across * across_x
-        fields[BY_Y * CAPACITY + i] = d_along * along_y + d_across * across_y
-
-
-#: A sampled Gaussian is narrower than the continuous one where it is below this (pixels).
-_WELL_SAMPLED_PX = 0.8
-#: Weights of the blur reach this many deviations, and a pixel more.
-_REACH = 3.0
-
-
-@njit(cache=True, error_model="numpy", forceinline=True)
-def blur_weights(blur: float, weights: NDArray[np.float32]) -> int:
-    """Gaussian weights 0 ... k of a blur on a grid of pixels, and k, its reach (see `weights`).
-
-    Their sum (both sides) is 1 and their variance blur^2, exactly so also where the blur is well
-    below a pixel: there the sampled Gaussian is one of a different width, found by Newton's method.
-    """
-    variance = blur * blur
-    if blur < _WELL_SAMPLED_PX:
-        # With q = exp(-1 / (2 s^2)) the weight n is q^(n^2).
-        q = min(0.5 * variance, 0.25)
-        for _ in range(6):
-            q4 = q * q * q * q
-            q9 = q4 * q4 * q
-            value = 2.0 * (q + 4.0 * q4 + 9.0 * q9) - variance * (1.0 + 2.0 * (q + q4 + q9))
-            slope = 2.0 + 32.0 * q4 / q + 162.0 * q9 / q
-            slope -= variance * (2.0 + 8.0 * q4 / q + 18.0 * q9 / q)
-            q -= value / slope
-    else:
-        q = math.exp(-0.5 / variance)
-    reach = min(int(_REACH * blur) + 1, len(weights) - 1)
-    total = 1.0
-    weight = 1.0
-    ratio = q
-    weights[0] = 1.0
-    for k in range(1, reach + 1):
-        # q^(k^2) = q^((k - 1)^2) q^(2 k - 1)
-        weight *= ratio
-        ratio *= q * q
-        weights[k] = weight
-        total += 2.0 * weight
-    for k in range(reach + 1):
-        weights[k] /= total
-    return reach
-
-
-@njit(cache=True, error_model="numpy", forceinline=True, fastmath=FASTMATH)
-def _sum_of_three(
-    middle: NDArray[np.float32],
-    left: NDArray[np.float32],
-    right: NDArray[np.float32],
-    weight: float,
-    weight_aside: float,
-    result: NDArray[np.float32],
-) -> None:
-    for i in range(len(result)):
-        result[i] = weight * middle[i] + weight_aside * (left[i] + right[i])
-
-
-@njit(cache=True, error_model="numpy", forceinline=True, fastmath=FASTMATH)
-def _add_four(
-    left: NDArray[np.float32],
-    right: NDArray[np.float32],
-    next_left: NDArray[np.float32],
-    next_right: NDArray[np.float32],
-    weight: float,
-    next_weight: float,
-    result: NDArray[np.float32],
-) -> None:
-    for i in range(len(result)):
-        result[i] += weight * (left[i] + right[i]) + next_weight * (next_left[i] + next_right[i])
-
-
-@njit(cache=True, error_model="numpy", forceinline=True, fastmath=FASTMATH)
-def _add_second_difference(
-    values: NDArray[np.float32], scale: float, result: NDArray[np.float32]
-) -> None:
-    for i in range(len(result)):
-        result[i] += scale * (values[i] - _2 * values[i + 1] + values[i + 2])
-
-
-@njit(cache=True, error_model="numpy", forceinline=True, fastmath=FASTMATH)
-def blur_across(
-    shares: NDArray[np.float32],
-    n: int,
-    margin: int,
-    blur: float,
-    weights: NDArray[np.float32],
-    fields: NDArray[np.float32],
-) -> None:
-    """Blur `chord_shares` across the steep axis.
-
-    Parameters
-    ----------
-    shares : (5 * CAPACITY,) float32
-        The shares of n pixels, line after line. Each line has a margin at both of its ends that
-        is longer than the blur reaches: blurred across the lines' ends, it gets wrong values.
-    n, margin : int
-        Pixels altogether, and of a margin.
-    blur : float
-        Standard deviation, pixels.
-    weights : (K,) float32
-        Working space; K - 1 is the longest reach.
-    fields : (5 * CAPACITY,) float32
-        Result, in the same layout.
-    """
-    reach = min(blur_weights(blur, weights), margin - 2)
-    # One pixel more on either side, for the second derivative.
-    begin = margin - 1
-    length = n - 2 * begin
-    for field in range(FIELDS):
-        at = field * CAPACITY + begin
-        result = fields[at : at + length]
-        _sum_of_three(
-            shares[at:], shares[at - 1 :], shares[at + 1 :], weights[0], weights[1], result
-        )
-        for k in range(2, reach + 1, 2):
-            next_weight = weights[k + 1] if k < reach else _0
-            _add_four(
-                shares[at - k :], shares[at + k :], shares[at - k - 1 :], shares[at + k + 1 :],
-                weights[k], next_weight, result,
-            )  # fmt: skip
-        fields[field * CAPACITY : at] = _0
-        fields[at + length : field * CAPACITY + n] = _0
-    # d/dlog(blur) of a Gaussian blur of variance t is t times the second derivative.
-    _add_second_difference(
-        fields[begin : begin + length],
-        F32(blur * blur),
-        fields[BY_BLUR * CAPACITY + margin : BY_BLUR * CAPACITY + n - margin],
-    )

@@ -41,15 +41,17 @@ from detect.discs.patch_kernels import (
     SADDLE,
     SADDLE_XY,
 )
+from detect.discs.sector_code import COPIES, PIXELS, SUMS, add_by_sector
 
 _SECTORS = 16
 #: Pixels that the middle of a disc must have to be looked at.
 _LEAST_MIDDLE = 2.0
-#: Of each sector eight sums, and of what is in none.
-SECTOR_SUMS = 8 * (_SECTORS + 1)
+#: Sums of the sectors, of what is in none, and of what only fills up.
+_ROWS = _SECTORS + 2
+_FILLING = _SECTORS + 1
+SECTOR_SUMS = COPIES * _ROWS * SUMS
 #: Numba knows it as the type, the type checker as a function.
 _I32: Callable[[Any], Any] = np.int32
-_U0, _U1, _U2, _U3, _U4, _U5, _U6 = (np.uint64(k) for k in range(7))
 # Where the sectors of a quadrant meet.
 _TAN_1 = math.tan(math.pi / 8.0)
 _TAN_3 = math.tan(3.0 * math.pi / 8.0)
@@ -228,6 +230,8 @@ def _sectors(
         k = _I32(15) - k if y < F32(0.0) else k
         counts = (terms[ONE * CAPACITY + i] > F32(0.0)) & (x * x + y * y >= r_2)
         sector[i] = k if counts else _I32(_SECTORS)
+    for i in range(n, (n + PIXELS - 1) // PIXELS * PIXELS):
+        sector[i] = _FILLING
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
@@ -247,7 +251,7 @@ def outline_statistics(
 
     The step is the regression of the grey values on the model's, relative to the whole disc's; the
     distance is the Gauss-Newton step of the radius from that sector's residuals alone. `sector`
-    and `sums` are working space for `n` pixels and for `SECTOR_SUMS`.
+    and `sums` are working space for `n` pixels, rounded up, and for `SECTOR_SUMS`.
 
     Returns
     -------
@@ -258,30 +262,23 @@ def outline_statistics(
     """
     _sectors(terms, n, x0, y0, 0.09 * radius * radius, sector)
     sums[:SECTOR_SUMS] = 0.0
-    c = F32(contrast)
-    for i in range(np.uint64(n)):
-        at = np.uint64(8) * np.uint64(sector[i])
-        w = fields[SHARE * CAPACITY + i]
-        error = errors[i]
-        by_radius = c * fields[BY_RADIUS * CAPACITY + i]
-        # What is left of the grey value when the background is taken off.
-        grey = error + c * w
-        sums[at + _U0] += F32(1.0)
-        sums[at + _U1] += w
-        sums[at + _U2] += w * w
-        sums[at + _U3] += grey
-        sums[at + _U4] += w * grey
-        sums[at + _U5] += by_radius * error
-        sums[at + _U6] += by_radius * by_radius
+    whole = (n + PIXELS - 1) // PIXELS * PIXELS
+    add_by_sector(
+        fields, SHARE * CAPACITY, BY_RADIUS * CAPACITY, errors, sector, whole, F32(contrast), sums,
+        _ROWS,
+    )  # fmt: skip
+    for copy in range(_ROWS * SUMS, SECTOR_SUMS, _ROWS * SUMS):
+        for k in range(_ROWS * SUMS):
+            sums[k] += sums[copy + k]
     seen = 0
     steps = 0.0
     good = 0
     deviation = 0.0
     strongest = 0.0
     for k in range(_SECTORS):
-        strongest = max(strongest, sums[8 * k + 6])
+        strongest = max(strongest, sums[SUMS * k + 6])
     for k in range(_SECTORS):
-        first = 8 * k
+        first = SUMS * k
         pixels, shares, greys = float(sums[first]), float(sums[first + 1]), float(sums[first + 3])
         if pixels < 3.0:
             continue
@@ -298,8 +295,8 @@ def outline_statistics(
         deviation += min(offset * offset, 0.25)
     # Pixels that are not fitted are in there, too, with shares and grey values of nothing.
     middle = 1.0
-    if sums[8 * _SECTORS + 1] >= _LEAST_MIDDLE:
-        middle = float(sums[8 * _SECTORS + 3]) / float(sums[8 * _SECTORS + 1]) / contrast
+    if sums[SUMS * _SECTORS + 1] >= _LEAST_MIDDLE:
+        middle = float(sums[SUMS * _SECTORS + 3]) / float(sums[SUMS * _SECTORS + 1]) / contrast
     if seen == 0:
         return 0.0, 0.0, 0.0, middle
     return steps / seen, good / seen, math.sqrt(deviation / seen), middle

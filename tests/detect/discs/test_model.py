@@ -11,7 +11,10 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.special import chndtr, ndtr
 
+from detect.discs import chord_kernels
 from detect.discs import model_kernels as kernels
+from detect.discs.blur_kernels import blur_across, blur_weights
+from detect.discs.patch_kernels import padded
 from detect.discs.profile import BEND, T_LIMIT, Z_LIMIT
 
 FloatArray = NDArray[np.float64]
@@ -58,7 +61,7 @@ def test_single_precision_functions_are_near_enough() -> None:
         assert below == pytest.approx(float(ndtr(x)), abs=2e-6)
     for x in np.linspace(-1.5, 1.5, 301):
         cut = min(max(x, -1.0), 1.0)
-        assert kernels._arcsine(float(x)) == pytest.approx(math.asin(cut), abs=5e-4)
+        assert chord_kernels._arcsine(float(x)) == pytest.approx(math.asin(cut), abs=5e-4)
 
 
 # -- the edge's profile -------------------------------------------------------------------------
@@ -215,10 +218,12 @@ def chord_values(
     shares = np.zeros(kernels.FIELDS * CAPACITY, np.float32)
     fields = np.zeros_like(shares)
     weights = np.zeros(64, np.float32)
-    kernels.chord_shares(
-        geometry, n, centre_px[0] / half_u, centre_px[1] / half_v, radius, blur_v, 1.0, shares
-    )
-    kernels.blur_across(shares, n, MARGIN, blur_u, weights, fields)
+    marks = np.zeros(CAPACITY, np.uint8)
+    first, last = chord_kernels.chord_shares(
+        geometry, padded(n), centre_px[0] / half_u, centre_px[1] / half_v, radius, blur_v, 1.0,
+        False, shares, marks, marks.view(np.uint64),
+    )  # fmt: skip
+    blur_across(shares, n, MARGIN, first, last, blur_u, weights, fields)
     result = fields.reshape(kernels.FIELDS, CAPACITY)[:, :n].reshape(-1, LINES, wide)
     return np.asarray(result[:, :, MARGIN:-MARGIN], np.float64)
 
@@ -277,7 +282,7 @@ def test_chords_that_miss_the_disc_see_nothing() -> None:
 @given(blur=st.floats(0.1, 8.0))
 def test_weights_have_the_blurs_variance(blur: float) -> None:
     weights = np.zeros(64, np.float32)
-    reach = kernels.blur_weights(blur, weights)
+    reach = blur_weights(blur, weights)
     k = np.arange(-reach, reach + 1)
     both = np.asarray(weights[np.abs(k)], np.float64)
     assert both.sum() == pytest.approx(1.0, abs=1e-5)
