@@ -38,6 +38,9 @@ def find_lines(
     band_row: NDArray[np.int32],
     band_pixel: NDArray[np.int32],
     band_runs: NDArray[np.int32],
+    band_lengths: NDArray[np.uint8],
+    band_odd: NDArray[np.int32],
+    band_odd_bounds: NDArray[np.int32],
     band_part: NDArray[np.float32],
     band_scale: NDArray[np.float32],
     band_visible: NDArray[np.bool_],
@@ -70,7 +73,8 @@ def find_lines(
         The table (see `lut.verticals.VerticalTable`).
     strip, ends, rise, lean_by_pitch, lean_by_roll
         See `detect.verticals.strip.Strip`.
-    band_row, band_pixel, band_runs, band_part, band_scale, band_visible, band_weights
+    band_row, band_pixel, band_runs, band_lengths, band_odd, band_odd_bounds, band_part, band_scale,
+    band_visible, band_weights
         See `detect.verticals.filter.StartBand`.
     weights, along
         See `detect.verticals.filter.LineFilter`.
@@ -93,8 +97,8 @@ def find_lines(
     response = np.empty(band_row.shape, np.float32)
     regulariser = np.float32(following[0])
     band_response(
-        image, band_pixel, band_runs, band_part, band_scale, band_visible, int(following[1]),
-        band_weights, along, regulariser, response,
+        image, band_pixel, band_runs, band_lengths, band_odd, band_odd_bounds, band_part,
+        band_scale, band_visible, int(following[1]), band_weights, along, regulariser, response,
     )  # fmt: skip
     threshold = following[2]
     level, start_column, start_sign = find_maxima(

@@ -1,33 +1,18 @@
 """Weighted sums of eight neighbouring grey values at a time, in the compiler's own vectors.
 
-What fits and starts need of single rows: as loops these are too short to be vectorised.
+What fits need of single rows: as loops these are too short to be vectorised.
 """
 
 from __future__ import annotations
 
 from typing import Any
 
-from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 
-from detect.verticals.vector_code import (
-    BYTES,
-    FLOATS,
-    I8,
-    I16,
-    I64,
-    INTS,
-    LANES,
-    LONGS,
-    SHORTS,
-    WORD,
-    Code,
-    constant,
-    operation,
-)
+from detect.verticals.vector_code import FLOATS, I64, LANES, WORD, Code, operation
 
-__all__ = ["LANES", "WORD", "interpolate", "interpolate_runs", "slope_and_bend", "sum_of_products"]
+__all__ = ["LANES", "WORD", "slope_and_bend", "sum_of_products"]
 
 
 @operation
@@ -144,99 +129,4 @@ def sum_of_products(
         return numbers[0]
 
     result = types.float32(pixels, at, weights, node, types.int64, types.int64, types.int64)
-    return result, generate
-
-
-@operation
-def interpolate(
-    _typing: Any, pixels: Any, where: Any, part: Any, grey: Any, square: Any, at: Any
-) -> Any:
-    """Grey values between neighbouring pixels, and their squares, at `LANES` places.
-
-    Parameters
-    ----------
-    pixels : uint8, contiguous
-        The image in scan order.
-    where : int32, contiguous
-        The pixel on the left of each place; -1 for none: both results are 0.
-    part : float32, contiguous
-        How far to the right of it each lies, 0 to 1.
-    grey, square : float32, contiguous
-        Results; grey values count from 128.
-    at : int64
-        Index of the first place in all of these.
-    """
-
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        code = Code(context, builder, signature, args)
-        left_of = code.load(1, args[5], INTS)
-        zero = constant(INTS, 0)
-        some = builder.icmp_signed(">=", left_of, zero)
-        left_of = builder.sext(builder.select(some, left_of, zero), LONGS)
-        pairs = code.gathered([code.load(0, place, I16) for place in code.scattered(left_of)])
-        # x - 128 is x with its highest bit turned over, as a signed number.
-        pairs = builder.xor(pairs, constant(SHORTS, 0x8080))
-        left, right = (
-            builder.sitofp(builder.sext(builder.trunc(each, BYTES), INTS), FLOATS)
-            for each in (pairs, builder.lshr(pairs, constant(SHORTS, 8)))
-        )
-        share = code.load(2, args[5], FLOATS)
-        for argument in (3, 4):
-            between = code.add(left, code.mul(share, code.sub(right, left)))
-            code.store(argument, args[5], code.only(some, between))
-            left, right = code.mul(left, left), code.mul(right, right)
-        return context.get_dummy_value()
-
-    result = types.void(pixels, where, part, grey, square, types.int64)
-    return result, generate
-
-
-@operation
-def interpolate_runs(
-    _typing: Any,
-    pixels: Any,
-    first: Any,
-    second: Any,
-    count: Any,
-    part: Any,
-    grey: Any,
-    square: Any,
-    at: Any,
-) -> Any:
-    """As `interpolate`, where the pixels on the left of the places are two runs of neighbours.
-
-    Parameters
-    ----------
-    pixels : uint8, contiguous
-        The image in scan order.
-    first, second : int64
-        The pixel on the left of place k is ``first + k`` for the first `count` places, and
-        ``second + k`` for the others; the image goes on for `LANES` pixels behind both.
-    count : int64
-        See above.
-    part, grey, square, at
-        As for `interpolate`.
-    """
-
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        code = Code(context, builder, signature, args)
-        lane = ir.Constant(BYTES, list(range(LANES)))
-        number = code.everywhere(builder.trunc(args[3], I8), BYTES)
-        of_first = builder.icmp_signed("<", lane, number)
-        sides = []
-        for side in range(2):
-            runs = (builder.add(run, code.number(side)) for run in args[1:3])
-            own, other = (code.load(0, run, BYTES) for run in runs)
-            values = builder.xor(builder.select(of_first, own, other), constant(BYTES, 0x80))
-            sides.append(builder.sitofp(builder.sext(values, INTS), FLOATS))
-        left, right = sides
-        share = code.load(4, args[7], FLOATS)
-        for argument in (5, 6):
-            code.store(argument, args[7], code.add(left, code.mul(share, code.sub(right, left))))
-            left, right = code.mul(left, left), code.mul(right, right)
-        return context.get_dummy_value()
-
-    result = types.void(
-        pixels, types.int64, types.int64, types.int64, part, grey, square, types.int64
-    )
     return result, generate
