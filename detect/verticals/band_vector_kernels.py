@@ -130,7 +130,8 @@ def interpolate_runs(
     part : float32, contiguous
         See `interpolate`.
     block : int64
-        Index in `runs` and `lengths` of the first `RUN` places, of which there are ``TILE / RUN``.
+        Index in `runs` and `lengths` of the first `RUN` places, of which there are ``TILE / RUN``;
+        pixels as far on again are fetched beforehand.
     between, plane, to
         As for `interpolate`.
     """
@@ -145,6 +146,8 @@ def interpolate_runs(
                 builder.sext(code.load(1, builder.add(own, code.number(run)), I32), I64)
                 for run in range(3)
             ]
+            if k == 0:
+                code.prefetch(0, builder.add(begin[0], code.number(TILE)))
             own = builder.mul(block, code.number(2))
             of_run = []
             for run in range(2):

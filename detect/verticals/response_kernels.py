@@ -191,14 +191,8 @@ def band_response(
     ----------
     image : (H, W) uint8
         Grey values.
-    pixel : (R, P) int32
-        Index into the flat image of the pixel on the left of each pixel of the strip, for rows that
-        are counted from the horizon; -1 beyond the ends of the vertical. P is W rounded up to whole
-        `TILE`.
-    runs, lengths, odd, odd_bounds
+    pixel, runs, lengths, odd, odd_bounds, part
         See `detect.verticals.filter.StartBand`.
-    part : (R, P) float32
-        How far the strip's pixel lies to the right of it.
     scale : (K, P) float32
         One over the sum of the weights along the vertical that lie on it, for each row of the
         result.
@@ -214,7 +208,8 @@ def band_response(
         Result: as `strip_response`.
     """
     width = image.shape[1]
-    rows, padded = pixel.shape
+    tiles, rows = pixel.shape[:2]
+    padded = tiles * TILE
     levels = len(response)
     taps = weights.shape[2]
     r = taps // 2
@@ -233,15 +228,15 @@ def band_response(
     length = padded + (BLOCK + taps + 15) // 16 * 16
     sums_plane = levels * length
     sums = _from_cache_line(np.empty(2 * sums_plane + 16, np.float32))
-    for tile in range(padded // TILE):
+    for tile in range(tiles):
         left = tile * TILE
         for row in range(rows):
             interpolate_runs(
-                flat, runs, lengths, flat_part, (row * padded + left) // RUN, between, plane,
+                flat, runs, lengths, flat_part, (tile * rows + row) * (TILE // RUN), between, plane,
                 row * TILE,
             )  # fmt: skip
         for n in range(odd_bounds[tile], odd_bounds[tile + 1]):
-            interpolate(flat, flat_pixel, flat_part, odd[n, 0], between, plane, odd[n, 1])
+            interpolate(flat, flat_pixel, flat_part, odd[n], between, plane, odd[n] - tile * plane)
         for k in range(levels):
             for own in range(0, TILE, BLOCK):
                 sums_along(

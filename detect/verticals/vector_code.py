@@ -61,6 +61,15 @@ class Code:
     def store(self, argument: int, index: Any, value: Any) -> None:
         self.builder.store(value, self._place(argument, index, value.type)).align = 4
 
+    def prefetch(self, argument: int, index: Any) -> None:
+        """Fetch a line of the cache that will be needed soon; it may lie outside the array."""
+        place = I8.as_pointer()
+        kind = ir.FunctionType(ir.VoidType(), [place, I32, I32, I32])
+        fetch = self.builder.module.declare_intrinsic("llvm.prefetch", [place], kind)
+        where = self.builder.bitcast(self.builder.gep(self.data[argument], [index]), place)
+        # To be read, and again, as data.
+        self.builder.call(fetch, [where, *(ir.Constant(I32, value) for value in (0, 3, 1))])
+
     def _place(self, argument: int, index: Any, kind: Any) -> Any:
         where = self.builder.gep(self.data[argument], [index])
         return self.builder.bitcast(where, kind.as_pointer())

@@ -257,19 +257,20 @@ def test_response_of_the_starts_is_that_of_the_whole_strip(preset: LineSettings)
 def test_runs_of_neighbours_are_the_pixels_of_the_band(width: int) -> None:
     camera = pinhole(width, 160, 200.0, pitch_deg=8.0, roll_deg=3.0)
     band = start_band(build_vertical_table(camera), DEFAULT)
-    rows, columns = band.pixel.shape
-    assert columns % TILE == 0
+    assert band.pixel.shape[2] == TILE
     runs = band.runs.astype(np.int64)
     assert runs.min() >= 0
     assert runs.max() + RUN < width * 160
     lane = np.arange(RUN)
     which = (lane >= band.lengths[:, :1]).astype(int) + (lane >= band.lengths[:, 1:])
-    told = (np.take_along_axis(runs, which, axis=1) + lane).reshape(rows, columns)
+    told = (np.take_along_axis(runs, which, axis=1) + lane).reshape(-1)
+    pixel = band.pixel.reshape(-1)
     # Most are such runs: that is what makes it fast.
-    assert len(band.odd) < 0.3 * band.pixel.size / LANES
-    for tile in range(columns // TILE):
-        for at, place in band.odd[band.odd_bounds[tile] : band.odd_bounds[tile + 1]]:
-            row, column = divmod(int(place), TILE)
-            assert at == row * columns + tile * TILE + column
-            told.reshape(-1)[at : at + LANES] = band.pixel.reshape(-1)[at : at + LANES]
-    np.testing.assert_array_equal(told[:, :width], band.pixel[:, :width])
+    assert len(band.odd) < 0.3 * pixel.size / LANES
+    for at in band.odd:
+        told[at : at + LANES] = pixel[at : at + LANES]
+    np.testing.assert_array_equal(told, pixel)
+    for tile in range(len(band.pixel)):
+        odd = band.odd[band.odd_bounds[tile] : band.odd_bounds[tile + 1]]
+        np.testing.assert_array_equal(odd // band.pixel[0].size, tile)
+    assert band.odd_bounds[-1] == len(band.odd)
