@@ -50,8 +50,7 @@ def find_lines(
     half: NDArray[np.int64],
     begin_of: NDArray[np.int64],
     height_weights: NDArray[np.float32],
-    first_weights: NDArray[np.float32],
-    second_weights: NDArray[np.float32],
+    derivatives: NDArray[np.float32],
     farthest: NDArray[np.float64],
     few_half: NDArray[np.int64],
     few_begin_of: NDArray[np.int64],
@@ -78,7 +77,7 @@ def find_lines(
         See `detect.verticals.filter.StartBand`.
     weights, along
         See `detect.verticals.filter.LineFilter`.
-    half, begin_of, height_weights, first_weights, second_weights
+    half, begin_of, height_weights, derivatives
         Filters of the refinement (see `detect.verticals.step_filters.StepFilters`).
     farthest
         How far its steps may go (see `fit_and_judge`).
@@ -150,7 +149,7 @@ def find_lines(
         fits, evidence, fate, tilt = fit_and_judge(
             image, strip, rise, bearing, anchor_row, row_aspect, polarity, bounds, row, column,
             score, few_half if few else half, few_begin_of if few else begin_of, height_weights,
-            first_weights, second_weights, few_farthest if few else farthest, limits,
+            derivatives, few_farthest if few else farthest, limits,
         )  # fmt: skip
         sharpness = median_sharpness(fits)
         if sharpness < following[15]:
