@@ -139,10 +139,11 @@ def _told_beforehand(
     told = (
         table.elevation_tan, table.bearing_rad, table.anchor_row, table.first_row,
         table.last_row, table.robot_from_camera, strip.column, strip.ends, strip.rise,
-        strip.lean_by_pitch, strip.lean_by_roll, band.row, band.pixel, band.runs, band.part,
-        band.scale, band.visible, band.weights, window.weights_between, window.along, filters.half,
-        filters.begin, filters.height, filters.first, filters.second, farthest, filters.half[few],
-        filters.begin[few], farthest[:_FIRST_STEPS], np.array(following, np.float64),
+        strip.lean_by_pitch, strip.lean_by_roll, band.row, band.pixel, band.runs, band.lengths,
+        band.odd, band.odd_bounds, band.part, band.scale, band.visible, band.weights,
+        window.weights_between, window.along, filters.half, filters.begin, filters.height,
+        filters.derivatives, farthest, filters.half[few], filters.begin[few],
+        farthest[:_FIRST_STEPS], np.array(following, np.float64),
         limits_of(settings, table.row_aspect), doubt, grouping_of(settings),
     )  # fmt: skip
     return window, told

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from detect.line_settings import LineSettings
 from lut.verticals import VerticalTable
 
 FloatArray = NDArray[np.float64]
+T = TypeVar("T", bound=np.generic)
 
 #: So many rows of the band are crossed by each line if starts need company on them.
 _CROSSED = 3
@@ -55,16 +57,22 @@ class StartBand:
     ----------
     row : (K, W) int32
         Image row of each position at which the filter is evaluated; -1 where tracks may not start.
-    pixel : (R, W) int32
+    pixel : (P // T, R, T) int32
         Index into the flat image of the pixel on the left of each pixel of the band; -1 beyond the
-        ends of the vertical.
-    runs : (R * W // L, 3) int32
-        The same for L pixels of the band together, where these indices are two runs of neighbours:
-        that of the first; that of the second, as if it began at the first pixel too; and the length
-        of the first. Length -1 where they are not.
-    part : (R, W) float32
+        ends of the vertical. Columns are gathered to tiles of T (`TILE`); P is W rounded up to
+        whole ones.
+    runs : (R * P // L, 3) int32
+        The same for L (`RUN`) pixels of the band together, where these indices are up to three runs
+        of neighbours: that of the first pixel of each run, as if it began at the first of all.
+    lengths : (R * P // L, 2) uint8
+        The number of the first pixel that is not of the first run, and not of the second.
+    odd : (N,) int32
+        Where there are more runs, or none: index in `pixel` of the first of `LANES` pixels.
+    odd_bounds : (P // T + 1,) int32
+        Those of tile t are ``odd[odd_bounds[t] : odd_bounds[t + 1]]``.
+    part : (P // T, R, T) float32
         How far the pixel of the band lies to the right of it.
-    scale : (K, W) float32
+    scale : (K, P) float32
         One over the sum of the weights that lie on the vertical; 0 where there are none.
     visible : (K, W) bool
         Whether the filter's window lies inside the image.
@@ -81,6 +89,9 @@ class StartBand:
     row: NDArray[np.int32]
     pixel: NDArray[np.int32]
     runs: NDArray[np.int32]
+    lengths: NDArray[np.uint8]
+    odd: NDArray[np.int32]
+    odd_bounds: NDArray[np.int32]
     part: NDArray[np.float32]
     scale: NDArray[np.float32]
     visible: NDArray[np.bool_]
@@ -167,6 +178,8 @@ def start_band(table: VerticalTable, settings: LineSettings) -> StartBand:
     StartBand
         Computed once for each table.
     """
+    from detect.verticals.band_vector_kernels import TILE
+
     window = line_filter(settings)
     r, s = window.weights.shape[1] // 2, len(window.along) // 2
     height, width = table.column.shape
@@ -194,12 +207,20 @@ def start_band(table: VerticalTable, settings: LineSettings) -> StartBand:
     allowed = visible & (middle >= border) & (middle <= height - 1 - border)
     spacing_px = [_typical_spacing(x[i], on_vertical[i]) for i in range(*evaluated.indices(len(x)))]
     weights = [_weights_across(settings.sigma_across_px, px) for px in spacing_px]
+    beyond = [(0, 0), (0, -width % TILE)]
+    # What is there counts nowhere; that it goes on like this makes it fast.
+    further = np.minimum(pixel[:, -1:] + np.arange(1, beyond[1][1] + 1), height * width - 2)
+    pixel = _in_tiles(np.concatenate([pixel, further], axis=1).astype(np.int32))
+    runs, lengths, odd, odd_bounds = _runs_of_neighbours(pixel, height * width)
     return StartBand(
         row=np.where(allowed, middle, -1).astype(np.int32),
         pixel=pixel,
-        runs=_runs_of_neighbours(pixel, height * width),
-        part=(x - left).astype(np.float32),
-        scale=scale.astype(np.float32),
+        runs=runs,
+        lengths=lengths,
+        odd=odd,
+        odd_bounds=odd_bounds,
+        part=_in_tiles(np.pad((x - left).astype(np.float32), beyond)),
+        scale=np.pad(scale.astype(np.float32), beyond),
         visible=visible,
         weights=np.array(weights, np.float32),
         spacing=settings.start_spacing_rows,
@@ -208,20 +229,38 @@ def start_band(table: VerticalTable, settings: LineSettings) -> StartBand:
     )
 
 
-def _runs_of_neighbours(pixel: NDArray[np.int32], pixels: int) -> NDArray[np.int32]:
-    """See `StartBand.runs`."""
+def _in_tiles(rows: NDArray[T]) -> NDArray[T]:
+    """(P // TILE, R, TILE) of (R, P)."""
+    from detect.verticals.band_vector_kernels import TILE
+
+    tiles = rows.reshape(len(rows), -1, TILE).transpose(1, 0, 2)
+    return np.ascontiguousarray(tiles)
+
+
+def _runs_of_neighbours(
+    pixel: NDArray[np.int32], pixels: int
+) -> tuple[NDArray[np.int32], NDArray[np.uint8], NDArray[np.int32], NDArray[np.int32]]:
+    """See `StartBand`: runs, lengths, odd, odd_bounds."""
+    from detect.verticals.band_vector_kernels import RUN
     from detect.verticals.vector_code import LANES
 
-    flat = pixel.reshape(-1)
-    block = flat[: len(flat) // LANES * LANES].reshape(-1, LANES)
+    block = pixel.reshape(-1, RUN)
     breaks = np.diff(block, axis=1) != 1
-    length = np.where(breaks.any(axis=1), breaks.argmax(axis=1) + 1, LANES)
-    first = block[:, 0]
-    inside = np.minimum(length, LANES - 1)
-    second = np.where(length < LANES, block[np.arange(len(block)), inside] - length, first)
-    two = (block >= 0).all(axis=1) & (breaks.sum(axis=1) <= 1) & (second >= 0)
-    two &= np.maximum(first, second) + LANES < pixels
-    return np.stack([first, second, np.where(two, length, -1)], axis=1).astype(np.int32)
+    number = np.concatenate([np.zeros((len(block), 1), np.intp), np.cumsum(breaks, axis=1)], axis=1)
+    # Which place is the first behind so many breaks.
+    lengths = np.stack([(number <= 0).sum(axis=1), (number <= 1).sum(axis=1)], axis=1)
+    own = np.arange(len(block))
+    begins = [np.zeros_like(own), *np.minimum(lengths, RUN - 1).T]
+    runs = np.stack([block[own, begin] - begin for begin in begins], axis=1)
+    regular = (block >= 0).all(axis=1) & (number[:, -1] <= 2) & (runs >= 0).all(axis=1)
+    regular &= runs.max(axis=1) + RUN < pixels
+    runs[~regular] = 0
+    odd = np.flatnonzero(np.repeat(~regular, RUN // LANES)) * LANES
+    bounds = np.searchsorted(odd, np.arange(len(pixel) + 1) * pixel[0].size)
+    return (
+        runs.astype(np.int32), lengths.astype(np.uint8), odd.astype(np.int32),
+        bounds.astype(np.int32),
+    )  # fmt: skip
 
 
 def _typical_spacing(x: FloatArray, shown: NDArray[np.bool_]) -> float:

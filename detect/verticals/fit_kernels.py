@@ -14,8 +14,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from detect.verticals.group_kernels import MARGIN, STEP
-from detect.verticals.step_filters import SUBPIXELS
-from detect.verticals.vector_kernels import LANES, WORD, slope_and_bend, sum_of_products
+from detect.verticals.refine_vector_kernels import ROWS, heights, move_crossings, newton_sums
+from detect.verticals.vector_code import LANES
 
 _Floats = NDArray[np.float64]
 
@@ -95,11 +95,17 @@ def fit_eigenlines(
     for t in range(len(bounds) - 1):
         begin, end = bounds[t], bounds[t + 1]
         n = end - begin
+        # Views: that no index of theirs is negative the compiler knows.
+        own_row = row[begin:end]
+        own_column = column[begin:end]
+        own_score = score[begin:end]
+        own_rise = rise[begin:end]
+        own_off = off[begin:end]
         mean_column = 0.0
         total = 0.0
-        for i in range(begin, end):
-            mean_column += column[i]
-            total += score[i]
+        for i in range(n):
+            mean_column += own_column[i]
+            total += own_score[i]
         j = min(max(int(mean_column / n + 0.5), 1), width - 2)
         phi = bearing[j]
         reference[t] = phi
@@ -116,26 +122,26 @@ def fit_eigenlines(
         sum_xx = 0.0
         sum_xz = 0.0
         sum_zz = 0.0
-        widest = 0.0
-        for i in range(begin, end):
-            j = min(int(column[i]), width - 2)
-            f = column[i] - j
-            off[i] = (1.0 - f) * bearing[j] + f * bearing[j + 1] - phi
-            rise[i] = (1.0 - f) * elevation[j, row[i]] + f * elevation[j + 1, row[i]]
-            widest = max(widest, abs(off[i]))
+        wide = 0
+        for i in range(n):
+            j = min(int(own_column[i]), width - 2)
+            f = own_column[i] - j
+            own_off[i] = (1.0 - f) * bearing[j] + f * bearing[j + 1] - phi
+            own_rise[i] = (1.0 - f) * elevation[j, own_row[i]] + f * elevation[j + 1, own_row[i]]
+            wide += abs(own_off[i]) > _SMALL
         # Near the chart's origin in a loop that becomes vectors.
-        near = end if widest <= _SMALL else begin
-        for i in range(begin, near):
-            x, secant = _short_tan_and_secant(off[i])
-            z = rise[i] * secant
+        near = n if wide == 0 else 0
+        for i in range(near):
+            x, secant = _short_tan_and_secant(own_off[i])
+            z = own_rise[i] * secant
             sum_x += x
             sum_z += z
             sum_xx += x * x
             sum_xz += x * z
             sum_zz += z * z
-        for i in range(near, end):
-            x = math.tan(off[i])
-            z = rise[i] / math.cos(off[i])
+        for i in range(near, n):
+            x = math.tan(own_off[i])
+            z = own_rise[i] / math.cos(own_off[i])
             sum_x += x
             sum_z += z
             sum_xx += x * x
@@ -176,8 +182,7 @@ def refine_lines(
     half: NDArray[np.int64],
     begin_of: NDArray[np.int64],
     height_weights: NDArray[np.float32],
-    first_weights: NDArray[np.float32],
-    second_weights: NDArray[np.float32],
+    derivatives: NDArray[np.float32],
     farthest: NDArray[np.float64],
     tracked_line: NDArray[np.float64],
 ) -> tuple[_Floats, _Floats, _Floats, _Floats, _Floats]:
@@ -204,7 +209,7 @@ def refine_lines(
         The tracks (see `follow_edges`).
     reference, pixel, middle, rise, point_off
         See `fit_eigenlines`.
-    half, begin_of, height_weights, first_weights, second_weights
+    half, begin_of, height_weights, derivatives
         Filters (see `detect.verticals.step_filters.StepFilters`): of each step of Newton's method,
         and two whose contrasts are compared, a fine and a coarse one.
     farthest : (K,) float64
@@ -234,18 +239,19 @@ def refine_lines(
     sharpness = np.ones(count)
     height, width = image.shape
     grey_values = image.reshape(-1)
-    crossing = np.empty(height)
-    by_a = np.empty(height)
-    by_b = np.empty(height)
+    # Up to a whole number of vectors, behind the last row.
+    crossing = np.empty(height + ROWS)
+    by_a = np.empty(height + ROWS)
+    by_b = np.empty(height + ROWS)
+    row_begin = np.empty(height + ROWS, np.int32)
+    near = np.empty(height, np.int32)
     turn = np.empty(height)
     height_of = np.empty(height)
     turn_by_a = np.empty(height)
-    off = np.empty(height)
-    weight = np.empty(height)
-    first = np.empty(height)
-    second = np.empty(height)
-    at_pixel = np.empty(height, np.int64)
-    at_weight = np.empty(height, np.int64)
+    bearings = np.empty(height)
+    next_bearings = np.empty(height)
+    columns = np.empty(height, np.float32)
+    next_columns = np.empty(height, np.float32)
     for t in range(len(sign)):
         begin, end = bounds[t], bounds[t + 1]
         a = tracked_line[t, 0]
@@ -255,88 +261,78 @@ def refine_lines(
             continue
         phi = reference[t]
         n = end - begin
-        widest = 0.0
-        # Again in loops of which the first, the long one, becomes vectors.
+        # Views: that no index of theirs is negative the compiler knows.
+        own_row = row[begin:end]
+        own_column = column[begin:end]
+        own_rise = rise[begin:end]
+        own_off = point_off[begin:end]
+        # In loops that become vectors, all but one; that is why it is counted, not maximised.
+        wide = 0
         for i in range(n):
             # Z depends on X in second order only: one repetition settles it.
-            x = a + b * rise[begin + i]
-            z = rise[begin + i] * math.sqrt(1.0 + x * x)
+            x = a + b * own_rise[i]
+            z = own_rise[i] * math.sqrt(1.0 + x * x)
             x = a + b * z
-            widest = max(widest, abs(x))
+            wide += abs(x) > _SMALL
             turn[i] = _arctan_series(x)
             height_of[i] = z
             turn_by_a[i] = 1.0 / (1.0 + x * x)
-        if widest > _SMALL:
+        if wide > 0:
             for i in range(n):
                 turn[i] = math.atan(a + b * height_of[i])
-        j = min(max(int(column[begin]), 1), width - 2)
+        j = min(max(int(own_column[0]), 1), width - 2)
         columns_about = 2.0 / (bearing[j + 1] - bearing[j - 1])
+        rightmost = np.float64(width - 1)
         for i in range(n):
-            v = row[begin + i]
             # To a hundredth of a column; it decides which of them it lies between.
-            at = column[begin + i] + (turn[i] - point_off[begin + i]) * columns_about
-            crossing[i] = math.nan
+            at = own_column[i] + (turn[i] - own_off[i]) * columns_about
+            inside = (at >= 0.0) & (at <= rightmost)
+            near[i] = np.int32(at if inside else -1.0)
+        for i in range(n):
+            v = own_row[i]
+            row_begin[i] = v * width
+            j = min(max(near[i], 0), width - 2)
+            bearings[i] = bearing[j]
+            next_bearings[i] = bearing[j + 1]
+            group = j // STEP
+            base = min(max(group * STEP - MARGIN, 0), width - LANES)
+            place = (group * height + v) * LANES + j - base
+            columns[i] = strip[place]
+            next_columns[i] = strip[place + 1]
+        for i in range(n):
+            columns_per_rad = 1.0 / (next_bearings[i] - bearings[i])
+            at = (phi + turn[i] - bearings[i]) * columns_per_rad
+            du_dc = next_columns[i] - columns[i]
+            # Beside it a vertical may have ended.
+            shown = (near[i] >= 0) & (abs(du_dc) < np.inf)
+            crossing[i] = columns[i] + at * du_dc if shown else np.nan
+            moved = du_dc * columns_per_rad * turn_by_a[i]
+            by_a[i] = moved if shown else 0.0
+            by_b[i] = moved * height_of[i] if shown else 0.0
+        blocks = (n + ROWS - 1) // ROWS
+        for i in range(n, blocks * ROWS):
+            row_begin[i] = 0
+            crossing[i] = np.nan
             by_a[i] = 0.0
             by_b[i] = 0.0
-            if 0.0 <= at <= width - 1.0:
-                j = min(int(at), width - 2)
-                columns_per_rad = 1.0 / (bearing[j + 1] - bearing[j])
-                at = (phi + turn[i] - bearing[j]) * columns_per_rad
-                group = j // STEP
-                base = min(max(group * STEP - MARGIN, 0), width - LANES)
-                place = (group * height + v) * LANES + j - base
-                du_dc = strip[place + 1] - strip[place]
-                # Beside it a vertical may have ended.
-                if math.isfinite(du_dc):
-                    crossing[i] = strip[place] + at * du_dc
-                    by_a[i] = du_dc * columns_per_rad * turn_by_a[i]
-                    by_b[i] = by_a[i] * height_of[i]
         largest_change = math.inf
         for step in range(len(farthest)):
             if step > 0 and begin_of[step] == begin_of[step - 1] and largest_change <= _STILL_PX:
                 continue
             reach = half[step]
-            hessian_aa = 0.0
-            hessian_ab = 0.0
-            hessian_bb = 0.0
-            gradient_a = 0.0
-            gradient_b = 0.0
-            meat_aa = 0.0
-            meat_ab = 0.0
-            meat_bb = 0.0
-            # In three loops, of which the compiler turns the first and the last into vectors.
-            shown = 0.0
-            for i in range(n):
-                u = crossing[i]
-                inside = (u > reach) & (u < width - 1 - reach)
-                u = u if inside else float(reach)
-                whole = int(u)
-                node = int((u - whole) * SUBPIXELS)
-                # From the tabulated position to the crossing.
-                off[i] = u - whole - (node + 0.5) / SUBPIXELS
-                weight[i] = 1.0 if inside else 0.0
-                shown += weight[i]
-                at_pixel[i] = row[begin + i] * width + whole - reach + 1
-                at_weight[i] = begin_of[step] + node * 2 * reach
-            for i in range(n):
-                first[i], second[i] = slope_and_bend(
-                    grey_values, at_pixel[i], first_weights, second_weights, at_weight[i],
-                    2 * reach // WORD,
-                )  # fmt: skip
-            for i in range(n):
-                bend = sign[t] * weight[i] * second[i]
-                slope = sign[t] * weight[i] * first[i] + off[i] * bend
-                hessian_aa += bend * by_a[i] * by_a[i]
-                hessian_ab += bend * by_a[i] * by_b[i]
-                hessian_bb += bend * by_b[i] * by_b[i]
-                slope_a = slope * by_a[i]
-                slope_b = slope * by_b[i]
-                gradient_a += slope_a
-                gradient_b += slope_b
-                meat_aa += slope_a * slope_a
-                meat_ab += slope_a * slope_b
-                meat_bb += slope_b * slope_b
-            used = int(shown)
+            sums = newton_sums(
+                grey_values, row_begin, crossing, by_a, by_b, blocks, derivatives,
+                2 * begin_of[step], reach, float(reach), float(width - 1 - reach),
+            )  # fmt: skip
+            hessian_aa = sign[t] * sums[0]
+            hessian_ab = sign[t] * sums[1]
+            hessian_bb = sign[t] * sums[2]
+            gradient_a = sign[t] * sums[3]
+            gradient_b = sign[t] * sums[4]
+            meat_aa = sums[5]
+            meat_ab = sums[6]
+            meat_bb = sums[7]
+            used = int(sums[8])
             determinant = hessian_aa * hessian_bb - hessian_ab * hessian_ab
             # No maximum here at this scale: what the coarser ones found stands.
             if used < 5 or not (hessian_aa < 0.0 and determinant > 1e-12 * hessian_aa * hessian_bb):
@@ -350,11 +346,7 @@ def refine_lines(
                 break
             a += change_a
             b += change_b
-            largest_change = 0.0
-            for i in range(n):
-                change = change_a * by_a[i] + change_b * by_b[i]
-                crossing[i] += change
-                largest_change = max(largest_change, abs(change))
+            largest_change = move_crossings(crossing, by_a, by_b, blocks, change_a, change_b)
             left_aa = inverse_aa * meat_aa + inverse_ab * meat_ab
             left_ab = inverse_aa * meat_ab + inverse_ab * meat_bb
             left_ba = inverse_ab * meat_aa + inverse_bb * meat_ab
@@ -372,23 +364,12 @@ def refine_lines(
         line[t, 1] = b
         moved = a - tracked_line[t, 0] + (b - tracked_line[t, 1]) * middle[t]
         shift_px[t] = abs(moved) / pixel[t]
-        used = 0
         margin = max(half[-2], half[-1])
-        for i in range(n):
-            u = crossing[i]
-            if not (u > margin and u < width - 1 - margin):
-                continue
-            whole = int(u)
-            at_pixel[used] = row[begin + i] * width + whole + 1
-            at_weight[used] = int((u - whole) * SUBPIXELS)
-            used += 1
-        fine_height = sum_of_products(
-            grey_values, at_pixel, height_weights, at_weight, used, begin_of[-2], half[-2]
-        )
-        coarse_height = sum_of_products(
-            grey_values, at_pixel, height_weights, at_weight, used, begin_of[-1], half[-1]
-        )
-        contrast[t] = sign[t] * fine_height / used if used > 0 else 0.0
+        fine_height, coarse_height, rows = heights(
+            grey_values, row_begin, crossing, blocks, height_weights, begin_of[-2], half[-2],
+            begin_of[-1], half[-1], float(margin), float(width - 1 - margin),
+        )  # fmt: skip
+        contrast[t] = sign[t] * fine_height / rows if rows > 0.0 else 0.0
         sharp = fine_height / coarse_height if sign[t] * coarse_height > 0.0 else 1.0
         sharpness[t] = min(max(sharp, 0.0), 1.0)
     return line, covariance, shift_px, contrast, sharpness

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from detect.uncounted import uncounted_contracting
 from detect.verticals.group_kernels import MARGIN, STEP, respond
+from detect.verticals.sum_kernels import sum_of
 from detect.verticals.vector_code import LANES
 
 #: Rows that are filtered ahead of a track.
@@ -25,6 +26,12 @@ def _top_of_parabola(left: np.float32, centre: np.float32, right: np.float32) ->
     """Offset of the maximum of the parabola through three neighbours."""
     bend = left - 2.0 * centre + right
     return float(0.5 * (left - right) / bend) if bend < 0.0 else 0.0
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _index(number: int) -> np.uint64:
+    """An index that the compiler need not compare with 0."""
+    return np.uint64(number)
 
 
 @uncounted_contracting
@@ -76,7 +83,9 @@ def _follow(
             if v < border or v > height - 1 - border or j < 1 or j > width - 2:
                 break
             # A vertical leans in the strip of a tilted camera.
-            moved = columns_per_rise[j] * (rise[j, v] - rise[j, v - direction])
+            moved = columns_per_rise[_index(j)] * (
+                rise[_index(j), _index(v)] - rise[_index(j), _index(v - direction)]
+            )
             if not math.isfinite(moved):
                 break
             part += moved
@@ -87,7 +96,7 @@ def _follow(
         if j < 2 or j > width - 3:
             break
         group = j // STEP
-        if not known[group, 0] <= v < known[group, 1]:
+        if not known[_index(group), 0] <= v < known[_index(group), 1]:
             begin = max(v - (_AHEAD - 1 if direction < 0 else 0), 0)
             end = min(v + (_AHEAD - 1 if direction > 0 else 0), height - 1) + 1
             if known[group, 0] < known[group, 1]:
@@ -106,28 +115,28 @@ def _follow(
             )  # fmt: skip
         base = min(max(group * STEP - MARGIN, 0), width - LANES)
         at = (group * height + v) * LANES + j - base
-        left = sign * response[at - 1]
-        centre = sign * response[at]
-        right = sign * response[at + 1]
+        left = sign * response[_index(at - 1)]
+        centre = sign * response[_index(at)]
+        right = sign * response[_index(at + 1)]
         off = -part
         # A fourth neighbour, if the highest of three is not the one in the middle.
         if left > centre and left > right:
             off -= 1.0
             right = centre
             centre = left
-            left = sign * response[at - 2]
+            left = sign * response[_index(at - 2)]
         elif right > centre:
             off += 1.0
             left = centre
             centre = right
-            right = sign * response[at + 2]
+            right = sign * response[_index(at + 2)]
         seen = False
         if centre >= threshold and centre >= left and centre >= right:
             off += _top_of_parabola(left, centre, right)
             # A start is known to a column only.
             seen = n == 0 or abs(off) <= reach
             if seen:
-                place = height + direction * n
+                place = _index(height + direction * n)
                 out_row[place] = v
                 out_column[place] = j + (part + off)
                 out_score[place] = centre
@@ -300,19 +309,26 @@ def follow_edges(
             grown_score = np.empty(capacity, np.float32)
             grown_score[:n] = score[:n]
             score = grown_score
-        total = 0.0
-        for i in range(begin, end):
-            total += own_score[i]
-            row[n] = own_row[i]
-            column[n] = own_column[i]
-            score[n] = own_score[i]
-            n += 1
-            if lowest <= own_row[i] <= highest:
-                j = math.floor(own_column[i] + 0.5)
+        # Views: that no index of theirs is negative the compiler knows.
+        points = end - begin
+        seen_row = own_row[begin:end]
+        seen_column = own_column[begin:end]
+        seen_score = own_score[begin:end]
+        to_row = row[n : n + points]
+        to_column = column[n : n + points]
+        to_score = score[n : n + points]
+        for i in range(points):
+            to_row[i] = seen_row[i]
+            to_column[i] = seen_column[i]
+            to_score[i] = seen_score[i]
+        n += points
+        for i in range(points):
+            if lowest <= seen_row[i] <= highest:
+                j = math.floor(seen_column[i] + 0.5)
                 for k in range(max(0, j - 1), min(width, j + 2)):
-                    followed[layer, own_row[i] - lowest, k] = True
+                    followed[layer, _index(seen_row[i] - lowest), _index(k)] = True
         sign[tracks] = polarity
         tracks += 1
         bounds[tracks] = n
-        counting += end - begin >= least_points and total >= least_score
+        counting += points >= least_points and sum_of(seen_score) >= least_score
     return sign[:tracks], bounds[: tracks + 1], row[:n], column[:n], score[:n], complete

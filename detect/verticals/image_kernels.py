@@ -38,6 +38,9 @@ def find_lines(
     band_row: NDArray[np.int32],
     band_pixel: NDArray[np.int32],
     band_runs: NDArray[np.int32],
+    band_lengths: NDArray[np.uint8],
+    band_odd: NDArray[np.int32],
+    band_odd_bounds: NDArray[np.int32],
     band_part: NDArray[np.float32],
     band_scale: NDArray[np.float32],
     band_visible: NDArray[np.bool_],
@@ -47,8 +50,7 @@ def find_lines(
     half: NDArray[np.int64],
     begin_of: NDArray[np.int64],
     height_weights: NDArray[np.float32],
-    first_weights: NDArray[np.float32],
-    second_weights: NDArray[np.float32],
+    derivatives: NDArray[np.float32],
     farthest: NDArray[np.float64],
     few_half: NDArray[np.int64],
     few_begin_of: NDArray[np.int64],
@@ -70,11 +72,12 @@ def find_lines(
         The table (see `lut.verticals.VerticalTable`).
     strip, ends, rise, lean_by_pitch, lean_by_roll
         See `detect.verticals.strip.Strip`.
-    band_row, band_pixel, band_runs, band_part, band_scale, band_visible, band_weights
+    band_row, band_pixel, band_runs, band_lengths, band_odd, band_odd_bounds, band_part, band_scale,
+    band_visible, band_weights
         See `detect.verticals.filter.StartBand`.
     weights, along
         See `detect.verticals.filter.LineFilter`.
-    half, begin_of, height_weights, first_weights, second_weights
+    half, begin_of, height_weights, derivatives
         Filters of the refinement (see `detect.verticals.step_filters.StepFilters`).
     farthest
         How far its steps may go (see `fit_and_judge`).
@@ -93,8 +96,8 @@ def find_lines(
     response = np.empty(band_row.shape, np.float32)
     regulariser = np.float32(following[0])
     band_response(
-        image, band_pixel, band_runs, band_part, band_scale, band_visible, int(following[1]),
-        band_weights, along, regulariser, response,
+        image, band_pixel, band_runs, band_lengths, band_odd, band_odd_bounds, band_part,
+        band_scale, band_visible, int(following[1]), band_weights, along, regulariser, response,
     )  # fmt: skip
     threshold = following[2]
     level, start_column, start_sign = find_maxima(
@@ -146,7 +149,7 @@ def find_lines(
         fits, evidence, fate, tilt = fit_and_judge(
             image, strip, rise, bearing, anchor_row, row_aspect, polarity, bounds, row, column,
             score, few_half if few else half, few_begin_of if few else begin_of, height_weights,
-            first_weights, second_weights, few_farthest if few else farthest, limits,
+            derivatives, few_farthest if few else farthest, limits,
         )  # fmt: skip
         sharpness = median_sharpness(fits)
         if sharpness < following[15]:

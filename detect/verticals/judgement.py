@@ -107,7 +107,7 @@ def judge_tracks(
     fits, evidence, fate, tilt = fit_and_judge(
         image, strip.column, strip.rise, table.bearing_rad, table.anchor_row,
         table.row_aspect, tracks.polarity, tracks.bounds, tracks.row, tracks.column, tracks.score,
-        filters.half, filters.begin, filters.height, filters.first, filters.second, farthest,
+        filters.half, filters.begin, filters.height, filters.derivatives, farthest,
         limits_of(settings, table.row_aspect),
     )  # fmt: skip
     votes, deviation = tilt[-2:].tolist()

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from detect.verticals.bearing_kernels import chain_neighbours, join_mixture, wrapped
 from detect.verticals.order_kernels import descending
+from detect.verticals.sum_kernels import sum_of
 
 ACCEPTED = 0
 JOINED = 1
@@ -108,9 +109,7 @@ def judge_tracks(
     fate = np.empty(count, np.int8)
     for t in range(count):
         begin, end = bounds[t], bounds[t + 1]
-        total = 0.0
-        for i in range(begin, end):
-            total += score[i]
+        total = sum_of(score[begin:end])
         evidence[t] = total * row_aspect * sharpness[t] * sharpness[t]
         near = min(max(int(np.rint(column[begin])), 0), width - 1)
         gap = max(anchor_row[near] - row[end - 1], row[begin] - anchor_row[near]) * row_aspect

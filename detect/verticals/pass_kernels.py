@@ -150,8 +150,7 @@ def fit_and_judge(
     half: NDArray[np.int64],
     begin_of: NDArray[np.int64],
     height_weights: NDArray[np.float32],
-    first_weights: NDArray[np.float32],
-    second_weights: NDArray[np.float32],
+    derivatives: NDArray[np.float32],
     farthest: NDArray[np.float64],
     limits: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int8], NDArray[np.float64]]:
@@ -167,7 +166,7 @@ def fit_and_judge(
         The table (see `lut.verticals.VerticalTable`).
     polarity, bounds, row, column, score
         The tracks (see `detect.verticals.tracks.LineTracks`).
-    half, begin_of, height_weights, first_weights, second_weights
+    half, begin_of, height_weights, derivatives
         Filters of the refinement (see `detect.verticals.fit_kernels.refine_lines`).
     farthest : (K,) float64
         How far its steps may go; of length 0 for none: the covariance is then that of independent
@@ -193,7 +192,7 @@ def fit_and_judge(
     if len(farthest) > 0:
         line, covariance, shift_px, contrast, sharpness = refine_lines(
             image, strip, bearing, polarity, bounds, row, column, reference, pixel, middle,
-            rise, off, half, begin_of, height_weights, first_weights, second_weights, farthest,
+            rise, off, half, begin_of, height_weights, derivatives, farthest,
             line,
         )  # fmt: skip
     else:

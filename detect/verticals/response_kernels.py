@@ -15,7 +15,15 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from detect.verticals.vector_kernels import LANES, interpolate, interpolate_runs
+from detect.verticals.band_vector_kernels import (
+    BLOCK,
+    RUN,
+    TILE,
+    interpolate,
+    interpolate_runs,
+    response_across,
+    sums_along,
+)
 
 _ZERO = np.float32(0.0)
 #: Grey values about 0 keep the small variances exact in single precision.
@@ -150,11 +158,20 @@ def strip_response(
                     )
 
 
+@njit(cache=True, error_model="numpy")
+def _from_cache_line(numbers: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The numbers from where a line of the cache begins: vectors do not cross two of them."""
+    return numbers[-(numbers.ctypes.data // 4) % 16 :]
+
+
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def band_response(
     image: NDArray[np.uint8],
     pixel: NDArray[np.int32],
     runs: NDArray[np.int32],
+    lengths: NDArray[np.uint8],
+    odd: NDArray[np.int32],
+    odd_bounds: NDArray[np.int32],
     part: NDArray[np.float32],
     scale: NDArray[np.float32],
     visible: NDArray[np.bool_],
@@ -174,14 +191,9 @@ def band_response(
     ----------
     image : (H, W) uint8
         Grey values.
-    pixel : (R, W) int32
-        Index into the flat image of the pixel on the left of each pixel of the strip, for rows that
-        are counted from the horizon; -1 beyond the ends of the vertical.
-    runs : (R * W // LANES, 3) int32
+    pixel, runs, lengths, odd, odd_bounds, part
         See `detect.verticals.filter.StartBand`.
-    part : (R, W) float32
-        How far the strip's pixel lies to the right of it.
-    scale : (K, W) float32
+    scale : (K, P) float32
         One over the sum of the weights along the vertical that lie on it, for each row of the
         result.
     visible : (K, W) bool
@@ -196,75 +208,54 @@ def band_response(
         Result: as `strip_response`.
     """
     width = image.shape[1]
-    r = weights.shape[2] // 2
-    s = len(along) // 2
+    tiles, rows = pixel.shape[:2]
+    padded = tiles * TILE
+    levels = len(response)
+    taps = weights.shape[2]
+    r = taps // 2
     inner = width - 2 * r
-    grey = np.empty(pixel.shape, np.float32)
-    square = np.empty(pixel.shape, np.float32)
+    if inner <= 0 or image.size <= RUN:
+        response[:] = _ZERO
+        return
     flat = image.reshape(-1)
     flat_pixel = pixel.reshape(-1)
     flat_part = part.reshape(-1)
-    flat_grey = grey.reshape(-1)
-    flat_square = square.reshape(-1)
-    whole = len(flat_pixel) // LANES * LANES
-    for block in range(len(runs)):
-        i = block * LANES
-        if runs[block, 2] >= 0:
+    flat_scale = scale.reshape(-1)
+    flat_weights = weights.reshape(-1)
+    # Some columns at a time: what is between the pixels stays in the innermost cache.
+    plane = rows * TILE
+    between = _from_cache_line(np.empty(2 * plane + 16, np.float32))
+    length = padded + (BLOCK + taps + 15) // 16 * 16
+    sums_plane = levels * length
+    sums = _from_cache_line(np.empty(2 * sums_plane + 16, np.float32))
+    for tile in range(tiles):
+        left = tile * TILE
+        for row in range(rows):
             interpolate_runs(
-                flat, runs[block, 0], runs[block, 1], runs[block, 2], flat_part, flat_grey,
-                flat_square, i,
+                flat, runs, lengths, flat_part, (tile * rows + row) * (TILE // RUN), between, plane,
+                row * TILE,
             )  # fmt: skip
-        else:
-            interpolate(flat, flat_pixel, flat_part, flat_grey, flat_square, i)
-    for i in range(whole, len(flat_pixel)):
-        flat_grey[i] = _ZERO
-        flat_square[i] = _ZERO
-        if flat_pixel[i] >= 0:
-            left = np.float32(flat[flat_pixel[i]]) - _MIDDLE
-            right = np.float32(flat[flat_pixel[i] + 1]) - _MIDDLE
-            flat_grey[i] = left + flat_part[i] * (right - left)
-            left *= left
-            flat_square[i] = left + flat_part[i] * (right * right - left)
-    grey_sum = np.empty(width, np.float32)
-    square_sum = np.empty(width, np.float32)
-    mean = np.empty(max(inner, 0), np.float32)
-    cov = np.empty(max(inner, 0), np.float32)
-    mean_square = np.empty(max(inner, 0), np.float32)
-    response[:] = _ZERO
-    for k in range(len(response) if inner > 0 else 0):
-        middle = k * spacing + s
-        row = grey[middle]
-        square_row = square[middle]
-        for c in range(width):
-            grey_sum[c] = along[s] * row[c]
-            square_sum[c] = along[s] * square_row[c]
-        for t in range(1, s + 1):
-            w = along[s + t]
-            above = grey[middle - t]
-            below = grey[middle + t]
-            square_above = square[middle - t]
-            square_below = square[middle + t]
-            for c in range(width):
-                grey_sum[c] += w * (above[c] + below[c])
-                square_sum[c] += w * (square_above[c] + square_below[c])
-        for c in range(width):
-            grey_sum[c] *= scale[k, c]
-            square_sum[c] *= scale[k, c]
-        mean[:] = _ZERO
-        cov[:] = _ZERO
-        mean_square[:] = _ZERO
-        for t in range(2 * r + 1):
-            w = weights[k, 0, t]
-            h = weights[k, 1, t]
-            near = grey_sum[t : t + inner]
-            near_square = square_sum[t : t + inner]
-            for c in range(inner):
-                mean[c] += w * near[c]
-                cov[c] += h * near[c]
-                mean_square[c] += w * near_square[c]
+        for n in range(odd_bounds[tile], odd_bounds[tile + 1]):
+            interpolate(flat, flat_pixel, flat_part, odd[n], between, plane, odd[n] - tile * plane)
+        for k in range(levels):
+            for own in range(0, TILE, BLOCK):
+                sums_along(
+                    between, plane, k * spacing * TILE + own, TILE, along, len(along), flat_scale,
+                    k * padded + left + own, sums, sums_plane, k * length + left + own,
+                )  # fmt: skip
+    for row in range(2 * levels):
+        # What is computed of it is not looked at, but may take long.
+        sums[row * length + padded : (row + 1) * length] = _ZERO
+    values = np.empty(length, np.float32)
+    for k in range(levels):
+        for c in range(0, inner, BLOCK):
+            response_across(
+                sums, sums_plane, k * length + c, flat_weights, 2 * k * taps, taps, regulariser,
+                values, c,
+            )  # fmt: skip
+        response[k, :r] = _ZERO
+        response[k, r + inner :] = _ZERO
         out = response[k, r : r + inner]
         shown = visible[k, r : r + inner]
         for c in range(inner):
-            variance = abs(mean_square[c] - mean[c] * mean[c])
-            value = cov[c] * abs(cov[c]) / (variance + regulariser)
-            out[c] = value if shown[c] else _ZERO
+            out[c] = values[c] if shown[c] else _ZERO

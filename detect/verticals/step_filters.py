@@ -31,16 +31,18 @@ class StepFilters:
     half : (K,) int64
         The filter at a position in pixels i to i + 1 covers ``2 half`` pixels, from i - half + 1.
     begin : (K,) int64
-        Where each filter's weights begin: `SUBPIXELS` rows of ``2 half``.
-    height, first, second : (N,) float32
-        Weights of the step's height and of its derivatives times sigma^2; each row has the sum 0.
+        Where each filter's weights begin: `SUBPIXELS` rows of ``2 half``, and one of zeros.
+    height : (N,) float32
+        Weights of the step's height; each row has the sum 0.
+    derivatives : (2 N,) float32
+        Those of its derivatives times sigma^2: `WORD` (`detect.verticals.vector_code`) of the
+        first, then as many of the second, and so on.
     """
 
     half: NDArray[np.int64]
     begin: NDArray[np.int64]
     height: NDArray[np.float32]
-    first: NDArray[np.float32]
-    second: NDArray[np.float32]
+    derivatives: NDArray[np.float32]
 
 
 @lru_cache(maxsize=16)
@@ -57,6 +59,8 @@ def step_filters(sigmas_px: tuple[float, ...]) -> StepFilters:
     StepFilters
         One filter for each, in this order.
     """
+    from detect.verticals.vector_code import WORD
+
     halves, tables = [], []
     # Equal ones share a table.
     widths = list(dict.fromkeys(sigmas_px))
@@ -72,14 +76,14 @@ def step_filters(sigmas_px: tuple[float, ...]) -> StepFilters:
         )
         # What is cut off must not see the image's brightness.
         weights -= weights.mean(axis=-1, keepdims=True)
+        weights = np.pad(weights, [(0, 0), (0, 1), (0, 0)])
         tables.append(weights.reshape(3, -1))
     height, first, second = np.concatenate(tables, axis=-1).astype(np.float32)
-    begins = np.concatenate([[0], np.cumsum([SUBPIXELS * 2 * half for half in halves])])
+    begins = np.concatenate([[0], np.cumsum([(SUBPIXELS + 1) * 2 * half for half in halves])])
     which = [widths.index(sigma) for sigma in sigmas_px]
     return StepFilters(
         half=np.array(halves, np.int64)[which],
         begin=begins.astype(np.int64)[which],
         height=height,
-        first=first,
-        second=second,
+        derivatives=np.stack([first.reshape(-1, WORD), second.reshape(-1, WORD)], 1).reshape(-1),
     )

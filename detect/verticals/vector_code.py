@@ -54,15 +54,42 @@ class Code:
 
     def load(self, argument: int, index: Any, kind: Any) -> Any:
         """A number, or as many as a vector holds, from an index of a contiguous array on."""
-        value = self.builder.load(self._place(argument, index, kind))
+        return self.load_from(self.data[argument], index, kind)
+
+    def load_from(self, begin: Any, index: Any, kind: Any) -> Any:
+        """As `load`, from a pointer to an element on."""
+        value = self.builder.load(self._behind(begin, index, kind))
         value.align = 4 if getattr(kind, "element", kind) == FLOAT else 1
         return value
+
+    def pointers(self, argument: int, indices: Any, begin: Any = None) -> list[Any]:
+        """Pointers to elements of an array; indices are a vector of 32 bit, from `begin` on."""
+        first = self.data[argument]
+        if begin is not None:
+            first = self.builder.gep(first, [begin])
+        longs = ir.VectorType(I64, indices.type.count)
+        size = {I8: 1, FLOAT: 4}[first.type.pointee]
+        behind = self.builder.mul(self.builder.sext(indices, longs), constant(longs, size))
+        places = self.builder.add(self.everywhere(self.builder.ptrtoint(first, I64), longs), behind)
+        return [self.builder.inttoptr(place, first.type) for place in self.scattered(places)]
 
     def store(self, argument: int, index: Any, value: Any) -> None:
         self.builder.store(value, self._place(argument, index, value.type)).align = 4
 
+    def prefetch(self, argument: int, index: Any) -> None:
+        """Fetch a line of the cache that will be needed soon; it may lie outside the array."""
+        place = I8.as_pointer()
+        kind = ir.FunctionType(ir.VoidType(), [place, I32, I32, I32])
+        fetch = self.builder.module.declare_intrinsic("llvm.prefetch", [place], kind)
+        where = self.builder.bitcast(self.builder.gep(self.data[argument], [index]), place)
+        # To be read, and again, as data.
+        self.builder.call(fetch, [where, *(ir.Constant(I32, value) for value in (0, 3, 1))])
+
     def _place(self, argument: int, index: Any, kind: Any) -> Any:
-        where = self.builder.gep(self.data[argument], [index])
+        return self._behind(self.data[argument], index, kind)
+
+    def _behind(self, begin: Any, index: Any, kind: Any) -> Any:
+        where = self.builder.gep(begin, [index])
         return self.builder.bitcast(where, kind.as_pointer())
 
     def add(self, a: Any, b: Any) -> Any:
@@ -97,9 +124,9 @@ class Code:
         places = (ir.Constant(I32, k) for k in range(vector.type.count))
         return [self.builder.extract_element(vector, place) for place in places]
 
-    def grey(self, argument: int, index: Any) -> Any:
-        """Neighbouring grey values, counted from 128."""
-        values = self.load(argument, index, BYTES)
+    def grey_from(self, begin: Any, index: Any) -> Any:
+        """Neighbouring grey values, counted from 128, from a pointer to a pixel on."""
+        values = self.load_from(begin, index, BYTES)
         # x - 128 is x with its highest bit turned over, as a signed number.
         values = self.builder.xor(values, constant(BYTES, 0x80))
         return self.builder.sitofp(self.builder.sext(values, INTS), FLOATS)

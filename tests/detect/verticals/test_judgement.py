@@ -11,6 +11,7 @@ from detect.verticals import judgement_kernels as kernels
 from detect.verticals.judgement import FATES
 from detect.verticals.order_kernels import descending
 from detect.verticals.step_filters import SUBPIXELS, step_filters
+from detect.verticals.vector_code import WORD
 
 
 def test_numbers_of_fates_are_places_of_their_names() -> None:
@@ -30,10 +31,14 @@ def test_tabulated_filters_are_derivatives(sigma: float) -> None:
     half, begin = filters.half[1], filters.begin[1]
     taps = np.arange(-half + 1, half + 1)
     rows = slice(begin, begin + SUBPIXELS * 2 * half)
+    words = filters.derivatives.reshape(-1, 2, WORD)
     height, first, second = (
-        table[rows].reshape(SUBPIXELS, 2 * half)
-        for table in (filters.height, filters.first, filters.second)
+        table.reshape(-1)[rows].reshape(SUBPIXELS, 2 * half)
+        for table in (filters.height, words[:, 0], words[:, 1])
     )
+    behind = slice(rows.stop, rows.stop + 2 * half)
+    for table in (filters.height, words[:, 0], words[:, 1]):
+        assert np.all(table.reshape(-1)[behind] == 0.0)
     position = (np.arange(SUBPIXELS) + 0.5) / SUBPIXELS
     # A parabola's first derivative is seen in proportion to the distance from its vertex, which a
     # sum over pixels reproduces as well as the integral does.

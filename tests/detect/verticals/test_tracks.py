@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from detect.line_settings import DEFAULT, PUBLISHED, LineSettings
+from detect.verticals.band_vector_kernels import RUN, TILE
 from detect.verticals.filter import FilteredColumns, gaussian_window, start_band
 from detect.verticals.start_kernels import find_starts
 from detect.verticals.tilt import TiltEstimate
@@ -256,14 +257,20 @@ def test_response_of_the_starts_is_that_of_the_whole_strip(preset: LineSettings)
 def test_runs_of_neighbours_are_the_pixels_of_the_band(width: int) -> None:
     camera = pinhole(width, 160, 200.0, pitch_deg=8.0, roll_deg=3.0)
     band = start_band(build_vertical_table(camera), DEFAULT)
-    first, second, length = (band.runs[:, k, None].astype(np.int64) for k in range(3))
-    whole = band.pixel.size // LANES * LANES
-    pixel = band.pixel.reshape(-1)[:whole].reshape(-1, LANES)
-    lane = np.arange(LANES)
-    expected = np.where(lane < length, first + lane, second + lane)
-    two = length[:, 0] >= 0
-    # Most are: that is what makes it fast.
-    assert np.mean(two) > 0.7
-    np.testing.assert_array_equal(expected[two], pixel[two])
-    assert np.minimum(first, second)[two].min() >= 0
-    assert np.maximum(first, second)[two].max() + LANES < width * 160
+    assert band.pixel.shape[2] == TILE
+    runs = band.runs.astype(np.int64)
+    assert runs.min() >= 0
+    assert runs.max() + RUN < width * 160
+    lane = np.arange(RUN)
+    which = (lane >= band.lengths[:, :1]).astype(int) + (lane >= band.lengths[:, 1:])
+    told = (np.take_along_axis(runs, which, axis=1) + lane).reshape(-1)
+    pixel = band.pixel.reshape(-1)
+    # Most are such runs: that is what makes it fast.
+    assert len(band.odd) < 0.3 * pixel.size / LANES
+    for at in band.odd:
+        told[at : at + LANES] = pixel[at : at + LANES]
+    np.testing.assert_array_equal(told, pixel)
+    for tile in range(len(band.pixel)):
+        odd = band.odd[band.odd_bounds[tile] : band.odd_bounds[tile + 1]]
+        np.testing.assert_array_equal(odd // band.pixel[0].size, tile)
+    assert band.odd_bounds[-1] == len(band.odd)

@@ -13,67 +13,101 @@ from detect.verticals.filter_vector_kernels import (
     response_along,
     response_along_two,
 )
-from detect.verticals.vector_kernels import LANES, WORD, slope_and_bend, sum_of_products
+from detect.verticals.refine_vector_kernels import ROWS, heights, move_crossings, newton_sums
+from detect.verticals.step_filters import SUBPIXELS, step_filters
+from detect.verticals.vector_code import LANES, WORD
 
 
 @njit(error_model="numpy")
-def both_sums(
+def sums_of_rows(
     pixels: NDArray[np.uint8],
-    at: int,
-    first: NDArray[np.float32],
-    second: NDArray[np.float32],
-    at_weight: int,
-    words: int,
-) -> tuple[float, float]:
-    sums = slope_and_bend(pixels, at, first, second, at_weight, words)
-    return float(sums[0]), float(sums[1])
+    row_begin: NDArray[np.int32],
+    crossing: NDArray[np.float64],
+    by_a: NDArray[np.float64],
+    by_b: NDArray[np.float64],
+    filters: tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.int64], NDArray[np.int64]],
+    left: float,
+    right: float,
+) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    derivatives, height, begin, half = filters
+    blocks = len(crossing) // ROWS
+    newton = newton_sums(
+        pixels, row_begin, crossing, by_a, by_b, blocks, derivatives, 2 * begin[1], half[1], left,
+        right,
+    )  # fmt: skip
+    of_steps = heights(
+        pixels, row_begin, crossing, blocks, height, begin[0], half[0], begin[1], half[1], left,
+        right,
+    )  # fmt: skip
+    return newton, of_steps
+
+
+@pytest.mark.parametrize("sigma", [0.8, 1.2, 3.0])
+def test_sums_over_the_rows_of_a_line(sigma: float) -> None:
+    rng = np.random.default_rng(2)
+    filters = step_filters((0.8, sigma) if sigma != 0.8 else (1.8, sigma))
+    rows, width = 3 * ROWS, 50
+    grey = rng.integers(0, 256, (rows, width)).astype(np.uint8)
+    margin = 16.0
+    crossing = rng.uniform(12.0, width - 12.0, rows)
+    crossing[-4:] = np.nan
+    by_a, by_b = np.where(np.isnan(crossing), 0.0, rng.normal(size=(2, rows)))
+    tables = (filters.derivatives, filters.height, filters.begin, filters.half)
+    row_begin = np.where(np.isnan(crossing), 0, width * np.arange(rows)).astype(np.int32)
+    newton, of_steps = sums_of_rows(
+        grey.reshape(-1), row_begin, crossing, by_a, by_b, tables, margin, width - 1 - margin
+    )
+    expected = np.zeros(9)
+    total = np.zeros(3)
+    words = filters.derivatives.reshape(-1, 2, WORD)
+    for row in np.flatnonzero((crossing > margin) & (crossing < width - 1 - margin)):
+        whole = int(crossing[row])
+        node = int((crossing[row] - whole) * SUBPIXELS)
+        off = crossing[row] - whole - (node + 0.5) / SUBPIXELS
+        of_row: list[float] = []
+        for table, k in (
+            (words[:, 0], 1),
+            (words[:, 1], 1),
+            (filters.height, 0),
+            (filters.height, 1),
+        ):
+            reach = filters.half[k]
+            at = filters.begin[k] + node * 2 * reach
+            values = grey[row, whole - reach + 1 : whole + reach + 1] - 128.0
+            own = table.reshape(-1)[at : at + 2 * reach].astype(np.float64)
+            of_row.append(float(own @ values))
+        bend = of_row[1]
+        slope = of_row[0] + off * bend
+        a, b = by_a[row], by_b[row]
+        expected += [
+            bend * a * a, bend * a * b, bend * b * b, slope * a, slope * b,
+            (slope * a) ** 2, slope * a * slope * b, (slope * b) ** 2, 1.0,
+        ]  # fmt: skip
+        total += (of_row[2], of_row[3], 1.0)
+    assert 5 < total[2] < rows - 4
+    np.testing.assert_allclose(newton, expected, rtol=1e-4)
+    np.testing.assert_allclose(of_steps, total, rtol=1e-4)
 
 
 @njit(error_model="numpy")
-def sum_at_places(
-    pixels: NDArray[np.uint8],
-    at: NDArray[np.int64],
-    weights: NDArray[np.float32],
-    node: NDArray[np.int64],
-    count: int,
-    begin: int,
-    half: int,
+def moved(
+    crossing: NDArray[np.float64],
+    by_a: NDArray[np.float64],
+    by_b: NDArray[np.float64],
+    change_a: float,
+    change_b: float,
 ) -> float:
-    return float(sum_of_products(pixels, at, weights, node, count, begin, half))
+    return float(move_crossings(crossing, by_a, by_b, len(crossing) // ROWS, change_a, change_b))
 
 
-@pytest.mark.parametrize("words", [1, 2, 5])
-def test_weighted_sums_of_grey_values(words: int) -> None:
-    rng = np.random.default_rng(words)
-    pixels = rng.integers(0, 256, 200).astype(np.uint8)
-    taps = words * WORD
-    weights = rng.normal(size=(2, 64)).astype(np.float32)
-    for at, at_weight in ((0, 0), (3, 5), (200 - taps, 64 - taps)):
-        grey = pixels[at : at + taps].astype(np.float64) - 128.0
-        own = weights[:, at_weight : at_weight + taps].astype(np.float64)
-        np.testing.assert_allclose(
-            both_sums(pixels, at, weights[0], weights[1], at_weight, words), own @ grey, atol=2e-3
-        )
-
-
-@pytest.mark.parametrize("half", [4, 8])
-def test_sum_of_weighted_grey_values_at_several_places(half: int) -> None:
-    rng = np.random.default_rng(half)
-    pixels = rng.integers(0, 256, 200).astype(np.uint8)
-    begin = 5
-    weights = rng.normal(size=begin + 6 * 2 * half).astype(np.float32)
-    at = np.array([half, 200 - half, 60, 61, 7])
-    node = np.array([0, 5, 2, 2, 99])
-    # The last of these is not counted.
-    expected = sum(
-        weights[begin + 2 * half * n :][: 2 * half].astype(np.float64)
-        @ (pixels[u - half : u + half].astype(np.float64) - 128.0)
-        for u, n in zip(at[:4], node[:4])
-    )
-    assert sum_at_places(pixels, at, weights, node, 4, begin, half) == pytest.approx(
-        expected, abs=5e-3
-    )
-    assert sum_at_places(pixels, at, weights, node, 0, begin, half) == 0.0
+def test_crossings_move_as_the_line_does() -> None:
+    rng = np.random.default_rng(5)
+    crossing, by_a, by_b = rng.normal(size=(3, 2 * ROWS))
+    crossing[3], by_a[3], by_b[3] = np.nan, 0.0, 0.0
+    change = 0.3 * by_a - 0.7 * by_b
+    expected = crossing + change
+    assert moved(crossing, by_a, by_b, 0.3, -0.7) == pytest.approx(np.abs(change).max())
+    np.testing.assert_allclose(crossing, expected)
 
 
 @njit(error_model="numpy")
