@@ -29,7 +29,6 @@ from detect.discs.descent_kernels import (
     new_work,
 )
 from detect.discs.gather_kernels import ALL as ALL
-from detect.discs.gather_kernels import EDGE as EDGE
 from detect.discs.gather_kernels import LEAST_BLUR, Gathered, gather
 from detect.discs.gather_kernels import LOOK as LOOK
 from detect.discs.normal_kernels import factor_rows, solution
@@ -43,8 +42,8 @@ X, Y, RADIUS, BLUR, CONTRAST = range(5)
 EXPLAINED, RESIDUAL_VARIANCE, PIXELS = range(5, 8)
 COV_XX, COV_XY, COV_YY = range(8, 11)
 SECTORS_STEP, SECTORS_GOOD, OUTLINE_DEVIATION, RELATIVE_BLUR = range(11, 15)
-ITERATIONS, BLUR_BOUND, COMPLETE, MIDDLE_STEP = range(15, 19)
-RESULT_SIZE = 19
+ITERATIONS, BLUR_BOUND, MIDDLE_STEP = range(15, 18)
+RESULT_SIZE = 18
 
 _MAX_EVALUATIONS = 15
 _LOOK_EVALUATIONS = 3
@@ -74,8 +73,8 @@ def fit_disc(
     blur_guess : float
         About how blurred the candidate is (along u), pixels: how far out pixels are gathered.
     detail : int
-        How many pixels: `LOOK`, about 160 and few steps; `EDGE`, of large discs all that tell where
-        the edge is and some hundred others; `ALL`.
+        How many pixels: `LOOK`, about 160 and few steps, or `ALL`; of discs larger than a patch all
+        that tell where the edge is, and as many others as there is room for.
     hope : Hope
         When to give up.
     out : (RESULT_SIZE,) float64
@@ -89,7 +88,6 @@ def fit_disc(
     out[:] = 0.0
     patch = gather(image, floor_xy, u0, v0, radius, settings, blur_guess, detail, work.patch)
     out[PIXELS] = patch.fitted
-    out[COMPLETE] = 1.0 if patch.complete else 0.0
     out[BLUR_BOUND] = patch.most_blur
     if patch.fitted - normal.UNKNOWNS < 4:
         return False

@@ -14,10 +14,9 @@ from detect.discs.patch_kernels import COLUMNS, LIST, FitSettings, Patch, padded
 from detect.uncounted import uncounted
 
 #: How many pixels a fit uses.
-LOOK, EDGE, ALL = range(3)
-#: About how many for a look, and besides those at the edge.
+LOOK, ALL = range(2)
+#: About how many for a look.
 _LOOK_PIXELS = 160
-_OTHER_PIXELS = 400
 
 LEAST_BLUR, MOST_BLUR = 0.1, 8.0
 
@@ -35,8 +34,6 @@ class Gathered(NamedTuple):
     """Of a grid's lines; 0 for single pixels."""
     most_blur: float
     """How far the blur may grow before the patch is too small for it."""
-    complete: bool
-    """Whether all pixels within reach are there."""
 
 
 @uncounted
@@ -58,7 +55,7 @@ def gather(
     ratio = settings.blur_ratio
     shape, along_u, along_v, area = view_of(floor_xy, u0, v0, radius, blur, ratio)
     if area == 0.0:
-        return Gathered(LIST, 0, 0, 0, MOST_BLUR, False)
+        return Gathered(LIST, 0, 0, 0, MOST_BLUR)
     beyond_u = max(settings.reach_px, settings.reach_blurs * blur)
     beyond_v = max(settings.reach_px, settings.reach_blurs * blur * ratio)
     room = 1.08 * settings.reach_radii
@@ -72,7 +69,7 @@ def gather(
         count = gather_sparse(
             image, floor_xy, u0, v0, radius, settings, half_u, half_v, every, shape, patch
         )
-        return Gathered(shape, padded(count), count, 0, MOST_BLUR, every == 1)
+        return Gathered(shape, padded(count), count, 0, MOST_BLUR)
     if shape != LIST:
         across = 1.0 if shape != COLUMNS else ratio
         margin = min(int(3.0 * 1.3 * blur * across) + 3, 30)
@@ -84,11 +81,10 @@ def gather(
                 shape == COLUMNS, patch,
             )  # fmt: skip
             most_blur = min((margin - 1.0) / (2.5 * across), MOST_BLUR)
-            return Gathered(shape, n, count, margin, most_blur, True)
-    every = 1 + window // _OTHER_PIXELS if detail == EDGE else 1
-    # All of them, but for discs that are larger than a patch.
-    every = max(every, 1 + window // CAPACITY)
+            return Gathered(shape, n, count, margin, most_blur)
+    # All of them, but for discs that are larger than a patch: all at the edge, and some others.
+    every = 1 + window // CAPACITY
     count = gather_list(
         image, floor_xy, u0, v0, radius, blur, settings, half_u, half_v, every, patch
     )
-    return Gathered(LIST, padded(count), count, 0, MOST_BLUR, every == 1)
+    return Gathered(LIST, padded(count), count, 0, MOST_BLUR)

@@ -259,15 +259,14 @@ def _fit_all(
             at_x, at_y = before[fit.X], before[fit.Y]
             log_blur = math.log(before[fit.BLUR])
             start[2] = before[fit.RADIUS] / radius
-            # First the pixels that tell most; a disc, or one too blurred for the patch, once more.
-            detail = fit.EDGE if refits == 0 else fit.ALL
+            detail = fit.ALL
             if refits == 0:
                 u, v = nearest_pixel(floor_xy, pixels[i, 0], pixels[i, 1], at_x, at_y)
                 # A look tells the blur but roughly: too small a patch would be gathered again.
                 blur = max(before[fit.BLUR], blur_start)
             else:
-                if before[fit.BLUR] > _AT_BOUND * before[fit.BLUR_BOUND]:
-                    blur = before[fit.BLUR_BOUND]
+                # Too blurred for its patch: once more, in a wider one.
+                blur = before[fit.BLUR_BOUND]
             start[0] = (at_x - floor_xy[v, u, 0]) / radius
             start[1] = (at_y - floor_xy[v, u, 1]) / radius
         start[3] = log_blur
@@ -293,9 +292,7 @@ def _fit_all(
             continue
         evidence[i] = told
         enough = fitted and (not search.verify or told >= search.least_evidence)
-        again = result[fit.BLUR] > _AT_BOUND * result[fit.BLUR_BOUND] or (
-            detail == fit.EDGE and result[fit.COMPLETE] == 0.0
-        )
+        again = result[fit.BLUR] > _AT_BOUND * result[fit.BLUR_BOUND]
         if enough and again and refits < _MOST_REFITS:
             refits += 1
             continue

@@ -152,7 +152,7 @@ def test_results_have_their_columns() -> None:
         kernels.X, kernels.Y, kernels.RADIUS, kernels.BLUR, kernels.CONTRAST, kernels.EXPLAINED,
         kernels.RESIDUAL_VARIANCE, kernels.PIXELS, kernels.COV_XX, kernels.COV_XY, kernels.COV_YY,
         kernels.SECTORS_STEP, kernels.SECTORS_GOOD, kernels.OUTLINE_DEVIATION,
-        kernels.RELATIVE_BLUR, kernels.ITERATIONS, kernels.BLUR_BOUND, kernels.COMPLETE,
+        kernels.RELATIVE_BLUR, kernels.ITERATIONS, kernels.BLUR_BOUND,
         kernels.MIDDLE_STEP,
     )  # fmt: skip
     assert sorted(names) == list(range(kernels.RESULT_SIZE))
