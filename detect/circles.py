@@ -45,7 +45,7 @@ PUBLISHED_PIXEL_VARIANCE = 2.0
 #: For the noise floor an image's noise is never less than this: one grey level, its resolution.
 _LEAST_NOISE = 1.0
 #: So many rows of an image tell its noise well enough.
-_NOISE_ROWS = 48
+_NOISE_ROWS = 32
 
 
 @dataclass(frozen=True)

@@ -237,7 +237,8 @@ def _make_folder(folder: Path) -> None:
 
 def _workers(command: DetectorFlags, run: ImageRun) -> Workers:
     """Who does the work of a command."""
-    from detect.runs.workers import cluster_workers, default_jobs, local_workers
+    from detect.run import Run
+    from detect.runs.workers import cluster_workers, default_jobs, local_workers, pixels_of
 
     # Tasks that carry images, or bring pictures back, are kept small.
     draws = isinstance(command, Circles | Lines | Markers) and command.draw is not None
@@ -247,7 +248,8 @@ def _workers(command: DetectorFlags, run: ImageRun) -> Workers:
             raise WorkerError("--jobs and --cluster: expected one of them")
         return cluster_workers(command.cluster, pictures=large)
     jobs = command.jobs if command.jobs is not None else default_jobs(run.frames.expected or 0)
-    return local_workers(jobs, pictures=large)
+    camera = run.camera if isinstance(run, Run) else None
+    return local_workers(jobs, pictures=large, frame_pixels=pixels_of(camera))
 
 
 def _conduct(command: DetectorFlags, log: Path) -> Conduct:

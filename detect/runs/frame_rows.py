@@ -44,11 +44,12 @@ from landmarks import (
 if TYPE_CHECKING:
     from detect.circles import CircleDetections
     from detect.lines import LineDetections
+    from detect.markers.detections import MarkerDetections
 
 R = TypeVar("R")
 
 #: So many pixels are decoded before any of them is looked at.
-_PIXELS_AT_ONCE = 1 << 23
+PIXELS_AT_ONCE = 1 << 24
 
 #: What is wrong with one frame, not with the run.
 _COSTS_THE_FRAME = (FrameError, ArithmeticError, np.linalg.LinAlgError, MemoryError)
@@ -126,7 +127,7 @@ def rows_of_frames(tasks: Sequence[FrameTask], plan: FramePlan, tables: Tables) 
         One for each.
     """
     camera = plan.camera
-    at_once = _PIXELS_AT_ONCE // (camera.width * camera.height) if camera is not None else 1
+    at_once = PIXELS_AT_ONCE // (camera.width * camera.height) if camera is not None else 1
     if plan.drawing is not None or plan.draw_response:
         at_once = 1
     rows: list[FrameRows] = []
@@ -146,9 +147,11 @@ def rows_of_frames(tasks: Sequence[FrameTask], plan: FramePlan, tables: Tables) 
             _attempt(task, discs_in_image, image, plan, tables, tilt)
             for task, image, tilt in zip(some, images, tilts)
         ]
-        markers = [
-            _attempt(task, markers_in_image, image, plan) for task, image in zip(some, images)
-        ]
+        markers: list[MarkerDetections | _Failed | None] = [None] * len(some)
+        if plan.markers is not None:
+            markers = [
+                _attempt(task, markers_in_image, image, plan) for task, image in zip(some, images)
+            ]
         found = [
             _attempt(task, seen_together, image, plan, *seen)
             for task, image, *seen in zip(some, images, lines, tilts, discs, markers)
@@ -165,9 +168,8 @@ class _Failed(NamedTuple):
 
 def _attempt(task: FrameTask, work: Callable[..., R], /, *given: object) -> R | _Failed:
     """The result of something done for a frame, or why it, or what it is given, could not be."""
-    for value in given:
-        if isinstance(value, _Failed):
-            return value
+    if _Failed in map(type, given):
+        return next(value for value in given if isinstance(value, _Failed))
     try:
         return work(*given)
     except _COSTS_THE_FRAME as error:

@@ -25,7 +25,7 @@ from detect.runs.dispatch import Workers, detect_chunks
 from detect.runs.frame import FramePlan, tables_of
 from detect.runs.frame_rows import FrameRows, FrameTask
 from detect.runs.resume import RunFiles
-from detect.runs.workers import local_workers
+from detect.runs.workers import local_workers, pixels_of
 from detect.sources.times import TIMES_HEAD
 from landmarks import FrameTilt, LineLandmark, format_head
 from storage import write_whole
@@ -36,7 +36,7 @@ LANDMARK_SUFFIXES = frozenset({".circles", ".lines", ".markers"})
 #: So many failures are kept word for word.
 KEPT_FAILURES = 100
 
-_TASKS_AHEAD = 32
+_TASKS_AHEAD = 64
 
 
 class TiltSource(Protocol):
@@ -173,7 +173,8 @@ def detect_run(
     """
     tables_of(plan)  # whatever is wrong with them is wrong with every frame
     if workers is None:
-        workers = local_workers(1, pictures=pictures is not None or run.frames.ships_images)
+        large = pictures is not None or run.frames.ships_images
+        workers = local_workers(1, pictures=large, frame_pixels=pixels_of(plan.camera))
     summary = RunSummary()
     if run.has_times:
         outputs = [*outputs, times_file([output.path for output in outputs])]

@@ -35,11 +35,14 @@ from detect.announcing import (
 from detect.errors import WorkerError
 from detect.runs.dispatch import Workers
 from detect.runs.frame import FramePlan, rehearse
+from detect.runs.frame_rows import PIXELS_AT_ONCE
 from detect.runs.interrupts import interrupts_deferred
 from storage.kernel_loading import load_kernels_alone, waiting_before_compiling
 
 if TYPE_CHECKING:
     from distributed import Client
+
+    from camera import Camera
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -47,7 +50,8 @@ R = TypeVar("R")
 #: Fewer frames than this are not worth another process's start.
 FRAMES_PER_PROCESS = 500
 
-_LOCAL_CHUNK = 32
+#: One job works on so many frames together at most.
+_LOCAL_CHUNK = 64
 _PROCESS_CHUNK = 16
 _CLUSTER_CHUNK = 16
 _WINDOW_PER_WORKER = 3
@@ -65,7 +69,12 @@ def default_jobs(frames: int) -> int:
     return max(1, min(cores, frames // FRAMES_PER_PROCESS))
 
 
-def local_workers(jobs: int, *, pictures: bool = False) -> Workers:
+def pixels_of(camera: Camera | None) -> int:
+    """How large a camera's images are; 0 if nobody knows."""
+    return 0 if camera is None else camera.width * camera.height
+
+
+def local_workers(jobs: int, *, pictures: bool = False, frame_pixels: int = 0) -> Workers:
     """Workers on this machine.
 
     Parameters
@@ -74,6 +83,8 @@ def local_workers(jobs: int, *, pictures: bool = False) -> Workers:
         How many processes; 1 is this process itself.
     pictures : bool
         Whether frames give pictures: tasks are kept small then.
+    frame_pixels : int
+        How large an image is, if that is known: one job works on as many as are decoded at once.
 
     Raises
     ------
@@ -83,7 +94,8 @@ def local_workers(jobs: int, *, pictures: bool = False) -> Workers:
     if jobs < 1:
         raise WorkerError(f"jobs is {jobs}: expected 1 or more")
     if jobs == 1:
-        return Workers(_in_process, chunk=1 if pictures else _LOCAL_CHUNK, window=lambda: 1)
+        together = min(max(PIXELS_AT_ONCE // max(frame_pixels, 1), 1), _LOCAL_CHUNK)
+        return Workers(_in_process, chunk=1 if pictures else together, window=lambda: 1)
     window = 2 + _WINDOW_PER_WORKER * jobs
     return Workers(
         lambda plan: _processes(jobs, plan),
