@@ -94,12 +94,15 @@ class StopAfter:
 
 
 class Room:
-    """Files may have so many bytes only."""
+    """Files may have so many bytes only, and frames are written eight by eight."""
 
     def __init__(self, size: int) -> None:
         self.size = size
 
     def __call__(self) -> None:
+        from detect.runs import workers
+
+        workers._LOCAL_CHUNK = 8
         resource.setrlimit(resource.RLIMIT_FSIZE, (self.size, resource.RLIM_INFINITY))
 
 
