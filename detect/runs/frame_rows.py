@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 R = TypeVar("R")
 
 #: So many pixels are decoded before any of them is looked at.
-PIXELS_AT_ONCE = 1 << 24
+PIXELS_AT_ONCE = 1 << 25
 
 #: What is wrong with one frame, not with the run.
 _COSTS_THE_FRAME = (FrameError, ArithmeticError, np.linalg.LinAlgError, MemoryError)

@@ -36,7 +36,7 @@ LANDMARK_SUFFIXES = frozenset({".circles", ".lines", ".markers"})
 #: So many failures are kept word for word.
 KEPT_FAILURES = 100
 
-_TASKS_AHEAD = 64
+_TASKS_AHEAD = 128
 
 
 class TiltSource(Protocol):

@@ -51,7 +51,7 @@ R = TypeVar("R")
 FRAMES_PER_PROCESS = 500
 
 #: One job works on so many frames together at most.
-_LOCAL_CHUNK = 64
+_LOCAL_CHUNK = 128
 _PROCESS_CHUNK = 16
 _CLUSTER_CHUNK = 16
 _WINDOW_PER_WORKER = 3

@@ -221,7 +221,7 @@ def test_only_files_are_asked_for_ahead(
     if ships_images:
         assert frames.largest_lead == 0
     else:
-        assert 0 < frames.largest_lead <= 64
+        assert 0 < frames.largest_lead <= 128
 
 
 def test_what_was_there_is_collected_again_after_a_run(run_folder: Path, tmp_path: Path) -> None:
