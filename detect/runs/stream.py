@@ -38,6 +38,9 @@ KEPT_FAILURES = 100
 
 _TASKS_AHEAD = 128
 
+#: Garbage is looked for when there are so many more objects that can hold others.
+_NEW_OBJECTS = 20_000
+
 
 class TiltSource(Protocol):
     """Tilts by image prefix: a dict, or a file that is looked into."""
@@ -250,15 +253,19 @@ def _write_pictures(frames: Sequence[FrameRows], folder: Path, *, overwrite: boo
 def _settled() -> Iterator[None]:
     """Have Python's collections of garbage leave out what is there already, as long as a run lasts.
 
-    Without this each of them would look through all that was imported.
+    Without this each of them would look through all that was imported; and there would be one every
+    other frame, of which nothing is garbage.
     """
     if gc.get_freeze_count():  # somebody has done so, or wants other things left out
         yield
         return
+    thresholds = gc.get_threshold()
     gc.freeze()
+    gc.set_threshold(_NEW_OBJECTS, *thresholds[1:])
     try:
         yield
     finally:
+        gc.set_threshold(*thresholds)
         gc.unfreeze()
 
 

@@ -226,6 +226,7 @@ def test_only_files_are_asked_for_ahead(
 
 def test_what_was_there_is_collected_again_after_a_run(run_folder: Path, tmp_path: Path) -> None:
     assert gc.get_freeze_count() == 0
+    thresholds = gc.get_threshold()
     during = []
     detect_circles_run(
         open_run(run_folder),
@@ -236,3 +237,4 @@ def test_what_was_there_is_collected_again_after_a_run(run_folder: Path, tmp_pat
     )
     assert min(during) > 0
     assert gc.get_freeze_count() == 0
+    assert gc.get_threshold() == thresholds
