@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 
 from detect.discs.list_kernels import floor_steps
 from detect.discs.model_kernels import F32, FASTMATH
+from detect.discs.patch_kernels import padded
+from detect.discs.quality_kernels import suppress_neighbours
 
 #: Candidates of a lower quality than this are looked at only if the grey value steps in this share
 #: of the directions, by this share of the contrast.
 CLEAR_QUALITY = 0.55
 _LEAST_STEPS = 0.9
 _LEAST_STEP = 0.25
-#: Loops over pairs of centres work on so many at a time, or on single ones.
-_AT_ONCE = 16
 _DIRECTIONS = np.array([[math.cos(k * math.pi / 8), math.sin(k * math.pi / 8)] for k in range(16)])
 
 
@@ -51,39 +51,14 @@ def strong_and_alone(
     (M,) int64
         Indices, ascending.
     """
-    strong = np.flatnonzero(np.abs(contrast) >= weakest)
-    order = strong[np.argsort(-quality[strong], kind="mergesort")]
-    x = np.full(_whole(len(order)), np.inf)
-    y = np.full(_whole(len(order)), np.inf)
-    count = 0
-    alone = np.zeros(len(quality), np.bool_)
-    for i in order:
+    index = np.flatnonzero(np.abs(contrast) >= weakest)
+    place = np.empty((len(index), 2))
+    for k in range(len(index)):
+        i = index[k]
         u, v = pixels[i, 0], pixels[i, 1]
-        x0, y0 = floor_xy[v, u, 0], floor_xy[v, u, 1]
-        if not _near_any(x, y, _whole(count), x0, y0, separation * separation):
-            alone[i] = True
-            x[count], y[count] = x0, y0
-            count += 1
-    return np.flatnonzero(alone)
-
-
-@njit(cache=True, error_model="numpy", forceinline=True)
-def _whole(count: int) -> int:
-    """So many, rounded up to what loops work on at once."""
-    return (count + _AT_ONCE - 1) // _AT_ONCE * _AT_ONCE
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def _near_any(
-    x: NDArray[np.float64], y: NDArray[np.float64], count: int, x0: float, y0: float, near: float
-) -> bool:
-    """Whether a place is nearer than the root of `near` to one of the first `count`."""
-    found = 0
-    for k in range(count):
-        dx = x[k] - x0
-        dy = y[k] - y0
-        found |= 1 if dx * dx + dy * dy < near else 0
-    return found != 0
+        place[k, 0] = floor_xy[v, u, 0]
+        place[k, 1] = floor_xy[v, u, 1]
+    return index[suppress_neighbours(place, quality[index], separation)]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -116,7 +91,7 @@ def middles(
     """
     strong = np.flatnonzero(np.abs(contrast) >= weakest)
     # Looked up once: there are as many pairs as centres, squared.
-    centres = np.zeros((5, _whole(len(strong))), np.float32)
+    centres = np.zeros((5, padded(len(strong))), np.float32)
     for m in range(len(strong)):
         i = strong[m]
         u, v = pixels[i, 0], pixels[i, 1]

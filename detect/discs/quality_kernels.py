@@ -19,6 +19,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from detect.discs.patch_kernels import padded
 from detect.discs.vector_kernels import (
     gather,
     lowest_bit,
@@ -253,21 +254,30 @@ def suppress_neighbours(
     -------
     (N,) bool
     """
-    n = len(score)
-    kept = np.zeros(n, np.bool_)
     order = np.argsort(-score, kind="mergesort")
-    chosen = np.empty(n, np.int64)
+    kept = np.zeros(len(score), np.bool_)
+    # Those chosen; what fills up is near to nothing.
+    x = np.full(padded(len(score)), np.inf)
+    y = np.full(padded(len(score)), np.inf)
     count = 0
     for i in order:
-        alone = True
-        for k in range(count):
-            dx = floor_xy[i, 0] - floor_xy[chosen[k], 0]
-            dy = floor_xy[i, 1] - floor_xy[chosen[k], 1]
-            if dx * dx + dy * dy < separation * separation:
-                alone = False
-                break
-        if alone:
+        x0, y0 = floor_xy[i, 0], floor_xy[i, 1]
+        if not _near_any(x, y, padded(count), x0, y0, separation * separation):
             kept[i] = True
-            chosen[count] = i
+            x[count], y[count] = x0, y0
             count += 1
     return kept
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _near_any(
+    x: NDArray[np.float64], y: NDArray[np.float64], count: int, x0: float, y0: float, near: float
+) -> bool:
+    """Whether a place is nearer than the root of `near` to one of the first `count`."""
+    found = 0
+    # All alike, without branches: so several are worked on at a time.
+    for k in range(count):
+        dx = x[k] - x0
+        dy = y[k] - y0
+        found |= 1 if dx * dx + dy * dy < near else 0
+    return found != 0

@@ -8,13 +8,13 @@ sector, add to different copies.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
-from numba.extending import intrinsic
+
+from detect.vector_code import FLOAT, I32, I64, Code, constant, operation
 
 #: Sums of one sector: of 1, w, w^2, g, w g, r e, r^2 (see `add_by_sector`), and one that is unused.
 SUMS = 8
@@ -22,17 +22,11 @@ SUMS = 8
 PIXELS = 8
 COPIES = 4
 
-_I32, _I64, _FLOAT = ir.IntType(32), ir.IntType(64), ir.FloatType()
-_INTS = ir.VectorType(_I32, PIXELS)
-_FLOATS = ir.VectorType(_FLOAT, PIXELS)
+_INTS = ir.VectorType(I32, PIXELS)
+_FLOATS = ir.VectorType(FLOAT, PIXELS)
 
 
-def _operation(define: Callable[..., Any]) -> Any:
-    """An operation that compiled code can call: without the first argument of its definition."""
-    return intrinsic(define)
-
-
-@_operation
+@operation
 def add_by_sector(
     _typing: Any,
     fields: Any,
@@ -67,42 +61,26 @@ def add_by_sector(
     """
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        def data(k: int) -> Any:
-            return context.make_array(signature.args[k])(context, builder, args[k]).data
-
-        def place(pointer: Any, at: Any, vector: Any) -> Any:
-            return builder.bitcast(builder.gep(pointer, [at]), vector.as_pointer())
-
-        def load(pointer: Any, at: Any, vector: Any) -> Any:
-            value = builder.load(place(pointer, at, vector))
-            value.align = 4
-            return value
-
-        values, residuals, numbers, result = (data(k) for k in (0, 3, 4, 7))
-        c = _everywhere(builder, args[6], _FLOATS)
-        per_copy = builder.mul(args[8], ir.Constant(_I64, SUMS))
-        one = ir.Constant(_FLOATS, [1.0] * PIXELS)
-        nothing = ir.Constant(_FLOATS, [0.0] * PIXELS)
-        blocks = builder.udiv(args[5], ir.Constant(_I64, PIXELS))
-        with cgutils.for_range(builder, blocks, intp=_I64) as loop:
-            i = builder.mul(loop.index, ir.Constant(_I64, PIXELS))
-            w = load(values, builder.add(args[1], i), _FLOATS)
-            r = builder.fmul(c, load(values, builder.add(args[2], i), _FLOATS))
-            e = load(residuals, i, _FLOATS)
-            g = builder.fadd(e, builder.fmul(c, w))
-            product = builder.fmul
+        code = Code(context, builder, signature, args)
+        c = code.everywhere(args[6], _FLOATS)
+        per_copy = builder.mul(args[8], code.number(SUMS))
+        one, nothing = constant(_FLOATS, 1.0), constant(_FLOATS, 0.0)
+        product = builder.fmul
+        blocks = builder.udiv(args[5], code.number(PIXELS))
+        with cgutils.for_range(builder, blocks, intp=I64) as loop:
+            i = builder.mul(loop.index, code.number(PIXELS))
+            w = code.load(0, builder.add(args[1], i), _FLOATS)
+            r = product(c, code.load(0, builder.add(args[2], i), _FLOATS))
+            e = code.load(3, i, _FLOATS)
+            g = builder.fadd(e, product(c, w))
             rows = [
                 one, w, product(w, w), g, product(w, g), product(r, e), product(r, r), nothing,
             ]  # fmt: skip
-            first = builder.shl(
-                load(numbers, i, _INTS), ir.Constant(_INTS, [SUMS.bit_length() - 1] * PIXELS)
-            )
-            for k, row in enumerate(_transposed(builder, rows)):
-                own = builder.zext(builder.extract_element(first, ir.Constant(_I32, k)), _I64)
-                copy = builder.mul(per_copy, ir.Constant(_I64, k % COPIES))
-                at = builder.add(own, copy)
-                total = builder.fadd(load(result, at, _FLOATS), row)
-                builder.store(total, place(result, at, _FLOATS)).align = 4
+            first = builder.shl(code.load(4, i, _INTS), constant(_INTS, SUMS.bit_length() - 1))
+            for k, (own, row) in enumerate(zip(code.scattered(first), _transposed(code, rows))):
+                copy = builder.mul(per_copy, code.number(k % COPIES))
+                at = builder.add(builder.zext(own, I64), copy)
+                code.store(7, at, builder.fadd(code.load(7, at, _FLOATS), row))
         return context.get_dummy_value()
 
     whole = types.uint64
@@ -110,14 +88,7 @@ def add_by_sector(
     return result, generate
 
 
-def _everywhere(builder: Any, value: Any, vector: Any) -> Any:
-    """A vector of equal numbers."""
-    undefined = ir.Constant(vector, ir.Undefined)
-    first = builder.insert_element(undefined, value, ir.Constant(_I32, 0))
-    return builder.shuffle_vector(first, first, ir.Constant(_INTS, [0] * PIXELS))
-
-
-def _transposed(builder: Any, rows: list[Any]) -> list[Any]:
+def _transposed(code: Code, rows: list[Any]) -> list[Any]:
     """As many vectors as they are long, rows and columns exchanged: halves by halves."""
     size = len(rows)
     half = size // 2
@@ -129,9 +100,7 @@ def _transposed(builder: Any, rows: list[Any]) -> list[Any]:
         for k in range(size):
             if not k & half:
                 for to, order in ((k, first), (k + half, second)):
-                    result[to] = builder.shuffle_vector(
-                        rows[k], rows[k + half], ir.Constant(_INTS, order)
-                    )
+                    result[to] = code.shuffled(rows[k], rows[k + half], order)
         rows = result
         half //= 2
     return rows

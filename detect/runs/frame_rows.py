@@ -108,9 +108,9 @@ class FrameRows(NamedTuple):
 def rows_of_frames(tasks: Sequence[FrameTask], plan: FramePlan, tables: Tables) -> list[FrameRows]:
     """Work on some frames; an image that cannot be worked on costs its frame only.
 
-    As many images are decoded, then looked at by one detector after the other, then written about,
-    as fit into the processor's caches: a decoder, the detectors and Python drive each other's
-    instructions and tables out of them.
+    Many images are decoded, then looked at by one detector after the other, then written about: a
+    decoder, the detectors and Python drive each other's instructions and tables out of the
+    processor's caches.
 
     Parameters
     ----------

@@ -11,7 +11,7 @@ from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 
-from detect.verticals.vector_code import (
+from detect.vector_code import (
     BYTES,
     FLOAT,
     FLOATS,

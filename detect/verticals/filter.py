@@ -119,8 +119,8 @@ class FilteredColumns:
     @classmethod
     def none_yet(cls, table: VerticalTable) -> FilteredColumns:
         """Nothing has been filtered."""
+        from detect.vector_code import LANES
         from detect.verticals.group_kernels import STEP
-        from detect.verticals.vector_code import LANES
 
         height, width = table.column.shape
         groups = -(-width // STEP)
@@ -146,7 +146,7 @@ def _weights_across(sigma_px: float, spacing_px: float) -> FloatArray:
 @lru_cache(maxsize=16)
 def line_filter(settings: LineSettings) -> LineFilter:
     """The filter that settings ask for."""
-    from detect.verticals.vector_code import WORD
+    from detect.vector_code import WORD
 
     weights = _weights_across(settings.sigma_across_px, 1.0)
     # Moments between two pixels are those of both, interpolated; so are the weights.
@@ -241,8 +241,8 @@ def _runs_of_neighbours(
     pixel: NDArray[np.int32], pixels: int
 ) -> tuple[NDArray[np.int32], NDArray[np.uint8], NDArray[np.int32], NDArray[np.int32]]:
     """See `StartBand`: runs, lengths, odd, odd_bounds."""
+    from detect.vector_code import LANES
     from detect.verticals.band_vector_kernels import RUN
-    from detect.verticals.vector_code import LANES
 
     block = pixel.reshape(-1, RUN)
     breaks = np.diff(block, axis=1) != 1

@@ -14,7 +14,7 @@ from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 
-from detect.verticals.vector_code import FLOAT, I32, I64, LANES, WORD, Code, constant, operation
+from detect.vector_code import FLOAT, I32, I64, LANES, WORD, Code, constant, operation
 
 #: Bytes of a word that are turned to numbers together: half of it.
 _HALF = WORD // 2

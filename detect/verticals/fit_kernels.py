@@ -13,9 +13,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from detect.vector_code import LANES
 from detect.verticals.group_kernels import MARGIN, STEP
 from detect.verticals.refine_vector_kernels import ROWS, heights, move_crossings, newton_sums
-from detect.verticals.vector_code import LANES
 
 _Floats = NDArray[np.float64]
 

@@ -13,9 +13,9 @@ from numba import njit
 from numpy.typing import NDArray
 
 from detect.uncounted import uncounted_contracting
+from detect.vector_code import LANES
 from detect.verticals.group_kernels import MARGIN, STEP, respond
 from detect.verticals.sum_kernels import sum_of
-from detect.verticals.vector_code import LANES
 
 #: Rows that are filtered ahead of a track.
 _AHEAD = 12

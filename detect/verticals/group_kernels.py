@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from detect.uncounted import uncounted_contracting
+from detect.vector_code import LANES, WORD
 from detect.verticals.filter_vector_kernels import (
     moments_across,
     moments_across_two,
     response_along,
     response_along_two,
 )
-from detect.verticals.vector_code import LANES, WORD
 
 #: Groups of verticals begin so many columns apart, and so many before the first that is theirs:
 #: whoever asks for a column may ask for two more on either side.

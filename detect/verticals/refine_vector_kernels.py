@@ -13,8 +13,7 @@ from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 
-from detect.verticals.step_filters import SUBPIXELS
-from detect.verticals.vector_code import (
+from detect.vector_code import (
     BYTES,
     FLOAT,
     FLOATS,
@@ -26,6 +25,7 @@ from detect.verticals.vector_code import (
     constant,
     operation,
 )
+from detect.verticals.step_filters import SUBPIXELS
 
 __all__ = ["ROWS", "heights", "move_crossings", "newton_sums"]
 

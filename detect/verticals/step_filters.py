@@ -35,7 +35,7 @@ class StepFilters:
     height : (N,) float32
         Weights of the step's height; each row has the sum 0.
     derivatives : (2 N,) float32
-        Those of its derivatives times sigma^2: `WORD` (`detect.verticals.vector_code`) of the
+        Those of its derivatives times sigma^2: `WORD` (`detect.vector_code`) of the
         first, then as many of the second, and so on.
     """
 
@@ -59,7 +59,7 @@ def step_filters(sigmas_px: tuple[float, ...]) -> StepFilters:
     StepFilters
         One filter for each, in this order.
     """
-    from detect.verticals.vector_code import WORD
+    from detect.vector_code import WORD
 
     halves, tables = [], []
     # Equal ones share a table.

@@ -41,8 +41,8 @@ class Strip:
 @lru_cache(maxsize=4)
 def strip_of(table: VerticalTable) -> Strip:
     """The strip of a table; made once for each."""
+    from detect.vector_code import LANES
     from detect.verticals.group_kernels import MARGIN, STEP
-    from detect.verticals.vector_code import LANES
 
     height, width = table.column.shape
     base = np.clip(np.arange(0, width, STEP) - MARGIN, 0, max(width - LANES, 0))

@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from detect.vector_code import WORD
 from detect.verticals import judgement_kernels as kernels
 from detect.verticals.judgement import FATES
 from detect.verticals.order_kernels import descending
 from detect.verticals.step_filters import SUBPIXELS, step_filters
-from detect.verticals.vector_code import WORD
 
 
 def test_numbers_of_fates_are_places_of_their_names() -> None:

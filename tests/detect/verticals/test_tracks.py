@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from detect.line_settings import DEFAULT, PUBLISHED, LineSettings
+from detect.vector_code import LANES
 from detect.verticals.band_vector_kernels import RUN, TILE
 from detect.verticals.filter import FilteredColumns, gaussian_window, start_band
 from detect.verticals.start_kernels import find_starts
@@ -21,7 +22,6 @@ from detect.verticals.tracks import (
     line_tracks,
     start_response,
 )
-from detect.verticals.vector_code import LANES
 from lut.verticals import build_vertical_table
 from tests.detect.line_scene import Edge, pinhole, render, tilted
 

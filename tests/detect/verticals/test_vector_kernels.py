@@ -7,6 +7,7 @@ import pytest
 from numba import njit
 from numpy.typing import NDArray
 
+from detect.vector_code import LANES, WORD
 from detect.verticals.filter_vector_kernels import (
     moments_across,
     moments_across_two,
@@ -15,7 +16,6 @@ from detect.verticals.filter_vector_kernels import (
 )
 from detect.verticals.refine_vector_kernels import ROWS, heights, move_crossings, newton_sums
 from detect.verticals.step_filters import SUBPIXELS, step_filters
-from detect.verticals.vector_code import LANES, WORD
 
 
 @njit(error_model="numpy")
