@@ -1,8 +1,18 @@
-"""``python -m detect``: the command ``detect``."""
+"""The program ``detect``, also as ``python -m detect``.
+
+Worker processes import this module too, before they know what for: whatever the command line needs
+is imported where it is used.
+"""
 
 import sys
 
-from detect.cli import main
 
-if __name__ == "__main__":  # worker processes import this module too
+def main() -> int:
+    """Run the command line; returns the exit code."""
+    from detect.cli import main as command_line
+
+    return command_line()
+
+
+if __name__ == "__main__":
     sys.exit(main())

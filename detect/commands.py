@@ -35,8 +35,6 @@ if TYPE_CHECKING:
 def carry_out(command: Command) -> int:
     """Carry out a command; returns the exit code."""
     show_announcements()
-    if isinstance(command, DetectorFlags):
-        load_kernels_alone()
     if isinstance(command, Circles):
         return _circles(command)
     if isinstance(command, Lines):
@@ -207,9 +205,11 @@ def _other_frames(summary: RunSummary, settings: CircleSettings) -> str:
 
 def _tell_blind_to_verticals(summary: RunSummary, run: Run) -> None:
     """Say so where there are no lines for no line can be seen."""
+    if summary.lines:
+        return
     from lut import cached_vertical_table
 
-    if summary.lines == 0 and not cached_vertical_table(run.camera).usable.any():
+    if not cached_vertical_table(run.camera).usable.any():
         print(
             "no verticals: as it is calibrated, the camera looks too far past the horizon, or lies "
             "on its side",
@@ -246,10 +246,14 @@ def _workers(command: DetectorFlags, run: ImageRun) -> Workers:
     if command.cluster is not None:
         if command.jobs is not None:
             raise WorkerError("--jobs and --cluster: expected one of them")
+        load_kernels_alone()
         return cluster_workers(command.cluster, pictures=large)
-    jobs = command.jobs if command.jobs is not None else default_jobs(run.frames.expected or 0)
-    camera = run.camera if isinstance(run, Run) else None
-    return local_workers(jobs, pictures=large, frame_pixels=pixels_of(camera))
+    expected = run.frames.expected
+    jobs = command.jobs if command.jobs is not None else default_jobs(expected or 0)
+    if jobs == 1:
+        load_kernels_alone()
+    pixels = pixels_of(run.camera if isinstance(run, Run) else None)
+    return local_workers(jobs, pictures=large, frame_pixels=pixels, frames=expected)
 
 
 def _conduct(command: DetectorFlags, log: Path) -> Conduct:

@@ -44,12 +44,16 @@ class Workers:
         How many tasks may be under way; asked again and again, as clusters grow.
     died : tuple of exception types
         What a task raises, besides `BrokenExecutor`, when its worker has died.
+    tell_of_tables : bool
+        Whether the first task tells what is wrong with the tables of a plan: this process need not
+        make them then, and gets ready sooner.
     """
 
     start: Callable[[FramePlan], AbstractContextManager[Executor]]
     chunk: int
     window: Callable[[], int]
     died: tuple[type[BaseException], ...] = ()
+    tell_of_tables: bool = False
 
 
 def detect_frames(

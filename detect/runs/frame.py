@@ -19,9 +19,9 @@ from camera import Camera
 from detect.latest import kept_for_latest
 from detect.run import RunFrame, read_image
 from landmarks import FrameTilt, tilt_as_written
-from lut import DiscShape, DiscTable, VerticalTable, cached_disc_table, cached_vertical_table
 
-# Detectors are imported when they are asked for: loading them all takes a tenth of a second each.
+# Detectors and tables are imported when they are asked for: loading them all takes a tenth of a
+# second each, and a process that has others do the work needs neither them nor a compiler.
 if TYPE_CHECKING:
     from detect.circles import CircleDetections
     from detect.line_settings import LineSettings
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from detect.markers.detections import MarkerDetections
     from detect.markers.settings import MarkerSettings
     from detect.settings import CircleSettings
+    from lut import DiscShape, DiscTable, VerticalTable
 
 
 @dataclass(frozen=True)
@@ -245,10 +246,22 @@ def tables_of(plan: FramePlan) -> Tables:
 def _tables(camera: Camera | None, verticals: bool, shape: DiscShape | None) -> Tables:
     if camera is None:
         return Tables(None, None)
+    from lut import cached_disc_table, cached_vertical_table
+
     return Tables(
         verticals=cached_vertical_table(camera) if verticals else None,
         discs=None if shape is None else cached_disc_table(camera, shape),
     )
+
+
+def import_detectors(plan: FramePlan) -> None:
+    """Import what a plan needs: what can be done while others make its tables."""
+    if plan.lines is not None:
+        import detect.lines
+    if plan.circles is not None:
+        import detect.circles
+    if plan.markers is not None:
+        import detect.markers.detect  # noqa: F401
 
 
 def rehearse(plan: FramePlan) -> None:

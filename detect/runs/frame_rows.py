@@ -27,7 +27,6 @@ from detect.runs.frame import (
     seen_together,
     tilt_of_frame,
 )
-from detect.runs.row_text import unknown_circles, unknown_lines
 from detect.sources.times import format_time
 from landmarks import (
     Frame,
@@ -240,11 +239,15 @@ def _line_rows(found: LineDetections, reference: tuple[LineLandmark, ...] | None
         from detect.verticals.identity import carry_ids
 
         return _rows(carry_ids(found.landmarks(), reference))
+    from detect.runs.row_text import unknown_lines
+
     rows = unknown_lines(found.line_numbers)
     return _rows(found.landmarks()) if rows is None else rows
 
 
 def _circle_rows(found: CircleDetections) -> bytes:
+    from detect.runs.row_text import unknown_circles
+
     rows = unknown_circles(found.floor_xy, found.quality, found.covariance)
     if rows is not None:
         return rows

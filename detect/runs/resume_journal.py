@@ -13,6 +13,7 @@ import os
 import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
+from importlib.metadata import version
 from pathlib import Path
 
 from detect.run import RunFrame
@@ -179,7 +180,6 @@ def left_journal(place: Path) -> Journal | None:
 def made_by(outputs: Sequence[RunOutput], plan: FramePlan, conduct: Conduct) -> str:
     """A digest of whatever decides the rows, besides the frames themselves."""
     import cv2
-    import numba
     import numpy as np
 
     settings = [
@@ -189,7 +189,7 @@ def made_by(outputs: Sequence[RunOutput], plan: FramePlan, conduct: Conduct) -> 
     values = (
         _JOURNAL_VERSION,
         conduct.version,
-        (np.__version__, cv2.__version__, numba.__version__),
+        (np.__version__, cv2.__version__, version("numba")),
         settings,
         None if plan.camera is None else plan.camera.content_hash,
         (plan.json, plan.drawing, plan.draw_response),

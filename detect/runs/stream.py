@@ -9,11 +9,10 @@ at all.
 from __future__ import annotations
 
 import dataclasses
-import gc
 import json
 from collections import Counter
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from collections.abc import Callable, Generator, Iterable, Sequence
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
@@ -24,6 +23,7 @@ from detect.runs.conduct import PLAIN, Conduct
 from detect.runs.dispatch import Workers, detect_chunks
 from detect.runs.frame import FramePlan, tables_of
 from detect.runs.frame_rows import FrameRows, FrameTask
+from detect.runs.garbage import settled
 from detect.runs.resume import RunFiles
 from detect.runs.workers import local_workers, pixels_of
 from detect.sources.times import TIMES_HEAD
@@ -37,9 +37,6 @@ LANDMARK_SUFFIXES = frozenset({".circles", ".lines", ".markers"})
 KEPT_FAILURES = 100
 
 _TASKS_AHEAD = 128
-
-#: Garbage is looked for when there are so many more objects that can hold others.
-_NEW_OBJECTS = 20_000
 
 
 class TiltSource(Protocol):
@@ -174,15 +171,16 @@ def detect_run(
     DetectError
         If another run is writing the same files, or a frame fails where every frame is demanded.
     """
-    tables_of(plan)  # whatever is wrong with them is wrong with every frame
     if workers is None:
         large = pictures is not None or run.frames.ships_images
         workers = local_workers(1, pictures=large, frame_pixels=pixels_of(plan.camera))
+    if not workers.tell_of_tables:
+        tables_of(plan)  # whatever is wrong with them is wrong with every frame
     summary = RunSummary()
     if run.has_times:
         outputs = [*outputs, times_file([output.path for output in outputs])]
     with ExitStack() as stack:
-        stack.enter_context(_settled())
+        stack.enter_context(settled())
         files = stack.enter_context(RunFiles(outputs, plan, conduct, overwrite=overwrite))
         tasks = stack.enter_context(closing(_tasks(run, tilts, reference)))
         for rows in files.kept(tasks):
@@ -247,26 +245,6 @@ def _write_pictures(frames: Sequence[FrameRows], folder: Path, *, overwrite: boo
         for name, picture in rows.pictures:
             with write_whole(folder / name, overwrite=overwrite) as stream:
                 stream.write(picture)
-
-
-@contextmanager
-def _settled() -> Iterator[None]:
-    """Have Python's collections of garbage leave out what is there already, as long as a run lasts.
-
-    Without this each of them would look through all that was imported; and there would be one every
-    other frame, of which nothing is garbage.
-    """
-    if gc.get_freeze_count():  # somebody has done so, or wants other things left out
-        yield
-        return
-    thresholds = gc.get_threshold()
-    gc.freeze()
-    gc.set_threshold(_NEW_OBJECTS, *thresholds[1:])
-    try:
-        yield
-    finally:
-        gc.set_threshold(*thresholds)
-        gc.unfreeze()
 
 
 def _tasks(

@@ -11,7 +11,6 @@ If that process is killed, they end by themselves.
 
 from __future__ import annotations
 
-import gc
 import multiprocessing
 import os
 import re
@@ -20,12 +19,13 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import CancelledError, Executor, Future, ProcessPoolExecutor
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from enum import Enum
 from multiprocessing.connection import wait
+from multiprocessing.context import SpawnContext
 from multiprocessing.process import BaseProcess
 from multiprocessing.synchronize import Event, Lock
-from typing import TYPE_CHECKING, ParamSpec, TypeVar, cast
+from typing import TYPE_CHECKING, NamedTuple, ParamSpec, TypeVar, cast
 
 from detect.announcing import (
     announce_compiling,
@@ -34,8 +34,9 @@ from detect.announcing import (
 )
 from detect.errors import WorkerError
 from detect.runs.dispatch import Workers
-from detect.runs.frame import FramePlan, rehearse
+from detect.runs.frame import FramePlan, import_detectors, rehearse, tables_of
 from detect.runs.frame_rows import PIXELS_AT_ONCE
+from detect.runs.garbage import settling, tidy_now_and_then
 from detect.runs.interrupts import interrupts_deferred
 from storage.kernel_loading import load_kernels_alone, waiting_before_compiling
 
@@ -52,11 +53,13 @@ FRAMES_PER_PROCESS = 500
 
 #: One job works on so many frames together at most.
 _LOCAL_CHUNK = 128
+#: A task of a process has so many frames; the larger one where there are enough for many of them.
 _PROCESS_CHUNK = 16
+_LARGE_PROCESS_CHUNK = 64
+_TASKS_PER_PROCESS = 32
 _CLUSTER_CHUNK = 16
 _WINDOW_PER_WORKER = 3
 _GRACE_S = 1.0
-_TIDY_EVERY = 256
 _CLUSTER_ANSWER_S = 10.0
 _CLUSTER_PATIENCE_S = 60.0
 _CLUSTER_LOOK_S = 5.0
@@ -74,7 +77,9 @@ def pixels_of(camera: Camera | None) -> int:
     return 0 if camera is None else camera.width * camera.height
 
 
-def local_workers(jobs: int, *, pictures: bool = False, frame_pixels: int = 0) -> Workers:
+def local_workers(
+    jobs: int, *, pictures: bool = False, frame_pixels: int = 0, frames: int | None = None
+) -> Workers:
     """Workers on this machine.
 
     Parameters
@@ -84,7 +89,10 @@ def local_workers(jobs: int, *, pictures: bool = False, frame_pixels: int = 0) -
     pictures : bool
         Whether frames give pictures: tasks are kept small then.
     frame_pixels : int
-        How large an image is, if that is known: one job works on as many as are decoded at once.
+        How large an image is, if that is known: no more are worked on together than are decoded at
+        once.
+    frames : int, optional
+        How many there are, if that is known: the longer the run, the more are worked on together.
 
     Raises
     ------
@@ -93,15 +101,24 @@ def local_workers(jobs: int, *, pictures: bool = False, frame_pixels: int = 0) -
     """
     if jobs < 1:
         raise WorkerError(f"jobs is {jobs}: expected 1 or more")
+    decoded_at_once = max(PIXELS_AT_ONCE // max(frame_pixels, 1), 1)
     if jobs == 1:
-        together = min(max(PIXELS_AT_ONCE // max(frame_pixels, 1), 1), _LOCAL_CHUNK)
+        together = min(decoded_at_once, _LOCAL_CHUNK)
         return Workers(_in_process, chunk=1 if pictures else together, window=lambda: 1)
     window = 2 + _WINDOW_PER_WORKER * jobs
     return Workers(
         lambda plan: _processes(jobs, plan),
-        chunk=1 if pictures else _PROCESS_CHUNK,
+        chunk=1 if pictures else min(decoded_at_once, _frames_per_task(jobs, frames)),
         window=lambda: window,
+        tell_of_tables=True,
     )
+
+
+def _frames_per_task(jobs: int, frames: int | None) -> int:
+    """How many frames a process works on together: few where the last tasks would be waited for."""
+    if frames is None:
+        return _PROCESS_CHUNK
+    return min(max(frames // (jobs * _TASKS_PER_PROCESS), _PROCESS_CHUNK), _LARGE_PROCESS_CHUNK)
 
 
 def cluster_workers(address: str, *, pictures: bool = False) -> Workers:
@@ -147,7 +164,7 @@ class _InProcess(Executor):
     """Does what it is given at once, before it gives the future back."""
 
     def submit(self, fn: Callable[P, R], /, *args: P.args, **kwargs: P.kwargs) -> Future[R]:
-        _tidy_now_and_then(_TIDY_EVERY)
+        tidy_now_and_then()
         future: Future[R] = Future()
         future.set_result(fn(*args, **kwargs))
         return future
@@ -183,12 +200,12 @@ def _processes(jobs: int, plan: FramePlan) -> Iterator[Executor]:
     context = multiprocessing.get_context("spawn")
     with ExitStack() as ending:
         with interrupts_deferred():
-            stop, first, ready = context.Event(), context.Lock(), context.Event()
+            stop, beginning = context.Event(), _Beginning.of(context)
             pool = _SpawnedProcesses(
                 jobs,
                 mp_context=context,
                 initializer=_begin,
-                initargs=(plan, stop, first, ready, announcements_are_shown()),
+                initargs=(plan, stop, beginning, announcements_are_shown()),
             )
             pool.plan = plan
             ending.callback(_shut_down, pool, stop)
@@ -232,20 +249,8 @@ def _unless_stopped(fn: Callable[..., R], /, *args: object, **kwargs: object) ->
     """Do a task, unless its result is no longer waited for."""
     if _stopped is not None and _stopped.is_set():
         raise CancelledError
-    _tidy_now_and_then(_TIDY_EVERY)
+    tidy_now_and_then()
     return fn(*[_own_plan if value is _Known.PLAN else value for value in args], **kwargs)
-
-
-def _tidy_now_and_then(every: int) -> None:
-    """Give back what Python keeps for later: its own collections leave it, and it grows slowly."""
-    global _tasks_begun
-    _tasks_begun += 1
-    if _tasks_begun % every == 0:
-        gc.collect()
-
-
-#: How many tasks this process has begun.
-_tasks_begun = 0
 
 
 class _Known(Enum):
@@ -261,29 +266,58 @@ _own_plan: FramePlan | None = None
 _stopped: Event | None = None
 
 
-def _begin(plan: FramePlan, stop: Event, first: Lock, ready: Event, show: bool) -> None:
-    """Make a new process a worker; one of them compiles what is to be compiled, for all."""
+class _Beginning(NamedTuple):
+    """What new worker processes share: one of them makes what is not in the caches yet, for all.
+
+    Attributes
+    ----------
+    first : Lock
+        Taken by that one.
+    tables, kernels : Event
+        Set when tables are in the cache, and when kernels are.
+    """
+
+    first: Lock
+    tables: Event
+    kernels: Event
+
+    @classmethod
+    def of(cls, context: SpawnContext) -> _Beginning:
+        return cls(context.Lock(), context.Event(), context.Event())
+
+
+def _begin(plan: FramePlan, stop: Event, beginning: _Beginning, show: bool) -> None:
+    """Make a new process a worker."""
     global _stopped, _own_plan
     _stopped, _own_plan = stop, plan
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     if show:
         show_announcements()
-    import cv2
+    with settling():
+        import cv2
 
-    cv2.setNumThreads(1)
-    announce_compiling()
-    if first.acquire(block=False):
-        load_kernels_alone()
-        rehearse(plan)
-        ready.set()
-    else:
-        with waiting_before_compiling(ready.wait) as waits:
-            if not waits:
-                ready.wait()
+        cv2.setNumThreads(1)
+        announce_compiling()
+        with suppress(Exception):  # whatever it is: the first task will tell
+            _rehearse_together(plan, beginning)
+
+
+def _rehearse_together(plan: FramePlan, beginning: _Beginning) -> None:
+    if beginning.first.acquire(block=False):
+        try:
+            load_kernels_alone()
+            tables_of(plan)
+            beginning.tables.set()
             rehearse(plan)
-    gc.collect()
-    gc.freeze()  # what is there stays: collections need not look at it
+        finally:  # the others see for themselves what is wrong
+            beginning.tables.set()
+            beginning.kernels.set()
+        return
+    with waiting_before_compiling(beginning.kernels.wait) as waits:
+        import_detectors(plan)
+        (beginning.tables if waits else beginning.kernels).wait()
+        rehearse(plan)
 
 
 def _end_with_parent() -> None:
