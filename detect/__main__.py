@@ -9,8 +9,12 @@ import sys
 
 def main() -> int:
     """Run the command line; returns the exit code."""
-    from detect.cli import main as command_line
+    try:
+        from detect.cli import main as command_line
+    except KeyboardInterrupt:
+        from storage.exit_codes import say_interrupted
 
+        return say_interrupted()
     return command_line()
 
 

@@ -2,43 +2,29 @@
 
 Each is a standard executor with its number of frames per task, put together as
 `detect.runs.dispatch.Workers`.
-
-Processes are spawned, not forked: compiled kernels, OpenCV and the libraries of linear algebra
-have threads of their own, which no fork survives. They take no notice of an interrupt from the
-keyboard; the process that started them does, and ends them.
-If that process is killed, they end by themselves.
 """
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import re
-import signal
-import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import CancelledError, Executor, Future, ProcessPoolExecutor
-from contextlib import ExitStack, contextmanager, suppress
-from enum import Enum
-from multiprocessing.connection import wait
-from multiprocessing.context import SpawnContext
-from multiprocessing.process import BaseProcess
-from multiprocessing.synchronize import Event, Lock
-from typing import TYPE_CHECKING, NamedTuple, ParamSpec, TypeVar, cast
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, Future
+from contextlib import ExitStack, contextmanager
+from typing import TYPE_CHECKING, ParamSpec, TypeVar
 
 from detect.announcing import (
     announce_compiling,
     announcements_are_shown,
-    show_announcements,
 )
 from detect.errors import WorkerError
 from detect.runs.dispatch import Workers
-from detect.runs.frame import FramePlan, import_detectors, rehearse, tables_of
+from detect.runs.frame import FramePlan
 from detect.runs.frame_rows import PIXELS_AT_ONCE
-from detect.runs.garbage import settling, tidy_now_and_then
+from detect.runs.garbage import tidy_now_and_then
 from detect.runs.interrupts import interrupts_deferred
-from storage.kernel_loading import load_kernels_alone, waiting_before_compiling
+from detect.runs.processes import WorkerProcesses
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -55,11 +41,10 @@ FRAMES_PER_PROCESS = 500
 _LOCAL_CHUNK = 128
 #: A task of a process has so many frames; the larger one where there are enough for many of them.
 _PROCESS_CHUNK = 16
-_LARGE_PROCESS_CHUNK = 64
+_LARGE_PROCESS_CHUNK = 128
 _TASKS_PER_PROCESS = 32
 _CLUSTER_CHUNK = 16
 _WINDOW_PER_WORKER = 3
-_GRACE_S = 1.0
 _CLUSTER_ANSWER_S = 10.0
 _CLUSTER_PATIENCE_S = 60.0
 _CLUSTER_LOOK_S = 5.0
@@ -179,152 +164,13 @@ def _in_process(plan: FramePlan) -> Iterator[Executor]:
 # -- processes ------------------------------------------------------------------------------
 
 
-class _SpawnedProcesses(ProcessPoolExecutor):
-    """Processes that inherit a blocked interrupt: it would reach them even while they start.
-
-    None is left half started: an interrupt of this process waits meanwhile.
-
-    The plan that they were started for, they have: it does not travel with every task.
-    """
-
-    plan: FramePlan
-
-    def submit(self, fn: Callable[P, R], /, *args: P.args, **kwargs: P.kwargs) -> Future[R]:
-        given = [_Known.PLAN if value is self.plan else value for value in args]
-        with interrupts_deferred():
-            return super().submit(_unless_stopped, fn, *given, **kwargs)
-
-
 @contextmanager
 def _processes(jobs: int, plan: FramePlan) -> Iterator[Executor]:
-    context = multiprocessing.get_context("spawn")
     with ExitStack() as ending:
         with interrupts_deferred():
-            stop, beginning = context.Event(), _Beginning.of(context)
-            pool = _SpawnedProcesses(
-                jobs,
-                mp_context=context,
-                initializer=_begin,
-                initargs=(plan, stop, beginning, announcements_are_shown()),
-            )
-            pool.plan = plan
-            ending.callback(_shut_down, pool, stop)
+            pool = WorkerProcesses(jobs, plan, show=announcements_are_shown())
+            ending.callback(pool.end)
         yield pool
-
-
-def _shut_down(pool: ProcessPoolExecutor, stop: Event) -> None:
-    """End a pool's processes, whatever they are doing; a further interrupt waits for that.
-
-    The thread that looks after them is waited for: an interrupted program leaves threads behind,
-    and this one would be stopped between the removal of a semaphore and the note of that.
-    """
-    with interrupts_deferred():
-        stop.set()
-        processes = list((pool._processes or {}).values())
-        caretaker = cast("threading.Thread | None", pool._executor_manager_thread)
-        pool.shutdown(wait=False, cancel_futures=True)
-        _end(processes)
-        if caretaker is not None:
-            caretaker.join(_GRACE_S)
-
-
-def _end(processes: Sequence[BaseProcess]) -> None:
-    """Let processes end, and make those that do not: they may still be starting."""
-    running = {process.sentinel: process for process in processes}
-    latest_s = time.monotonic() + _GRACE_S
-    while running and (left_s := latest_s - time.monotonic()) > 0.0:
-        for ended in wait(list(running), left_s):
-            assert isinstance(ended, int)
-            del running[ended]
-    for process in running.values():
-        process.terminate()
-    for process in processes:
-        process.join(_GRACE_S)
-        if process.is_alive():
-            process.kill()
-            process.join()
-
-
-def _unless_stopped(fn: Callable[..., R], /, *args: object, **kwargs: object) -> R:
-    """Do a task, unless its result is no longer waited for."""
-    if _stopped is not None and _stopped.is_set():
-        raise CancelledError
-    tidy_now_and_then()
-    return fn(*[_own_plan if value is _Known.PLAN else value for value in args], **kwargs)
-
-
-class _Known(Enum):
-    """What stands in a task for what a worker has already."""
-
-    PLAN = "plan"
-
-
-#: In a worker process: the plan that it was started for.
-_own_plan: FramePlan | None = None
-
-#: Set in a worker process when the run ends early.
-_stopped: Event | None = None
-
-
-class _Beginning(NamedTuple):
-    """What new worker processes share: one of them makes what is not in the caches yet, for all.
-
-    Attributes
-    ----------
-    first : Lock
-        Taken by that one.
-    tables, kernels : Event
-        Set when tables are in the cache, and when kernels are.
-    """
-
-    first: Lock
-    tables: Event
-    kernels: Event
-
-    @classmethod
-    def of(cls, context: SpawnContext) -> _Beginning:
-        return cls(context.Lock(), context.Event(), context.Event())
-
-
-def _begin(plan: FramePlan, stop: Event, beginning: _Beginning, show: bool) -> None:
-    """Make a new process a worker."""
-    global _stopped, _own_plan
-    _stopped, _own_plan = stop, plan
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-    if show:
-        show_announcements()
-    with settling():
-        import cv2
-
-        cv2.setNumThreads(1)
-        announce_compiling()
-        with suppress(Exception):  # whatever it is: the first task will tell
-            _rehearse_together(plan, beginning)
-
-
-def _rehearse_together(plan: FramePlan, beginning: _Beginning) -> None:
-    if beginning.first.acquire(block=False):
-        try:
-            load_kernels_alone()
-            tables_of(plan)
-            beginning.tables.set()
-            rehearse(plan)
-        finally:  # the others see for themselves what is wrong
-            beginning.tables.set()
-            beginning.kernels.set()
-        return
-    with waiting_before_compiling(beginning.kernels.wait) as waits:
-        import_detectors(plan)
-        (beginning.tables if waits else beginning.kernels).wait()
-        rehearse(plan)
-
-
-def _end_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        wait([parent.sentinel])
-        os._exit(1)
 
 
 # -- a cluster ------------------------------------------------------------------------------
