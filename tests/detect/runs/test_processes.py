@@ -1,0 +1,152 @@
+"""Worker processes: how they begin, and what the process that has them need not do."""
+
+from __future__ import annotations
+
+import gc
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from detect.cli import main
+from detect.run import open_run
+from detect.runs.circles_run import detect_circles_run
+from detect.runs.frame_rows import PIXELS_AT_ONCE
+from detect.runs.garbage import settling
+from detect.runs.workers import local_workers
+from detect.settings import CircleSettings
+from lut import TableError
+
+
+def python(program: str, root: Path) -> str:
+    """What a program prints that ends well."""
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=root, capture_output=True, text=True, check=True
+    )
+    return done.stdout
+
+
+# -- the process that has them --------------------------------------------------------------
+
+
+@pytest.mark.long
+def test_who_has_others_work_loads_no_compiler(small_run: Path, project_root: Path) -> None:
+    """It would begin half a second later."""
+    said = python(
+        "import sys\n"
+        "from detect.cli import main\n"
+        "if __name__ == '__main__':\n"
+        f"    code = main(['circles', {str(small_run)!r}, '--jobs', '2'])\n"
+        "    heavy = {'numba', 'scipy', 'skimage', 'lut'} & set(sys.modules)\n"
+        "    print('exit', code, 'heavy', sorted(heavy))\n",
+        project_root,
+    )
+    assert said.splitlines()[-1] == "exit 0 heavy []"
+
+
+def test_workers_load_no_command_line(project_root: Path) -> None:
+    """They import the program before they know what for."""
+    said = python(
+        "import sys, detect.__main__; print({'tyro', 'detect.cli', 'numpy'} & set(sys.modules))",
+        project_root,
+    )
+    assert said == "set()\n"
+
+
+def test_an_interrupt_while_the_program_is_imported(project_root: Path) -> None:
+    said = python(
+        "import sys\n"
+        "from detect.__main__ import main\n"
+        "class Interrupting:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        "        if name == 'detect.cli':\n"
+        "            raise KeyboardInterrupt\n"
+        "sys.meta_path.insert(0, Interrupting())\n"
+        "print(main())\n",
+        project_root,
+    )
+    assert said == "130\n"
+
+
+# -- how many frames they work on together ----------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("jobs", "frames", "together"),
+    [(2, None, 16), (2, 80, 16), (2, 2000, 31), (2, 10**6, 128), (64, 10**4, 16)],
+)
+def test_tasks_are_larger_where_there_are_many(
+    jobs: int, frames: int | None, together: int
+) -> None:
+    assert local_workers(jobs, frames=frames).chunk == together
+
+
+@given(
+    jobs=st.integers(1, 200),
+    frames=st.none() | st.integers(0, 10**7),
+    pixels=st.integers(0, 10**9),
+)
+def test_no_more_than_are_decoded_at_once(jobs: int, frames: int | None, pixels: int) -> None:
+    chunk = local_workers(jobs, frames=frames, frame_pixels=pixels).chunk
+    assert 1 <= chunk <= 128
+    assert chunk == 1 or chunk * pixels <= PIXELS_AT_ONCE
+
+
+# -- what they begin with -----------------------------------------------------------------------
+
+
+@pytest.mark.long
+def test_one_of_them_makes_the_tables(
+    small_run: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    """The others wait for the cache, and find there what a process alone would have made."""
+    arguments = ["all", str(small_run), "-o"]
+    assert main([*arguments, str(tmp_path / "one")]) == 0
+    monkeypatch.setenv("REDETECT_CACHE", str(tmp_path / "tables"))
+    capfd.readouterr()
+    assert main([*arguments, str(tmp_path / "two"), "--jobs", "2"]) == 0
+    said = capfd.readouterr().err
+    assert said.count("computing the table of discs") == 1
+    assert said.count("computing the table of verticals") == 1
+    for kind in ("circles", "lines", "tilt"):
+        one, two = (tmp_path / name / f"detected.{kind}" for name in ("one", "two"))
+        assert one.read_bytes() == two.read_bytes()
+
+
+@pytest.mark.long
+def test_workers_tell_what_is_wrong_with_the_tables(small_run: Path) -> None:
+    """As the process itself would; and nothing is left of what was begun."""
+    run = open_run(small_run)
+    rows = run.camera.robot_from_camera
+    under = replace(run.camera, robot_from_camera=(*rows[:2], (*rows[2][:3], -1.5)))
+    before = sorted(small_run.iterdir())
+    with pytest.raises(TableError, match=r"the camera is -1\.5 m above the floor: expected more"):
+        detect_circles_run(
+            replace(run, camera=under),
+            CircleSettings(),
+            small_run / "out.circles",
+            version="1",
+            workers=local_workers(2),
+        )
+    assert sorted(small_run.iterdir()) == before
+
+
+def test_a_process_that_settles_leaves_out_what_is_there() -> None:
+    thresholds = gc.get_threshold()
+    assert gc.get_freeze_count() == 0
+    try:
+        with settling():
+            assert not gc.isenabled()
+        assert gc.isenabled()
+        assert gc.get_freeze_count() > 1000
+        assert gc.get_threshold()[0] > thresholds[0]
+    finally:
+        gc.unfreeze()
+        gc.set_threshold(*thresholds)
