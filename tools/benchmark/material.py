@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,6 +16,9 @@ from landmarks import Frame, write_frames
 from tools.benchmark.errors import BenchmarkError
 
 _JPEG_QUALITY = 90
+
+#: A long run has so many files of its own: more than a processor's caches hold.
+_MOST_COPIES = 1600
 _PHOTOGRAPHS = frozenset({".jpg", ".jpeg", ".png"})
 
 #: Noise that scaled images get (grey levels): enlarged ones have none of their own.
@@ -142,7 +146,7 @@ def repeated_run(run: Run, folder: Path, frames: int) -> Path:
     Parameters
     ----------
     run : Run
-        The run whose image files are copied.
+        The run whose image files are copied; beyond some, links to the copies will do.
     folder : path
         Where the new run folder is made.
     frames : int
@@ -160,9 +164,15 @@ def repeated_run(run: Run, folder: Path, frames: int) -> Path:
     (target / "images").mkdir(parents=True)
     write_camera(run.camera, target / f"{target.name}.cam")
     steps = []
+    copies: list[Path] = []
     for number in range(frames):
         source, step = sources[number % len(sources)]
-        shutil.copyfile(source, target / "images" / f"e.{number:06d}{source.suffix}")
+        image = target / "images" / f"e.{number:06d}{source.suffix}"
+        if number < max(_MOST_COPIES, len(sources)):
+            shutil.copyfile(source, image)
+            copies.append(image)
+        else:
+            os.link(copies[number % len(copies)], image)
         steps.append(Frame(replace(step, prefix=f"e.{number:06d}")))
     write_frames(target / f"{target.name}.txt", steps)
     return target

@@ -135,6 +135,7 @@ def _frames(axes: Axes, runs: Sequence[RunTimes]) -> None:
             label=f"{own[0].command}, {jobs} job{'s' if jobs > 1 else ''}",
             markersize=4,
         )
+    axes.set_xscale("log")
     axes.set_ylim(bottom=0.0)
     axes.set_xlabel("frames of the run")
     axes.set_ylabel("images per second, files in, files out")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 from rich.console import Group
 from rich.table import Table
@@ -120,8 +120,32 @@ def format_markdown(result: Result) -> str:
     for alone in result.runs[:1]:
         lines += _markdown_row(["*decoding from memory*", "1", _per_s(alone)[0], "1", ""])
         lines += _markdown_row(["*reading and decoding files*", "1", _per_s(alone)[1], "", "1"])
+    lines += _by_frames(result.by_frames)
     lines += ["", "Growth, fitted to the medians:", "", *(f"- {t}" for t in growth_lines(result))]
     return "\n".join(lines) + "\n"
+
+
+def _by_frames(runs: Sequence[RunTimes]) -> list[str]:
+    """Runs of growing length by each number of jobs; how many times as many images as by one."""
+    if not runs:
+        return []
+    jobs = sorted({times.jobs for times in runs})
+    lines = [
+        "",
+        f"`{runs[0].command}` on runs of growing length, images/s (times those of one job); "
+        "processes of their own take a second to begin:",
+        "",
+        *_markdown_row(["frames", *(f"jobs: {count}" for count in jobs)], head=True),
+    ]
+    for frames in sorted({times.frames for times in runs}):
+        cells = []
+        for times in sorted((t for t in runs if t.frames == frames), key=lambda t: t.jobs):
+            cell = number(times.images_per_s.median)
+            if times.jobs > 1 and times.times_one_job is not None:
+                cell += f" ({number(times.times_one_job.median)})"
+            cells.append(cell)
+        lines += _markdown_row([str(frames), *cells])
+    return lines
 
 
 def format_headline(result: Result) -> str:
@@ -142,12 +166,14 @@ def format_headline(result: Result) -> str:
         passes += (
             f" ({alone.frames} frames; decoding alone {decoding} images/s, with reading {reading})"
         )
-    if result.by_frames:
-        last = result.by_frames[-1]
-        passes += (
-            f"; `{last.command}` of {last.frames} frames with {last.jobs} jobs "
-            f"{number(last.images_per_s.median)} images/s"
-        )
+    longest = max((times.frames for times in result.by_frames), default=0)
+    for times in result.by_frames:
+        if times.frames == longest and times.jobs > 1 and times.times_one_job is not None:
+            passes += (
+                f"; `{times.command}` of {times.frames} frames with {times.jobs} jobs "
+                f"{number(times.images_per_s.median)} images/s, "
+                f"{number(times.times_one_job.median)} times one job"
+            )
     pictures, rounds = (result.settings[key] for key in ("pictures", "rounds"))
     machine = result.machine
     return "\n".join(
@@ -274,6 +300,7 @@ def _runs_table(title: str, runs: Iterable[RunTimes]) -> Table:
         "images/s",
         "frames",
         "jobs",
+        "of one job",
     ):
         table.add_column(column, justify="right")
     for times in runs:
@@ -287,6 +314,7 @@ def _runs_table(title: str, runs: Iterable[RunTimes]) -> Table:
             number(times.images_per_s.median),
             str(times.frames),
             str(times.jobs),
+            "" if times.times_one_job is None else number(times.times_one_job.median),
         )
     return table
 

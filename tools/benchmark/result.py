@@ -95,6 +95,8 @@ class RunTimes:
         Images per second and job / those of decoding from memory.
     share_of_reading : Spread
         Images per second and job / those of reading and decoding.
+    times_one_job : Spread or None
+        Images per second / those of one job; None where one job was not measured.
     """
 
     command: str
@@ -105,6 +107,7 @@ class RunTimes:
     reading_images_per_s: Spread
     share_of_decoding: Spread
     share_of_reading: Spread
+    times_one_job: Spread | None = None
 
 
 @dataclass(frozen=True)
@@ -190,6 +193,7 @@ def run_times(
     seconds: FloatArray,
     decoding: FloatArray,
     reading: FloatArray,
+    one_job: FloatArray | None = None,
 ) -> RunTimes:
     """Sum up passes over a run.
 
@@ -200,6 +204,8 @@ def run_times(
     seconds, decoding, reading : (rounds,) float64
         Of the command, of decoding the same files from memory, and of reading and decoding them, in
         the same round; NaN where left out.
+    one_job : (rounds,) float64, optional
+        Of the same command with one job.
     """
     return RunTimes(
         command,
@@ -210,6 +216,7 @@ def run_times(
         spread_of(frames / reading),
         spread_of(paired_ratios(decoding, seconds) / jobs),
         spread_of(paired_ratios(reading, seconds) / jobs),
+        None if one_job is None else spread_of(paired_ratios(one_job, seconds)),
     )
 
 

@@ -68,6 +68,19 @@ def read_and_decode_run(paths: Sequence[Path]) -> None:
             decode(np.frombuffer(stream.readall(), np.uint8))
 
 
+def contents_of(paths: Sequence[Path]) -> list[NDArray[np.uint8]]:
+    """What files hold; files that are one under several names are held once."""
+    held: dict[tuple[int, int], NDArray[np.uint8]] = {}
+    contents = []
+    for path in paths:
+        status = path.stat()
+        key = (status.st_dev, status.st_ino)
+        if key not in held:
+            held[key] = np.fromfile(path, np.uint8)
+        contents.append(held[key])
+    return contents
+
+
 def measure_runs(
     performed: Mapping[Key, Command],
     run: Path,
@@ -103,7 +116,7 @@ def measure_runs(
     """
     opened = open_run(run)
     paths = [frame.image for frame in opened.frames if frame.image is not None]
-    files = [np.fromfile(path, np.uint8) for path in paths]
+    files = contents_of(paths)
 
     def performing(command: Command) -> Callable[[int], object]:
         return lambda _: perform(command)

@@ -93,7 +93,7 @@ class Settings:
     budget_s: float = 3.0
     factors: tuple[float, ...] = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0)
     landmarks: tuple[int, ...] = (0, 5, 10, 20, 30, 50)
-    frames: tuple[int, ...] = (20, 50, 100, 200, 500)
+    frames: tuple[int, ...] = (80, 320, 1600, 6400)
     jobs: tuple[int, ...] = (1, 2)
     seed: int = 0
 
@@ -279,6 +279,8 @@ def _runs(
         performed, run, settings.run_rounds, warm_up=warm_up
     )
     return [
-        run_times(name, frames, count, seconds[name, count], decoding, reading)
+        run_times(
+            name, frames, count, seconds[name, count], decoding, reading, seconds.get((name, 1))
+        )
         for name, count in performed
     ]

@@ -24,6 +24,7 @@ from tools.benchmark.material import (
     scaled_picture,
 )
 from tools.benchmark.painted import disc_places, floor_with_discs, wall_with_edges
+from tools.benchmark.runs import contents_of
 
 
 def test_a_scaled_camera_sees_the_same_directions(published_camera: Camera) -> None:
@@ -88,6 +89,23 @@ def test_a_repeated_run_holds_the_frames_over_and_over(project_root: Path, tmp_p
     assert len(images) == len(sources) + 2
     for place, image in enumerate(images):
         assert image.read_bytes() == sources[place % len(sources)].read_bytes()
+
+
+def test_a_long_run_takes_no_more_room_on_the_disk_than_a_processor_notices(
+    project_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tools.benchmark.material._MOST_COPIES", 100)
+    run = open_run(project_root / "images/e")
+    sources = [frame.image for frame in run.frames if frame.image is not None]
+    longer = open_run(repeated_run(run, tmp_path, 250))
+    images = [frame.image for frame in longer.frames if frame.image is not None]
+    assert len(images) == 250
+    assert len({image.stat().st_ino for image in images}) == 100
+    contents = contents_of(images)
+    assert len({id(content) for content in contents}) == 100
+    for image, content in zip(images, contents):
+        assert image.read_bytes() == content.tobytes()
+    assert images[180].read_bytes() == sources[0].read_bytes()
 
 
 @pytest.mark.parametrize("count", [0, 5, 20, 50])

@@ -48,6 +48,7 @@ def _result() -> Result:
             np.array([2.0, 2.0, 4.0]) / jobs,
             np.full(3, 0.5),
             np.full(3, 0.6),
+            np.array([2.0, 2.0, 4.0]),
         )
         for jobs in (1, 2)
     ]
@@ -97,6 +98,16 @@ def test_the_share_of_decoding_is_per_job() -> None:
     assert times.share_of_reading.median == pytest.approx(0.15)
 
 
+def test_jobs_are_compared_with_one_in_the_same_round() -> None:
+    one, two = np.array([4.0, 4.0, 9.0]), np.array([2.0, np.nan, 5.0])
+    decoding = np.ones(3)
+    times = run_times("detect all", 100, 2, two, decoding, decoding, one)
+    assert times.times_one_job is not None
+    assert times.times_one_job.median == pytest.approx(1.9)
+    assert times.times_one_job.count == 2
+    assert run_times("detect all", 100, 2, two, decoding, decoding).times_one_job is None
+
+
 def test_json_holds_all_of_it() -> None:
     document = json.loads(format_json(_result()))
     assert set(document) == {
@@ -121,6 +132,8 @@ def test_markdown_tells_ratios_first_and_what_is_missing() -> None:
     )
     assert "| *decoding from memory* | 1 | 20.0 | 1 |  |" in text
     assert "| *reading and decoding files* | 1 | 16.7 |  | 1 |" in text
+    assert "| frames | jobs: 1 | jobs: 2 |" in text
+    assert "| 10 | 5.00 | 10.0 (2.00) |" in text
     assert "settings: pictures 2, rounds 7, jobs 1 2" in text
     assert "not installed: something" in text
     assert "not measured: photographs: no folder was given" in text
@@ -150,7 +163,7 @@ def test_the_headline_is_medians_alone() -> None:
     assert "| own | 2.50 (5.00) |" in text
     assert "5.00 images/s, 0.25 of decoding from memory, 0.30 of reading and decoding" in text
     assert "(10 frames; decoding alone 20.0 images/s, with reading 16.7)" in text
-    assert "`detect all` of 10 frames with 2 jobs 10.0 images/s." in text
+    assert "`detect all` of 10 frames with 2 jobs 10.0 images/s, 2.00 times one job." in text
     assert "A processor; 2 pictures of each kind, 7 rounds." in text
 
 
