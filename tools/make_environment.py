@@ -57,7 +57,7 @@ def _installed(environment: Path) -> bool:
         )
         return _installed_unlocked(environment)
     pip = _new_environment(environment)
-    # Modules are compiled when they are first imported: most never are.
+    # Compiled below, by all cores.
     locked = subprocess.run(
         [
             *pip, "install", "--quiet", "--no-compile", "--require-hashes", "--no-deps",
@@ -68,7 +68,10 @@ def _installed(environment: Path) -> bool:
     if locked.returncode == 0:
         # All that it needs is there, setuptools too: nothing is fetched to build with.
         own = [*pip, "install", "--quiet", "--no-build-isolation", "--editable", f"{ROOT}[dev]"]
-        return subprocess.run(own, check=False).returncode == 0
+        if subprocess.run(own, check=False).returncode != 0:
+            return False
+        _compile_modules(environment)
+        return True
     sys.stderr.write(locked.stderr)
     if _WRONG_HASH in locked.stderr:
         # Somebody gives out other files under the same names: nothing is to be had from there.
@@ -79,6 +82,17 @@ def _installed(environment: Path) -> bool:
         flush=True,
     )
     return _installed_unlocked(environment)
+
+
+def _compile_modules(environment: Path) -> None:
+    """Compile what is installed, also where Python is told not to keep what it compiles.
+
+    Else every process there would compile all of its imports again: a third of a second for
+    `detect`, and for each of its workers.
+    """
+    command = [str(environment / "bin" / "python"), "-m", "compileall", "-qq", "-j", "0"]
+    # Some files are templates, or for other versions of Python, and no modules here.
+    subprocess.run([*command, str(environment)], check=False)
 
 
 def _installed_unlocked(environment: Path) -> bool:

@@ -15,6 +15,7 @@ from tools.benchmark.result import (
     RunTimes,
     costs_per_landmark,
     growth_powers,
+    times_one_job_beyond,
 )
 from tools.benchmark.timing import Spread
 
@@ -145,6 +146,14 @@ def _by_frames(runs: Sequence[RunTimes]) -> list[str]:
                 cell += f" ({number(times.times_one_job.median)})"
             cells.append(cell)
         lines += _markdown_row([str(frames), *cells])
+    for count in jobs:
+        beyond = times_one_job_beyond(runs, count) if count > 1 else None
+        if beyond is not None:
+            lines += [
+                "",
+                f"Beyond the first {beyond[0]} frames {count} jobs do {number(beyond[1])} times as "
+                "many.",
+            ]
     return lines
 
 
@@ -174,6 +183,9 @@ def format_headline(result: Result) -> str:
                 f"{number(times.images_per_s.median)} images/s, "
                 f"{number(times.times_one_job.median)} times one job"
             )
+            beyond = times_one_job_beyond(result.by_frames, times.jobs)
+            if beyond is not None:
+                passes += f" ({number(beyond[1])} beyond the first {beyond[0]})"
     pictures, rounds = (result.settings[key] for key in ("pictures", "rounds"))
     machine = result.machine
     return "\n".join(

@@ -220,6 +220,34 @@ def run_times(
     )
 
 
+def times_one_job_beyond(runs: Sequence[RunTimes], jobs: int) -> tuple[int, float] | None:
+    """How many times as many images as one job some do, once they have begun.
+
+    Parameters
+    ----------
+    runs : sequence of RunTimes
+        Of one command, on runs of growing length.
+    jobs : int
+
+    Returns
+    -------
+    frames : int
+        Length of the longest run but one.
+    times : float
+        Ratio of what the frames beyond that took in the longest run, by the medians. None where
+        there are not two lengths that both were measured on, or some took no time.
+    """
+    seconds = {(t.frames, t.jobs): t.frames / t.images_per_s.median for t in runs}
+    lengths = sorted(
+        {frames for frames, _ in seconds if {(frames, 1), (frames, jobs)} <= set(seconds)}
+    )
+    if len(lengths) < 2:
+        return None
+    first, last = lengths[-2:]
+    one, several = (seconds[last, count] - seconds[first, count] for count in (1, jobs))
+    return (first, one / several) if min(one, several) > 0.0 else None
+
+
 def growth_powers(points: Sequence[GrowthPoint]) -> dict[str, float]:
     """The power of the amount that each function's median time grows as (least squares of logs)."""
     amounts = np.log([point.amount for point in points])

@@ -23,6 +23,7 @@ from tools.benchmark.result import (
     function_times,
     growth_powers,
     run_times,
+    times_one_job_beyond,
 )
 
 _MEASURED = [
@@ -106,6 +107,22 @@ def test_jobs_are_compared_with_one_in_the_same_round() -> None:
     assert times.times_one_job.median == pytest.approx(1.9)
     assert times.times_one_job.count == 2
     assert run_times("detect all", 100, 2, two, decoding, decoding).times_one_job is None
+
+
+def test_what_several_jobs_do_once_they_have_begun() -> None:
+    """A job takes 2 s for a thousand frames; two begin after 3 s and take 1.25 s."""
+    once = np.ones(1)
+    runs = [
+        run_times("detect all", frames, jobs, seconds * once, once, once)
+        for frames in (1000, 4000)
+        for jobs, seconds in ((1, 0.002 * frames), (2, 3.0 + 0.00125 * frames))
+    ]
+    beyond = times_one_job_beyond(runs, 2)
+    assert beyond is not None
+    assert beyond[0] == 1000
+    assert beyond[1] == pytest.approx(1.6)
+    assert times_one_job_beyond(runs[:2], 2) is None
+    assert times_one_job_beyond(runs, 3) is None
 
 
 def test_json_holds_all_of_it() -> None:
