@@ -246,14 +246,15 @@ def _workers(command: DetectorFlags, run: ImageRun) -> Workers:
     if command.cluster is not None:
         if command.jobs is not None:
             raise WorkerError("--jobs and --cluster: expected one of them")
+        workers = cluster_workers(command.cluster, pictures=large)
+    else:
+        expected = run.frames.expected
+        jobs = command.jobs if command.jobs is not None else default_jobs(expected or 0)
+        pixels = pixels_of(run.camera if isinstance(run, Run) else None)
+        workers = local_workers(jobs, pictures=large, frame_pixels=pixels, frames=expected)
+    if not workers.tell_of_tables:  # this process makes the tables, at least
         load_kernels_alone()
-        return cluster_workers(command.cluster, pictures=large)
-    expected = run.frames.expected
-    jobs = command.jobs if command.jobs is not None else default_jobs(expected or 0)
-    if jobs == 1:
-        load_kernels_alone()
-    pixels = pixels_of(run.camera if isinstance(run, Run) else None)
-    return local_workers(jobs, pictures=large, frame_pixels=pixels, frames=expected)
+    return workers
 
 
 def _conduct(command: DetectorFlags, log: Path) -> Conduct:

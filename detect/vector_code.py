@@ -14,9 +14,9 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-#: Columns of the strip in one vector: a register of single precision numbers with AVX2.
+#: Numbers of single precision in one vector: a register with AVX2.
 LANES = 8
-#: Pixels that are read at once for each lane.
+#: Pixels that are read at once for each of them.
 WORD = 8
 
 I8, I16, I32, I64 = (ir.IntType(bits) for bits in (8, 16, 32, 64))

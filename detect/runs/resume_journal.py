@@ -26,10 +26,6 @@ from storage.parts import named, new_locked, old_locked, write_all
 #: Raised with every change of what a journal or the rows that it stands for look like.
 _JOURNAL_VERSION = 3
 
-#: Libraries whose version may decide the last digits of a row: told by what is installed, for a
-#: process that has others do the work does not load them.
-_DECIDING_LIBRARIES = ("numpy", "opencv-python-headless", "numba")
-
 _DIGITS = 16
 _COMPLETE = b'"complete"\n'
 _JSON = json.JSONEncoder(separators=(",", ":"))
@@ -183,6 +179,9 @@ def left_journal(place: Path) -> Journal | None:
 
 def made_by(outputs: Sequence[RunOutput], plan: FramePlan, conduct: Conduct) -> str:
     """A digest of whatever decides the rows, besides the frames themselves."""
+    import cv2
+    import numpy as np
+
     settings = [
         None if values is None else asdict(values)
         for values in (plan.circles, plan.lines, plan.markers)
@@ -190,7 +189,8 @@ def made_by(outputs: Sequence[RunOutput], plan: FramePlan, conduct: Conduct) -> 
     values = (
         _JOURNAL_VERSION,
         conduct.version,
-        [version(library) for library in _DECIDING_LIBRARIES],
+        # A process that has others do the work does not load the compiler, which takes long.
+        (np.__version__, cv2.__version__, version("numba")),
         settings,
         None if plan.camera is None else plan.camera.content_hash,
         (plan.json, plan.drawing, plan.draw_response),

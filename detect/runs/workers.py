@@ -14,10 +14,7 @@ from concurrent.futures import Executor, Future
 from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING, ParamSpec, TypeVar
 
-from detect.announcing import (
-    announce_compiling,
-    announcements_are_shown,
-)
+from detect.announcing import announce_compiling, announcements_are_shown
 from detect.errors import WorkerError
 from detect.runs.dispatch import Workers
 from detect.runs.frame import FramePlan
