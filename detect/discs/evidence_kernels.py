@@ -8,6 +8,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from detect.discs.rim import Rim
+
 #: What no disc's fit violates: radius relative to the nominal one, explained variance, and the
 #: share of the outline that has a step of the right sign.
 RADIUS_RANGE = (0.75, 1.28)
@@ -53,6 +55,66 @@ def evidence_of(
         - 6.3 * math.log(max(blur / max(optics_px, 1.0), 0.02))
         - 11.7
     )
+
+
+#: From this evidence of the fit on, a disc is certain enough without its rim.
+CLEAR_EVIDENCE = 6.0
+#: The rim is followed where a radius is this many pixels (the geometric mean over directions).
+LEAST_RIM_PX = 5.0
+#: The share of the rim, and the range of its radius, that a disc needs which its fit speaks against.
+LEAST_RIM = 0.4
+RIM_RADIUS_RANGE = (0.83, 1.12)
+#: Radius of a rim that fits best, relative to the nominal one: where the grey value changes most
+#: lies a little inside the edge.
+RIM_RADIUS = 0.95
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def evidence_with_rim(
+    fitted: float, explained: float, contrast: float, quality: float, rim: Rim, radius: float
+) -> float:
+    """Log-odds that a candidate is a disc, from its fit and its rim together.
+
+    The fit of a disc that something hides or touches explains little; then the rim decides. The
+    weights are a logistic regression on candidates of real images and renders that the fit alone
+    leaves in doubt (`python -m tools.evaluation rim-weights`).
+
+    Parameters
+    ----------
+    fitted : float
+        Log-odds by the fit alone (`evidence_of`), possibly minus infinity.
+    explained, contrast : float
+        Share of the variance that the fitted disc explains, and its contrast, grey levels: what is
+        faint is more often a reflection.
+    quality : float
+        Otsu's quality of the candidate.
+    rim : Rim
+        See `detect.discs.rim.follow_rim`.
+    radius : float
+        Nominal radius, metres.
+    """
+    relative = rim.radius / radius
+    if fitted == -math.inf and not (
+        rim.agreeing >= LEAST_RIM and RIM_RADIUS_RANGE[0] < relative < RIM_RADIUS_RANGE[1]
+    ):
+        return -math.inf
+    return (
+        -4.23
+        + 0.18 * min(max(fitted, -6.0), 6.0)
+        + 0.46 * _log_odds(quality)
+        + 0.57 * _log_odds(explained)
+        + 6.91 * rim.agreeing
+        - 0.38 * min(rim.runs, 4)
+        - 3.77 * abs(math.log(max(relative, 0.1) / RIM_RADIUS))
+        + 0.94 * math.log(min(max(abs(contrast), 1.0), 80.0) / 40.0)
+        + 1.0 * math.log(min(max(abs(contrast), 1.0), 40.0) / 40.0)
+    )
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _log_odds(share: float) -> float:
+    bounded = min(max(share, 0.003), 0.997)
+    return math.log(bounded / (1.0 - bounded))
 
 
 @njit(cache=True, error_model="numpy")

@@ -13,13 +13,23 @@ from detect.discs import fit_kernels as fit
 from detect.discs.candidate_kernels import middles, nearest_pixel, strong_and_alone, worth_a_look
 from detect.discs.covariance_kernels import refined_covariances
 from detect.discs.descent_kernels import PATIENT, Hope, Work, work_in
-from detect.discs.evidence_kernels import evidence_of
+from detect.discs.evidence_kernels import (
+    CLEAR_EVIDENCE,
+    LEAST_MIDDLE_STEP,
+    LEAST_RIM_PX,
+    RADIUS_RANGE,
+    evidence_of,
+    evidence_with_rim,
+)
 from detect.discs.fit_kernels import fit_disc
 from detect.discs.patch_kernels import FitSettings
 from detect.discs.quality_kernels import suppress_neighbours
+from detect.discs.rim import follow_rim
 
-#: Candidates whose first look is this much below the required evidence are not fitted in full.
+#: Candidates whose first look is this much below the required evidence are not fitted in full; more
+#: is allowed where the quality is high, for what hides part of a disc hardly lowers that.
 _FIRST_LOOK_SLACK = 2.0
+_SLACK_PER_QUALITY, _ORDINARY_QUALITY = 15.0, 0.7
 #: A look must promise to explain this share of the variance.
 _LEAST_SHARE = 0.1
 #: A look this much above the required evidence shows a disc clearly; within this share of the
@@ -31,6 +41,11 @@ _SAME_DISC = 0.3
 #: A blur that reached this share of the most that a patch allows is fitted again in a wider one.
 _AT_BOUND = 0.98
 _MOST_REFITS = 2
+#: By fit and rim together, a candidate that the fit speaks against needs these log-odds, and one
+#: that it speaks for is dropped below those.
+_RESCUED, _REFUTED = 0.95, 0.0
+#: From this share of the rim on, the fit of the whole disc tells the place better.
+_WHOLE_RIM = 0.9
 
 
 class DiscSearch(NamedTuple):
@@ -110,7 +125,7 @@ def search_discs(
     starts = middles(pixels, quality, contrast, floor_xy, weakest, near, keep)
     results, evidence, found = _fit_all(
         image, floor_xy, starts, quality[keep], contrast[keep], search, settings,
-        work_in(memory, indices, marks),
+        work_in(memory, indices, marks), camera_numbers,
     )  # fmt: skip
     own_pixels = np.empty((len(found), 2), np.int64)
     own_quality = np.empty(len(found))
@@ -146,6 +161,48 @@ def _evidence(result: NDArray[np.float64], radius: float, optics_px: float) -> f
         result[fit.RELATIVE_BLUR],
         optics_px,
     )
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _slack(quality: float) -> float:
+    """How much less than the required evidence a first look may promise."""
+    return _FIRST_LOOK_SLACK + _SLACK_PER_QUALITY * max(quality - _ORDINARY_QUALITY, 0.0)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _with_rim(
+    image: NDArray[np.uint8],
+    camera_numbers: NDArray[np.float64],
+    search: DiscSearch,
+    quality: float,
+    told: float,
+    result: NDArray[np.float64],
+) -> float:
+    """The evidence of a doubtful fit with its rim; a partly hidden disc's place becomes the rim's."""
+    relative = result[fit.RADIUS] / search.radius
+    possible = (
+        RADIUS_RANGE[0] < relative < RADIUS_RANGE[1] and result[fit.MIDDLE_STEP] > LEAST_MIDDLE_STEP
+    )
+    if not possible:
+        return told
+    rim = follow_rim(
+        image, camera_numbers, result[fit.X], result[fit.Y], search.radius, result[fit.CONTRAST]
+    )
+    if rim.radius_px < LEAST_RIM_PX:
+        return told
+    together = evidence_with_rim(
+        told, result[fit.EXPLAINED], result[fit.CONTRAST], quality, rim, search.radius
+    )
+    if told >= search.least_evidence:
+        return told if together >= _REFUTED else -math.inf
+    if rim.agreeing < _WHOLE_RIM:
+        result[fit.X], result[fit.Y] = rim.x, rim.y
+        result[fit.COV_XX], result[fit.COV_XY], result[fit.COV_YY] = (
+            rim.cov_xx,
+            rim.cov_xy,
+            rim.cov_yy,
+        )
+    return search.least_evidence + together - _RESCUED
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -195,6 +252,7 @@ def _fit_all(
     search: DiscSearch,
     settings: FitSettings,
     work: Work,
+    camera_numbers: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
     """Look at the candidates, then fit what the looks left: the results, the evidence, the discs.
 
@@ -212,8 +270,6 @@ def _fit_all(
     start = np.zeros(4)
     blur_start = max(settings.blur_px, 0.6 * search.optics_px)
     hope = PATIENT
-    if search.verify:
-        hope = Hope(_LEAST_SHARE, search.least_evidence - _FIRST_LOOK_SLACK, search.optics_px)
     clear = np.empty((n, 2))
     clear_count = 0
     # The best first.
@@ -270,6 +326,9 @@ def _fit_all(
             start[0] = (at_x - floor_xy[v, u, 0]) / radius
             start[1] = (at_y - floor_xy[v, u, 1]) / radius
         start[3] = log_blur
+        if search.verify:
+            slack = _slack(quality[i]) if looking else _slack(1.0)
+            hope = Hope(_LEAST_SHARE, search.least_evidence - slack, search.optics_px)
         fitted = fit_disc(
             image, floor_xy, u, v, radius, settings, start, blur,
             detail, hope, work, result,
@@ -283,13 +342,15 @@ def _fit_all(
             if not search.verify:
                 if fitted:
                     promise[i] = told if told > -math.inf else -1e9
-            elif told >= search.least_evidence - _FIRST_LOOK_SLACK:
+            elif told >= search.least_evidence - _slack(quality[i]):
                 promise[i] = told
                 if told >= search.least_evidence + _CLEAR:
                     clear[clear_count, 0] = result[fit.X]
                     clear[clear_count, 1] = result[fit.Y]
                     clear_count += 1
             continue
+        if search.verify and fitted and told < search.least_evidence + CLEAR_EVIDENCE:
+            told = _with_rim(image, camera_numbers, search, quality[i], told, result)
         evidence[i] = told
         enough = fitted and (not search.verify or told >= search.least_evidence)
         again = result[fit.BLUR] > _AT_BOUND * result[fit.BLUR_BOUND]
