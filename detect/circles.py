@@ -1,11 +1,11 @@
 """The disc detector: one image in, discs on the floor out.
 
 The way of one image, top to bottom, is `detect_circles`. The published detector (DLR Spatial
-Cognition data set report, circle detection) needs no more than the quality of each centre: it accepts those of a
-good quality and contrast, keeps the best within a disc's width, and reports the pixel with a
-covariance of one pixel and some centimetres. The default goes on from the maxima of the quality: it
-fits a disc through the camera at each, weighs the evidence, suppresses neighbours in the floor
-plane and refines the position.
+Cognition data set report, circle detection) needs no more than the quality of each centre: it
+accepts those of a good quality and contrast, keeps the best within a disc's width, and reports the
+pixel with a covariance of one pixel and some centimetres. The default goes on from the maxima of
+the quality: it fits a disc through the camera at each, weighs the evidence, suppresses neighbours
+in the floor plane and refines the position.
 """
 
 from __future__ import annotations
@@ -147,9 +147,7 @@ def _without_fit(
             image, table, settings.threshold, settings.polarity
         )
     else:
-        u, v, quality, contrast = good_centres(
-            image, table, settings.threshold, settings.polarity
-        )
+        u, v, quality, contrast = good_centres(image, table, settings.threshold, settings.polarity)
         pixels = np.stack([u, v], axis=-1)
     weakest = 0.0
     if settings.noise_floor > 0.0:

@@ -132,7 +132,9 @@ class CircleSettings:
             value = getattr(self, name)
             expected = "less" if name == "inner_ring" else "more"
             if not least < value < most:
-                raise DetectError(f"{name} is {value:g}: expected {expected} than 1, the disc's edge")
+                raise DetectError(
+                    f"{name} is {value:g}: expected {expected} than 1, the disc's edge"
+                )
 
     @property
     def inner_radius_m(self) -> float:

@@ -55,8 +55,8 @@ def strong_and_highest(
         kept[i] = True
         for j in range(len(strong)):
             other = quality[strong[j]]
-            if other > own or (other == own and j < i and kept[j]):
-                if (x[j] - x[i]) ** 2 + (y[j] - y[i]) ** 2 < near:
-                    kept[i] = False
-                    break
+            better = other > own or (other == own and j < i and kept[j])
+            if better and (x[j] - x[i]) ** 2 + (y[j] - y[i]) ** 2 < near:
+                kept[i] = False
+                break
     return strong[kept]
