@@ -44,9 +44,6 @@ from camera.model_checks import check_numbers, check_one_to_one, checked_pose, c
 FloatArray = NDArray[np.float64]
 Pose = tuple[tuple[float, float, float, float], ...]
 
-#: The published step of the central differences by which the data set's covariances were made.
-PUBLISHED_STEP_PX = 0.1
-
 
 @dataclass(frozen=True)
 class Camera:
