@@ -160,8 +160,8 @@ class MapByImage:
         near = np.flatnonzero(np.hypot(*xy.T) <= _REACH_M)
         spread = robot_from_map @ self._discs.covariance[near] @ robot_from_map.T
         return [
-            MappedDisc(number, *place, c[0][0], c[0][1], c[1][1])
-            for number, place, c in zip(
+            MappedDisc(number, px, py, c[0][0], c[0][1], c[1][1])
+            for number, (px, py), c in zip(
                 self._discs.ids[near].tolist(), xy[near].tolist(), spread.tolist()
             )
         ]

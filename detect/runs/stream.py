@@ -85,10 +85,9 @@ class IdSources:
     def of(self, prefix: str) -> KnownRows:
         """What is known of a frame."""
         return KnownRows(
-            *(
-                None if source is None else tuple(source.get(prefix) or ())
-                for source in (self.lines, self.discs, self.mapped)
-            )
+            lines=None if self.lines is None else tuple(self.lines.get(prefix) or ()),
+            discs=None if self.discs is None else tuple(self.discs.get(prefix) or ()),
+            mapped=None if self.mapped is None else tuple(self.mapped.get(prefix) or ()),
         )
 
 

@@ -155,7 +155,7 @@ def test_saturated_discs_are_neither_lost_nor_doubled(
 ) -> None:
     """Without noise many pixels of a disc have the quality 1."""
     floor = PaintedFloor(published_camera, floor=float(grey - step if not dark else grey))
-    places = PLACES[:3] + [shift, 0.0]
+    places = PLACES[:3] + np.array([shift, 0.0])
     for place in places:
         floor.disc(place, float(grey if not dark else grey - step))
     found = detect(floor.image(), published_camera)
