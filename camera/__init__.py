@@ -7,10 +7,9 @@
 
 from camera.camfile import format_camera, parse_camera, read_camera, write_camera
 from camera.errors import CameraError
-from camera.model import PUBLISHED_STEP_PX, Camera
+from camera.model import Camera
 
 __all__ = [
-    "PUBLISHED_STEP_PX",
     "Camera",
     "CameraError",
     "format_camera",

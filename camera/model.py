@@ -44,9 +44,6 @@ from camera.model_checks import check_numbers, check_one_to_one, checked_pose, c
 FloatArray = NDArray[np.float64]
 Pose = tuple[tuple[float, float, float, float], ...]
 
-#: The published step of the central differences by which the data set's covariances were made.
-PUBLISHED_STEP_PX = 0.1
-
 
 @dataclass(frozen=True)
 class Camera:
@@ -365,24 +362,21 @@ class Camera:
         (..., 2, 2) array
             Metres per pixel, rows X, Y, columns u, v; NaN where the pixel does not see the floor.
         """
-        floor_xy = self.floor_from_pixel(pixels)
-        point = np.concatenate([floor_xy, np.zeros_like(floor_xy[..., :1])], axis=-1)
-        pixels_per_metre = (
-            self.project_jacobian(self.robot_to_camera(point)) @ self.camera_from_robot[:, :2]
-        )
-        return _inverse_2x2(pixels_per_metre)
+        return self._floor_jacobian(self.floor_from_pixel(pixels), self.camera_from_robot)
 
     def floor_jacobian_published(self, pixels: ArrayLike) -> FloatArray:
-        """d(floor X, Y) / d(u, v) by central differences over +-0.1 px, as the data set has it.
+        """d(floor X, Y) / d(u, v) as the data set's own detector has it.
 
-        Shapes as in `floor_jacobian`.
+        Its projection turns by the transpose of `rotation`, which differs from the inverse in the
+        last digits that the file has. Shapes as in `floor_jacobian`.
         """
-        uv = np.asarray(pixels, dtype=np.float64)
-        step = PUBLISHED_STEP_PX * np.array([[1.0, 0.0], [0.0, 1.0]])
-        # Rows: what is seen a step ahead in u, in v, and a step behind.
-        seen = self.floor_from_pixel(uv[..., None, :] + np.concatenate([step, -step]))
-        moved = seen[..., :2, :] - seen[..., 2:, :]
-        return np.asarray(moved.swapaxes(-1, -2) / (2.0 * PUBLISHED_STEP_PX))
+        return self._floor_jacobian(self.floor_from_pixel(pixels), self.rotation.T)
+
+    def _floor_jacobian(self, floor_xy: FloatArray, camera_from_robot: FloatArray) -> FloatArray:
+        point = np.concatenate([floor_xy, np.zeros_like(floor_xy[..., :1])], axis=-1)
+        in_camera = (point - self.centre) @ camera_from_robot.T
+        pixels_per_metre = self.project_jacobian(in_camera) @ camera_from_robot[:, :2]
+        return _inverse_2x2(pixels_per_metre)
 
 
 def _read_only(array: FloatArray) -> FloatArray:

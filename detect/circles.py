@@ -1,10 +1,11 @@
 """The disc detector: one image in, discs on the floor out.
 
 The way of one image, top to bottom, is `detect_circles`. The published detector (DLR Spatial
-Cognition data set report, circle detection) is its first half: quality of every centre, local
-maxima above a threshold, a covariance of one pixel and some centimetres. The second half makes one
-disc one row: it fits a disc through the camera at each maximum, weighs the evidence, suppresses
-neighbours in the floor plane and refines the position.
+Cognition data set report, circle detection) needs no more than the quality of each centre: it
+accepts those of a good quality and contrast, keeps the best within a disc's width, and reports the
+pixel with a covariance of one pixel and some centimetres. The default goes on from the maxima of
+the quality: it fits a disc through the camera at each, weighs the evidence, suppresses neighbours
+in the floor plane and refines the position.
 """
 
 from __future__ import annotations
@@ -21,10 +22,9 @@ from numpy.typing import NDArray
 from camera import Camera
 from camera.distortion import inverse_table
 from camera.kernels import camera_numbers, lens_numbers
-from camera.model import PUBLISHED_STEP_PX
-from detect.discs.candidate_kernels import strong_and_alone
+from detect.discs.alone_kernels import strong_and_highest
 from detect.discs.centre_rows import CentreRows, rows_to_look_at
-from detect.discs.centres import best_centres
+from detect.discs.centres import best_centres, good_centres
 from detect.discs.centres import quality_of_centres as quality_of_centres
 from detect.discs.covariance_kernels import refined_covariances
 from detect.discs.fit import blur_ratio_of, fit_settings, working_space
@@ -106,28 +106,12 @@ def detect_circles(
             f"the image is {image.shape[1]}x{image.shape[0]} px: "
             f"the calibration is for {camera.width}x{camera.height}"
         )
+    if not (settings.verify or settings.refine):
+        return _without_fit(image, camera, table, settings)
     centres = _looked_at(table)(settings)
     pixels, found_quality, contrast = best_centres(
         image, centres.table, settings.threshold, settings.polarity, centres.rank
     )
-    if not (settings.verify or settings.refine):
-        weakest = 0.0
-        if settings.noise_floor > 0.0:
-            weakest = settings.noise_floor * max(estimate_noise(image, _NOISE_ROWS), _LEAST_NOISE)
-        if weakest > 0.0 or settings.separation_m > 0.0:
-            keep = strong_and_alone(
-                pixels, found_quality, contrast, table.floor_xy, weakest, settings.separation_m
-            )
-            pixels, found_quality = pixels[keep], found_quality[keep]
-        floor_xy, covariance = published_positions(camera, pixels)
-        return CircleDetections(
-            pixels=pixels,
-            floor_xy=floor_xy,
-            covariance=covariance,
-            quality=found_quality,
-            evidence=np.full(len(pixels), np.nan),
-        )
-
     noise = estimate_noise(image, _NOISE_ROWS)
     kernel = _kernel_camera(camera)
     pixels, found_quality, floor_xy, covariance, evidence = search_discs(
@@ -154,6 +138,34 @@ def detect_circles(
     )
 
 
+def _without_fit(
+    image: NDArray[np.uint8], camera: Camera, table: DiscTable, settings: CircleSettings
+) -> CircleDetections:
+    """The published detector: centres of the table by their quality and contrast alone."""
+    if settings.stride == 0.0:
+        pixels, quality, contrast = best_centres(
+            image, table, settings.threshold, settings.polarity
+        )
+    else:
+        u, v, quality, contrast = good_centres(image, table, settings.threshold, settings.polarity)
+        pixels = np.stack([u, v], axis=-1)
+    weakest = 0.0
+    if settings.noise_floor > 0.0:
+        weakest = settings.noise_floor * max(estimate_noise(image, _NOISE_ROWS), _LEAST_NOISE)
+    keep = strong_and_highest(
+        pixels,
+        quality,
+        contrast,
+        table.floor_xy,
+        settings.threshold if settings.stride > 0.0 else 0.0,
+        max(weakest, settings.least_contrast),
+        settings.separation_m,
+    )
+    pixels, quality = pixels[keep], quality[keep]
+    floor_xy, covariance = published_positions(camera, pixels)
+    return CircleDetections(pixels, floor_xy, covariance, quality, np.full(len(pixels), np.nan))
+
+
 @kept_for_latest
 def _looked_at(table: DiscTable) -> Callable[[CircleSettings], CentreRows]:
     return kept_for_latest(lambda settings: rows_to_look_at(table, settings))
@@ -177,12 +189,16 @@ def _disc_search(settings: CircleSettings) -> DiscSearch:
 
 def disc_shape(settings: CircleSettings) -> DiscShape:
     """What the table needs to know of the settings."""
+    inner, outer = settings.inner_radius_m, settings.outer_radius_m
     return DiscShape(
-        inner_radius_m=settings.inner_radius_m,
-        outer_radius_m=settings.outer_radius_m,
+        inner_radius_m=inner,
+        outer_radius_m=outer,
         samples=settings.samples,
         border_px=settings.border_px,
         far_limit_m_per_px=settings.far_limit_m_per_px,
+        least_pairs=settings.least_pairs,
+        apart_px=settings.apart_px,
+        stride_m=settings.stride * (outer - inner),
     )
 
 
@@ -201,13 +217,13 @@ def published_positions(camera: Camera, pixels: NDArray[np.int64]) -> tuple[Floa
     floor_xy : (N, 2) float64
         Robot frame, metres; NaN where a pixel does not see the floor.
     covariance : (N, 2, 2) float64
-        (0.04 m)^2 I + 2 px^2 J J^T, square metres. J is the Jacobian of the position by central
-        differences over 0.1 px (`Camera.floor_jacobian_published`).
+        (0.04 m)^2 I + 2 px^2 J J^T, square metres. J is the Jacobian of the position
+        (`Camera.floor_jacobian_published`).
     """
     kernel = _kernel_camera(camera)
     return pixel_positions(
         pixels, kernel.lens, kernel.pose, kernel.distorted, kernel.undistorted,
-        PUBLISHED_STEP_PX, PUBLISHED_FLOOR_M**2, PUBLISHED_PIXEL_VARIANCE,
+        kernel.rigid, PUBLISHED_FLOOR_M**2, PUBLISHED_PIXEL_VARIANCE,
     )  # fmt: skip
 
 
@@ -220,6 +236,7 @@ class _KernelCamera(NamedTuple):
     """A camera in the forms that kernels take."""
 
     numbers: FloatArray
+    rigid: FloatArray
     lens: FloatArray
     pose: FloatArray
     distorted: FloatArray
@@ -232,8 +249,11 @@ class _KernelCamera(NamedTuple):
 @lru_cache(maxsize=4)
 def _kernel_camera(camera: Camera) -> _KernelCamera:
     pinhole = [camera.scale_x, camera.scale_y, camera.offset_x, camera.offset_y]
+    rigid = camera_numbers(camera)
+    rigid[10:19] = camera.rotation.T.ravel()
     return _KernelCamera(
         camera_numbers(camera),
+        rigid,
         np.array([*pinhole, *lens_numbers(camera)]),
         np.array(camera.robot_from_camera),
         *inverse_table(camera.coef),

@@ -26,7 +26,8 @@ from detect.markers.settings import PRESETS as MARKER_PRESETS
 from detect.markers.settings import MarkerSettings
 from detect.options import All, Circles, Compare, Lines, Markers
 from detect.runs.interrupts import interrupts_noted
-from detect.settings import PUBLISHED, CircleSettings
+from detect.settings import PRESETS as CIRCLE_PRESETS
+from detect.settings import CircleSettings
 from detect.viewing_options import Draw, Report, Tune, View
 from storage.exit_codes import say_error, say_interrupted
 
@@ -36,8 +37,6 @@ _WHERE_KERNELS_GO = (
     "compiled kernels cannot be kept, neither beside the program nor in the user's cache folder: "
     "name a folder for them by the environment variable NUMBA_CACHE_DIR"
 )
-
-_CIRCLE_PRESETS = {"default": CircleSettings(), "published": PUBLISHED}
 
 Command = Circles | Lines | Markers | All | Compare | Export | Draw | View | Report | Tune
 
@@ -75,7 +74,7 @@ def main(arguments: list[str] | None = None) -> int:
 def parsed(arguments: Sequence[str]) -> Command:
     """What a command line says; exits, as `--help` does, where it says nothing that can be done."""
     preset = _preset(arguments)
-    circles = _CIRCLE_PRESETS.get(preset, CircleSettings())
+    circles = CIRCLE_PRESETS.get(preset, CircleSettings())
     lines = LINE_PRESETS.get(preset, LineSettings())
     markers = MARKER_PRESETS.get(preset, MarkerSettings())
     return tyro.cli(

@@ -15,7 +15,15 @@ from typing import TYPE_CHECKING
 from detect.announcing import show_announcements
 from detect.cli import Command
 from detect.errors import EXIT_FRAMES_FAILED, DetectError, WorkerError
-from detect.options import All, Circles, Compare, DetectorFlags, Lines, Markers
+from detect.options import (
+    All,
+    Circles,
+    Compare,
+    DetectorFlags,
+    DiscIdOptions,
+    Lines,
+    Markers,
+)
 from detect.runs.progress import print_failures, progress_bar
 from detect.viewing_options import PERFORMED_BY
 from storage.exit_codes import EXIT_ERROR
@@ -26,6 +34,7 @@ if TYPE_CHECKING:
 
     from detect.comparison.result import Rates
     from detect.run import ImageRun, Run
+    from detect.runs.circles_run import DiscIds
     from detect.runs.conduct import Conduct
     from detect.runs.dispatch import Workers
     from detect.runs.stream import RunSummary
@@ -63,6 +72,7 @@ def _circles(command: Circles) -> int:
         from detect.runs.by_image import TiltsByImage
 
         tilts = TiltsByImage(command.tilt)
+    ids = _disc_ids(command.ids)
     if command.draw is not None:
         _make_folder(command.draw)
     with progress_bar("discs", run.frames.expected) as advance:
@@ -74,6 +84,8 @@ def _circles(command: Circles) -> int:
             overwrite=command.force,
             json_output=command.json,
             tilts=tilts,
+            ids=ids,
+            crlf=command.line_ends == "crlf",
             pictures=command.draw,
             workers=_workers(command, run),
             on_progress=advance,
@@ -81,6 +93,24 @@ def _circles(command: Circles) -> int:
         )
     print(f"{output}: {summary.discs} discs in {summary.frames} frames")
     return _exit_code(summary, run)
+
+
+def _disc_ids(options: DiscIdOptions) -> DiscIds:
+    """Where the IDs of discs come from."""
+    from detect.drawing.head import read_head
+    from detect.runs.by_image import DiscsByImage, MapByImage
+    from detect.runs.circles_run import DiscIds
+
+    if (options.ids_from_map is None) != (options.path is None):
+        raise DetectError("--ids-from-map and --path: expected both or neither")
+    rows = mapped = None
+    level = False
+    if options.ids_from is not None:
+        rows = DiscsByImage(options.ids_from)
+        level = read_head(options.ids_from).levelled
+    if options.ids_from_map is not None and options.path is not None:
+        mapped = MapByImage(options.ids_from_map, options.path)
+    return DiscIds(rows, level, mapped, options.id_slack_m)
 
 
 def _lines(command: Lines) -> int:
@@ -116,6 +146,7 @@ def _lines(command: Lines) -> int:
             pictures=command.draw,
             drawing="tracks" if command.rejected else "lines",
             draw_response=command.response,
+            crlf=command.line_ends == "crlf",
             workers=_workers(command, run),
             on_progress=advance,
             conduct=conduct,
@@ -172,6 +203,12 @@ def _all(command: All) -> int:
         _make_folder(command.output)
     conduct = _conduct(command, log_place(lines.with_suffix("")))
     _demand_new([lines, tilt, circles], command.force, run, conduct)
+    disc_ids = _disc_ids(command.ids)
+    line_ids = None
+    if command.line_ids_from is not None:
+        from detect.runs.by_image import LinesByImage
+
+        line_ids = LinesByImage(command.line_ids_from)
     with progress_bar("lines, tilt and discs", run.frames.expected) as advance:
         summary = detect_all_run(
             run,
@@ -185,6 +222,9 @@ def _all(command: All) -> int:
             workers=_workers(command, run),
             on_progress=advance,
             conduct=conduct,
+            disc_ids=disc_ids,
+            line_ids=line_ids,
+            crlf=command.line_ends == "crlf",
         )
     print(f"{lines}: {summary.lines} lines in {summary.frames} frames")
     print(f"{tilt}: the tilt of {summary.tilts} frames{_other_frames(summary, command.circles)}")

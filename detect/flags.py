@@ -15,6 +15,8 @@ MaybeFloat = Optional[float]  # noqa: UP045
 MaybeStr = Optional[str]  # noqa: UP045
 
 Preset = Literal["default", "published"]
+DiscPreset = Literal["default", "published", "report"]
+LineEnds = Literal["lf", "crlf"]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,7 +11,16 @@ from pathlib import Path
 from tyro.conf import OmitArgPrefixes, Positional
 
 from detect.comparison.result import CompareOptions
-from detect.flags import MaybeFloat, MaybeInt, MaybePath, MaybeStr, Preset, RunFlags
+from detect.flags import (
+    DiscPreset,
+    LineEnds,
+    MaybeFloat,
+    MaybeInt,
+    MaybePath,
+    MaybeStr,
+    Preset,
+    RunFlags,
+)
 from detect.line_settings import LineSettings
 from detect.markers.settings import MarkerSettings
 from detect.runs.conduct import ConductOptions
@@ -46,6 +55,29 @@ class DetectorFlags(RunFlags):
 
 
 @dataclass(frozen=True, kw_only=True)
+class DiscIdOptions:
+    """Where the IDs of discs come from.
+
+    Parameters
+    ----------
+    ids_from : Path
+        A .circles file whose IDs are carried over to the rows of the same discs, levelled or not.
+    ids_from_map : Path
+        A map (map.csv of `slam map`): rows that --ids-from knows nothing of get the ID of the disc
+        they fall on,
+    path : Path
+        seen from the frame's pose in this path (path.csv of `slam map`),
+    id_slack_m : float
+        which map and path know to this standard deviation besides the covariances, metres.
+    """
+
+    ids_from: MaybePath = None
+    ids_from_map: MaybePath = None
+    path: MaybePath = None
+    id_slack_m: float = 0.1
+
+
+@dataclass(frozen=True, kw_only=True)
 class Circles(DetectorFlags):
     """Detect the discs of a run and write them to a .circles file.
 
@@ -55,7 +87,8 @@ class Circles(DetectorFlags):
     Parameters
     ----------
     preset : str
-        Values that the other flags start from: `published` is the report's detector to the letter.
+        Values that the other flags start from: `published` is the detector that made the data set's
+        rows (all of them and only those), `report` what the report prints of it.
     output : Path
         The file to write; by default detected.circles in the run folder, or named after the video
         or bag and beside it.
@@ -65,9 +98,14 @@ class Circles(DetectorFlags):
         Folder for images with the outlines and qualities drawn in.
     json : Path
         Write the rows with their pixels and evidence as JSON as well.
+    line_ends : str
+        How lines end; the data set's own end with CR and LF.
     """
 
+    preset: DiscPreset = "default"  # type: ignore[assignment]
     tilt: MaybePath = None
+    ids: OmitArgPrefixes[DiscIdOptions] = field(default_factory=DiscIdOptions)
+    line_ends: LineEnds = "lf"
     draw: MaybePath = None
     json: MaybePath = None
     settings: OmitArgPrefixes[CircleSettings] = field(default_factory=CircleSettings)
@@ -99,6 +137,8 @@ class Lines(DetectorFlags):
         Draw all tracks instead, the rejected ones with the reason.
     response : bool
         Draw the filter's response as well, into files of their own.
+    line_ends : str
+        How lines end; the data set's own end with CR and LF.
     """
 
     tilt: MaybePath = None
@@ -107,6 +147,7 @@ class Lines(DetectorFlags):
     draw: MaybePath = None
     rejected: bool = False
     response: bool = False
+    line_ends: LineEnds = "lf"
     settings: OmitArgPrefixes[LineSettings] = field(default_factory=LineSettings)
 
 
@@ -149,8 +190,15 @@ class All(DetectorFlags):
     output : Path
         Folder for detected.circles, detected.lines and detected.tilt; by default the run's, or
         named after the video or bag and beside it.
+    line_ids_from : Path
+        A .lines file whose IDs are carried over where the match is unambiguous.
+    line_ends : str
+        How lines end in files of landmarks; the data set's own end with CR and LF.
     """
 
+    ids: OmitArgPrefixes[DiscIdOptions] = field(default_factory=DiscIdOptions)
+    line_ids_from: MaybePath = None
+    line_ends: LineEnds = "lf"
     circles: CircleSettings = field(default_factory=CircleSettings)
     lines: LineSettings = field(default_factory=LineSettings)
 

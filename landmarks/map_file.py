@@ -24,6 +24,8 @@ IntArray = NDArray[np.int64]
 Kind = Literal["disc", "line"]
 
 MAP_COLUMNS = ("kind", "id", "x_m", "y_m", "cxx_m2", "cxy_m2", "cyy_m2", "rows")
+#: A map of discs that are where they are said to be.
+SHORT_MAP_COLUMNS = ("id", "x_m", "y_m", "rows")
 _COVARIANCE = (
     "cxx",
     "cxy",
@@ -140,6 +142,8 @@ def write_map(
 
 def read_map(path: str | os.PathLike[str]) -> LandmarkMap:
     """Read a map that `write_map` wrote, or one made by hand with the same columns.
+
+    The columns may also be `SHORT_MAP_COLUMNS`: discs without covariances, which are 0.
 
     Raises
     ------
@@ -259,6 +263,9 @@ def _read(
         words = next(csv.reader([line]))
         if head is None:
             widths = {len(columns), fewest or len(columns)}
+            if columns is MAP_COLUMNS and tuple(words) == SHORT_MAP_COLUMNS:
+                head = words
+                continue
             if len(words) not in widths or tuple(words) != tuple(columns[: len(words)]):
                 raise LandmarkFileError(place, number, f"expected the columns {','.join(columns)}")
             head = words
@@ -266,6 +273,8 @@ def _read(
         if len(words) != len(head):
             raise LandmarkFileError(place, number, f"{len(words)} values: expected {len(head)}")
         count += 1
+        if tuple(head) == SHORT_MAP_COLUMNS:
+            words = ["disc", *words[:3], "0", "0", "0", words[3]]
         yield number, words
     if count == 0:
         raise LandmarkFileError(

@@ -32,7 +32,7 @@ from lut.verticals import VerticalTable, build_vertical_table
 from storage import write_whole
 
 #: Raised with every change of what tables hold or how they are computed.
-TABLE_VERSION = 8
+TABLE_VERSION = 9
 
 Made = TypeVar("Made")
 

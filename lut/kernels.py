@@ -7,13 +7,14 @@ without a branch, so that several pixels are worked on at once; a test holds the
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from camera.brown_kernels import straightened_point
-from camera.kernels import has_brown
+from camera.kernels import has_brown, project_floor_point
 
 #: Neighbouring pixels of a row that a detector works on at once; bytes of one copy.
 BLOCK = 64
@@ -27,6 +28,30 @@ GROUP = 4
 #: A block has at least so many copies for every two groups of its rows, one of each outline: they
 #: are carried out while other rows are summed.
 LEAST_COPIES = 16
+
+
+class Scan(NamedTuple):
+    """Which of the centres are tested, and how their samples vote.
+
+    Attributes
+    ----------
+    size : (H, W) float64
+        How far the floor moves from each pixel to the one below, metres.
+    stride : float
+        From one centre to the next along a row: this length in pixels of their size, rounded up,
+        metres; 0 for every pixel.
+    pairs : bool
+        Whether samples vote in pairs: an inner and an outer one in the same direction, both in the
+        image, even before they are rounded to whole pixels on its left and upper border.
+    apart_px : float
+        How far, in pixels of that size, the samples of a pair that fall on the same pixel are
+        moved, the inner one inwards, the outer one outwards.
+    """
+
+    size: NDArray[np.float64]
+    stride: float
+    pairs: bool
+    apart_px: float
 
 
 @njit(cache=True, error_model="numpy")
@@ -114,9 +139,12 @@ def _nearest_pixels(
     end: int,
     height: int,
     width: int,
+    least: float,
     nearest: NDArray[np.float64],
 ) -> None:
     """Index in the image of the pixel nearest to one sample of centres' outlines; -1 outside.
+
+    What lies left of or above `least` (pixels, before they are rounded) is outside, too.
 
     `x_robot` and `y_robot` are the centres of a row, of which those from `begin` to `end` are
     worked on, `offset` is the sample's from its centre, `nearest` the result (whole numbers). That
@@ -146,12 +174,34 @@ def _nearest_pixels(
             along += squared * (brown[0] + squared * (brown[1] + squared * brown[4]))
             x_place += scale_x * (along * x + squared * brown[3])
             y_place += scale_y * (along * y + squared * brown[2])
-        column = np.floor(x_place + offset_x + 0.5)
-        row = np.floor(y_place + offset_y + 0.5)
+        x_place += offset_x
+        y_place += offset_y
+        column = np.floor(x_place + 0.5)
+        row = np.floor(y_place + 0.5)
         # NaN fails every comparison.
-        seen = (z > 0.0) & (r <= r_max)
+        seen = (z > 0.0) & (r <= r_max) & (x_place >= least) & (y_place >= least)
         inside = (column >= 0.0) & (column < width) & (row >= 0.0) & (row < height)
         nearest[u] = row * width + column if seen & inside else -1.0
+
+
+@njit(cache=True, error_model="numpy")
+def _sample_apart(
+    numbers: NDArray[np.float64],
+    centre: NDArray[np.float64],
+    sample: NDArray[np.float64],
+    farther: float,
+    height: int,
+    width: int,
+) -> float:
+    """As `_nearest_pixels`, of one sample that is moved away from its centre, metres."""
+    scale = 1.0 + farther / math.hypot(sample[0], sample[1])
+    u, v = project_floor_point(
+        numbers, centre[0] + scale * sample[0], centre[1] + scale * sample[1]
+    )
+    if not (u >= 0.0 and v >= 0.0):  # NaN fails this
+        return -1.0
+    column, row = math.floor(u + 0.5), math.floor(v + 0.5)
+    return row * width + column if column < width and row < height else -1.0
 
 
 @njit(cache=True, error_model="numpy")
@@ -162,6 +212,7 @@ def encode_outlines(
     inner: NDArray[np.float64],
     outer: NDArray[np.float64],
     enough: float,
+    scan: Scan,
 ) -> tuple[
     NDArray[np.uint64],
     NDArray[np.int64],
@@ -184,6 +235,8 @@ def encode_outlines(
         Samples of the outlines relative to their centre, metres.
     enough : float
         Samples of each outline that must be inside the image.
+    scan : Scan
+        Which centres are left out, and whether samples vote in pairs.
 
     Returns
     -------
@@ -192,6 +245,7 @@ def encode_outlines(
     """
     height, width = candidate.shape
     samples = inner.shape[0]
+    border = 0.0 if scan.pairs else -0.5
     padded = -(-samples // GROUP) * GROUP
     shifted = has_brown(numbers[22:27])
     nothing = height * width
@@ -229,13 +283,26 @@ def encode_outlines(
             if shifted:
                 _nearest_pixels(
                     numbers, numbers[22:27], x_robot, y_robot, offset,
-                    begin, end, height, width, nearest[k],
+                    begin, end, height, width, border, nearest[k],
                 )  # fmt: skip
             else:
                 _nearest_pixels(
                     numbers, None, x_robot, y_robot, offset,
-                    begin, end, height, width, nearest[k],
+                    begin, end, height, width, border, nearest[k],
                 )  # fmt: skip
+        if scan.pairs:
+            for k in range(samples):
+                for u in range(begin, end):
+                    if nearest[k, u] == nearest[samples + k, u] and nearest[k, u] >= 0.0:
+                        apart = scan.apart_px * scan.size[v, u]
+                        nearest[k, u] = _sample_apart(
+                            numbers, floor_xy[v, u], inner[k], -apart, height, width
+                        )
+                        nearest[samples + k, u] = _sample_apart(
+                            numbers, floor_xy[v, u], outer[k], apart, height, width
+                        )
+                    if nearest[k, u] < 0.0 or nearest[samples + k, u] < 0.0:
+                        nearest[k, u] = nearest[samples + k, u] = -1.0
         for u in range(begin, end):
             votes[0, u] = votes[1, u] = 0
         for k in range(2 * samples):
@@ -244,11 +311,18 @@ def encode_outlines(
                 votes[outline, u] += 1 if nearest[k, u] >= 0.0 else 0
         first = width
         last = 0
+        following = begin
         for u in range(begin, end):
-            usable[u] = candidate[v, u] and votes[0, u] >= enough and votes[1, u] >= enough
+            usable[u] = (
+                u >= following
+                and candidate[v, u]
+                and votes[0, u] >= enough
+                and votes[1, u] >= enough
+            )
             if usable[u]:
                 first = min(first, u)
                 last = u + 1
+                following = u + max(1, math.ceil(scan.stride / scan.size[v, u]))
 
         room = count + (2 * padded + LEAST_COPIES) * (width + BLOCK)
         if room > len(copies):

@@ -29,8 +29,8 @@ from camera import Camera
 from camera.kernels import camera_numbers
 from lut.errors import TableError
 from lut.floor import floor_positions
-from lut.kernels import ADVANCE_BITS, BLOCK, encode_outlines
-from storage.bounds import ABOVE_0, LIMIT, demand, whole
+from lut.kernels import ADVANCE_BITS, BLOCK, Scan, encode_outlines
+from storage.bounds import ABOVE_0, LIMIT, NOT_NEGATIVE, demand, whole
 
 #: Part of an outline's samples that must lie inside the image.
 MIN_SHARE_INSIDE = 0.5
@@ -51,6 +51,15 @@ class DiscShape:
     far_limit_m_per_px : float
         Far limit: the floor moves at most this far from one image row to the next, metres;
         infinite: however far.
+    least_pairs : int
+        Samples vote in pairs, an inner and an outer one, of which so many must be inside the image;
+        0: each for itself.
+    apart_px : float
+        How far the samples of a pair that fall on the same pixel are moved, one inwards and one
+        outwards: the length on the floor of so many pixels down the image.
+    stride_m : float
+        After a usable centre, those nearer than this along the row are left out, metres: counted
+        in pixels as long as one down the image, rounded up; 0: none.
     """
 
     inner_radius_m: float = 0.06
@@ -58,6 +67,9 @@ class DiscShape:
     samples: int = 16
     border_px: int = 12
     far_limit_m_per_px: float = 0.05
+    least_pairs: int = 0
+    apart_px: float = 0.0
+    stride_m: float = 0.0
 
     def __post_init__(self) -> None:
         demand(
@@ -68,6 +80,9 @@ class DiscShape:
             samples=whole(3, 128),
             border_px=whole(0),
             far_limit_m_per_px=LIMIT,
+            least_pairs=whole(0, self.samples),
+            apart_px=NOT_NEGATIVE,
+            stride_m=NOT_NEGATIVE,
         )
         if not self.inner_radius_m < self.outer_radius_m:
             raise TableError(
@@ -183,13 +198,21 @@ def build_disc_table(camera: Camera, shape: DiscShape) -> DiscTable:
             f"the camera is {camera.centre[2]:g} m above the floor: expected more than 0"
         )
     floor_xy = floor_positions(camera)
+    numbers = camera_numbers(camera)
+    size = _size_down(floor_xy)
+    if shape.least_pairs:
+        # The data set's own detector turns by the transpose of a rotation that its file gives in
+        # few digits; by the inverse some samples would fall on other pixels.
+        numbers[10:19] = camera.rotation.T.ravel()
+        size = _exact_size_down(camera)
     copies, block_copies, row, column, pattern, patterns = encode_outlines(
-        camera_numbers(camera),
+        numbers,
         floor_xy,
-        _within_limits(camera, shape, floor_xy),
+        _within_limits(size, shape),
         ring(shape.inner_radius_m, shape.samples),
         ring(shape.outer_radius_m, shape.samples),
-        MIN_SHARE_INSIDE * shape.samples,
+        shape.least_pairs or MIN_SHARE_INSIDE * shape.samples,
+        Scan(size, shape.stride_m, shape.least_pairs > 0, shape.apart_px),
     )
     pixels = camera.height * camera.width
     fits = (pixels + 1) << ADVANCE_BITS <= np.iinfo(np.uint32).max + 1
@@ -205,16 +228,28 @@ def build_disc_table(camera: Camera, shape: DiscShape) -> DiscTable:
     )
 
 
-def _within_limits(
-    camera: Camera, shape: DiscShape, floor_xy: NDArray[np.float64]
-) -> NDArray[np.bool_]:
+def _size_down(floor_xy: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(H, W) how far the floor moves per image row, metres, by differences of whole pixels."""
+    # Central differences over the neighbouring rows; one-sided at the image's first and last.
+    if len(floor_xy) == 1:
+        return np.full(floor_xy.shape[:2], np.nan)
+    per_row = np.gradient(floor_xy, axis=0)
+    return np.hypot(per_row[..., 0], per_row[..., 1])
+
+
+def _exact_size_down(camera: Camera) -> NDArray[np.float64]:
+    """(H, W) how far the floor moves per image row, metres: its derivative."""
+    v, u = np.mgrid[0 : camera.height, 0 : camera.width]
+    per_row = camera.floor_jacobian_published(np.stack([u, v], axis=-1))[..., 1]
+    return np.hypot(per_row[..., 0], per_row[..., 1])
+
+
+def _within_limits(size: NDArray[np.float64], shape: DiscShape) -> NDArray[np.bool_]:
     """Pixels far enough from the border and near enough on the floor."""
-    height, width = camera.height, camera.width
+    height, width = size.shape
     u, v = np.arange(width), np.arange(height)
     border = shape.border_px
     inside_u = (u >= border) & (u <= width - border)
     inside_v = (v >= border) & (v <= height - border)
-    # Central differences over the neighbouring rows; one-sided at the image's first and last.
-    per_row = np.gradient(floor_xy, axis=0) if height > 1 else np.full_like(floor_xy, np.nan)
-    near = np.hypot(per_row[..., 0], per_row[..., 1]) <= shape.far_limit_m_per_px
+    near = size <= shape.far_limit_m_per_px
     return np.asarray(near & inside_v[:, None] & inside_u[None, :])

@@ -111,5 +111,18 @@ def shared_data() -> Path:
 
 
 @pytest.fixture(scope="session")
+def given_runs(request: pytest.FixtureRequest) -> list[Path]:
+    """The run folders given by ``--run`` that are there, with shipped rows."""
+    given = [Path(run) for run in request.config.getoption("--run")]
+    runs = [run for run in given if (run / "map.circles").is_file()]
+    if not runs:
+        pytest.skip(
+            "no run folder with map.circles was given by --run: the DLR Spatial Cognition data set "
+            "is published by the University of Bremen's group AG EBV (docs/data.md)"
+        )
+    return runs
+
+
+@pytest.fixture(scope="session")
 def project_root() -> Path:
     return ROOT

@@ -68,11 +68,29 @@ def best_centres(
     FrameError
         If the image does not belong to the table.
     """
+    rank = _all_rows(len(image)) if rank is None else rank
+    found = good_centres(image, table, threshold, polarity)
+    return highest(*found, len(found[0]), rank)
+
+
+def good_centres(
+    image: NDArray[np.uint8], table: DiscTable, threshold: float, polarity: Polarity = "any"
+) -> tuple[NDArray[np.int64], NDArray[np.int64], FloatArray, NDArray[np.float32]]:
+    """All centres whose quality reaches a threshold, in scan order.
+
+    Parameters, and errors, as of `best_centres`.
+
+    Returns
+    -------
+    columns, rows : (N,) int64
+    quality : (N,) float64
+    contrast : (N,) float32
+        As in `quality_of_centres`. Until the calling thread asks again: then they change.
+    """
     sign = _SIGNS[polarity]
     space = _working_space(image.size, table.samples)
     arguments = _kernel_arguments(image, table, space.pixels)
     room = space.columns, space.rows, space.quality, space.contrast
-    rank = _all_rows(len(image)) if rank is None else rank
     full: list[tuple[NDArray[Any], ...]] = []
     block, count = 0, 0
     while True:
@@ -86,8 +104,13 @@ def best_centres(
     if full:
         full.append(tuple([values[:count] for values in room]))
         columns, rows, quality, contrast = (np.concatenate(values) for values in zip(*full))
-        return highest(columns, rows, quality, contrast, len(columns), rank)
-    return highest(*room, count, rank)
+        return columns, rows, quality, contrast
+    return (
+        space.columns[:count],
+        space.rows[:count],
+        space.quality[:count],
+        space.contrast[:count],
+    )
 
 
 def quality_of_centres(

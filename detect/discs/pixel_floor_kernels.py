@@ -12,6 +12,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from camera.brown_kernels import straightened_point
+from camera.kernels import project_floor_point
 
 #: Newton's method in `camera.distortion` takes at most so many steps, and ends with one this small.
 _NEWTON_STEPS = 60
@@ -141,6 +142,10 @@ def floor_of_pixel(
     )
 
 
+#: Of central differences on the floor.
+_STEP_M = 1e-5
+
+
 @njit(cache=True, error_model="numpy", nogil=True)
 def published_positions(
     pixels: NDArray[np.int64],
@@ -148,11 +153,11 @@ def published_positions(
     pose: NDArray[np.float64],
     table_g: NDArray[np.float64],
     table_r: NDArray[np.float64],
-    step_px: float,
+    rigid: NDArray[np.float64],
     floor_variance: float,
     pixel_variance: float,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Positions of pixels on the floor, and s I + p J J^T with J by central differences.
+    """Positions of pixels on the floor, and s I + p J J^T, J the derivative of the position.
 
     Parameters
     ----------
@@ -160,8 +165,9 @@ def published_positions(
         Pixels (u, v).
     lens, pose, table_g, table_r
         See `floor_of_pixel`.
-    step_px : float
-        Of the central differences.
+    rigid : (27,) float64
+        `camera.kernels.camera_numbers`, with the transpose of the rotation for its inverse: the
+        projection whose derivative is inverted.
     floor_variance, pixel_variance : float
         s (square metres) and p (square pixels).
 
@@ -174,19 +180,21 @@ def published_positions(
     """
     floor_xy = np.empty((len(pixels), 2))
     covariance = np.empty((len(pixels), 2, 2))
-    per_px = 2.0 * step_px
     for k in range(len(pixels)):
         u = np.float64(pixels[k, 0])
         v = np.float64(pixels[k, 1])
-        x, y, r = floor_of_pixel(u, v, lens, pose, table_g, table_r, math.nan)
+        x, y, _ = floor_of_pixel(u, v, lens, pose, table_g, table_r, math.nan)
         floor_xy[k, 0] = x
         floor_xy[k, 1] = y
-        x1, y1, _ = floor_of_pixel(u + step_px, v, lens, pose, table_g, table_r, r)
-        x0, y0, _ = floor_of_pixel(u - step_px, v, lens, pose, table_g, table_r, r)
-        xu, yu = (x1 - x0) / per_px, (y1 - y0) / per_px
-        x1, y1, _ = floor_of_pixel(u, v + step_px, lens, pose, table_g, table_r, r)
-        x0, y0, _ = floor_of_pixel(u, v - step_px, lens, pose, table_g, table_r, r)
-        xv, yv = (x1 - x0) / per_px, (y1 - y0) / per_px
+        u1, v1 = project_floor_point(rigid, x + _STEP_M, y)
+        u0, v0 = project_floor_point(rigid, x - _STEP_M, y)
+        ux, vx = u1 - u0, v1 - v0
+        u1, v1 = project_floor_point(rigid, x, y + _STEP_M)
+        u0, v0 = project_floor_point(rigid, x, y - _STEP_M)
+        uy, vy = u1 - u0, v1 - v0
+        per_determinant = 2.0 * _STEP_M / (ux * vy - uy * vx)
+        xu, xv = vy * per_determinant, -uy * per_determinant
+        yu, yv = -vx * per_determinant, ux * per_determinant
         covariance[k, 0, 0] = floor_variance + pixel_variance * (xu * xu + xv * xv)
         covariance[k, 0, 1] = pixel_variance * (xu * yu + xv * yv)
         covariance[k, 1, 0] = covariance[k, 0, 1]

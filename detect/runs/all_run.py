@@ -7,12 +7,12 @@ from pathlib import Path
 
 from detect.line_settings import LineSettings
 from detect.run import Run
-from detect.runs.circles_run import circles_file
+from detect.runs.circles_run import UNKNOWN, DiscIds, circles_file
 from detect.runs.conduct import PLAIN, Conduct
 from detect.runs.dispatch import Workers
 from detect.runs.frame import FramePlan
 from detect.runs.lines_run import lines_file, tilt_file
-from detect.runs.stream import RunSummary, detect_run
+from detect.runs.stream import IdSources, LineSource, RunSummary, detect_run
 from detect.settings import CircleSettings
 
 
@@ -29,6 +29,9 @@ def detect_all_run(
     workers: Workers | None = None,
     on_progress: Callable[[], None] | None = None,
     conduct: Conduct = PLAIN,
+    disc_ids: DiscIds = UNKNOWN,
+    line_ids: LineSource | None = None,
+    crlf: bool = False,
 ) -> RunSummary:
     """Detect the verticals, the tilt and the discs of a run, each image decoded once.
 
@@ -51,6 +54,12 @@ def detect_all_run(
         Whether existing files may be replaced.
     workers, on_progress, conduct
         As in `detect.runs.stream.detect_run`.
+    disc_ids : DiscIds
+        Where the IDs of discs come from.
+    line_ids : mapping, optional
+        Lines with IDs by image prefix: carried over where the match is unambiguous.
+    crlf : bool
+        Whether the lines of the files of landmarks end with CR and LF.
 
     Returns
     -------
@@ -63,17 +72,25 @@ def detect_all_run(
     storage.OutputExistsError
         If an output exists and must not be replaced.
     """
-    plan = FramePlan(run.camera, lines=lines, circles=circles, working_folder=Path.cwd())
+    plan = FramePlan(
+        run.camera,
+        lines=lines,
+        circles=circles,
+        known_level=disc_ids.level,
+        id_slack_m=disc_ids.slack_m,
+        working_folder=Path.cwd(),
+    )
     files = [
         tilt_file(tilt_output, version),
-        lines_file(lines_output, lines, version, run),
-        circles_file(circles_output, circles, version, run, levelled=True),
+        lines_file(lines_output, lines, version, run, crlf=crlf),
+        circles_file(circles_output, circles, version, run, levelled=True, crlf=crlf),
     ]
     return detect_run(
         run,
         plan,
         files,
         overwrite=overwrite,
+        ids=IdSources(line_ids, disc_ids.rows, disc_ids.mapped),
         workers=workers,
         on_progress=on_progress,
         conduct=conduct,

@@ -6,9 +6,13 @@ from array import array
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+import numpy as np
+
+from detect.discs.identity import MappedDisc
 from detect.runs.image_names import image_name
 from detect.runs.name_index import NameIndex
 from landmarks import (
+    CircleLandmark,
     Frame,
     FrameTilt,
     LineLandmark,
@@ -18,6 +22,10 @@ from landmarks import (
     parse_rows,
     read_rows,
 )
+from landmarks.map_file import read_map, read_path
+
+#: Discs of a map that are farther from a frame than this are not looked for in it, metres.
+_REACH_M = 20.0
 
 
 class TiltsByImage:
@@ -105,6 +113,58 @@ class LinesByImage:
         """The lines of a frame; None if the file does not know it."""
         frame = self._frames.get(prefix)
         return None if frame is None else frame.lines
+
+
+class DiscsByImage:
+    """The discs of a ``.circles`` file, by the name of their image; see `FramesByImage`."""
+
+    def __init__(self, path: Path) -> None:
+        self._frames = FramesByImage(path)
+
+    def get(self, prefix: str) -> Sequence[CircleLandmark] | None:
+        """The discs of a frame; None if the file does not know it."""
+        frame = self._frames.get(prefix)
+        return None if frame is None else frame.circles
+
+
+class MapByImage:
+    """The discs of a map that the frames of a path should see, by the name of their image.
+
+    Parameters
+    ----------
+    map_path, path_path : path
+        As `slam map` writes them (`landmarks.read_map`, `landmarks.read_path`).
+
+    Raises
+    ------
+    landmarks.LandmarkFileError
+        If a file cannot be read or a row is malformed; names file and line.
+    """
+
+    def __init__(self, map_path: Path, path_path: Path) -> None:
+        self._discs = read_map(map_path).discs
+        poses = read_path(path_path)
+        self._poses = {
+            image_name(prefix): pose for prefix, pose in zip(poses.prefixes, poses.poses)
+        }
+
+    def get(self, prefix: str) -> Sequence[MappedDisc] | None:
+        """The discs within reach of a frame's pose; None if the path does not know it."""
+        pose = self._poses.get(image_name(prefix))
+        if pose is None:
+            return None
+        x, y, theta = pose
+        cosine, sine = np.cos(theta), np.sin(theta)
+        robot_from_map = np.array([[cosine, sine], [-sine, cosine]])
+        xy = (self._discs.xy - (x, y)) @ robot_from_map.T
+        near = np.flatnonzero(np.hypot(*xy.T) <= _REACH_M)
+        spread = robot_from_map @ self._discs.covariance[near] @ robot_from_map.T
+        return [
+            MappedDisc(number, px, py, c[0][0], c[0][1], c[1][1])
+            for number, (px, py), c in zip(
+                self._discs.ids[near].tolist(), xy[near].tolist(), spread.tolist()
+            )
+        ]
 
 
 def _bytes(text: str) -> bytes:

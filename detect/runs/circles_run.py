@@ -4,15 +4,52 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 from detect.run import Run
 from detect.runs.conduct import PLAIN, Conduct
 from detect.runs.dispatch import Workers
 from detect.runs.frame import FramePlan
-from detect.runs.stream import Output, RunSummary, TiltSource, detect_run, json_file
+from detect.runs.stream import (
+    DiscSource,
+    IdSources,
+    MapSource,
+    Output,
+    RunSummary,
+    TiltSource,
+    detect_run,
+    json_file,
+)
 from detect.settings import CircleSettings
 from landmarks import format_head
+
+
+@dataclass(frozen=True)
+class DiscIds:
+    """Where the IDs of discs come from.
+
+    Attributes
+    ----------
+    rows : mapping, optional
+        Rows with IDs by image prefix: those of the same discs are carried over.
+    level : bool
+        Whether these rows are corrected for the tilt.
+    mapped : mapping, optional
+        Discs of a map by image prefix: rows that `rows` knows nothing of get the ID of the one they
+        fall on.
+    slack_m : float
+        Standard deviation of where these are, besides their covariances, metres.
+    """
+
+    rows: DiscSource | None = None
+    level: bool = False
+    mapped: MapSource | None = None
+    slack_m: float = 0.1
+
+
+#: No row has an ID.
+UNKNOWN = DiscIds()
 
 
 def detect_circles_run(
@@ -28,6 +65,8 @@ def detect_circles_run(
     workers: Workers | None = None,
     on_progress: Callable[[], None] | None = None,
     conduct: Conduct = PLAIN,
+    ids: DiscIds = UNKNOWN,
+    crlf: bool = False,
 ) -> RunSummary:
     """Detect the discs of a run and write them.
 
@@ -51,6 +90,10 @@ def detect_circles_run(
         Folder for images with the discs drawn in.
     workers, on_progress, conduct
         As in `detect.runs.stream.detect_run`.
+    ids : DiscIds
+        Where the rows' IDs come from.
+    crlf : bool
+        Whether the lines of the ``.circles`` file end with CR and LF.
 
     Returns
     -------
@@ -68,15 +111,19 @@ def detect_circles_run(
         circles=settings,
         json=json_output is not None,
         drawing=None if pictures is None else "discs",
+        known_level=ids.level,
+        id_slack_m=ids.slack_m,
         working_folder=Path.cwd(),
     )
     as_json = [] if json_output is None else [json_file(json_output, plan, version)]
+    file = circles_file(output, settings, version, run, levelled=tilts is not None, crlf=crlf)
     return detect_run(
         run,
         plan,
-        [*as_json, circles_file(output, settings, version, run, levelled=tilts is not None)],
+        [*as_json, file],
         overwrite=overwrite,
         tilts=tilts,
+        ids=IdSources(discs=ids.rows, mapped=ids.mapped),
         pictures=pictures,
         workers=workers,
         on_progress=on_progress,
@@ -89,7 +136,13 @@ LEVELLED = "corrected for the tilt of the frames that have one"
 
 
 def circles_file(
-    path: Path, settings: CircleSettings, version: str, run: Run, *, levelled: bool = False
+    path: Path,
+    settings: CircleSettings,
+    version: str,
+    run: Run,
+    *,
+    levelled: bool = False,
+    crlf: bool = False,
 ) -> Output:
     """A ``.circles`` file: what the rows mean and how they were made stands at its head."""
     odometry = run.odometry.name if run.odometry is not None else "none: the steps are zeros"
@@ -106,4 +159,5 @@ def circles_file(
         f"camera {run.camera}",
         f"settings {values}",
     ]
-    return Output(path, "circles", format_head("\n".join(lines)))
+    head = format_head("\n".join(lines), "\r\n" if crlf else "\n")
+    return Output(path, "circles", head, crlf=crlf)

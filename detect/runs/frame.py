@@ -53,6 +53,10 @@ class FramePlan:
         that are no lines.
     draw_response : bool
         Whether the filter's response of the lines is drawn as well.
+    known_level : bool
+        Whether the discs whose IDs are carried over are corrected for the tilt.
+    id_slack_m : float
+        Standard deviation of where a map and a path expect discs, besides the covariances, metres.
     working_folder : path or None
         What relative image paths are relative to, on whatever machine; by default a process's own.
     """
@@ -64,6 +68,8 @@ class FramePlan:
     json: bool = False
     drawing: Literal["discs", "lines", "tracks", "markers"] | None = None
     draw_response: bool = False
+    known_level: bool = False
+    id_slack_m: float = 0.1
     working_folder: Path | None = None
 
 
@@ -88,6 +94,8 @@ class FrameDetections:
     discs : CircleDetections or None
         Corrected for the tilt, where there is one.
     markers : MarkerDetections or None
+    seen : CircleDetections or None
+        The discs before that.
     """
 
     image: NDArray[np.uint8]
@@ -95,6 +103,7 @@ class FrameDetections:
     tilt: FrameTilt | None
     discs: CircleDetections | None
     markers: MarkerDetections | None = None
+    seen: CircleDetections | None = None
 
 
 def detect_frame(
@@ -204,6 +213,7 @@ def seen_together(
     -------
     FrameDetections
     """
+    seen = discs
     if discs is not None and tilt is not None:
         from detect.levelling import levelled, with_prior
 
@@ -211,7 +221,7 @@ def seen_together(
         assert plan.circles is not None
         prior_rad = math.radians(plan.circles.tilt_sigma_deg)
         discs = levelled(discs, plan.camera, with_prior(tilt, prior_rad))
-    return FrameDetections(image, lines, tilt, discs, markers)
+    return FrameDetections(image, lines, tilt, discs, markers, seen)
 
 
 def tilt_of_lines(prefix: str, lines: LineDetections) -> FrameTilt | None:

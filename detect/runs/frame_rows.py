@@ -5,6 +5,7 @@ This is all that a worker sends back, whichever process or machine it runs on: s
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import islice
@@ -29,6 +30,7 @@ from detect.runs.frame import (
 )
 from detect.sources.times import format_time
 from landmarks import (
+    CircleLandmark,
     Frame,
     FrameTilt,
     Landmark,
@@ -42,6 +44,7 @@ from landmarks import (
 
 if TYPE_CHECKING:
     from detect.circles import CircleDetections
+    from detect.discs.identity import MappedDisc
     from detect.lines import LineDetections
     from detect.markers.detections import MarkerDetections
 
@@ -54,6 +57,24 @@ PIXELS_AT_ONCE = 1 << 25
 _COSTS_THE_FRAME = (FrameError, ArithmeticError, np.linalg.LinAlgError, MemoryError)
 
 
+class KnownRows(NamedTuple):
+    """What is known of a frame's landmarks beforehand; None is what is not asked for.
+
+    Attributes
+    ----------
+    lines : tuple of LineLandmark or None
+        Its lines with IDs.
+    discs : tuple of CircleLandmark or None
+        Its discs with IDs.
+    mapped : tuple of MappedDisc or None
+        The discs that it should see.
+    """
+
+    lines: tuple[LineLandmark, ...] | None = None
+    discs: tuple[CircleLandmark, ...] | None = None
+    mapped: tuple[MappedDisc, ...] | None = None
+
+
 class FrameTask(NamedTuple):
     """A frame to be worked on, and what is known about it beforehand. Small.
 
@@ -63,13 +84,13 @@ class FrameTask(NamedTuple):
         STEP row and path of the image.
     tilt : FrameTilt or None
         Its tilt, where it is known: the discs are corrected for it.
-    reference : tuple of LineLandmark or None
-        Its lines with IDs, which are carried over.
+    known : KnownRows or None
+        Rows with IDs, which are carried over.
     """
 
     frame: RunFrame
     tilt: FrameTilt | None = None
-    reference: tuple[LineLandmark, ...] | None = None
+    known: KnownRows | None = None
 
 
 class FrameRows(NamedTuple):
@@ -191,14 +212,14 @@ def _rows_of(
     head = _line(format_record(step))
     circles = lines = tilt = markers = record = b""
     if found.lines is not None:
-        lines = head + _line_rows(found.lines, task.reference)
+        lines = head + _line_rows(found.lines, None if task.known is None else task.known.lines)
         if found.tilt is None:
             tilt = _line(format_no_tilt(step.prefix, len(found.lines)))
         else:
             tilt = _line(format_tilt(found.tilt))
     if found.discs is not None:
         discs = found.discs
-        circles = head + _circle_rows(discs)
+        circles = head + _circle_rows(found, discs, task.known, plan)
         if plan.json:
             record = _json({"frame": step.prefix, "discs": _disc_records(discs)})
     if found.markers is not None:
@@ -245,14 +266,47 @@ def _line_rows(found: LineDetections, reference: tuple[LineLandmark, ...] | None
     return _rows(found.landmarks()) if rows is None else rows
 
 
-def _circle_rows(found: CircleDetections) -> bytes:
-    from detect.runs.row_text import unknown_circles
+def _circle_rows(
+    found: FrameDetections, discs: CircleDetections, known: KnownRows | None, plan: FramePlan
+) -> bytes:
+    if known is None or (known.discs is None and known.mapped is None):
+        from detect.runs.row_text import unknown_circles
 
-    rows = unknown_circles(found.floor_xy, found.quality, found.covariance)
-    if rows is not None:
-        return rows
-    unknown = np.full(len(found), -1)
-    return _rows(circle_landmarks(found.floor_xy, found.quality, found.covariance, unknown))
+        text = unknown_circles(discs.floor_xy, discs.quality, discs.covariance)
+        if text is not None:
+            return text
+    rows = circle_landmarks(
+        discs.floor_xy, discs.quality, discs.covariance, np.full(len(discs), -1)
+    )
+    return _rows(
+        dataclasses.replace(row, ids=ids)
+        for row, ids in zip(rows, _ids_of_discs(found, discs, known, plan))
+    )
+
+
+def _ids_of_discs(
+    found: FrameDetections, discs: CircleDetections, known: KnownRows | None, plan: FramePlan
+) -> list[tuple[int, ...]]:
+    """The IDs of each row: those of a known row of the same disc, or of a map's, or -1."""
+    from detect.discs.identity import ids_of_map, ids_of_rows
+
+    ids: list[tuple[int, ...]] = [()] * len(discs)
+    if known is not None and known.discs:
+        seen = discs if plan.known_level or found.seen is None else found.seen
+        by_pixel = dict(
+            zip(map(tuple, seen.pixels.tolist()), ids_of_rows(seen.floor_xy, known.discs))
+        )
+        ids = [by_pixel[u, v] for u, v in discs.pixels.tolist()]
+    if known is not None and known.mapped:
+        taken = {number for own in ids for number in own}
+        left = [disc for disc in known.mapped if disc.id not in taken]
+        open_rows = [k for k, own in enumerate(ids) if own in ((), (-1,))]
+        named = ids_of_map(
+            discs.floor_xy[open_rows], discs.covariance[open_rows], left, plan.id_slack_m
+        )
+        for k, number in zip(open_rows, named.tolist()):
+            ids[k] = (number,)
+    return [own or (-1,) for own in ids]
 
 
 def _rows(landmarks: Iterable[Landmark]) -> bytes:

@@ -12,7 +12,7 @@ from detect.run import Run
 from detect.runs.conduct import PLAIN, Conduct
 from detect.runs.dispatch import Workers
 from detect.runs.frame import FramePlan
-from detect.runs.stream import LineSource, Output, RunSummary, detect_run
+from detect.runs.stream import IdSources, LineSource, Output, RunSummary, detect_run
 from landmarks import format_head
 
 
@@ -31,6 +31,7 @@ def detect_lines_run(
     workers: Workers | None = None,
     on_progress: Callable[[], None] | None = None,
     conduct: Conduct = PLAIN,
+    crlf: bool = False,
 ) -> RunSummary:
     """Detect the verticals of a run and write them, with the tilt that they show.
 
@@ -56,6 +57,8 @@ def detect_lines_run(
         and for images of the filter's response.
     workers, on_progress, conduct
         As in `detect.runs.stream.detect_run`.
+    crlf : bool
+        Whether the lines of the ``.lines`` file end with CR and LF.
 
     Returns
     -------
@@ -76,9 +79,9 @@ def detect_lines_run(
     return detect_run(
         run,
         plan,
-        [tilt_file(tilt_output, version), lines_file(output, settings, version, run)],
+        [tilt_file(tilt_output, version), lines_file(output, settings, version, run, crlf=crlf)],
         overwrite=overwrite,
-        reference=reference,
+        ids=None if reference is None else IdSources(lines=reference),
         pictures=pictures,
         workers=workers,
         on_progress=on_progress,
@@ -86,7 +89,9 @@ def detect_lines_run(
     )
 
 
-def lines_file(path: Path, settings: LineSettings, version: str, run: Run) -> Output:
+def lines_file(
+    path: Path, settings: LineSettings, version: str, run: Run, *, crlf: bool = False
+) -> Output:
     """A ``.lines`` file: what the rows mean and how they were made stands at its head."""
     odometry = run.odometry.name if run.odometry is not None else "none: the steps are zeros"
     values = " ".join(
@@ -106,7 +111,8 @@ def lines_file(path: Path, settings: LineSettings, version: str, run: Run) -> Ou
         f"camera {run.camera}",
         f"settings {values}",
     ]
-    return Output(path, "lines", format_head("\n".join(lines)))
+    head = format_head("\n".join(lines), "\r\n" if crlf else "\n")
+    return Output(path, "lines", head, crlf=crlf)
 
 
 def tilt_file(path: Path, version: str) -> Output:

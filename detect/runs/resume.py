@@ -332,6 +332,8 @@ class RunFiles:
         def rows_of(rows: FrameRows, _: str) -> bytes:
             content = getattr(rows, output.part)
             assert isinstance(content, bytes)
+            if output.crlf:
+                content = content.replace(b"\n", b"\r\n")
             return output.between + content if output.between and self._frames else content
 
         return rows_of

@@ -220,7 +220,7 @@ def _digest(before: str, values: bytes, content: list[bytes]) -> str:
 
 
 def task_digest(task: FrameTask) -> str:
-    """A digest of what is to be done with a frame: its step, image, tilt and reference.
+    """A digest of what is to be done with a frame: its step, image, tilt and known rows.
 
     Of an image file, name, size and time of change count.
     """
@@ -234,7 +234,7 @@ def task_digest(task: FrameTask) -> str:
         frame.bits,
         frame.failure,
         task.tilt,
-        task.reference,
+        task.known,
     )
     digest = hashlib.sha256(numbers + repr(beside).encode("utf-8", "surrogateescape"))
     if frame.content is not None:

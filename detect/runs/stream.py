@@ -18,16 +18,17 @@ from itertools import islice
 from pathlib import Path
 from typing import Literal, Protocol
 
+from detect.discs.identity import MappedDisc
 from detect.run import ImageRun
 from detect.runs.conduct import PLAIN, Conduct
 from detect.runs.dispatch import Workers, detect_chunks
 from detect.runs.frame import FramePlan, tables_of
-from detect.runs.frame_rows import FrameRows, FrameTask
+from detect.runs.frame_rows import FrameRows, FrameTask, KnownRows
 from detect.runs.garbage import settled
 from detect.runs.resume import RunFiles
 from detect.runs.workers import local_workers, pixels_of
 from detect.sources.times import TIMES_HEAD
-from landmarks import FrameTilt, LineLandmark, format_head
+from landmarks import CircleLandmark, FrameTilt, LineLandmark, format_head
 from storage import write_whole
 
 #: Endings of files of landmarks.
@@ -51,6 +52,45 @@ class LineSource(Protocol):
     def get(self, prefix: str, /) -> Sequence[LineLandmark] | None: ...
 
 
+class DiscSource(Protocol):
+    """Rows of discs with IDs by image prefix: a dict, or a file that is looked into."""
+
+    def get(self, prefix: str, /) -> Sequence[CircleLandmark] | None: ...
+
+
+class MapSource(Protocol):
+    """Discs that a map and a path let each frame see, by image prefix."""
+
+    def get(self, prefix: str, /) -> Sequence[MappedDisc] | None: ...
+
+
+@dataclass(frozen=True)
+class IdSources:
+    """Where the IDs of a run's rows come from.
+
+    Attributes
+    ----------
+    lines : mapping, optional
+        Lines with IDs by image prefix: carried over where the match is unambiguous.
+    discs : mapping, optional
+        Discs with IDs by image prefix.
+    mapped : mapping, optional
+        Discs of a map by image prefix, for rows that `discs` knows nothing of.
+    """
+
+    lines: LineSource | None = None
+    discs: DiscSource | None = None
+    mapped: MapSource | None = None
+
+    def of(self, prefix: str) -> KnownRows:
+        """What is known of a frame."""
+        return KnownRows(
+            lines=None if self.lines is None else tuple(self.lines.get(prefix) or ()),
+            discs=None if self.discs is None else tuple(self.discs.get(prefix) or ()),
+            mapped=None if self.mapped is None else tuple(self.mapped.get(prefix) or ()),
+        )
+
+
 @dataclass(frozen=True)
 class Output:
     """A file that a run is written to.
@@ -64,6 +104,8 @@ class Output:
         What stands before and after the rows of all frames.
     between : bytes
         What stands between those of two frames.
+    crlf : bool
+        Whether rows end with CR and LF, as in the data set's own files.
     """
 
     path: Path
@@ -71,6 +113,7 @@ class Output:
     head: bytes = b""
     tail: bytes = b""
     between: bytes = b""
+    crlf: bool = False
 
 
 @dataclass
@@ -124,7 +167,7 @@ def detect_run(
     *,
     overwrite: bool = False,
     tilts: TiltSource | None = None,
-    reference: LineSource | None = None,
+    ids: IdSources | None = None,
     pictures: Path | None = None,
     workers: Workers | None = None,
     on_progress: Callable[[], None] | None = None,
@@ -144,8 +187,8 @@ def detect_run(
         Whether existing files may be replaced.
     tilts : mapping, optional
         Tilts by image prefix, for frames whose verticals are not looked for.
-    reference : mapping, optional
-        Lines with IDs by image prefix: carried over where the match is unambiguous.
+    ids : IdSources, optional
+        Where the rows' IDs come from.
     pictures : path, optional
         Folder for what the plan has drawn.
     workers : Workers, optional
@@ -182,7 +225,7 @@ def detect_run(
     with ExitStack() as stack:
         stack.enter_context(settled())
         files = stack.enter_context(RunFiles(outputs, plan, conduct, overwrite=overwrite))
-        tasks = stack.enter_context(closing(_tasks(run, tilts, reference)))
+        tasks = stack.enter_context(closing(_tasks(run, tilts, ids)))
         for rows in files.kept(tasks):
             summary.add(rows)
             if on_progress is not None:
@@ -248,7 +291,7 @@ def _write_pictures(frames: Sequence[FrameRows], folder: Path, *, overwrite: boo
 
 
 def _tasks(
-    run: ImageRun, tilts: TiltSource | None, reference: LineSource | None
+    run: ImageRun, tilts: TiltSource | None, ids: IdSources | None
 ) -> Generator[FrameTask, None, None]:
     with closing(iter(run.frames)) as frames:
         for frame in frames:
@@ -256,5 +299,5 @@ def _tasks(
             yield FrameTask(
                 frame,
                 tilt=None if tilts is None else tilts.get(prefix),
-                reference=None if reference is None else tuple(reference.get(prefix) or ()),
+                known=None if ids is None else ids.of(prefix),
             )

@@ -25,7 +25,7 @@ from detect.circles import (
     tilt_jacobian,
 )
 from detect.errors import FrameError
-from detect.settings import PUBLISHED, CircleSettings, Polarity
+from detect.settings import REPORT, CircleSettings, Polarity
 from lut import DiscShape, DiscTable, build_disc_table, ring
 from tests.detect.painted_floor import DARK, LIGHT, PaintedFloor, mirrored_camera
 from tools.evaluation.accuracy import measure_accuracy
@@ -120,7 +120,7 @@ def test_published_detector_obeys_polarity(
         polarity: {
             tuple(pixel)
             for pixel in detect(
-                discs_image, published_camera, replace(PUBLISHED, polarity=polarity)
+                discs_image, published_camera, replace(REPORT, polarity=polarity)
             ).pixels.tolist()
         }
         for polarity in ("any", "light", "dark")
@@ -134,10 +134,10 @@ def test_published_detector_obeys_polarity(
 def test_suppression_alone_makes_one_disc_one_row(
     discs_image: NDArray[np.uint8], published_camera: Camera
 ) -> None:
-    plain = replace(PUBLISHED, separation_m=0.14)
+    plain = replace(REPORT, separation=1.4)
     found = detect(discs_image, published_camera, plain)
     assert_found_once(found, PLACES, within_m=0.06)
-    assert len(detect(discs_image, published_camera, PUBLISHED)) > len(PLACES)
+    assert len(detect(discs_image, published_camera, REPORT)) > len(PLACES)
 
 
 def test_disc_partly_behind_the_lower_border(published_camera: Camera) -> None:
@@ -184,7 +184,7 @@ def test_nothing_on_a_bare_floor(published_camera: Camera, noise: float) -> None
         assert len(detect(floor.image(noise, seed), published_camera)) == 0
 
 
-@pytest.mark.parametrize("preset", [DEFAULT, PUBLISHED], ids=["default", "published"])
+@pytest.mark.parametrize("preset", [DEFAULT, REPORT], ids=["default", "published"])
 @pytest.mark.parametrize("grey", [0, 1, 128, 254, 255])
 def test_nothing_in_an_even_image(
     published_camera: Camera, grey: int, preset: CircleSettings
@@ -269,8 +269,8 @@ def test_image_of_another_size_is_refused(published_camera: Camera) -> None:
 def test_published_rows_are_pixels(
     discs_image: NDArray[np.uint8], published_camera: Camera
 ) -> None:
-    found = detect(discs_image, published_camera, PUBLISHED)
-    table = table_of(published_camera, disc_shape(PUBLISHED))
+    found = detect(discs_image, published_camera, REPORT)
+    table = table_of(published_camera, disc_shape(REPORT))
     quality, _ = quality_of_centres(discs_image, table)
     columns, rows = found.pixels.T
     assert np.issubdtype(found.pixels.dtype, np.integer)
@@ -298,29 +298,29 @@ def test_published_positions_are_the_cameras(published_camera: Camera) -> None:
     near = np.hypot(*seen.T) < 10.0
     assert near.sum() > 3000
     np.testing.assert_allclose(floor_xy[near], seen[near], rtol=0.0, atol=1e-13)
-    np.testing.assert_allclose(covariance[near], expected[near], rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(covariance[near], expected[near], rtol=1e-7, atol=1e-10)
 
 
 def test_published_covariance_is_the_formula(published_camera: Camera) -> None:
-    """(0.04 m)^2 I + 2 px^2 J J^T with J by central differences over +-0.1 px."""
+    """(0.04 m)^2 I + 2 px^2 J J^T."""
     pixels = np.array([[384, 270], [100, 120], [700, 90], [50, 200], [384, 60]])
     for pixel, covariance in zip(pixels, published_covariance(published_camera, pixels)):
         jacobian = np.column_stack(
             [
                 published_camera.floor_from_pixel(pixel + step)
                 - published_camera.floor_from_pixel(pixel - step)
-                for step in 0.1 * np.eye(2)
+                for step in 0.001 * np.eye(2)
             ]
         )
-        jacobian /= 0.2
+        jacobian /= 0.002
         expected = 0.04**2 * np.eye(2) + 2.0 * jacobian @ jacobian.T
-        np.testing.assert_allclose(covariance, expected, rtol=1e-10, atol=0.0)
+        np.testing.assert_allclose(covariance, expected, rtol=1e-4, atol=0.0)
 
 
 def test_published_rows_have_the_published_covariance(
     discs_image: NDArray[np.uint8], published_camera: Camera
 ) -> None:
-    for asked in (PUBLISHED, replace(DEFAULT, refine=False)):
+    for asked in (REPORT, replace(DEFAULT, refine=False)):
         found = detect(discs_image, published_camera, asked)
         expected = published_covariance(published_camera, found.pixels)
         np.testing.assert_array_equal(found.covariance, expected)
@@ -330,12 +330,12 @@ def test_quality_is_that_of_the_outlines(
     discs_image: NDArray[np.uint8], published_camera: Camera
 ) -> None:
     """Otsu's quotient from the definition, the outlines straight through the camera."""
-    table = table_of(published_camera, disc_shape(PUBLISHED))
+    table = table_of(published_camera, disc_shape(REPORT))
     quality, contrast = quality_of_centres(discs_image, table)
     rng = np.random.default_rng(11)
     rows, columns = np.nonzero(table.usable)
     some = rng.choice(len(rows), 300, replace=False)
-    peaks = detect(discs_image, published_camera, PUBLISHED).pixels
+    peaks = detect(discs_image, published_camera, REPORT).pixels
     for u, v in [*zip(columns[some], rows[some]), *peaks]:
         centre = published_camera.floor_from_pixel(np.array([u, v], float))
         values = []
@@ -405,12 +405,12 @@ def test_mirrored_image_and_camera_give_mirrored_rows(
     """
     image, mirror_image = image_and_mirror_image(published_camera, shift, seed)
     width = published_camera.width
-    quality, _ = quality_of_centres(image, table_of(published_camera, disc_shape(PUBLISHED)))
-    found = detect(image, published_camera, PUBLISHED)
+    quality, _ = quality_of_centres(image, table_of(published_camera, disc_shape(REPORT)))
+    found = detect(image, published_camera, REPORT)
     for u, v in found.pixels:
         around = quality[v - 1 : v + 2, u - 1 : u + 2]
         assume(np.count_nonzero(around == quality[v, u]) == 1)
-    back = mirrored_rows(detect(mirror_image, mirrored_camera(published_camera), PUBLISHED), width)
+    back = mirrored_rows(detect(mirror_image, mirrored_camera(published_camera), REPORT), width)
     a, b = ((rows.pixels[:, 0] > 13) & (rows.pixels[:, 0] < width - 14) for rows in (found, back))
     assert np.count_nonzero(a) >= len(PLACES)
     np.testing.assert_array_equal(back.pixels[b], found.pixels[a])

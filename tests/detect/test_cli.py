@@ -88,11 +88,11 @@ def test_published_preset(small_run: Path, preset: list[str]) -> None:
 
 @pytest.mark.parametrize("first", [True, False])
 def test_flags_override_the_preset(small_run: Path, first: bool) -> None:
-    preset, flag = ["--preset", "published"], ["--threshold", "0.95", "--separation-m", "0.2"]
+    preset, flag = ["--preset", "published"], ["--threshold", "0.95", "--separation", "1.5"]
     arguments = [*flag, *preset] if first else [*preset, *flag]
     assert main(["circles", str(small_run), *arguments]) == 0
     written = settings_of(small_run / "detected.circles")
-    assert (written["threshold"], written["separation_m"]) == ("0.95", "0.2")
+    assert (written["threshold"], written["separation"]) == ("0.95", "1.5")
     assert (written["refine"], written["noise_floor"]) == ("False", "0.0")
     counts = [len(frame.circles) for frame in read_frames(small_run / "detected.circles")]
     assert counts == [2, 1, 0]
@@ -286,7 +286,7 @@ def test_places_where_nothing_can_be_written(
         ["circles", "RUN", "--threshold", "high"],
         ["circles", "RUN", "--threshold", "0"],
         ["circles", "RUN", "--threshold", "nan"],
-        ["circles", "RUN", "--separation-m", "-1"],
+        ["circles", "RUN", "--separation", "-1"],
         ["circles", "RUN", "--polarity", "grey"],
         ["compare", "RUN", "--gate-m", "0"],
     ],

@@ -16,7 +16,7 @@ from detect.line_settings import DEFAULT as LINES_DEFAULT
 from detect.lines import detect_lines
 from detect.noise import estimate_noise
 from detect.runs.frame import tilt_of_lines
-from detect.settings import PUBLISHED, CircleSettings
+from detect.settings import PUBLISHED, REPORT, CircleSettings
 from detect.verticals.tracks import line_response
 from lut import cached_disc_table, cached_vertical_table
 from tools.benchmark.material import Picture, decode
@@ -26,8 +26,8 @@ from tools.benchmark.plain_gather import gather_table, plain_quality_of_centres
 DECODING = "decoding"
 
 #: What ratios of one's own parts and of peers are taken between, for the report.
-KERNEL = "quality map (published)"
-PLAIN_GATHER = "plain gather (published)"
+KERNEL = "quality map (report)"
+PLAIN_GATHER = "plain gather (report)"
 RESPONSE = "response (dense)"
 CIRCLES = "circles (default)"
 LINES = "lines (default)"
@@ -67,16 +67,17 @@ def decoding() -> Measured:
 def circle_detectors(camera: Camera, *, parts: bool = True) -> list[Measured]:
     """The disc detector: both presets whole, and (with `parts`) its quality map by itself."""
     published = cached_disc_table(camera, disc_shape(PUBLISHED))
+    report = cached_disc_table(camera, disc_shape(REPORT))
     settings = CircleSettings()
     default = cached_disc_table(camera, disc_shape(settings))
     some, rank = rows_to_look_at(default, settings)
     pieces = [
-        Measured(KERNEL, "circles", lambda p: quality_of_centres(p.grey, published)),
+        Measured(KERNEL, "circles", lambda p: quality_of_centres(p.grey, report)),
         Measured("quality map (default)", "circles", lambda p: quality_of_centres(p.grey, default)),
         Measured(
-            "best centres (published)",
+            "best centres (report)",
             "circles",
-            lambda p: best_centres(p.grey, published, PUBLISHED.threshold, PUBLISHED.polarity),
+            lambda p: best_centres(p.grey, report, REPORT.threshold, REPORT.polarity),
         ),
         Measured(
             "best centres (default)",
@@ -120,8 +121,8 @@ def both_detectors(camera: Camera) -> Measured:
 
 
 def plain_gather(camera: Camera) -> Measured:
-    """The published preset's quality map by one gather per sample."""
-    shape = disc_shape(PUBLISHED)
+    """The quality map of the preset `report` by one gather per sample."""
+    shape = disc_shape(REPORT)
     table = gather_table(camera, shape, cached_disc_table(camera, shape))
     return Measured(PLAIN_GATHER, "peer", lambda p: plain_quality_of_centres(p.grey, table))
 

@@ -261,7 +261,7 @@ def _tilt(command: Tilt) -> int:
         settings = replace(
             CircleSettings(),
             polarity="light",
-            far_limit_m_per_px=0.05,
+            far_limit=0.5,
             tilt_sigma_deg=command.tilt_sigma_deg,
         )
         for label, known in (("without", None), ("with", tilts)):

@@ -21,7 +21,7 @@ from detect.circles import detect_circles, disc_shape
 from detect.discs.centres import best_centres, quality_of_centres
 from detect.discs.maxima_kernels import local_maxima
 from detect.errors import FrameError
-from detect.settings import PUBLISHED, CircleSettings, Polarity
+from detect.settings import REPORT, CircleSettings, Polarity
 from lut import DiscShape, DiscTable, build_disc_table
 from tests.camera.strategies import cameras
 from tests.conftest import PUBLISHED_CAM
@@ -194,7 +194,7 @@ def demo_images(project_root: Path) -> list[GreyImage]:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("preset", [PUBLISHED, CircleSettings()], ids=["published", "default"])
+@pytest.mark.parametrize("preset", [REPORT, CircleSettings()], ids=["published", "default"])
 def test_maps_and_best_centres_at_full_size(preset: CircleSettings, project_root: Path) -> None:
     table, outlines = both(PUBLISHED_CAMERA, disc_shape(preset))
     assert np.count_nonzero(outlines.index == 288 * 768) > 1000
@@ -213,7 +213,7 @@ def test_maps_and_best_centres_at_full_size(preset: CircleSettings, project_root
     assert count > 100
 
 
-@pytest.mark.parametrize("preset", [PUBLISHED, CircleSettings()], ids=["published", "default"])
+@pytest.mark.parametrize("preset", [REPORT, CircleSettings()], ids=["published", "default"])
 def test_landmarks_are_those_of_plain_centres(
     preset: CircleSettings, project_root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -242,14 +242,14 @@ def test_photographs(group: str, shared_data: Path) -> None:
     (path,) = (folder / "images").iterdir()
     camera = read_camera(folder / f"{folder.name}.cam")
     image = np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), np.uint8)
-    table, outlines = both(camera, disc_shape(PUBLISHED))
+    table, outlines = both(camera, disc_shape(REPORT))
     expected = plain_best_centres(image, outlines, 0.6)
     assert len(expected[0]) > 30
     assert_same(best_centres(image, table, 0.6), expected)
 
 
 def test_more_centres_than_there_is_room_for_at_a_time() -> None:
-    table, _ = both(PUBLISHED_CAMERA, disc_shape(PUBLISHED))
+    table, _ = both(PUBLISHED_CAMERA, disc_shape(REPORT))
     image = image_of("random", (288, 768))
     quality, contrast = quality_of_centres(image, table)
     for threshold in (1e-9, 0.1):
@@ -286,14 +286,14 @@ def test_an_image_of_eight_megapixels() -> None:
 
 def test_tables_of_very_large_images_are_worked_on_alike() -> None:
     # Their copies have 64 bits.
-    table, _ = both(PUBLISHED_CAMERA, disc_shape(PUBLISHED))
+    table, _ = both(PUBLISHED_CAMERA, disc_shape(REPORT))
     wide = dataclasses.replace(table, copies=table.copies.astype(np.uint64))
     image = image_of("blocks", (288, 768))
     assert_same(best_centres(image, wide, 0.3), best_centres(image, table, 0.3))
 
 
 def test_an_image_whose_memory_is_not_contiguous_or_read_only_is_the_same_image() -> None:
-    table, _ = both(PUBLISHED_CAMERA, disc_shape(PUBLISHED))
+    table, _ = both(PUBLISHED_CAMERA, disc_shape(REPORT))
     image = image_of("blocks", (288, 768))
     expected = best_centres(image, table, 0.3)
     fixed = image.copy()
@@ -304,7 +304,7 @@ def test_an_image_whose_memory_is_not_contiguous_or_read_only_is_the_same_image(
 
 
 def test_threads_do_not_disturb_each_other() -> None:
-    table, _ = both(PUBLISHED_CAMERA, disc_shape(PUBLISHED))
+    table, _ = both(PUBLISHED_CAMERA, disc_shape(REPORT))
     images = [image_of("blocks", (288, 768), seed) for seed in range(12)]
     expected = [best_centres(image, table, 0.3) for image in images]
     assert len({len(found[0]) for found in expected}) > 3
@@ -317,7 +317,7 @@ def test_threads_do_not_disturb_each_other() -> None:
 
 
 def test_only_what_comes_before_the_first_source_does_not_matter() -> None:
-    table, _ = both(PUBLISHED_CAMERA, disc_shape(PUBLISHED))
+    table, _ = both(PUBLISHED_CAMERA, disc_shape(REPORT))
     image = image_of("random", (288, 768))
     first = table.first_source
     assert first > 768

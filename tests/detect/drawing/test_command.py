@@ -217,9 +217,9 @@ def test_rows_are_drawn_without_detecting_again(small_run: Path, tmp_path: Path)
 
 
 def test_settings_and_tilt_are_read_from_the_head(small_run: Path) -> None:
-    assert main(["circles", str(small_run), "--outer-radius-m", "0.15"]) == 0
+    assert main(["circles", str(small_run), "--outer-ring", "1.5"]) == 0
     head = read_head(small_run / "detected.circles")
-    assert head.circle_settings == CircleSettings(outer_radius_m=0.15)
+    assert head.circle_settings == CircleSettings(outer_ring=1.5)
     assert not head.levelled
     assert main(["all", str(small_run), "--force"]) == 0
     assert read_head(small_run / "detected.circles").levelled

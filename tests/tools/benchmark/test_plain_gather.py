@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from camera import Camera
 from detect.circles import disc_shape, quality_of_centres
-from detect.settings import PUBLISHED, CircleSettings
+from detect.settings import REPORT, CircleSettings
 from lut import build_disc_table, ring
 from tools.benchmark.material import decode, scaled_camera
 from tools.benchmark.plain_gather import gather_table, plain_quality_of_centres
@@ -21,7 +21,7 @@ def _noise(camera: Camera) -> NDArray[np.uint8]:
     return rng.integers(0, 256, (camera.height, camera.width), dtype=np.uint8)
 
 
-@pytest.mark.parametrize("settings", [PUBLISHED, CircleSettings()], ids=["published", "default"])
+@pytest.mark.parametrize("settings", [REPORT, CircleSettings()], ids=["published", "default"])
 @pytest.mark.parametrize("picture", ["demo", "noise", "flat"])
 def test_the_maps_are_those_of_the_detector(
     settings: CircleSettings, picture: str, published_camera: Camera, project_root: Path
@@ -45,7 +45,7 @@ def test_the_maps_are_those_of_the_detector(
 
 def test_the_quality_is_that_of_the_definition(published_camera: Camera) -> None:
     camera = scaled_camera(published_camera, 0.5)
-    shape = disc_shape(PUBLISHED)
+    shape = disc_shape(REPORT)
     table = build_disc_table(camera, shape)
     gathered = gather_table(camera, shape, table)
     image = _noise(camera)
