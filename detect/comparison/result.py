@@ -124,10 +124,14 @@ class NormalisedError:
 
 @dataclass(frozen=True, slots=True)
 class Levelling:
-    """How many frames' rows are levelled, and by what (medians, degrees; None where none are)."""
+    """How many frames' rows are levelled, and by what (medians, degrees; None where none are).
+
+    `true` says that rows are level positions that no tilt was applied to.
+    """
 
     frames: int
     levelled: int
+    true: bool
     pitch_deg: float | None = None
     roll_deg: float | None = None
 
