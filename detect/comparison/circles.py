@@ -198,7 +198,9 @@ def compare_frames(
         in_image=in_image,
         image_median_px=quantile(apart_px, 0.5),
         image_95_px=quantile(apart_px, 0.95),
-        reference_levelling=_levelling(names, wanted_by),
+        reference_levelling=_levelling(
+            names, wanted_by, true=sight is not None and sight.reference_level
+        ),
         detected_levelling=_levelling(names, found_by),
         floor=_floor_bins(pairs, lean),
         lean=_stated(lean, pairs),
@@ -321,9 +323,15 @@ def _levelled_by(frames: Sequence[Frame]) -> dict[str, Tilt]:
     }
 
 
-def _levelling(names: Sequence[str], by: Mapping[str, Tilt]) -> Levelling:
+def _levelling(names: Sequence[str], by: Mapping[str, Tilt], *, true: bool = False) -> Levelling:
     tilts = np.degrees([by[name] for name in names if name in by]).reshape(-1, 2)
-    return Levelling(len(names), len(tilts), quantile(tilts[:, 0], 0.5), quantile(tilts[:, 1], 0.5))
+    return Levelling(
+        len(names),
+        len(tilts),
+        true and not len(tilts),
+        quantile(tilts[:, 0], 0.5),
+        quantile(tilts[:, 1], 0.5),
+    )
 
 
 def _apart_px(

@@ -84,7 +84,8 @@ def format_json(comparison: Comparison) -> str:
 def _summary(c: Comparison) -> Table:
     counts = f"{c.matched} matched, {c.missed} missed, {c.extra} extra"
     if c.in_image:
-        where, gate = "in the image", f" (within half the disc's image, {c.options.least_px:g} px)"
+        where = "in the image"
+        gate = f" (within half the disc's image or {c.options.least_px:g} px)"
     else:
         measure = (
             f"{c.options.gate_m:g} m" if c.options.sigma is None else f"{c.options.sigma:g} sigma"
@@ -144,12 +145,14 @@ def levelling_text(c: Comparison) -> str:
         )
     )
     held = "compared at the pixels where they were seen" if c.in_image else "compared on the floor"
-    return f"{reference}, {detected}: {held}"
+    return f"{reference}; {detected}: {held}"
 
 
 def _levelled_side(name: str, side: Levelling) -> str:
     if side.pitch_deg is None or side.roll_deg is None:
-        return f"{name} rows are as they were written"
+        if side.true:
+            return f"{name} rows are level"
+        return f"{name} rows are where the camera as calibrated saw them"
     which = "all" if side.levelled == side.frames else f"{side.levelled} of {side.frames}"
     return (
         f"{name} rows are levelled in {which} frames "
@@ -158,7 +161,8 @@ def _levelled_side(name: str, side: Levelling) -> str:
 
 
 def _any_levelled(c: Comparison) -> bool:
-    return bool(c.reference_levelling.levelled or c.detected_levelling.levelled)
+    sides = (c.reference_levelling, c.detected_levelling)
+    return any(side.levelled or side.true for side in sides)
 
 
 def lean_text(lean: CommonLean) -> str:
@@ -167,8 +171,8 @@ def lean_text(lean: CommonLean) -> str:
     return (
         f"pitch {lean.pitch_deg:.3f} +- {lean.pitch_sigma_deg:.3f} deg, "
         f"roll {lean.roll_deg:.3f} +- {lean.roll_sigma_deg:.3f} deg, "
-        f"camera {100 * lean.raised_m:.2f} +- {100 * lean.raised_sigma_m:.2f} cm higher "
-        f"turn reference positions into detected ones; left after it: {left}, "
+        f"height {100 * lean.raised_m:+.2f} +- {100 * lean.raised_sigma_m:.2f} cm would turn "
+        f"reference positions into detected ones; left after it: {left}, "
         f"normalised error {number(lean.normalised_error.per_dof, 3)}"
     )
 
@@ -216,12 +220,12 @@ def _over_distance(c: Comparison) -> Table:
 
 def _floor_differences(c: Comparison) -> Table:
     table = titled_table(
-        "On the floor: detected minus reference positions, m (along: farther away, across: to the\n"
-        "left; medians), and after the common lean"
+        "On the floor, m: detected minus reference; the same after the common lean\n"
+        "(along: farther away, across: to the left; medians)"
     )
     for heading in (
         "metres", "pairs", "median", "95 %", "along", "across",
-        "after: median", "95 %", "along", "across",
+        "after", "95 %", "along", "across",
     ):  # fmt: skip
         table.add_column(heading, justify="right")
     for part in c.floor:

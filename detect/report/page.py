@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from detect.comparison.circles import FLOOR_GATE_M
 from detect.comparison.tables import number
 from detect.drawing.inputs import picture_name
 from detect.line_settings import LineSettings
@@ -138,8 +139,8 @@ def _frames(
         parts.append(
             Part(
                 "note",
-                "Above a disc: quality, distance to its reference row, the same in standard "
-                "deviations (sd). Below a vertical: error of the bearing in standard deviations.",
+                "Above a disc: quality, distance to its reference row in the image. Below a "
+                "vertical: error of the bearing in standard deviations.",
             )
         )
     else:
@@ -249,10 +250,14 @@ def _settings(inputs: ReportInputs, version: str) -> list[Part]:
         words = [line for line in head.comments if line and not line.startswith("settings ")]
         parts += [Part("note", line) for line in words] or [Part("note", "No head in the file.")]
     gate, line_gate = inputs.gate, inputs.line_gate
+    if inputs.sight is not None and not gate.on_floor:
+        same = f"within half its image or {gate.least_px:g} px"
+    else:
+        same = f"within {FLOOR_GATE_M if gate.gate_m is None else gate.gate_m:g} m"
     parts.append(
         Part(
             "note",
-            f"The same disc: within {gate.gate_m:g} m. The same vertical: within "
+            f"The same disc: {same}. The same vertical: within "
             f"{line_gate.tolerance_deg:g}° or {line_gate.sigmas:g} standard deviations. "
             f"Page written by detect report, version {version}.",
         )
