@@ -106,7 +106,7 @@ class FrameView:
 
     def gates(self, reference_xy: FloatArray, least_px: float) -> FloatArray:
         """(N, 2) half the width and height of discs' images, `least_px` at least, pixels."""
-        ring = circle_on_floor(reference_xy.reshape(-1, 2), self.radius_m)
+        ring = circle_on_floor(reference_xy.reshape(-1, 2), self.radius_m, 16)
         edge = image_positions(self.camera, ring, self.reference_by)
         seen = np.isfinite(edge)
         low = np.where(seen, edge, np.inf).min(axis=1, initial=np.inf)

@@ -73,13 +73,13 @@ def disc_parts(inputs: ReportInputs) -> list[Part]:
         parts.append(
             figure_part(
                 floor_figure(result.pairs, lean=result.lean is not None),
-                "Where on the floor the two sides put the same disc, detected minus reference: each "
-                "pair, and medians in bins of equally many.",
+                "Where on the floor the two sides put the same disc, detected minus reference: "
+                "each pair, and medians in bins of equally many.",
             )
         )
     if result.lean is not None:
         parts += [
-            Part("text", f"One lean for all frames: {lean_text(result.lean)}."),
+            Part("text", f"One lean for all frames: {lean_text(result.lean)}.".replace("+-", "±")),
             _floor(result),
         ]
     error = result.normalised_error if result.lean is None else result.lean.normalised_error

@@ -127,7 +127,7 @@ def distance_figure(bins: Sequence[DistanceBin]) -> bytes:
         rates.set_ylim(0.0, 1.05)
         names = [
             f"<{p.to_m:g}" if p.from_m is None
-            else f"{p.from_m:g}\u2013" + ("" if p.to_m is None else f"{p.to_m:g}")
+            else f"≥{p.from_m:g}" if p.to_m is None else f"{p.from_m:g}-{p.to_m:g}"
             for p in shown
         ]  # fmt: skip
         for one, name in ((rows, "rows"), (rates, "share")):
@@ -139,7 +139,7 @@ def distance_figure(bins: Sequence[DistanceBin]) -> bytes:
 
 
 def floor_figure(pairs: DiscPairs, *, lean: bool) -> bytes:
-    """Differences on the floor over distance, along and across the view, before and after a lean."""
+    """Differences on the floor over distance, along and across the view; also after a lean."""
 
     def draw(figure: Figure) -> None:
         left_of = np.column_stack([-pairs.away[:, 1], pairs.away[:, 0]])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import fields
 from typing import Any
 
@@ -23,11 +23,16 @@ from detect.settings import CircleSettings
 Picture = tuple[bytes, int, int] | str
 
 _NAMES = {"circles": "Discs", "lines": "Verticals", "markers": "Markers", "tilt": "Tilt"}
+_FATES = {"missed": "reference rows that are missing", "extra": "rows that fit no reference row"}
 _SIGMA = "\N{GREEK SMALL LETTER SIGMA}"
 
 
 def report_page(
-    inputs: ReportInputs, version: str, worst: int, picture_of: Callable[[str], Picture]
+    inputs: ReportInputs,
+    version: str,
+    worst: int,
+    picture_of: Callable[[str], Picture],
+    galleries: Sequence[tuple[str, bytes, int, int, int, int]] = (),
 ) -> bytes:
     """The whole page, UTF-8; the same inputs give the same bytes.
 
@@ -40,6 +45,9 @@ def report_page(
         How many of the worst frames are shown.
     picture_of : callable
         Gives the picture of a frame, by its prefix.
+    galleries : sequence
+        Of cut-outs: "missed" or "extra", a JPEG, its width and height, how many discs are shown,
+        and how many there are.
     """
     from jinja2 import Environment, StrictUndefined
     from markupsafe import Markup
@@ -47,6 +55,17 @@ def report_page(
     sections = [Section("summary", "What was found", _summary(inputs))]
     if "circles" in inputs.files.detected:
         sections.append(Section("discs", "Discs against the reference", disc_parts(inputs)))
+        sections[-1].parts.extend(
+            Part(
+                "figure",
+                f"{shown} of the {count} {_FATES[fate]}, evenly over the run; the outline is "
+                "wider than the disc.",
+                data_address(content, "jpeg"),
+                width,
+                height,
+            )
+            for fate, content, width, height, shown, count in galleries
+        )
     if "lines" in inputs.files.detected:
         sections.append(Section("verticals", "Verticals against the reference", line_parts(inputs)))
     sections.append(Section("frames", *_frames(inputs, worst, picture_of)))
