@@ -64,6 +64,8 @@ class CircleDetections:
         Otsu's quality at the pixel, 0 to 1.
     evidence : (N,) float64
         Log-odds that it is a disc; NaN if that was not looked at.
+    levelled_by : (float, float) or None
+        Pitch and roll (rad) that turned the positions level, if any did.
     """
 
     pixels: NDArray[np.int64]
@@ -71,6 +73,7 @@ class CircleDetections:
     covariance: FloatArray
     quality: FloatArray
     evidence: FloatArray
+    levelled_by: tuple[float, float] | None = None
 
     def __len__(self) -> int:
         return len(self.quality)

@@ -32,6 +32,7 @@ from storage.kernel_loading import load_kernels_alone
 if TYPE_CHECKING:
     from rich.console import Group
 
+    from detect.comparison.circles import Sight
     from detect.comparison.result import Rates
     from detect.run import ImageRun, Run
     from detect.runs.circles_run import DiscIds
@@ -376,13 +377,32 @@ def _compared_discs(command: Compare) -> tuple[Group, str, Rates]:
     from detect.comparison.circles import compare_runs
     from detect.comparison.report import comparison_tables, format_json
 
+    sight = _sight(command)
+    if sight is None and not command.options.on_floor:
+        print("no calibration: positions are compared on the floor; --camera names one")
     result = compare_runs(
         command.run,
         reference=command.reference,
         detected=command.detected,
         options=command.options,
+        sight=sight,
     )
     return comparison_tables(result), format_json(result), result
+
+
+def _sight(command: Compare) -> Sight | None:
+    """How rows come back into the images; None without a calibration."""
+    from camera import read_camera
+    from detect.comparison.circles import Sight
+    from detect.drawing.head import read_head
+    from detect.run import camera_in
+
+    camera = camera_in(command.run) if command.camera is None else read_camera(command.camera)
+    if camera is None:
+        return None
+    reference = read_head(command.reference or command.run / "map.circles")
+    detected = read_head(command.detected or command.run / "detected.circles")
+    return Sight(camera, detected.circle_settings.radius_m, reference.level)
 
 
 def _compared_lines(command: Compare) -> tuple[Group, str, Rates]:

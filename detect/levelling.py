@@ -36,14 +36,18 @@ def levelled(found: CircleDetections, camera: Camera, tilt: FrameTilt) -> Circle
         covariance,
         down,
     )
+    by = (tilt.pitch, tilt.roll)
     if all_down:
-        return CircleDetections(found.pixels, floor_xy, covariance, found.quality, found.evidence)
+        return CircleDetections(
+            found.pixels, floor_xy, covariance, found.quality, found.evidence, by
+        )
     return CircleDetections(
         pixels=found.pixels[down],
         floor_xy=floor_xy[down],
         covariance=covariance[down],
         quality=found.quality[down],
         evidence=found.evidence[down],
+        levelled_by=by,
     )
 
 

@@ -219,6 +219,9 @@ class Compare:
         Reference rows; by default map.circles (map.lines) in the run folder.
     detected : Path
         Detected rows; by default detected.circles (detected.lines) in the run folder.
+    camera : Path
+        Calibration, by default the one in the run folder: discs are compared in the image, each row
+        where it was seen. Without one, or with --gate-m or --sigma, on the floor.
     tolerance_deg : float
         Bearings of the same line differ by at most this,
     sigmas : float
@@ -237,6 +240,7 @@ class Compare:
     lines: bool = False
     reference: MaybePath = None
     detected: MaybePath = None
+    camera: MaybePath = None
     tolerance_deg: float = 0.5
     sigmas: float = 2.0
     min_recall: MaybeFloat = None

@@ -358,6 +358,19 @@ def read_image(
     return image
 
 
+def camera_in(folder: Path) -> Camera | None:
+    """The calibration in a run folder; None where there is none.
+
+    Raises
+    ------
+    DetectError, camera.CameraError
+        If there are several to choose from, or it cannot be read.
+    """
+    if not any(folder.glob("*.cam")):
+        return None
+    return read_camera(_only_camera(folder))
+
+
 def _only_camera(folder: Path) -> Path:
     cameras = sorted(folder.glob("*.cam"))
     if not cameras:

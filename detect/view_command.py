@@ -6,19 +6,20 @@ import os
 import shutil
 import tempfile
 from collections.abc import Iterable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.drawing.detections import circle_on_floor
-from detect.drawing.frame import ends_of, floor_projection, line_curves, sigma_bars
+from detect.drawing.frame import ends_of, line_curves, sigma_bars
 from detect.drawing.inputs import SeenRows, find_files, open_rows
 from detect.drawing.selection import select_frames
 from detect.errors import EXIT_FRAMES_FAILED, DetectError, FrameError
 from detect.run import Run, read_image
 from detect.runs.progress import print_failures, progress_bar
+from detect.seen import circle_on_floor, image_positions
 from detect.settings import CircleSettings
 from detect.sources.opening import demand_recording, open_source
 from detect.viewing_options import View
@@ -170,7 +171,7 @@ def _log_world(
 def _log_image(rr: Any, recording: Any, run: Run, rows: SeenRows, settings: CircleSettings) -> None:
     camera = run.camera
     if rows.circles is not None:
-        project = floor_projection(camera, rows.tilt if rows.levelled else None)
+        project = partial(image_positions, camera, levelled_by=rows.levelled_by)
         seen = [
             (project(circle_on_floor(np.array([row.px, row.py]), settings.radius_m)), row.quality)
             for row in rows.circles

@@ -12,7 +12,7 @@ from tyro.conf import OmitArgPrefixes, arg
 
 from detect.comparison.result import CompareError, CompareOptions
 from detect.exports.options import Export
-from detect.flags import MaybeInt, MaybePath, MaybeStr, PickedFrames, Preset, RunFlags
+from detect.flags import MaybeFloat, MaybeInt, MaybePath, MaybeStr, PickedFrames, Preset, RunFlags
 from detect.line_settings import LineSettings
 from detect.settings import CircleSettings
 from detect.sources.options import SourceOptions
@@ -61,19 +61,22 @@ class Gates:
     Parameters
     ----------
     gate_m : float
-        Largest distance between a detected and a reference disc that are the same, metres.
+        Largest distance on the floor between a detected and a reference disc that are the same,
+        metres; by default, discs are the same that were seen at the same place in the image.
     tolerance_deg : float
         Bearings of the same vertical differ by at most this,
     sigmas : float
         or by this many standard deviations of the detected one.
     """
 
-    gate_m: float = 0.10
+    gate_m: MaybeFloat = None
     tolerance_deg: float = 0.5
     sigmas: float = 2.0
 
     def __post_init__(self) -> None:
-        demand(self, CompareError, gate_m=ABOVE_0, tolerance_deg=ABOVE_0, sigmas=NOT_NEGATIVE)
+        demand(self, CompareError, tolerance_deg=ABOVE_0, sigmas=NOT_NEGATIVE)
+        if self.gate_m is not None:
+            demand(self, CompareError, gate_m=ABOVE_0)
 
     @property
     def discs(self) -> CompareOptions:

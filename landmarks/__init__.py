@@ -46,7 +46,14 @@ from landmarks.tilts import (
     read_tilts,
     tilt_as_written,
 )
-from landmarks.writing import format_frame, format_head, format_record, write_frames, write_rows
+from landmarks.writing import (
+    format_frame,
+    format_head,
+    format_levelling,
+    format_record,
+    write_frames,
+    write_rows,
+)
 
 __all__ = [
     "Association",
@@ -72,6 +79,7 @@ __all__ = [
     "circle_landmarks",
     "format_frame",
     "format_head",
+    "format_levelling",
     "format_no_tilt",
     "format_record",
     "format_tilt",

@@ -44,6 +44,8 @@ _NUMBER_PATTERN = rb"[+-]?(?:[0-9]++(?:\.[0-9]*+)?|\.[0-9]++)(?:[eE][+-]?[0-9]++
 _NUMBER = re.compile(_NUMBER_PATTERN)
 _NUMBERS = re.compile(rb"(?:%b )*+" % _NUMBER_PATTERN)
 _WHOLE_NUMBER = re.compile(rb"[+-]?[0-9]+")
+# A comment, so that programs that know nothing of it read the file as well.
+_LEVELLED = re.compile(rb"# levelled (%b) (%b)\r?\n?" % (_NUMBER_PATTERN, _NUMBER_PATTERN))
 # A STEP as programs write it, in a line of its own: of a long run all are. Such numbers are finite.
 _PLAIN_STEP = re.compile(
     rb"STEP ((?!#)[!-\[\]-~]{1,255}+)"
@@ -125,19 +127,21 @@ def iterate_prefixes(path: str | os.PathLike[str]) -> Iterator[str]:
 
 
 def frames_of_rows(rows: Iterable[Row]) -> Iterator[Frame]:
-    """Gather rows to frames; comments and detector settings are left out."""
+    """Gather rows to frames; detector settings are left out, and comments but ``# levelled``."""
     step: Step | None = None
     landmarks: list[Landmark] = []
+    levelled_by: tuple[float, float] | None = None
     for row in rows:
         if isinstance(row.record, Step):
             if step is not None:
-                yield Frame(step, tuple(landmarks))
-            step = row.record
-            landmarks = []
+                yield Frame(step, tuple(landmarks), levelled_by)
+            step, landmarks, levelled_by = row.record, [], None
         elif isinstance(row.record, Landmark):
             landmarks.append(row.record)
+        elif row.source is not None and (found := _LEVELLED.fullmatch(row.source)):
+            levelled_by = float(found[1]), float(found[2])
     if step is not None:
-        yield Frame(step, tuple(landmarks))
+        yield Frame(step, tuple(landmarks), levelled_by)
 
 
 def parse_rows(stream: BinaryIO, name: str = "<stream>") -> Iterator[Row]:

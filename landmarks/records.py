@@ -249,10 +249,20 @@ Record = Step | Landmark | DetectorSettings
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """A step and what was seen in the image taken after it."""
+    """A step and what was seen in the image taken after it.
+
+    Attributes
+    ----------
+    step : Step
+    landmarks : tuple of Landmark
+    levelled_by : (float, float) or None
+        Pitch and roll (rad) that turned the positions of its discs level; None: they are where the
+        camera as calibrated sees them.
+    """
 
     step: Step
     landmarks: tuple[Landmark, ...] = ()
+    levelled_by: tuple[float, float] | None = None
 
     @property
     def circles(self) -> tuple[CircleLandmark, ...]:

@@ -51,6 +51,12 @@ def format_record(record: Record) -> str:
     return " ".join([text, *(f"{identifier:d}" for identifier in record.ids)])
 
 
+def format_levelling(levelled_by: tuple[float, float]) -> str:
+    """The comment behind a STEP that says by which pitch and roll (rad) its discs were levelled."""
+    pitch, roll = levelled_by
+    return f"# levelled {pitch:.9f} {roll:.9f}"
+
+
 def format_head(head: str, line_end: LineEnd = "\n") -> bytes:
     """A text as the comments at the head of a file: a ``#`` before each of its lines."""
     lines = head.split("\n") if head else []
@@ -58,9 +64,11 @@ def format_head(head: str, line_end: LineEnd = "\n") -> bytes:
 
 
 def format_frame(frame: Frame, line_end: LineEnd = "\n") -> bytes:
-    """The rows of a frame as they stand in a file: its STEP and its landmarks."""
-    records = (frame.step, *frame.landmarks)
-    return _encode("".join([format_record(record) + line_end for record in records]))
+    """The rows of a frame as they stand in a file: its STEP, its levelling and its landmarks."""
+    rows = [format_record(record) for record in (frame.step, *frame.landmarks)]
+    if frame.levelled_by is not None:
+        rows.insert(1, format_levelling(frame.levelled_by))
+    return _encode("".join([row + line_end for row in rows]))
 
 
 def write_frames(

@@ -1,14 +1,16 @@
 """Detected discs held against reference rows of the same run.
 
 Frames are matched by the names of their images; in each, detected rows are paired with reference
-rows one to one within a gate. What is left over on either side is missed or extra.
+rows one to one within a gate: in the image, each where it was seen, or on the floor. What is left
+over on either side is missed or extra. Where on the floor each puts a disc is a second question:
+its differences, and the tilt and height of the camera that would explain them.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import accumulate, pairwise
 from math import inf, isfinite
 from pathlib import Path
@@ -16,22 +18,31 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from camera import Camera
 from detect.comparison.figures import fraction, normalised_error, quantile
+from detect.comparison.lean import Lean, common_lean
 from detect.comparison.pairing import FrameMatch, match_rows, pair_frames, shown_name
 from detect.comparison.result import (
+    CommonLean,
     CompareError,
     CompareOptions,
     Comparison,
+    DiscPairs,
     DistanceBin,
     ErrorCovariance,
+    FloorBin,
+    FloorDifference,
     FrameScore,
+    Levelling,
     NormalisedError,
 )
 from detect.runs.image_names import image_name
+from detect.seen import FrameView, Tilt, image_positions, level_seen
 from landmarks import (
     Association,
     CircleLandmark,
     Frame,
+    associate,
     associate_positions,
     associate_within_covariance,
     circle_arrays,
@@ -47,6 +58,34 @@ BoolArray = NDArray[np.bool_]
 
 # The forward distances for which the data set's own qualities are known.
 DISTANCE_EDGES_M = (0.8, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0)
+#: Of rows that are compared on the floor, where nothing else is said (m).
+FLOOR_GATE_M = 0.10
+RADIUS_M = 0.10
+
+
+@dataclass(frozen=True, slots=True)
+class Sight:
+    """How rows come back into the images.
+
+    Attributes
+    ----------
+    camera : Camera
+    radius_m : float
+        Of the discs.
+    reference_level : bool
+        Reference rows are level though they do not say by which tilt: they are seen through that
+        of the detected rows.
+    """
+
+    camera: Camera
+    radius_m: float = RADIUS_M
+    reference_level: bool = False
+
+    def of(self, reference_by: Tilt | None, detected_by: Tilt | None) -> FrameView:
+        """The view of a frame whose rows these tilts levelled."""
+        if self.reference_level and reference_by is None:
+            reference_by = detected_by
+        return FrameView(self.camera, self.radius_m, reference_by, detected_by)
 
 
 def compare_runs(
@@ -55,6 +94,7 @@ def compare_runs(
     reference: str | os.PathLike[str] | None = None,
     detected: str | os.PathLike[str] | None = None,
     options: CompareOptions | None = None,
+    sight: Sight | None = None,
 ) -> Comparison:
     """Compare a run's detected discs with its reference rows.
 
@@ -66,6 +106,8 @@ def compare_runs(
         By default ``map.circles`` and ``detected.circles`` in that folder.
     options : CompareOptions, optional
         What counts as the same disc, and which rows count.
+    sight : Sight, optional
+        How rows come back into the images; without it, they are compared on the floor.
 
     Returns
     -------
@@ -86,6 +128,7 @@ def compare_runs(
         read_frames(reference),
         read_frames(detected),
         options or CompareOptions(),
+        sight=sight,
         reference_name=os.fspath(reference),
         detected_name=os.fspath(detected),
     )
@@ -96,6 +139,7 @@ def compare_frames(
     detected: Iterable[Frame],
     options: CompareOptions,
     *,
+    sight: Sight | None = None,
     reference_name: str = "reference",
     detected_name: str = "detected",
 ) -> Comparison:
@@ -103,6 +147,7 @@ def compare_frames(
 
     See `compare_runs`.
     """
+    reference, detected = list(reference), list(detected)
     paired = pair_frames(
         reference,
         detected,
@@ -111,11 +156,27 @@ def compare_frames(
         reference_name=reference_name,
         detected_name=detected_name,
     )
-    matches = [_match_frame(*frame, options) for frame in paired.frames]
+    in_image = sight is not None and not options.on_floor
+    if not in_image and options.gate_m is None:
+        options = replace(options, gate_m=FLOOR_GATE_M)
+    wanted_by, found_by = _levelled_by(reference), _levelled_by(detected)
+    views = [
+        None if sight is None else sight.of(wanted_by.get(name), found_by.get(name))
+        for name, *_ in paired.frames
+    ]
+    matches = [
+        _match_frame(*frame, options, view if in_image else None)
+        for frame, view in zip(paired.frames, views)
+    ]
     wanted = _pool([(match.reference, match.pairs.first) for match in matches])
     found = _pool([(match.detected, match.pairs.second) for match in matches])
-    offset_xy = found.xy[found.paired] - wanted.xy[wanted.paired]
-    error_m = np.asarray(np.linalg.norm(offset_xy, axis=1), dtype=np.float64)
+    apart_px = _apart_px(matches, views)
+    covariance = _error_covariance(wanted, found, options.error_covariance)
+    lean, pairs = _floor_pairs(
+        wanted.xy[wanted.paired], found.xy[found.paired], covariance, matches, sight
+    )
+    error_m = np.asarray(np.linalg.norm(pairs.offset, axis=1), dtype=np.float64)
+    names = [name for name, *_ in paired.frames]
     return Comparison(
         reference_name=reference_name,
         detected_name=detected_name,
@@ -128,17 +189,22 @@ def compare_frames(
         precision=_mean(found.is_paired),
         error_median_m=quantile(error_m, 0.5),
         error_95_m=quantile(error_m, 0.95),
-        normalised_error=_normalised_error(
-            offset_xy, _error_covariance(wanted, found, options.error_covariance)
-        ),
+        normalised_error=_normalised_error(pairs.offset, covariance),
         reference_quality_matched=quantile(wanted.quality[wanted.is_paired], 0.5),
         reference_quality_missed=quantile(wanted.quality[~wanted.is_paired], 0.5),
         detected_quality_matched=quantile(found.quality[found.is_paired], 0.5),
         detected_quality_extra=quantile(found.quality[~found.is_paired], 0.5),
-        bins=tuple(
-            _distance_bin(from_m, to_m, wanted, found, error_m)
-            for from_m, to_m in pairwise((-inf, *DISTANCE_EDGES_M, inf))
+        bins=tuple(_distance_bin(*ends, wanted, found, error_m) for ends in _ranges()),
+        in_image=in_image,
+        image_median_px=quantile(apart_px, 0.5),
+        image_95_px=quantile(apart_px, 0.95),
+        reference_levelling=_levelling(
+            names, wanted_by, true=sight is not None and sight.reference_level
         ),
+        detected_levelling=_levelling(names, found_by),
+        floor=_floor_bins(pairs, lean),
+        lean=_stated(lean, pairs),
+        pairs=pairs,
         frames=_frame_scores(matches, error_m),
         frames_only_in_reference=paired.only_in_reference,
         frames_only_in_detected=paired.only_in_detected,
@@ -161,6 +227,7 @@ def _match_frame(
     reference: Sequence[CircleLandmark],
     detected: Sequence[CircleLandmark],
     options: CompareOptions,
+    view: FrameView | None,
 ) -> FrameMatch[CircleLandmark]:
     measurable = is_positive_definite(circle_arrays(reference).covariance)
     if options.sigma is not None and not measurable.all():
@@ -172,13 +239,16 @@ def _match_frame(
         name,
         reference,
         detected,
-        lambda some, others: pair_discs(some, others, options),
+        lambda some, others: pair_discs(some, others, options, view),
         only_identified=options.only_identified,
     )
 
 
 def pair_discs(
-    reference: Sequence[CircleLandmark], detected: Sequence[CircleLandmark], options: CompareOptions
+    reference: Sequence[CircleLandmark],
+    detected: Sequence[CircleLandmark],
+    options: CompareOptions,
+    view: FrameView | None = None,
 ) -> Association:
     """Pair discs one to one.
 
@@ -188,16 +258,26 @@ def pair_discs(
         Rows of one frame.
     options : CompareOptions
         The gate.
+    view : FrameView, optional
+        How the rows come back into the image: compares there, unless the options ask for the floor.
 
     Returns
     -------
     Association
         As many pairs of reference (first) and detected rows (second) as possible, and of those with
-        the least sum of squared distances.
+        the least sum of squared distances (in the image: in units of the gate).
     """
     first, second = circle_arrays(reference), circle_arrays(detected)
+    if view is not None and not options.on_floor:
+        seen = image_positions(view.camera, first.xy, view.reference_by)
+        again = image_positions(view.camera, second.xy, view.detected_by)
+        gate = view.gates(first.xy, options.least_px)
+        apart = (again[None] - seen[:, None]) / gate[:, None]
+        cost = np.where(np.isfinite(apart).all(axis=-1), (apart**2).sum(axis=-1), np.inf)
+        return associate(np.minimum(cost, 2.0), cost <= 1.0)
     if options.sigma is None:
-        return associate_positions(first.xy, second.xy, gate_m=options.gate_m)
+        gate_m = FLOOR_GATE_M if options.gate_m is None else options.gate_m
+        return associate_positions(first.xy, second.xy, gate_m=gate_m)
     return associate_within_covariance(
         first.xy, second.xy, first.covariance, gate_sigma=options.sigma
     )
@@ -228,6 +308,115 @@ def _normalised_error(offset_xy: FloatArray, covariance: FloatArray) -> Normalis
         squared_mahalanobis(offset_xy[usable], covariance[usable]),
         dof_per_row=2,
         left_out=int((~usable).sum()),
+    )
+
+
+def _ranges() -> list[tuple[float, float]]:
+    return list(pairwise((-inf, *DISTANCE_EDGES_M, inf)))
+
+
+def _levelled_by(frames: Sequence[Frame]) -> dict[str, Tilt]:
+    return {
+        image_name(frame.step.prefix): frame.levelled_by
+        for frame in frames
+        if frame.levelled_by is not None
+    }
+
+
+def _levelling(names: Sequence[str], by: Mapping[str, Tilt], *, true: bool = False) -> Levelling:
+    tilts = np.degrees([by[name] for name in names if name in by]).reshape(-1, 2)
+    return Levelling(
+        len(names),
+        len(tilts),
+        true and not len(tilts),
+        quantile(tilts[:, 0], 0.5),
+        quantile(tilts[:, 1], 0.5),
+    )
+
+
+def _apart_px(
+    matches: Sequence[FrameMatch[CircleLandmark]], views: Sequence[FrameView | None]
+) -> FloatArray:
+    """Distances of matched rows in the image."""
+    apart = [np.zeros(0)]
+    for match, view in zip(matches, views):
+        if view is None or not len(match.pairs.first):
+            continue
+        first = circle_arrays([match.reference[i] for i in match.pairs.first]).xy
+        second = circle_arrays([match.detected[j] for j in match.pairs.second]).xy
+        offset = image_positions(view.camera, second, view.detected_by) - image_positions(
+            view.camera, first, view.reference_by
+        )
+        apart.append(np.linalg.norm(offset, axis=1))
+    together = np.concatenate(apart)
+    return together[np.isfinite(together)]
+
+
+def _floor_pairs(
+    reference_xy: FloatArray,
+    detected_xy: FloatArray,
+    covariance: FloatArray,
+    matches: Sequence[FrameMatch[CircleLandmark]],
+    sight: Sight | None,
+) -> tuple[Lean | None, DiscPairs]:
+    offset = detected_xy - reference_xy
+    left, lean, centre = offset, None, np.zeros(2)
+    if sight is not None:
+        centre = sight.camera.centre[:2]
+        of = np.repeat(np.arange(len(matches)), [len(match.pairs.first) for match in matches])
+        lean = common_lean(sight.camera, reference_xy, detected_xy, of)
+        if lean is not None:
+            level = level_seen(sight.camera, reference_xy, lean.tilt, lean.raised_m)
+            left = detected_xy - level
+    away = reference_xy - centre
+    away = away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)
+    return lean, DiscPairs(reference_xy, offset, left, covariance, away)
+
+
+def _stated(lean: Lean | None, pairs: DiscPairs) -> CommonLean | None:
+    if lean is None:
+        return None
+    sigma_p, sigma_r, sigma_h = lean.sigma
+    seen = np.isfinite(pairs.left).all(axis=1)
+    return CommonLean(
+        pitch_deg=float(np.degrees(lean.pitch_rad)),
+        pitch_sigma_deg=float(np.degrees(sigma_p)),
+        roll_deg=float(np.degrees(lean.roll_rad)),
+        roll_sigma_deg=float(np.degrees(sigma_r)),
+        raised_m=lean.raised_m,
+        raised_sigma_m=sigma_h,
+        left=_difference(pairs.left, pairs.away),
+        normalised_error=_normalised_error(pairs.left[seen], pairs.covariance[seen]),
+    )
+
+
+def _floor_bins(pairs: DiscPairs, lean: Lean | None) -> tuple[FloorBin, ...]:
+    forward = -pairs.reference_xy[:, 1]
+    bins = []
+    for from_m, to_m in _ranges():
+        here = (from_m <= forward) & (forward < to_m)
+        bins.append(
+            FloorBin(
+                from_m if isfinite(from_m) else None,
+                to_m if isfinite(to_m) else None,
+                _difference(pairs.offset[here], pairs.away[here]),
+                None if lean is None else _difference(pairs.left[here], pairs.away[here]),
+            )
+        )
+    return tuple(bins)
+
+
+def _difference(offset: FloatArray, away: FloatArray) -> FloorDifference:
+    seen = np.isfinite(offset).all(axis=1)
+    offset, away = offset[seen], away[seen]
+    size = np.asarray(np.linalg.norm(offset, axis=1), dtype=np.float64)
+    return FloorDifference(
+        pairs=len(offset),
+        median_m=quantile(size, 0.5),
+        most_m=quantile(size, 0.95),
+        along_m=quantile((offset * away).sum(axis=1), 0.5),
+        # Forward is -Y and left is X: left of a direction is it turned from -Y to X.
+        across_m=quantile(away[:, 0] * offset[:, 1] - away[:, 1] * offset[:, 0], 0.5),
     )
 
 

@@ -6,6 +6,9 @@ from dataclasses import dataclass, field
 from math import isfinite
 from typing import Literal, Protocol
 
+import numpy as np
+from numpy.typing import NDArray
+
 ErrorCovariance = Literal["detected", "reference", "sum"]
 
 
@@ -19,11 +22,16 @@ class CompareOptions:
 
     Attributes
     ----------
-    gate_m : float
-        Largest distance between a detected and a reference row of the same disc (m).
+    gate_m : float or None
+        Compare positions on the floor: the largest distance between a detected and a reference row
+        of the same disc (m). By default the image is compared where there is a calibration: each
+        row where it was seen; without one, 0.1 m.
     sigma : float or None
-        If given, used instead: the largest Mahalanobis distance under the reference row's
+        Compare on the floor, too: the largest Mahalanobis distance under the reference row's
         covariance (standard deviations).
+    least_px : float
+        In the image, rows are the same if they differ by at most half the width and height of the
+        disc's own image, or by this (px), whichever is more.
     only_identified : bool
         Count only reference rows that have an ID. Detected rows that fit a reference row without
         one are then neither right nor wrong: they are set aside.
@@ -34,16 +42,23 @@ class CompareOptions:
         or, where both err independently, their sum.
     """
 
-    gate_m: float = 0.10
+    gate_m: float | None = None
     sigma: float | None = None
+    least_px: float = 3.0
     only_identified: bool = False
     all_frames: bool = False
     error_covariance: ErrorCovariance = "detected"
 
     def __post_init__(self) -> None:
-        for name, gate in (("gate_m", self.gate_m), ("sigma", self.sigma)):
+        gates = {"gate_m": self.gate_m, "sigma": self.sigma, "least_px": self.least_px}
+        for name, gate in gates.items():
             if gate is not None and not (isfinite(gate) and gate > 0):
                 raise CompareError(f"{name} is {gate}: expected a positive number")
+
+    @property
+    def on_floor(self) -> bool:
+        """Whether rows are to be compared on the floor even where there is a calibration."""
+        return self.gate_m is not None or self.sigma is not None
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,6 +123,93 @@ class NormalisedError:
 
 
 @dataclass(frozen=True, slots=True)
+class Levelling:
+    """How many frames' rows are levelled, and by what (medians, degrees; None where none are).
+
+    `true` says that rows are level positions that no tilt was applied to.
+    """
+
+    frames: int
+    levelled: int
+    true: bool
+    pitch_deg: float | None = None
+    roll_deg: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class FloorDifference:
+    """Detected minus reference positions on the floor of matched rows.
+
+    Attributes
+    ----------
+    pairs : int
+    median_m, most_m : float or None
+        Median and 95 % quantile of the distance.
+    along_m, across_m : float or None
+        Medians along the viewing direction (positive: farther away) and across (to the left).
+    """
+
+    pairs: int
+    median_m: float | None
+    most_m: float | None
+    along_m: float | None
+    across_m: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class FloorBin:
+    """Floor differences at a range of forward distances, before and after the common lean."""
+
+    from_m: float | None
+    to_m: float | None
+    before: FloorDifference
+    after: FloorDifference | None
+
+
+@dataclass(frozen=True, slots=True)
+class CommonLean:
+    """What constant tilt and height of the camera explain the differences, and what is left.
+
+    Each figure with its standard deviation; positive pitch and roll as in a ``.tilt`` file.
+    """
+
+    pitch_deg: float
+    pitch_sigma_deg: float
+    roll_deg: float
+    roll_sigma_deg: float
+    raised_m: float
+    raised_sigma_m: float
+    left: FloorDifference
+    normalised_error: NormalisedError
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DiscPairs:
+    """Matched rows.
+
+    Attributes
+    ----------
+    reference_xy : (N, 2) float64
+        Metres.
+    offset, left : (N, 2) float64
+        Detected minus reference positions on the floor (m), before and after the common lean.
+    covariance : (N, 2, 2) float64
+        That errors are measured in.
+    away : (N, 2) float64
+        Unit vectors on the floor along which the camera sees the discs.
+    """
+
+    reference_xy: NDArray[np.float64]
+    offset: NDArray[np.float64]
+    left: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    away: NDArray[np.float64]
+
+
+NO_PAIRS = DiscPairs(*(np.zeros((0, 2)),) * 3, np.zeros((0, 2, 2)), np.zeros((0, 2)))
+
+
+@dataclass(frozen=True, slots=True)
 class Comparison:
     """How a run's detected discs compare with reference rows.
 
@@ -131,6 +233,14 @@ class Comparison:
     detected_quality_matched: float | None
     detected_quality_extra: float | None
     bins: tuple[DistanceBin, ...]
+    in_image: bool
+    image_median_px: float | None
+    image_95_px: float | None
+    reference_levelling: Levelling
+    detected_levelling: Levelling
+    floor: tuple[FloorBin, ...]
+    lean: CommonLean | None
+    pairs: DiscPairs = field(repr=False)
     frames: tuple[FrameScore, ...] = field(repr=False)
     frames_only_in_reference: tuple[str, ...] = field(repr=False)
     frames_only_in_detected: tuple[str, ...] = field(repr=False)

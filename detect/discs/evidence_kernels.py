@@ -61,7 +61,7 @@ def evidence_of(
 CLEAR_EVIDENCE = 6.0
 #: The rim is followed where a radius is this many pixels (the geometric mean over directions).
 LEAST_RIM_PX = 5.0
-#: The share of the rim, and the range of its radius, that a disc needs which its fit speaks against.
+#: Where the fit speaks against a disc, its rim needs this share in view, and this radius.
 LEAST_RIM = 0.4
 RIM_RADIUS_RANGE = (0.83, 1.12)
 #: Radius of a rim that fits best, relative to the nominal one: where the grey value changes most
@@ -107,7 +107,7 @@ def evidence_with_rim(
         - 0.38 * min(rim.runs, 4)
         - 3.77 * abs(math.log(max(relative, 0.1) / RIM_RADIUS))
         + 0.94 * math.log(min(max(abs(contrast), 1.0), 80.0) / 40.0)
-        + 1.0 * math.log(min(max(abs(contrast), 1.0), 40.0) / 40.0)
+        + math.log(min(max(abs(contrast), 1.0), 40.0) / 40.0)
     )
 
 

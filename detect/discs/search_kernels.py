@@ -178,7 +178,7 @@ def _with_rim(
     told: float,
     result: NDArray[np.float64],
 ) -> float:
-    """The evidence of a doubtful fit with its rim; a partly hidden disc's place becomes the rim's."""
+    """The evidence of a doubtful fit with its rim, which also places a partly hidden disc."""
     relative = result[fit.RADIUS] / search.radius
     possible = (
         RADIUS_RANGE[0] < relative < RADIUS_RANGE[1] and result[fit.MIDDLE_STEP] > LEAST_MIDDLE_STEP

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from camera import Camera
 from detect.drawing.strokes import Colour, draw_curve, draw_text, enlargement
+from detect.seen import circle_on_floor
 from detect.settings import CircleSettings
 
 if TYPE_CHECKING:
@@ -17,7 +18,6 @@ if TYPE_CHECKING:
 
 FloatArray = NDArray[np.float64]
 
-_POINTS = 64
 EDGE_COLOUR: Colour = (0, 170, 255)
 _OUTLINE_COLOUR: Colour = (60, 200, 60)
 _TEXT_COLOUR: Colour = (0, 230, 255)
@@ -90,9 +90,3 @@ def outline_disc(
         times = enlargement(canvas)
         at = (round(float(u)) - 14 * times, max(10 * times, round(float(v)) - 3 * times))
         draw_text(canvas, text, at, _TEXT_COLOUR)
-
-
-def circle_on_floor(centre_xy: FloatArray, radius_m: float) -> FloatArray:
-    """(N, 2) points round a circle on the floor (m)."""
-    angle = 2.0 * np.pi * np.arange(_POINTS) / _POINTS
-    return np.asarray(centre_xy + radius_m * np.stack([np.cos(angle), np.sin(angle)], axis=-1))

@@ -9,7 +9,8 @@ rows that fit none have another colour.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,19 +20,16 @@ from detect.comparison.circles import pair_discs
 from detect.comparison.lines import joined_lines, pair_lines
 from detect.comparison.lines_result import LineCompareOptions
 from detect.comparison.result import CompareOptions
-from detect.drawing.detections import EDGE_COLOUR, circle_on_floor, outline_disc
+from detect.drawing.detections import EDGE_COLOUR, outline_disc
 from detect.drawing.inputs import SeenRows
 from detect.drawing.strokes import Colour, draw_curve, draw_text, enlargement
+from detect.seen import FrameView, circle_on_floor, image_positions
 from detect.settings import CircleSettings
-from detect.verticals.tilt import level_rotation
 from landmarks import (
     CircleLandmark,
-    FrameTilt,
     LineLandmark,
     MarkerLandmark,
     circle_arrays,
-    is_positive_definite,
-    squared_mahalanobis,
     wrap_angle,
 )
 
@@ -83,9 +81,9 @@ def draw_rows(
         if rows.lines is not None:
             words.append(_draw_lines(canvas, camera, rows.lines, rows.reference_lines, line_gate))
         if rows.circles is not None:
-            project = floor_projection(camera, rows.tilt if rows.levelled else None)
+            view = FrameView(camera, settings.radius_m, rows.reference_by, rows.levelled_by)
             words.append(
-                _draw_discs(canvas, project, rows.circles, rows.reference_circles, settings, gate)
+                _draw_discs(canvas, view, rows.circles, rows.reference_circles, settings, gate)
             )
     if rows.markers is not None:
         words.append(_draw_markers(canvas, rows.markers))
@@ -97,32 +95,6 @@ def draw_rows(
     at = (4 * times, (_LEGEND_PX - 5) * times)
     draw_text(legend, "   ".join(words), at, _WORDS_COLOUR, 0.38)
     return np.concatenate([canvas, legend])
-
-
-def floor_projection(camera: Camera, tilt: FrameTilt | None) -> Callable[[FloatArray], FloatArray]:
-    """Where places on the floor are seen by a robot that is tilted.
-
-    Parameters
-    ----------
-    camera : Camera
-        The camera as calibrated on the level robot.
-    tilt : FrameTilt or None
-        The tilt (see `landmarks.FrameTilt`), about the origin of the robot frame; None is level.
-
-    Returns
-    -------
-    callable
-        From (..., 2) places in the level robot frame (m) to (..., 2) pixels; NaN where not seen.
-    """
-    if tilt is None:
-        return camera.project_floor
-    rotation = level_rotation(tilt.pitch, tilt.roll)
-
-    def project(floor_xy: FloatArray) -> FloatArray:
-        # The rotation turns measured directions level; its transpose turns level ones back.
-        return camera.project_robot(np.asarray(floor_xy) @ rotation[:2])
-
-    return project
 
 
 def line_curves(camera: Camera, ends: FloatArray) -> FloatArray:
@@ -186,28 +158,28 @@ def ends_of(rows: Sequence[LineLandmark]) -> FloatArray:
 
 def _draw_discs(
     canvas: NDArray[np.uint8],
-    project: Callable[[FloatArray], FloatArray],
+    view: FrameView,
     found: Sequence[CircleLandmark],
     wanted: Sequence[CircleLandmark] | None,
     settings: CircleSettings,
     gate: CompareOptions,
 ) -> str:
+    camera = view.camera
+    project = partial(image_positions, camera, levelled_by=view.detected_by)
     places = circle_arrays(found)
     colours = [EDGE_COLOUR if wanted is None else _EXTRA_COLOUR] * len(found)
     texts = [f"{row.quality:.2f}" for row in found]
     words = f"{len(found)} discs"
     if wanted is not None:
-        pairs = pair_discs(wanted, found, gate)
-        reference = circle_arrays(wanted)
-        for i, j in zip(pairs.first, pairs.second):
+        pairs = pair_discs(wanted, found, gate, view)
+        reference_xy = circle_arrays(wanted).xy
+        at = partial(image_positions, camera, levelled_by=view.reference_by)
+        apart = project(places.xy[pairs.second]) - at(reference_xy[pairs.first])
+        for j, size in zip(pairs.second, np.hypot(*apart.T)):
             colours[j] = EDGE_COLOUR
-            offset = places.xy[j] - reference.xy[i]
-            texts[j] += f" {1000.0 * float(np.hypot(*offset)):.0f}mm"
-            if is_positive_definite(places.covariance[j : j + 1])[0]:
-                squared = squared_mahalanobis(offset[None], places.covariance[j : j + 1])
-                texts[j] += f" {float(np.sqrt(squared[0])):.1f}sd"
+            texts[j] += f" {size:.1f}px"
         for i in pairs.first_alone:
-            edge = project(circle_on_floor(reference.xy[i], settings.radius_m))
+            edge = at(circle_on_floor(reference_xy[i], settings.radius_m))
             draw_curve(canvas, edge, _MISSED_COLOUR, closed=True)
         words += _fate(len(pairs.second_alone), len(pairs.first_alone))
     for centre, text, colour in zip(places.xy, texts, colours):

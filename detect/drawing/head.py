@@ -10,7 +10,7 @@ from typing import Any
 
 from detect.errors import DetectError
 from detect.line_settings import LineSettings
-from detect.runs.circles_run import LEVELLED
+from detect.runs.circles_run import LEVEL, LEVELLED
 from detect.settings import CircleSettings
 from detect.tune.grid import parameter_value
 from storage.messages import excerpt
@@ -32,15 +32,16 @@ class FileHead:
         Its lines without the signs of comment.
     settings : tuple of (str, str)
         The effective settings: names and values, as they are written.
-    levelled : bool
-        Whether it says that positions of discs are corrected for the frames' tilts.
+    level : bool
+        Whether it says that positions of discs are corrected for the frames' tilts, or true ones
+        in the level robot frame.
     name : str
         What messages call the file.
     """
 
     comments: tuple[str, ...] = ()
     settings: tuple[tuple[str, str], ...] = ()
-    levelled: bool = False
+    level: bool = False
     name: str = ""
 
     @property
@@ -101,8 +102,8 @@ def read_head(path: Path) -> FileHead:
         for name, equals, value in (word.partition("=") for word in text.split()[1:])
         if equals
     )
-    levelled = any(LEVELLED in text for text in comments)
-    return FileHead(tuple(comments), settings, levelled, str(path))
+    level = any(LEVELLED in text or LEVEL in text for text in comments)
+    return FileHead(tuple(comments), settings, level, str(path))
 
 
 def _line_values(settings: Iterable[tuple[str, str]]) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 
 from detect.drawing.head import FileHead, read_head
@@ -10,6 +11,7 @@ from detect.errors import DetectError
 from detect.run import ImageRun
 from detect.runs.by_image import FramesByImage, TiltsByImage
 from detect.runs.image_names import image_name
+from detect.seen import Tilt
 from detect.viewing_options import RowFiles
 from landmarks import CircleLandmark, FrameTilt, LineLandmark, MarkerLandmark
 
@@ -26,8 +28,10 @@ class SeenRows:
         Detected.
     tilt : FrameTilt or None
         None also where the frame has none.
-    levelled : bool
-        Whether the discs' positions are corrected for it.
+    levelled_by : (float, float) or None
+        Pitch and roll that turned the discs' positions level.
+    reference_by : (float, float) or None
+        The same of the reference rows.
     reference_circles, reference_lines : tuple of rows or None
         What they are held against; None also where that file does not know the image.
     """
@@ -36,7 +40,8 @@ class SeenRows:
     lines: tuple[LineLandmark, ...] | None = None
     markers: tuple[MarkerLandmark, ...] | None = None
     tilt: FrameTilt | None = None
-    levelled: bool = False
+    levelled_by: Tilt | None = None
+    reference_by: Tilt | None = None
     reference_circles: tuple[CircleLandmark, ...] | None = None
     reference_lines: tuple[LineLandmark, ...] | None = None
 
@@ -60,6 +65,16 @@ class SeenFiles:
     reference_circles: Path | None
     reference_lines: Path | None
 
+    @cached_property
+    def reference_level(self) -> bool:
+        """Whether the reference rows of discs are level, whatever the tilt was."""
+        return self.reference_circles is not None and read_head(self.reference_circles).level
+
+    @property
+    def radius_m(self) -> float:
+        """Of the discs."""
+        return self.heads.get("circles", FileHead()).circle_settings.radius_m
+
 
 @dataclass(frozen=True)
 class RowSource:
@@ -74,13 +89,17 @@ class RowSource:
         found = {kind: source.get(prefix) for kind, source in self._frames.items()}
         circles, lines, markers = (found.get(kind) for kind in KINDS[:3])
         wanted, wanted_lines = found.get("reference_circles"), found.get("reference_lines")
-        head = self.files.heads.get("circles")
+        levelled_by = None if circles is None else circles.levelled_by
+        reference_by = None if wanted is None else wanted.levelled_by
+        if reference_by is None and self.files.reference_level:
+            reference_by = levelled_by
         return SeenRows(
             circles=None if circles is None else circles.circles,
             lines=None if lines is None else lines.lines,
             markers=None if markers is None else markers.markers,
             tilt=None if self._tilts is None else self._tilts.get(prefix),
-            levelled=head is not None and head.levelled,
+            levelled_by=levelled_by,
+            reference_by=reference_by,
             reference_circles=None if wanted is None else wanted.circles,
             reference_lines=None if wanted_lines is None else wanted_lines.lines,
         )

@@ -7,9 +7,16 @@ from typing import Any
 import numpy as np
 
 from detect.comparison.lines_result import LineComparison
+from detect.comparison.report import lean_text, levelling_text
 from detect.comparison.result import Comparison, NormalisedError
 from detect.comparison.tables import number
-from detect.report.figures import errors_figure, rates_figure, whitened_figure
+from detect.report.figures import (
+    distance_figure,
+    errors_figure,
+    floor_figure,
+    rates_figure,
+    whitened_figure,
+)
 from detect.report.inputs import ReportInputs
 from detect.report.parts import Part, figure_part, range_text, scaled, share_text
 from detect.report.statistics import (
@@ -35,35 +42,77 @@ def disc_parts(inputs: ReportInputs) -> list[Part]:
     if result is None:
         return [_no_reference("map.circles", "--reference")]
     curve = disc_rates(inputs.disc_pairs, inputs.gate, _quality_levels(inputs))
-    residuals = disc_residuals(inputs.disc_pairs, inputs.gate)
-    error = f"{scaled(result.error_median_m, 1e3, 1)} mm"
-    most = f"{scaled(result.error_95_m, 1e3, 1)} mm"
-    errors = (("median error", error), ("95 %", most))
-    return [
-        _outcome(result, f"within {inputs.gate.gate_m:g} m", errors),
-        *_rates(curve, "least quality", "quality", 1.0),
-        *_honesty(residuals, result.normalised_error, "two components for each matched disc"),
+    figures = [
+        ("median difference on the floor", f"{scaled(result.error_median_m, 1e3, 1)} mm"),
+        ("95 %", f"{scaled(result.error_95_m, 1e3, 1)} mm"),
+    ]
+    where = "on the floor"
+    if result.in_image:
+        where = "in the image"
+        figures.insert(
+            0, ("median difference in the image", f"{number(result.image_median_px, 2)} px")
+        )
+    parts = [_outcome(result, where, tuple(figures))]
+    if result.in_image:
+        parts.append(
+            Part(
+                "text",
+                f"{sentence(levelling_text(result))} A detected row fits a reference row if they "
+                f"are at most half the disc's image apart ({result.options.least_px:g} px for "
+                "those that are smaller).",
+            )
+        )
+    parts += [
         figure_part(
-            errors_figure(residuals, "mm", 1e3),
-            "Position errors of matched discs over their distance from the robot and over bearing: "
-            "each disc, medians and 95 % quantiles in bins of equally many.",
+            distance_figure(result.bins),
+            "Rows, recall and precision by forward distance, each side's rows by their own.",
         ),
-        Part(
-            "table",
-            caption="By forward distance; error and quality are medians",
-            head=("metres", "reference", "missed", "recall", "detected", "extra", "precision",
-                  "error / mm", "reference quality", "detected quality"),
-            rows=tuple(
-                (range_text(part.from_m, part.to_m), str(part.reference), str(part.missed),
-                 number(part.recall, 3), str(part.detected), str(part.extra),
-                 number(part.precision, 3), scaled(part.error_median_m, 1e3, 1),
-                 number(part.reference_quality_median, 3),
-                 number(part.detected_quality_median, 3))
-                for part in result.bins
-                if part.reference or part.detected
-            ),
-        ),
-    ]  # fmt: skip
+        *_rates(curve, "least quality", "quality", 1.0),
+    ]
+    if result.matched:
+        parts.append(
+            figure_part(
+                floor_figure(result.pairs, lean=result.lean is not None),
+                "Where on the floor the two sides put the same disc, detected minus reference: "
+                "each pair, and medians in bins of equally many.",
+            )
+        )
+    if result.lean is not None:
+        parts += [
+            Part("text", f"One lean for all frames: {lean_text(result.lean)}.".replace("+-", "±")),
+            _floor(result),
+        ]
+    error = result.normalised_error if result.lean is None else result.lean.normalised_error
+    what = "two components for each matched disc"
+    if result.lean is not None:
+        what += ", after the common lean"
+    return [*parts, *_honesty(disc_residuals(result.pairs), error, what)]
+
+
+def sentence(text: str) -> str:
+    """The same with a capital letter and a full stop."""
+    return f"{text[:1].upper()}{text[1:]}."
+
+
+def _floor(result: Comparison) -> Part:
+    rows = []
+    for part in result.floor:
+        if part.before.pairs == 0 or part.after is None:
+            continue
+        figures = [
+            scaled(value, 1e3, 0)
+            for one in (part.before, part.after)
+            for value in (one.median_m, one.most_m, one.along_m, one.across_m)
+        ]
+        rows.append((range_text(part.from_m, part.to_m), str(part.before.pairs), *figures))
+    return Part(
+        "table",
+        caption="Differences on the floor in mm by forward distance of the reference row in m, "
+        "as the rows are and after the common lean; along (farther) and across (left) are medians",
+        head=("metres", "pairs", "median", "95 %", "along", "across",
+              "after: median", "95 %", "along", "across"),
+        rows=tuple(rows),
+    )  # fmt: skip
 
 
 def line_parts(inputs: ReportInputs) -> list[Part]:

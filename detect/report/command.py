@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import numpy as np
+from numpy.typing import NDArray
+
 from detect.drawing.frame import draw_rows
 from detect.errors import DetectError, FrameError
 from detect.report.inputs import ReportInputs, gather
@@ -31,7 +34,12 @@ def perform(options: Report) -> int:
     def picture_of(prefix: str) -> Picture:
         return _picture(inputs, prefix)
 
-    page = report_page(inputs, __version__, options.worst, picture_of)
+    galleries = [
+        (fate, *encoded)
+        for fate in ("missed", "extra")
+        if (encoded := _gallery(inputs, fate)) is not None
+    ]
+    page = report_page(inputs, __version__, options.worst, picture_of, galleries)
     with write_whole(output, overwrite=options.force) as stream:
         stream.write(page)
     held = [
@@ -42,6 +50,29 @@ def perform(options: Report) -> int:
     against = f" against {' and '.join(held)}" if held else ", no reference rows"
     print(f"{output}: {len(inputs.rows)} frames, {', '.join(inputs.files.detected)}{against}")
     return 0
+
+
+def _gallery(inputs: ReportInputs, fate: str) -> tuple[bytes, int, int, int, int] | None:
+    """Cut-outs of missed or extra discs as JPEG: content, width, height, how many, of how many."""
+    import cv2
+
+    from detect.report.gallery import gallery
+
+    frames = {frame.step.prefix: frame for frame in inputs.run.frames}
+    camera = inputs.run.camera if isinstance(inputs.run, Run) else None
+
+    def image_of(prefix: str) -> NDArray[np.uint8] | None:
+        try:
+            return read_image(frames[prefix], camera)
+        except FrameError:
+            return None
+
+    found = gallery(inputs, fate, image_of)
+    if found is None:
+        return None
+    picture, shown, count = found
+    _, encoded = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
+    return encoded.tobytes(), picture.shape[1], picture.shape[0], shown, count
 
 
 def _picture(inputs: ReportInputs, prefix: str) -> Picture:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from detect.comparison.result import DiscPairs, DistanceBin
 from detect.drawing.inputs import SeenRows
 from detect.report.plot import BAND, DATA, MARK, REFERENCE, SECOND, plotted
 from detect.report.statistics import RateCurve, Residuals, normality
@@ -108,28 +109,87 @@ def whitened_figure(residuals: Residuals) -> bytes:
     return plotted(draw, (_WIDE, 2.8), "svg")
 
 
-def errors_figure(residuals: Residuals, unit: str, factor: float) -> bytes:
-    """Errors over distance (where there is one) and over bearing: dots, medians, 95 % quantiles."""
+def distance_figure(bins: Sequence[DistanceBin]) -> bytes:
+    """Recall and precision by forward distance, over how many rows there are."""
 
     def draw(figure: Figure) -> None:
-        over = [("bearing / deg, positive to the left", np.degrees(residuals.bearing_rad))]
-        if np.isfinite(residuals.distance_m).any():
-            over.insert(0, ("distance / m", residuals.distance_m))
-        error = factor * residuals.error
-        all_axes = figure.subplots(1, len(over), sharey=True, squeeze=False).ravel()
-        for axes, (name, at) in zip(all_axes, over):
-            thin = max(1, len(at) // _MOST_DOTS)
-            axes.plot(at[::thin], error[::thin], ".", color=REFERENCE, ms=2.5, alpha=0.6)
-            middle, half, most = binned(at, error)
-            axes.plot(middle, half, "o-", color=DATA, lw=1.4, ms=4, label="median")
-            axes.plot(middle, most, "s--", color=SECOND, lw=1.2, ms=3.5, label="95 %")
-            if (error > 0.0).any():
-                axes.set_yscale("log")
-            _finish(axes, name, "")
-        all_axes[0].set_ylabel(f"error / {unit}")
-        all_axes[0].legend(fontsize=8)
+        shown = [part for part in bins if part.reference or part.detected]
+        at = np.arange(len(shown))
+        rows, rates = figure.subplots(1, 2)
+        for one, key, shift, colour, name in (
+            (rows, "reference", -0.2, REFERENCE, "reference rows"),
+            (rows, "detected", 0.2, DATA, "detected rows"),
+        ):
+            one.bar(at + shift, [getattr(p, key) for p in shown], 0.4, color=colour, label=name)
+        for key, mark, colour in (("recall", "o-", DATA), ("precision", "s--", SECOND)):
+            share = [np.nan if (v := getattr(p, key)) is None else v for p in shown]
+            rates.plot(at, share, mark, color=colour, lw=1.2, ms=4, label=key)
+        rates.set_ylim(0.0, 1.05)
+        names = [
+            f"<{p.to_m:g}" if p.from_m is None
+            else f"≥{p.from_m:g}" if p.to_m is None else f"{p.from_m:g}-{p.to_m:g}"
+            for p in shown
+        ]  # fmt: skip
+        for one, name in ((rows, "rows"), (rates, "share")):
+            one.set_xticks(at, names, fontsize=7)
+            _finish(one, "forward distance / m", name)
+            one.legend(fontsize=8)
+
+    return plotted(draw, (_WIDE, 2.8), "svg")
+
+
+def floor_figure(pairs: DiscPairs, *, lean: bool) -> bytes:
+    """Differences on the floor over distance, along and across the view; also after a lean."""
+
+    def draw(figure: Figure) -> None:
+        left_of = np.column_stack([-pairs.away[:, 1], pairs.away[:, 0]])
+        at = np.hypot(*pairs.reference_xy.T)
+        # Both of one panel are of the same scale, so that what a lean explains is seen.
+        series = [("as the rows are", pairs.offset, SECOND, "s--")]
+        if lean:
+            series.append(("after the common lean", pairs.left, DATA, "o-"))
+        thin = max(1, len(at) // _MOST_DOTS)
+        names = ("along the view, farther is positive", "across, left is positive")
+        both = figure.subplots(1, 2)
+        for axes, direction, name in zip(both, (pairs.away, left_of), names):
+            spread = []
+            for label, offset, colour, mark in series:
+                usable = np.isfinite(offset).all(axis=1)
+                error = 1e3 * (offset * direction).sum(axis=1)[usable]
+                here = at[usable]
+                axes.plot(here[::thin], error[::thin], ".", color=colour, ms=1.5, alpha=0.25)
+                middle, half, _ = binned(here, error)
+                axes.plot(middle, half, mark, color=colour, lw=1.4, ms=4, label=label)
+                spread += [*np.quantile(error, [0.01, 0.99])] if len(error) else []
+            axes.axhline(0.0, color=REFERENCE, lw=0.8)
+            if spread:
+                margin = 0.1 * (max(spread) - min(spread)) + 1e-3
+                axes.set_ylim(min(spread) - margin, max(spread) + margin)
+            _finish(axes, "distance / m", "difference / mm")
+            axes.set_title(name, fontsize=9)
+        both[0].legend(fontsize=8)
 
     return plotted(draw, (_WIDE, 3.1), "svg")
+
+
+def errors_figure(residuals: Residuals, unit: str, factor: float) -> bytes:
+    """Errors over bearing: dots, medians, 95 % quantiles."""
+
+    def draw(figure: Figure) -> None:
+        at = np.degrees(residuals.bearing_rad)
+        error = factor * residuals.error
+        axes = figure.subplots()
+        thin = max(1, len(at) // _MOST_DOTS)
+        axes.plot(at[::thin], error[::thin], ".", color=REFERENCE, ms=2.5, alpha=0.6)
+        middle, half, most = binned(at, error)
+        axes.plot(middle, half, "o-", color=DATA, lw=1.4, ms=4, label="median")
+        axes.plot(middle, most, "s--", color=SECOND, lw=1.2, ms=3.5, label="95 %")
+        if (error > 0.0).any():
+            axes.set_yscale("log")
+        _finish(axes, "bearing / deg, positive to the left", f"error / {unit}")
+        axes.legend(fontsize=8)
+
+    return plotted(draw, (_WIDE, 2.8), "svg")
 
 
 def tilt_figure(rows: Sequence[SeenRows]) -> bytes:

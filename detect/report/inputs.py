@@ -7,7 +7,7 @@ import time
 from dataclasses import dataclass
 from functools import cached_property
 
-from detect.comparison.circles import compare_frames
+from detect.comparison.circles import Sight, compare_frames
 from detect.comparison.lines import compare_line_frames
 from detect.comparison.lines_result import LineCompareOptions, LineComparison
 from detect.comparison.result import CompareOptions, Comparison
@@ -16,6 +16,7 @@ from detect.errors import DetectError, FrameError
 from detect.report.statistics import FramePair
 from detect.run import ImageRun, Run, RunFrame, read_image
 from detect.runs.frame import FramePlan, detect_frame, tables_of
+from detect.seen import FrameView
 from detect.viewing_options import Gates, RowFiles
 from landmarks import CircleLandmark, Frame, LineLandmark, Step
 
@@ -56,10 +57,21 @@ class ReportInputs:
     timing: Timing | None = None
 
     @cached_property
+    def sight(self) -> Sight | None:
+        """How discs come back into the images; None without a calibration."""
+        if not isinstance(self.run, Run):
+            return None
+        return Sight(self.run.camera, self.files.radius_m, self.files.reference_level)
+
+    def view_of(self, rows: SeenRows) -> FrameView | None:
+        """How the discs of a frame come back into its image."""
+        return None if self.sight is None else self.sight.of(rows.reference_by, rows.levelled_by)
+
+    @cached_property
     def disc_pairs(self) -> list[FramePair[CircleLandmark]]:
         """The frames that both files of discs have."""
         return [
-            FramePair(rows.reference_circles, rows.circles)
+            FramePair(rows.reference_circles, rows.circles, self.view_of(rows))
             for rows in self.rows
             if rows.circles is not None and rows.reference_circles is not None
         ]
@@ -79,7 +91,10 @@ class ReportInputs:
         if self.files.reference_circles is None or not self.disc_pairs:
             return None
         both = [
-            (Frame(_step(name), rows.reference_circles), Frame(_step(name), rows.circles))
+            (
+                Frame(_step(name), rows.reference_circles, rows.reference_by),
+                Frame(_step(name), rows.circles, rows.levelled_by),
+            )
             for name, rows in zip(self.names, self.rows)
             if rows.circles is not None and rows.reference_circles is not None
         ]
@@ -87,6 +102,7 @@ class ReportInputs:
             [reference for reference, _ in both],
             [detected for _, detected in both],
             self.gate,
+            sight=self.sight,
             reference_name=self.files.reference_circles.name,
             detected_name=self.files.detected["circles"].name,
         )

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import fields
 from typing import Any
 
 import numpy as np
 
+from detect.comparison.circles import FLOOR_GATE_M
 from detect.comparison.tables import number
 from detect.drawing.inputs import picture_name
 from detect.line_settings import LineSettings
@@ -22,11 +23,16 @@ from detect.settings import CircleSettings
 Picture = tuple[bytes, int, int] | str
 
 _NAMES = {"circles": "Discs", "lines": "Verticals", "markers": "Markers", "tilt": "Tilt"}
+_FATES = {"missed": "reference rows that are missing", "extra": "rows that fit no reference row"}
 _SIGMA = "\N{GREEK SMALL LETTER SIGMA}"
 
 
 def report_page(
-    inputs: ReportInputs, version: str, worst: int, picture_of: Callable[[str], Picture]
+    inputs: ReportInputs,
+    version: str,
+    worst: int,
+    picture_of: Callable[[str], Picture],
+    galleries: Sequence[tuple[str, bytes, int, int, int, int]] = (),
 ) -> bytes:
     """The whole page, UTF-8; the same inputs give the same bytes.
 
@@ -39,6 +45,9 @@ def report_page(
         How many of the worst frames are shown.
     picture_of : callable
         Gives the picture of a frame, by its prefix.
+    galleries : sequence
+        Of cut-outs: "missed" or "extra", a JPEG, its width and height, how many discs are shown,
+        and how many there are.
     """
     from jinja2 import Environment, StrictUndefined
     from markupsafe import Markup
@@ -46,6 +55,17 @@ def report_page(
     sections = [Section("summary", "What was found", _summary(inputs))]
     if "circles" in inputs.files.detected:
         sections.append(Section("discs", "Discs against the reference", disc_parts(inputs)))
+        sections[-1].parts.extend(
+            Part(
+                "figure",
+                f"{shown} of the {count} {_FATES[fate]}, evenly over the run; the outline is "
+                "wider than the disc.",
+                data_address(content, "jpeg"),
+                width,
+                height,
+            )
+            for fate, content, width, height, shown, count in galleries
+        )
     if "lines" in inputs.files.detected:
         sections.append(Section("verticals", "Verticals against the reference", line_parts(inputs)))
     sections.append(Section("frames", *_frames(inputs, worst, picture_of)))
@@ -138,8 +158,8 @@ def _frames(
         parts.append(
             Part(
                 "note",
-                "Above a disc: quality, distance to its reference row, the same in standard "
-                "deviations (sd). Below a vertical: error of the bearing in standard deviations.",
+                "Above a disc: quality, distance to its reference row in the image. Below a "
+                "vertical: error of the bearing in standard deviations.",
             )
         )
     else:
@@ -249,10 +269,14 @@ def _settings(inputs: ReportInputs, version: str) -> list[Part]:
         words = [line for line in head.comments if line and not line.startswith("settings ")]
         parts += [Part("note", line) for line in words] or [Part("note", "No head in the file.")]
     gate, line_gate = inputs.gate, inputs.line_gate
+    if inputs.sight is not None and not gate.on_floor:
+        same = f"within half its image or {gate.least_px:g} px"
+    else:
+        same = f"within {FLOOR_GATE_M if gate.gate_m is None else gate.gate_m:g} m"
     parts.append(
         Part(
             "note",
-            f"The same disc: within {gate.gate_m:g} m. The same vertical: within "
+            f"The same disc: {same}. The same vertical: within "
             f"{line_gate.tolerance_deg:g}° or {line_gate.sigmas:g} standard deviations. "
             f"Page written by detect report, version {version}.",
         )

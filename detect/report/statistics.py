@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -12,11 +12,11 @@ from numpy.typing import ArrayLike, NDArray
 from detect.comparison.circles import pair_discs
 from detect.comparison.lines import joined_lines, pair_lines
 from detect.comparison.lines_result import LineCompareOptions
-from detect.comparison.result import CompareOptions
+from detect.comparison.result import CompareOptions, DiscPairs
+from detect.seen import FrameView
 from landmarks import (
     CircleLandmark,
     LineLandmark,
-    circle_arrays,
     is_positive_definite,
     wrap_angle,
 )
@@ -29,10 +29,11 @@ _LEAST_SIGMA_RAD = 1e-12
 
 @dataclass(frozen=True)
 class FramePair(Generic[RowType]):
-    """The rows of one image on both sides."""
+    """The rows of one image on both sides, and how discs come back into it."""
 
     reference: Sequence[RowType]
     detected: Sequence[RowType]
+    view: FrameView | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,22 +80,15 @@ class RateCurve:
     kept: NDArray[np.int64]
 
 
-def disc_residuals(frames: Sequence[FramePair[CircleLandmark]], gate: CompareOptions) -> Residuals:
-    """Residuals of discs; whitened by the Cholesky factor of the detected row's covariance."""
-    wanted: list[CircleLandmark] = []
-    found: list[CircleLandmark] = []
-    for frame in frames:
-        pairs = pair_discs(frame.reference, frame.detected, gate)
-        wanted += [frame.reference[i] for i in pairs.first]
-        found += [frame.detected[j] for j in pairs.second]
-    truth, seen = circle_arrays(wanted), circle_arrays(found)
-    offset = seen.xy - truth.xy
-    usable = is_positive_definite(seen.covariance)
-    factor = np.linalg.cholesky(seen.covariance[usable])
+def disc_residuals(pairs: DiscPairs) -> Residuals:
+    """Residuals of discs after the common lean; whitened by the Cholesky factor of covariances."""
+    xy, offset = pairs.reference_xy, pairs.left
+    usable = is_positive_definite(pairs.covariance) & np.isfinite(offset).all(axis=1)
+    factor = np.linalg.cholesky(pairs.covariance[usable])
     whitened = np.linalg.solve(factor, offset[usable][:, :, None])[:, :, 0]
     return Residuals(
-        distance_m=np.hypot(truth.xy[:, 0], truth.xy[:, 1]),
-        bearing_rad=np.arctan2(truth.xy[:, 0], -truth.xy[:, 1]),
+        distance_m=np.hypot(xy[:, 0], xy[:, 1]),
+        bearing_rad=np.arctan2(xy[:, 0], -xy[:, 1]),
         error=np.hypot(offset[:, 0], offset[:, 1]),
         whitened=whitened.ravel(),
     )
@@ -128,7 +122,7 @@ def disc_rates(
     """Recall and precision of discs of at least each quality."""
 
     def count(frame: FramePair[CircleLandmark]) -> tuple[int, int]:
-        matched = len(pair_discs(frame.reference, frame.detected, gate).first)
+        matched = len(pair_discs(frame.reference, frame.detected, gate, frame.view).first)
         return matched, matched
 
     return _rates(frames, lambda row: row.quality, count, thresholds)
@@ -163,7 +157,7 @@ def _rates(
         for k in np.argsort(levels, kind="stable"):
             passed = [row for row in frame.detected if score(row) >= levels[k]]
             if len(passed) != before:
-                before, counts = len(passed), count(FramePair(frame.reference, passed))
+                before, counts = len(passed), count(replace(frame, detected=passed))
             kept[k] += len(passed)
             found[k] += counts[0]
             right[k] += counts[1]

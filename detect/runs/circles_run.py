@@ -131,7 +131,8 @@ def detect_circles_run(
     )
 
 
-#: Stands in the head of files whose positions are corrected for the tilt.
+#: Stand in the head of files whose positions are true level ones, or corrected for the tilt.
+LEVEL = "level robot frame"
 LEVELLED = "corrected for the tilt of the frames that have one"
 
 
@@ -155,7 +156,7 @@ def circles_file(
         f"  odometry: {odometry}; the image was taken after the step",
         "LANDMARK_C <pX> <pY> <quality> <cXX> <cXY> <cYY> <ID>",
         f"  position {position}; quality is Otsu's, 0 to 1; ID -1: unknown",
-        *([f"  positions are {LEVELLED}"] if levelled else []),
+        *([f"  positions are {LEVELLED}: # levelled <pitch> <roll>"] if levelled else []),
         f"camera {run.camera}",
         f"settings {values}",
     ]

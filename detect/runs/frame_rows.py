@@ -37,6 +37,7 @@ from landmarks import (
     LineLandmark,
     circle_landmarks,
     format_frame,
+    format_levelling,
     format_no_tilt,
     format_record,
     format_tilt,
@@ -219,7 +220,7 @@ def _rows_of(
             tilt = _line(format_tilt(found.tilt))
     if found.discs is not None:
         discs = found.discs
-        circles = head + _circle_rows(found, discs, task.known, plan)
+        circles = head + _levelling(discs) + _circle_rows(found, discs, task.known, plan)
         if plan.json:
             record = _json({"frame": step.prefix, "discs": _disc_records(discs)})
     if found.markers is not None:
@@ -264,6 +265,10 @@ def _line_rows(found: LineDetections, reference: tuple[LineLandmark, ...] | None
 
     rows = unknown_lines(found.line_numbers)
     return _rows(found.landmarks()) if rows is None else rows
+
+
+def _levelling(found: CircleDetections) -> bytes:
+    return b"" if found.levelled_by is None else _line(format_levelling(found.levelled_by))
 
 
 def _circle_rows(

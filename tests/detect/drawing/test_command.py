@@ -14,13 +14,14 @@ from detect.circles import CircleDetections
 from detect.cli import main
 from detect.comparison.lines_result import LineCompareOptions
 from detect.comparison.result import CompareOptions
-from detect.drawing.frame import draw_rows, floor_projection, line_curves, sigma_bars
+from detect.drawing.frame import draw_rows, line_curves, sigma_bars
 from detect.drawing.head import read_head
 from detect.drawing.inputs import SeenRows
 from detect.drawing.selection import select_frames
 from detect.errors import DetectError
 from detect.levelling import level_positions
 from detect.run import open_images
+from detect.seen import image_positions
 from detect.settings import CircleSettings
 from landmarks import CircleLandmark, FrameTilt, LineLandmark, circle_landmarks
 from tests.detect.drawing.test_detections import changed
@@ -64,7 +65,7 @@ def test_positions_corrected_for_the_tilt_are_drawn_where_they_were_seen(
     seen = np.array([[0.4, -1.2], [-0.9, -2.5], [0.1, -3.9]])
     level = level_positions(published_camera, seen, tilt.pitch, tilt.roll)
     assert np.abs(level - seen).max() > 0.05
-    drawn = floor_projection(published_camera, tilt)(level)
+    drawn = image_positions(published_camera, level, (tilt.pitch, tilt.roll))
     np.testing.assert_allclose(drawn, published_camera.project_floor(seen), atol=1e-9)
 
 
@@ -220,9 +221,9 @@ def test_settings_and_tilt_are_read_from_the_head(small_run: Path) -> None:
     assert main(["circles", str(small_run), "--outer-ring", "1.5"]) == 0
     head = read_head(small_run / "detected.circles")
     assert head.circle_settings == CircleSettings(outer_ring=1.5)
-    assert not head.levelled
+    assert not head.level
     assert main(["all", str(small_run), "--force"]) == 0
-    assert read_head(small_run / "detected.circles").levelled
+    assert read_head(small_run / "detected.circles").level
 
 
 def test_video_has_a_picture_per_frame(small_run: Path, tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from detect.cli import main
-from detect.comparison.circles import compare_runs
+from detect.comparison.circles import Sight, compare_frames, compare_runs
 from detect.comparison.lines import compare_line_frames
 from detect.comparison.lines_result import LineCompareOptions
 from detect.comparison.result import CompareOptions
@@ -21,12 +21,14 @@ from detect.line_settings import PUBLISHED as PUBLISHED_LINES
 from detect.report.figures import binned
 from detect.report.statistics import (
     FramePair,
+    Residuals,
     disc_rates,
     disc_residuals,
     line_rates,
     line_residuals,
     normality,
 )
+from detect.run import camera_in
 from landmarks import CircleLandmark, Frame, LineLandmark, Step
 from tests.detect.test_cli import assert_refused
 
@@ -83,11 +85,18 @@ def test_without_rows_there_are_no_rates() -> None:
     assert np.isnan(curve.precision).all()
 
 
+def residuals_of(frames: list[FramePair[CircleLandmark]], gate: CompareOptions) -> Residuals:
+    steps = [Step(f"e.{k}", *[0.0] * 9) for k in range(len(frames))]
+    reference = [Frame(step, tuple(pair.reference)) for step, pair in zip(steps, frames)]
+    detected = [Frame(step, tuple(pair.detected)) for step, pair in zip(steps, frames)]
+    return disc_residuals(compare_frames(reference, detected, gate).pairs)
+
+
 # -- residuals --------------------------------------------------------------------------------
 
 
 def test_whitened_residuals_are_the_mahalanobis_distance() -> None:
-    residuals = disc_residuals([FramePair([disc(0.3, -1.0)], [disc(0.32, -1.05)])], GATE)
+    residuals = residuals_of([FramePair([disc(0.3, -1.0)], [disc(0.32, -1.05)])], GATE)
     covariance = np.array([[4e-4, 1e-4], [1e-4, 9e-4]])
     offset = np.array([0.02, -0.05])
     np.testing.assert_allclose(
@@ -106,7 +115,7 @@ def test_errors_drawn_from_the_covariance_are_standard_normal() -> None:
     for _ in range(2000):
         dx, dy = factor @ rng.standard_normal(2)
         frames.append(FramePair([disc(0.0, -2.0)], [disc(dx, -2.0 + dy)]))
-    residuals = disc_residuals(frames, CompareOptions(gate_m=1.0))
+    residuals = residuals_of(frames, CompareOptions(gate_m=1.0))
     figures = normality(residuals.whitened)
     assert figures is not None
     assert figures.count == 4000
@@ -222,11 +231,13 @@ def judged_run(small_run: Path) -> Path:
 def test_page_states_what_comparing_does(judged_run: Path, tmp_path: Path) -> None:
     page = reported(judged_run, tmp_path / "r.html")
     words = " ".join(" ".join(page.words).split())
-    expected = compare_runs(judged_run)
+    camera = camera_in(judged_run)
+    assert camera is not None
+    expected = compare_runs(judged_run, sight=Sight(camera))
     assert (expected.matched, expected.missed, expected.extra) == (2, 1, 1)
     assert f"recall {expected.recall:.4f}" in words
     assert f"precision {expected.precision:.4f}" in words
-    assert "reference rows 3 detected rows 3 matched within 0.1 m 2 missed 1 extra 1" in words
+    assert "reference rows 3 detected rows 3 matched in the image 2 missed 1 extra 1" in words
     assert "s.0001 0 1 1 -" in words
     assert "radius_m 0.1" in words
     first = (tmp_path / "r.html").read_bytes()

@@ -1,0 +1,114 @@
+"""Where in the image rows of discs were seen: through the tilt they were levelled by, and the lens.
+
+Plain numpy: comparing files takes no compiler.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
+
+from camera import Camera
+
+FloatArray = NDArray[np.float64]
+Tilt = tuple[float, float]
+
+_POINTS = 64
+
+
+def image_positions(
+    camera: Camera, floor_xy: ArrayLike, levelled_by: Tilt | None = None, raised_m: float = 0.0
+) -> FloatArray:
+    """Where the camera saw places on the floor; exact inverse of detection and levelling.
+
+    Parameters
+    ----------
+    camera : Camera
+        The camera as calibrated on the level robot.
+    floor_xy : (..., 2) array_like
+        Robot X and Y, metres.
+    levelled_by : (float, float), optional
+        Pitch and roll (rad) that turned the positions level, about the origin of the robot frame
+        (`landmarks.Frame.levelled_by`); None: nothing did.
+    raised_m : float
+        How much higher the camera is than calibrated, metres.
+
+    Returns
+    -------
+    (..., 2) float64
+        Pixels; NaN where not seen.
+    """
+    xy = np.asarray(floor_xy, dtype=np.float64)
+    points = np.concatenate([xy, np.zeros_like(xy[..., :1])], axis=-1)
+    if levelled_by is not None:
+        # The rotation turns measured directions level; its transpose turns level ones back.
+        points = points @ level_matrix(levelled_by)
+    return camera.project_robot(points - np.array([0.0, 0.0, raised_m]))
+
+
+def level_seen(
+    camera: Camera, floor_xy: ArrayLike, levelled_by: Tilt, raised_m: float = 0.0
+) -> FloatArray:
+    """Level positions of what the camera as calibrated sees at `floor_xy`.
+
+    Parameters
+    ----------
+    camera, levelled_by, raised_m
+        As in `image_positions`.
+    floor_xy : (N, 2) array_like
+        Positions computed without knowledge of tilt and height, metres.
+
+    Returns
+    -------
+    (N, 2) float64
+        Metres; NaN where the levelled ray does not meet the floor.
+    """
+    xy = np.asarray(floor_xy, dtype=np.float64).reshape(-1, 2)
+    turn = level_matrix(levelled_by)
+    rays = (np.column_stack([xy, np.zeros(len(xy))]) - camera.centre) @ turn.T
+    centre = turn @ (camera.centre + np.array([0.0, 0.0, raised_m]))
+    down = np.where(rays[:, 2] < 0.0, rays[:, 2], np.nan)
+    return np.asarray(centre[:2] - (centre[2] / down)[:, None] * rays[:, :2])
+
+
+def level_matrix(levelled_by: Tilt) -> FloatArray:
+    """(3, 3) rotation exp([pitch, roll, 0]x) that turns measured directions level."""
+    return np.asarray(Rotation.from_rotvec([*levelled_by, 0.0]).as_matrix())
+
+
+def circle_on_floor(centre_xy: ArrayLike, radius_m: float, points: int = _POINTS) -> FloatArray:
+    """(..., points, 2) places round circles on the floor (m)."""
+    angle = 2.0 * np.pi * np.arange(points) / points
+    ring = radius_m * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    return np.asarray(np.asarray(centre_xy, dtype=np.float64)[..., None, :] + ring)
+
+
+@dataclass(frozen=True, eq=False)
+class FrameView:
+    """How reference and detected rows of one frame come back into its image.
+
+    Attributes
+    ----------
+    camera : Camera
+    radius_m : float
+        Of the discs.
+    reference_by, detected_by : (float, float) or None
+        What levelled the rows of either side.
+    """
+
+    camera: Camera
+    radius_m: float
+    reference_by: Tilt | None = None
+    detected_by: Tilt | None = None
+
+    def gates(self, reference_xy: FloatArray, least_px: float) -> FloatArray:
+        """(N, 2) half the width and height of discs' images, `least_px` at least, pixels."""
+        ring = circle_on_floor(reference_xy.reshape(-1, 2), self.radius_m, 16)
+        edge = image_positions(self.camera, ring, self.reference_by)
+        seen = np.isfinite(edge)
+        low = np.where(seen, edge, np.inf).min(axis=1, initial=np.inf)
+        high = np.where(seen, edge, -np.inf).max(axis=1, initial=-np.inf)
+        return np.asarray(np.maximum(0.5 * (high - low), least_px))

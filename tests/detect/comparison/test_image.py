@@ -1,0 +1,246 @@
+"""Rows that come back into the image: known leans, missing and doubled rows, frames not level."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from camera import Camera
+from detect.circles import CircleDetections
+from detect.cli import main
+from detect.comparison.circles import Sight, compare_frames
+from detect.comparison.report import format_json, format_text
+from detect.comparison.result import CompareOptions, Comparison
+from detect.levelling import level_positions, levelled, with_prior
+from detect.seen import image_positions, level_seen
+from landmarks import (
+    CircleLandmark,
+    Frame,
+    FrameTilt,
+    Step,
+    circle_landmarks,
+    format_frame,
+    read_frames,
+    write_frames,
+)
+from storage import write_whole
+
+FloatArray = NDArray[np.float64]
+
+PITCH, ROLL = np.radians([-2.3, 0.7])
+
+
+def frame(index: int, xy: FloatArray, by: tuple[float, float] | None = None, ids: int = 1) -> Frame:
+    count = len(xy)
+    covariance = np.tile(4e-4 * np.eye(2), (count, 1, 1))
+    rows = circle_landmarks(xy, np.full(count, 0.9), covariance, np.full(count, ids))
+    return Frame(Step(f"s.{index:04d}", *[0.0] * 9), rows, by)
+
+
+def places(rng: np.random.Generator, count: int = 6) -> FloatArray:
+    """Discs in view, no two within each other's image."""
+    forward = np.linspace(1.0, 4.0, count)
+    return np.column_stack([rng.uniform(-0.3, 0.3, count) * forward, -forward])
+
+
+def leaning_run(
+    camera: Camera, noise_px: float = 0.3, frames: int = 60, declared: bool = True
+) -> tuple[list[Frame], list[Frame]]:
+    """Raw rows, and the same levelled by a constant lean, with noise in the image."""
+    rng = np.random.default_rng(4)
+    raw, level = [], []
+    for k in range(frames):
+        xy = places(rng)
+        pixels = camera.project_floor(xy) + rng.normal(0.0, noise_px, xy.shape)
+        again = level_positions(camera, camera.floor_from_pixel(pixels), PITCH, ROLL)
+        raw.append(frame(k, xy))
+        level.append(frame(k, again, (PITCH, ROLL) if declared else None))
+    return raw, level
+
+
+def compare(camera: Camera, raw: list[Frame], level: list[Frame]) -> Comparison:
+    return compare_frames(raw, level, CompareOptions(), sight=Sight(camera))
+
+
+@settings(deadline=None, max_examples=60)
+@given(
+    st.lists(st.tuples(st.floats(60, 700), st.floats(110, 280)), min_size=1, max_size=5),
+    st.floats(-0.08, 0.08),
+    st.floats(-0.08, 0.08),
+)
+def test_pixels_come_back_from_detection_and_levelling(
+    published_camera: Camera, pixels: list[tuple[float, float]], pitch: float, roll: float
+) -> None:
+    seen = np.array(pixels)
+    raw = published_camera.floor_from_pixel(seen)
+    level = level_positions(published_camera, raw, pitch, roll)
+    known = np.isfinite(level).all(axis=1) & (np.linalg.norm(level, axis=1) < 100.0)
+    back = image_positions(published_camera, level, (pitch, roll))
+    np.testing.assert_allclose(back[known], seen[known], atol=1e-6)
+    np.testing.assert_allclose(
+        level_seen(published_camera, raw, (pitch, roll))[known], level[known], rtol=1e-9, atol=1e-9
+    )
+
+
+def test_files_keep_what_levelled_a_frame(published_camera: Camera, tmp_path: Path) -> None:
+    """The tilt that was applied, prior and all; and pixels to the file's six digits."""
+    pixels = np.array([[300.25, 250.5], [420.75, 180.125], [100.0, 160.0]])
+    raw = published_camera.floor_from_pixel(pixels)
+    count = len(raw)
+    found = CircleDetections(
+        np.rint(pixels).astype(np.int64),
+        raw,
+        np.tile(1e-4 * np.eye(2), (count, 1, 1)),
+        np.full(count, 0.9),
+        np.ones(count),
+    )
+    tilt = FrameTilt("s.0000", 0.031, -0.017, 1e-4, 0.0, 1e-4, 9)
+    applied = with_prior(tilt, np.radians(1.0))
+    discs = levelled(found, published_camera, applied)
+    assert discs.levelled_by == (applied.pitch, applied.roll) != (tilt.pitch, tilt.roll)
+    path = tmp_path / "detected.circles"
+    write_frames(path, [frame(0, discs.floor_xy, discs.levelled_by), frame(1, raw)])
+    first, second = read_frames(path)
+    assert first.levelled_by == pytest.approx(discs.levelled_by, abs=1e-9)
+    assert second.levelled_by is None
+    xy = np.array([(row.px, row.py) for row in first.circles])
+    back = image_positions(published_camera, xy, first.levelled_by)
+    np.testing.assert_allclose(back, pixels, atol=2e-3)
+    with write_whole(tmp_path / "again.circles", overwrite=False) as stream:
+        for again in (first, second):
+            stream.write(format_frame(again))
+    assert (tmp_path / "again.circles").read_bytes() == path.read_bytes()
+
+
+def test_a_lean_is_a_difference_on_the_floor_not_missed_rows(published_camera: Camera) -> None:
+    found = compare(published_camera, *leaning_run(published_camera))
+    assert found.in_image
+    assert found.recall == found.precision == 1.0
+    assert found.image_median_px == pytest.approx(0.35, abs=0.1)
+    assert found.error_median_m is not None
+    assert found.error_median_m > 0.1
+    lean = found.lean
+    assert lean is not None
+    for value, sigma, true in (
+        (lean.pitch_deg, lean.pitch_sigma_deg, -2.3),
+        (lean.roll_deg, lean.roll_sigma_deg, 0.7),
+        (lean.raised_m, lean.raised_sigma_m, 0.0),
+    ):
+        assert abs(value - true) < 4.0 * sigma
+    assert lean.pitch_sigma_deg < 0.05
+    assert lean.roll_sigma_deg < 0.05
+    assert lean.left.median_m is not None
+    assert lean.left.median_m < 0.02
+    far = next(part for part in found.floor if part.from_m == 3.0)
+    assert far.before.along_m is not None
+    assert far.before.along_m > 0.2
+    assert far.after is not None
+    assert abs(far.after.along_m or 0.0) < 0.02
+    text = format_text(found)
+    assert "detected rows are levelled in all frames (medians: pitch -2.30, roll 0.70" in " ".join(
+        text.split()
+    )
+    told = json.loads(format_json(found))
+    assert told["lean"]["pitch_deg"] == lean.pitch_deg
+    assert told["pairs"] == found.matched
+
+
+def test_height_is_found_beside_the_tilt(published_camera: Camera) -> None:
+    rng = np.random.default_rng(6)
+    raw, level = [], []
+    for k in range(40):
+        xy = places(rng)
+        raw.append(frame(k, xy))
+        level.append(frame(k, level_seen(published_camera, xy, (PITCH, ROLL), -0.045), None))
+    found = compare_frames(
+        raw, level, CompareOptions(gate_m=2.0), sight=Sight(published_camera)
+    ).lean
+    assert found is not None
+    assert found.raised_m == pytest.approx(-0.045, abs=1e-4)
+    assert found.pitch_deg == pytest.approx(-2.3, abs=1e-3)
+
+
+def test_frames_without_a_tilt_and_with_other_rows(published_camera: Camera) -> None:
+    raw, level = leaning_run(published_camera, noise_px=0.0)
+    # Not levelled, since no tilt was known; one row not found; one found twice.
+    level[0] = frame(0, np.array([(r.px, r.py) for r in raw[0].circles]))
+    level[1] = Frame(level[1].step, level[1].landmarks[1:], level[1].levelled_by)
+    level[2] = Frame(
+        level[2].step, (*level[2].landmarks, level[2].landmarks[0]), level[2].levelled_by
+    )
+    found = compare(published_camera, raw, level)
+    assert (found.missed, found.extra) == (1, 1)
+    assert (found.detected_levelling.levelled, found.detected_levelling.frames) == (59, 60)
+
+
+def test_level_truth_is_seen_through_the_tilt_of_what_was_detected(
+    published_camera: Camera,
+) -> None:
+    _, level = leaning_run(published_camera)
+    truth = [Frame(f.step, f.landmarks) for f in level]
+    sight = Sight(published_camera, reference_level=True)
+    found = compare_frames(truth, level, CompareOptions(), sight=sight)
+    assert found.recall == 1.0
+    assert found.image_95_px == pytest.approx(0.0, abs=1e-9)
+    assert "reference rows are level;" in " ".join(format_text(found).split())
+    without = compare_frames(truth, level, CompareOptions(), sight=Sight(published_camera))
+    assert (without.recall or 0.0) < 0.8
+
+
+def test_a_far_disc_is_the_same_within_three_pixels(published_camera: Camera) -> None:
+    far = np.array([[0.0, -6.0]])
+    pixel = published_camera.project_floor(far)
+
+    def matched(rows: float, columns: float = 0.0) -> int:
+        moved = published_camera.floor_from_pixel(pixel + np.array([columns, rows]))
+        return compare(published_camera, [frame(0, far)], [frame(0, moved)]).matched
+
+    assert [matched(2.9), matched(3.1), matched(0.0, 6.0), matched(0.0, 12.0)] == [1, 0, 1, 0]
+
+
+def test_few_rows_tell_no_lean(published_camera: Camera) -> None:
+    xy = np.array([[0.1, -2.0], [0.1, -3.0]])
+    assert compare(published_camera, [frame(0, xy)], [frame(0, xy)]).lean is None
+    nothing = compare(published_camera, [frame(0, xy)], [frame(0, xy[:0])])
+    assert (nothing.matched, nothing.lean) == (0, None)
+    json.loads(format_json(nothing))
+
+
+def test_without_a_calibration_the_floor_is_compared(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    row = CircleLandmark(0.0, -1.0, 0.9, 1e-4, 0.0, 1e-4, (1,))
+    for name in ("map.circles", "detected.circles"):
+        write_frames(tmp_path / name, [Frame(Step("s.0000", *[0.0] * 9), (row,))])
+    assert main(["compare", str(tmp_path)]) == 0
+    told = capsys.readouterr().out
+    assert "no calibration: positions are compared on the floor" in told
+    assert "within 0.1 m" in told
+    assert main(["compare", str(tmp_path), "--gate-m", "0.2"]) == 0
+    assert "no calibration" not in capsys.readouterr().out
+
+
+def test_real_rows_levelled_or_not_are_the_same_rows(shared_data: Path, tmp_path: Path) -> None:
+    """All shipped rows, levelled by any tilt, are found again."""
+    from detect.run import camera_in
+
+    folder = shared_data / "dlr" / "e"
+    camera = camera_in(folder)
+    assert camera is not None
+    raw = list(read_frames(folder / "map.circles"))[:200]
+    level = []
+    for index, one in enumerate(raw):
+        xy = np.array([(r.px, r.py) for r in one.circles]).reshape(-1, 2)
+        level.append(
+            Frame(one.step, frame(index, level_positions(camera, xy, PITCH, ROLL)).landmarks,
+                  (PITCH, ROLL))
+        )  # fmt: skip
+    found = compare(camera, raw, level)
+    assert found.recall == found.precision == 1.0
+    assert found.image_95_px == pytest.approx(0.0, abs=1e-6)
