@@ -108,7 +108,7 @@ def _disc_ids(options: DiscIdOptions) -> DiscIds:
     level = False
     if options.ids_from is not None:
         rows = DiscsByImage(options.ids_from)
-        level = read_head(options.ids_from).levelled
+        level = read_head(options.ids_from).level
     if options.ids_from_map is not None and options.path is not None:
         mapped = MapByImage(options.ids_from_map, options.path)
     return DiscIds(rows, level, mapped, options.id_slack_m)

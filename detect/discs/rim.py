@@ -84,7 +84,7 @@ def _grey(image: NDArray[np.uint8], u: float, v: float) -> float:
     a, b = u - i, v - j
     upper = (1.0 - a) * image[j, i] + a * image[j, i + 1]
     lower = (1.0 - a) * image[j + 1, i] + a * image[j + 1, i + 1]
-    return (1.0 - b) * upper + b * lower
+    return float((1.0 - b) * upper + b * lower)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

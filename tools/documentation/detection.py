@@ -9,7 +9,7 @@ import numpy as np
 
 from camera import Camera
 from detect.circles import detect_circles, disc_shape
-from detect.drawing.detections import circle_on_floor
+from detect.seen import circle_on_floor
 from detect.drawing.lines import track_pixels
 from detect.line_settings import LineSettings
 from detect.lines import detect_lines
