@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Literal
 
@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from detect.verticals.tilt import ConsensusSettings
 
 BearingConvention = Literal["level", "published"]
+Joining = Literal["evidence", "equal"]
 
 _BOUNDS = {
     **dict.fromkeys(
@@ -162,6 +163,9 @@ class LineSettings:
         Lines closer than this at the horizon are joined to one row.
     join_share : float
         Lines with less than this part of the other's evidence are dropped instead.
+    joined : "evidence" or "equal"
+        Joined lines count by their evidence, and the row has the ends of the strongest; or all
+        count the same, and ends and inclination are means as well, as in the data set's own rows.
     shoulder_px, shoulder_share : float
         Lines closer than this to one with so much more contrast (the part that theirs is of it) are
         dropped: they are what light does beside an edge.
@@ -220,6 +224,7 @@ class LineSettings:
     same_edge_px: float = 2.0
     join_px: float = 2.7
     join_share: float = 0.5
+    joined: Joining = "evidence"
     shoulder_px: float = 5.0
     shoulder_share: float = 0.5
     sigma_px: float = 0.9
@@ -263,34 +268,52 @@ class LineSettings:
         )
 
 
-#: The report's parameters to the letter; what it does not say is set to change nothing.
+#: What gives the data set's own rows back as far as these are known (docs/verticals.md).
 PUBLISHED = LineSettings(
-    sigma_across_px=2.5,
-    sigma_along_rows=7.0,
-    regulariser=9.0,
-    threshold=0.4,
-    border_rows=22,
+    sigma_across_px=2.05,
+    sigma_along_rows=7.33,
+    regulariser=120.0,
+    threshold=0.0435,
+    border_rows=23,
     start_band_rows=0,
     start_spacing_rows=1,
     guided=False,
     refine_steps_px=(),
-    least_rows=30,
+    least_rows=52,
     least_length_px=0.0,
     least_evidence=0.0,
     least_sharpness=0.0,
     largest_horizon_gap_px=math.inf,
+    largest_scatter_px=1.5,
     largest_shift_px=math.inf,
     largest_noise_px=math.inf,
     bend_px=0.7,
     lean_noise=1.0,
     building_deg=0.036,
     stray_share=0.0,
+    join_px=10.0,
     join_share=0.0,
-    sigma_px=1.0,
+    joined="equal",
+    sigma_px=math.sqrt(2.0),
     blurred_widths=(),
     alpha="published",
 )
 
+#: The parameters that the report prints.
+REPORT = replace(
+    PUBLISHED,
+    sigma_across_px=2.5,
+    sigma_along_rows=7.0,
+    regulariser=9.0,
+    threshold=0.4,
+    border_rows=22,
+    least_rows=30,
+    largest_scatter_px=1.0,
+    join_px=2.7,
+    joined="evidence",
+    sigma_px=1.0,
+)
+
 DEFAULT = LineSettings()
 
-PRESETS = {"default": DEFAULT, "published": PUBLISHED}
+PRESETS = {"default": DEFAULT, "published": PUBLISHED, "report": REPORT}

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 from tyro.conf import OmitArgPrefixes, Positional
 
@@ -121,7 +122,8 @@ class Lines(DetectorFlags):
     Parameters
     ----------
     preset : str
-        Values that the other flags start from: `published` is the report's parameters.
+        Values that the other flags start from: `published` gives the data set's own rows as far as
+        they are known, `report` is what the report prints of their detector.
     output : Path
         The file to write; by default detected.lines in the run folder, or named after the video
         or bag and beside it.
@@ -141,6 +143,7 @@ class Lines(DetectorFlags):
         How lines end; the data set's own end with CR and LF.
     """
 
+    preset: Literal["default", "published", "report"] = "default"  # type: ignore[assignment]
     tilt: MaybePath = None
     ids_from: MaybePath = None
     join_threshold: MaybeFloat = None

@@ -172,6 +172,7 @@ def grouping_of(settings: LineSettings) -> FloatArray:
             settings.shoulder_px,
             settings.shoulder_share,
             settings.sigma_px,
+            1.0 if settings.joined == "equal" else 0.0,
         ],
         np.float64,
     )

@@ -268,7 +268,7 @@ def lines_of_tracks(
         1 to undo the tilt, -1 to apply it once more.
     building
         See `turned_bearings`.
-    grouping : (6,) float64
+    grouping : (7,) float64
         See `detect.verticals.judgement.grouping_of`.
 
     Returns
@@ -293,11 +293,20 @@ def lines_of_tracks(
         alpha, pixel, contrast, polarity, evidence, fate, grouping[0], grouping[1], grouping[2],
         grouping[3], grouping[4],
     )  # fmt: skip
-    joined, sigma = join_tracks(alpha, noise, pixel, evidence, members, member_bounds, grouping[5])
+    equal = grouping[6] != 0.0
+    weight = np.ones(count) if equal else evidence
+    joined, sigma = join_tracks(alpha, noise, pixel, weight, members, member_bounds, grouping[5])
     strongest = members[member_bounds[:-1]]
     ends, beta = ends_of_lines(
-        bearing, elevation_tan, robot_from_camera, bounds, row, column, reference, line, strongest
+        bearing, elevation_tan, robot_from_camera, bounds, row, column, reference, line, members
     )
+    for n in range(len(strongest)):
+        # The first member of a line is its strongest.
+        first, last = member_bounds[n], member_bounds[n + 1]
+        last = last if equal else first + 1
+        for k in range(4):
+            ends[n, k] = ends[first:last, k].mean()
+        beta[n] = beta[first:last].mean()
     lines = np.empty((8, len(strongest)))
     for n in range(len(strongest)):
         for k in range(4):

@@ -19,13 +19,14 @@ from hypothesis import strategies as st
 from camera import Camera, read_camera
 from detect.drawing.lines import draw_lines, draw_response, draw_tracks, track_pixels
 from detect.errors import DetectError, FrameError
-from detect.line_settings import DEFAULT, PUBLISHED, LineSettings
+from detect.line_settings import DEFAULT, PUBLISHED, REPORT, LineSettings
 from detect.lines import ACCEPTED, JOINED, detect_lines, tilt_beyond_doubt
 from detect.verticals.bearing import compensated_bearings, inclinations, plane_normals
 from detect.verticals.judgement import judge_tracks
 from detect.verticals.tracks import line_response, line_starts, line_tracks
 from lut.verticals import build_vertical_table
 from tests.detect.line_scene import Edge, edge_columns, mirrored, pinhole, render, tilted
+from tools.evaluation.published_lines import compare_printed_lines
 
 BARREL = (0.0, -0.1, 0.0, 0.0, 0.0)
 CAMERA = pinhole(240, 160, 200.0, pitch_deg=10.0, roll_deg=1.0, coef=BARREL)
@@ -125,13 +126,14 @@ def test_published_convention_turns_the_other_way() -> None:
     assert np.abs(other.alpha_rad - level.alpha_rad).max() > 1e-3
 
 
-def test_published_preset_keeps_its_margin_of_22_rows() -> None:
+@pytest.mark.parametrize(("preset", "margin"), [(REPORT, 22.0), (PUBLISHED, 23.0)])
+def test_published_presets_keep_their_margins(preset: LineSettings, margin: float) -> None:
     camera = pinhole(240, 160, 200.0)
     table = build_vertical_table(camera)
-    found = detect_lines(scene(camera), table, PUBLISHED)
+    found = detect_lines(scene(camera), table, preset)
     np.testing.assert_allclose(found.alpha_rad, truth(), atol=3e-3)
     rows = camera.distort(found.ends.reshape(-1, 2, 2))[..., 1]
-    np.testing.assert_allclose(rows, [[22.0, 137.0]] * len(EDGES), atol=0.02)
+    np.testing.assert_allclose(rows, [[margin, 159.0 - margin]] * len(EDGES), atol=0.02)
 
 
 @given(gain=st.floats(0.8, 2.0), offset=st.floats(0.0, 10.0))
@@ -218,6 +220,41 @@ def test_close_edges_are_joined_to_one_row() -> None:
     assert joined.alpha_rad[0] == pytest.approx(mean, abs=1e-6)
     spread = share[order] @ (apart.sigma_rad**2 + (sides - mean) ** 2)
     assert joined.sigma_rad[0] == pytest.approx(np.sqrt(spread), rel=1e-3)
+
+
+def test_rows_of_the_published_preset_join_lines_as_equals() -> None:
+    """Two edges 8 px apart, one of them faint and short: the means of all that they have."""
+    camera = pinhole(240, 160, 200.0)
+    table = build_vertical_table(camera)
+    image = render(camera, [Edge(0.02, 90.0), Edge(-0.02, 25.0)], grey=80.0)
+    # The right edge ends above row 110; lines of the other remain.
+    image[110:, 120:] = image[110:, 117:118]
+    preset = replace(PUBLISHED, least_rows=30)
+    apart = detect_lines(image, table, replace(preset, join_px=1.0))
+    joined = detect_lines(image, table, preset)
+    assert (len(apart), len(joined)) == (2, 1)
+    rows = camera.distort(apart.ends.reshape(-1, 2, 2))[..., 1]
+    assert rows[0, 1] > rows[1, 1] + 10.0
+    np.testing.assert_allclose(joined.ends[0], apart.ends.mean(axis=0), atol=1e-9)
+    assert joined.beta_rad[0] == pytest.approx(apart.beta_rad.mean(), abs=1e-9)
+    assert joined.alpha_rad[0] == pytest.approx(apart.alpha_rad.mean(), abs=1e-9)
+    variance = np.mean(apart.sigma_rad**2) + 0.25 * np.ptp(apart.alpha_rad) ** 2
+    assert joined.sigma_rad[0] == pytest.approx(np.sqrt(variance), rel=1e-9)
+    # A single line is known to the root of two pixels.
+    assert apart.sigma_rad[0] == pytest.approx(np.sqrt(2.0) / 200.0, rel=0.02)
+
+
+def test_the_rows_that_the_report_prints(shared_data: Path) -> None:
+    """Each of them by the published preset: ends, bearing, joined or not."""
+    folder = shared_data / "dlr" / "e"
+    lines, _ = compare_printed_lines(shared_data / "published.json", folder)
+    assert len(lines) == 8
+    for line in lines:
+        assert line.ends_off_rows <= 1.0
+        assert line.ends_off <= 0.003
+        assert line.bearing_off_sigmas <= 0.5
+        assert line.detected.sigma == pytest.approx(line.printed.sigma, rel=0.15)
+        assert line.found
 
 
 def test_a_few_edges_tell_the_tilt_as_well_as_all_of_them() -> None:

@@ -21,6 +21,7 @@ from landmarks import FrameTilt
 from storage.exit_codes import exit_code_of
 from tools.evaluation.markers_command import Markers, MarkersCommand
 from tools.evaluation.markers_command import perform as evaluate_markers
+from tools.evaluation.published_lines import print_printed_lines
 
 _BLURS_PX = (0.3, 0.7, 1.2)
 _BINS_M = ((0.0, 1.5), (1.5, 2.5), (2.5, 4.0), (4.0, 7.0))
@@ -93,7 +94,23 @@ class Buildings:
     """
 
     data: Positional[Path] = Path("../shared/data/york")
-    preset: Literal["default", "published"] = "default"
+    preset: Literal["default", "published", "report"] = "default"
+
+
+@dataclass(frozen=True)
+class PublishedLines:
+    """Hold detected lines against the rows that the data set's report prints.
+
+    Parameters
+    ----------
+    data : Path
+        Folder with `published.json` and, in `dlr/e`, the first images of run e.
+    preset : str
+        Preset of the line detector.
+    """
+
+    data: Positional[Path] = Path("../shared/data")
+    preset: Literal["default", "published", "report"] = "published"
 
 
 @dataclass(frozen=True)
@@ -109,7 +126,7 @@ class RenderedLines:
     """
 
     run: Positional[Path] = Path("../shared/data/rendered/r1")
-    preset: Literal["default", "published"] = "default"
+    preset: Literal["default", "published", "report"] = "default"
 
 
 @dataclass(frozen=True)
@@ -135,6 +152,7 @@ def main(arguments: list[str] | None = None) -> int:
         | Annotated[Photographs, subcommand("photographs")]
         | Annotated[Rendered, subcommand("rendered")]
         | Annotated[Buildings, subcommand("buildings")]
+        | Annotated[PublishedLines, subcommand("published-lines")]
         | Annotated[RenderedLines, subcommand("rendered-lines")]
         | Annotated[Tilt, subcommand("tilt")]
         | MarkersCommand,
@@ -146,7 +164,14 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _carry_out(
-    command: Accuracy | Photographs | Rendered | Buildings | RenderedLines | Tilt | Markers,
+    command: Accuracy
+    | Photographs
+    | Rendered
+    | Buildings
+    | PublishedLines
+    | RenderedLines
+    | Tilt
+    | Markers,
 ) -> int:
     if isinstance(command, Markers):
         return evaluate_markers(command)
@@ -158,6 +183,10 @@ def _carry_out(
         return _rendered(command)
     if isinstance(command, Buildings):
         return _buildings(command)
+    if isinstance(command, PublishedLines):
+        data = command.data
+        print_printed_lines(data / "published.json", data / "dlr/e", LINE_PRESETS[command.preset])
+        return 0
     if isinstance(command, RenderedLines):
         return _rendered_lines(command)
     return _tilt(command)
