@@ -9,11 +9,11 @@ import numpy as np
 
 from camera import Camera
 from detect.circles import detect_circles, disc_shape
-from detect.seen import circle_on_floor
 from detect.drawing.lines import track_pixels
 from detect.line_settings import LineSettings
 from detect.lines import detect_lines
 from detect.run import open_run, read_image
+from detect.seen import circle_on_floor
 from detect.settings import CircleSettings
 from detect.verticals.tracks import line_response
 from lut import cached_disc_table, cached_vertical_table
