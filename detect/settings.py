@@ -91,7 +91,7 @@ class CircleSettings:
     apart_px: float = 0.0
     stride: float = 0.0
     threshold: float = 0.5
-    border_px: int = 12
+    border_px: int = 6
     far_limit: float = 1.2
     polarity: Polarity = "any"
     rows_apart: float = 0.75
@@ -182,6 +182,7 @@ PUBLISHED = CircleSettings(
 #: What the report on the data set prints of it: other outlines, every pixel, all local maxima.
 REPORT = CircleSettings(
     threshold=0.6,
+    border_px=12,
     far_limit=0.5,
     noise_floor=0.0,
     separation=0.0,

@@ -43,7 +43,9 @@ _AT_BOUND = 0.98
 _MOST_REFITS = 2
 #: By fit and rim together, a candidate that the fit speaks against needs these log-odds, and one
 #: that it speaks for is dropped below those.
-_RESCUED, _REFUTED = 0.95, 0.0
+_RESCUED, _REFUTED = 0.93, 0.0
+#: Where the edge is farther than this from a circle (radii), the rim is a coincidence.
+_MOST_UNEVEN = 0.14
 #: From this share of the rim on, the fit of the whole disc tells the place better.
 _WHOLE_RIM = 0.9
 
@@ -195,6 +197,8 @@ def _with_rim(
     )
     if told >= search.least_evidence:
         return told if together >= _REFUTED else -math.inf
+    if result[fit.OUTLINE_DEVIATION] > _MOST_UNEVEN:
+        return told
     if rim.agreeing < _WHOLE_RIM:
         result[fit.X], result[fit.Y] = rim.x, rim.y
         result[fit.COV_XX], result[fit.COV_XY], result[fit.COV_YY] = (

@@ -194,7 +194,7 @@ def demo_images(project_root: Path) -> list[GreyImage]:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("preset", [REPORT, CircleSettings()], ids=["published", "default"])
+@pytest.mark.parametrize("preset", [REPORT, CircleSettings()], ids=["report", "default"])
 def test_maps_and_best_centres_at_full_size(preset: CircleSettings, project_root: Path) -> None:
     table, outlines = both(PUBLISHED_CAMERA, disc_shape(preset))
     assert np.count_nonzero(outlines.index == 288 * 768) > 1000
@@ -213,7 +213,7 @@ def test_maps_and_best_centres_at_full_size(preset: CircleSettings, project_root
     assert count > 100
 
 
-@pytest.mark.parametrize("preset", [REPORT, CircleSettings()], ids=["published", "default"])
+@pytest.mark.parametrize("preset", [REPORT, CircleSettings()], ids=["report", "default"])
 def test_landmarks_are_those_of_plain_centres(
     preset: CircleSettings, project_root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -224,7 +224,11 @@ def test_landmarks_are_those_of_plain_centres(
     assert len(found) > 5
 
     def plain(
-        image: GreyImage, table: DiscTable, threshold: float, polarity: Polarity, rank: object
+        image: GreyImage,
+        table: DiscTable,
+        threshold: float,
+        polarity: Polarity,
+        rank: object = None,
     ) -> Found:
         return plain_best_centres(image, outlines, threshold, polarity)
 
