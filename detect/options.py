@@ -25,7 +25,7 @@ from detect.flags import (
 from detect.line_settings import LineSettings
 from detect.markers.settings import MarkerSettings
 from detect.runs.conduct import ConductOptions
-from detect.settings import CircleSettings
+from detect.settings import CircleSettings, Levelling
 from detect.sources.options import SourceOptions
 
 
@@ -197,10 +197,14 @@ class All(DetectorFlags):
         A .lines file whose IDs are carried over where the match is unambiguous.
     line_ends : str
         How lines end in files of landmarks; the data set's own end with CR and LF.
+    tilt : str
+        What levels the discs: the `run`'s tilt (a constant lean, and what frames are believed to
+        deviate from it), that of the single `frame`, or `none`.
     """
 
     ids: OmitArgPrefixes[DiscIdOptions] = field(default_factory=DiscIdOptions)
     line_ids_from: MaybePath = None
+    tilt: Levelling = "run"
     line_ends: LineEnds = "lf"
     circles: CircleSettings = field(default_factory=CircleSettings)
     lines: LineSettings = field(default_factory=LineSettings)
