@@ -183,7 +183,7 @@ class Markers(DetectorFlags):
 
 @dataclass(frozen=True, kw_only=True)
 class All(DetectorFlags):
-    """Detect verticals, tilt and discs of a run; the discs' positions are corrected for the tilt.
+    """Detect verticals, tilt and discs of a run; --tilt corrects the discs' positions for it.
 
     Example: detect all images/e --circles.polarity light, or:
     detect all 'drive/*.png' --camera front.cam --times drive.times --odometry drive.tum
@@ -198,13 +198,13 @@ class All(DetectorFlags):
     line_ends : str
         How lines end in files of landmarks; the data set's own end with CR and LF.
     tilt : str
-        What levels the discs: the `run`'s tilt (a constant lean, and what frames are believed to
-        deviate from it), that of the single `frame`, or `none`.
+        What levels the discs: `none`, the tilt of the single `frame`, or the `run`'s (a constant
+        lean, and what frames are believed to deviate from it).
     """
 
     ids: OmitArgPrefixes[DiscIdOptions] = field(default_factory=DiscIdOptions)
     line_ids_from: MaybePath = None
-    tilt: Levelling = "run"
+    tilt: Levelling = "none"
     line_ends: LineEnds = "lf"
     circles: CircleSettings = field(default_factory=CircleSettings)
     lines: LineSettings = field(default_factory=LineSettings)

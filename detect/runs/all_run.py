@@ -36,7 +36,7 @@ def detect_all_run(
     disc_ids: DiscIds = UNKNOWN,
     line_ids: LineSource | None = None,
     crlf: bool = False,
-    levelling: Levelling = "run",
+    levelling: Levelling = "none",
     on_lean: Callable[[RunTilt], None] | None = None,
 ) -> RunSummary:
     """Detect the verticals, the tilt and the discs of a run, each image decoded once.
