@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from detect.comparison.circles import Sight
     from detect.comparison.result import Rates
     from detect.run import ImageRun, Run
+    from detect.run_tilt import RunTilt
     from detect.runs.circles_run import DiscIds
     from detect.runs.conduct import Conduct
     from detect.runs.dispatch import Workers
@@ -191,7 +192,7 @@ def _markers(command: Markers) -> int:
 
 def _all(command: All) -> int:
     from detect import __version__
-    from detect.runs.all_run import detect_all_run
+    from detect.runs.all_run import detect_all_run, frames_tilt_place
     from detect.runs.run_log import log_place
     from detect.sources.opening import open_calibrated
 
@@ -203,7 +204,9 @@ def _all(command: All) -> int:
     if command.output is not None:
         _make_folder(command.output)
     conduct = _conduct(command, log_place(lines.with_suffix("")))
-    _demand_new([lines, tilt, circles], command.force, run, conduct)
+    frames_tilt = frames_tilt_place(tilt) if command.tilt == "run" else None
+    _demand_new([lines, tilt, circles, frames_tilt], command.force, run, conduct)
+    leans: list[RunTilt] = []
     disc_ids = _disc_ids(command.ids)
     line_ids = None
     if command.line_ids_from is not None:
@@ -226,9 +229,16 @@ def _all(command: All) -> int:
             disc_ids=disc_ids,
             line_ids=line_ids,
             crlf=command.line_ends == "crlf",
+            levelling=command.tilt,
+            on_lean=leans.append,
         )
     print(f"{lines}: {summary.lines} lines in {summary.frames} frames")
-    print(f"{tilt}: the tilt of {summary.tilts} frames{_other_frames(summary, command.circles)}")
+    if leans:
+        print(f"{frames_tilt}: the tilt of {summary.tilts} frames, each by itself")
+        print(f"{tilt}: {leans[0].sentence()}")
+    else:
+        others = _other_frames(summary, command.circles) if command.tilt != "none" else ""
+        print(f"{tilt}: the tilt of {summary.tilts} frames{others}")
     print(f"{circles}: {summary.discs} discs in {summary.frames} frames")
     _tell_blind_to_verticals(summary, run)
     return _exit_code(summary, run)

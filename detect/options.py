@@ -25,7 +25,7 @@ from detect.flags import (
 from detect.line_settings import LineSettings
 from detect.markers.settings import MarkerSettings
 from detect.runs.conduct import ConductOptions
-from detect.settings import CircleSettings
+from detect.settings import CircleSettings, Levelling
 from detect.sources.options import SourceOptions
 
 
@@ -183,7 +183,7 @@ class Markers(DetectorFlags):
 
 @dataclass(frozen=True, kw_only=True)
 class All(DetectorFlags):
-    """Detect verticals, tilt and discs of a run; the discs' positions are corrected for the tilt.
+    """Detect verticals, tilt and discs of a run; --tilt corrects the discs' positions for it.
 
     Example: detect all images/e --circles.polarity light, or:
     detect all 'drive/*.png' --camera front.cam --times drive.times --odometry drive.tum
@@ -197,10 +197,14 @@ class All(DetectorFlags):
         A .lines file whose IDs are carried over where the match is unambiguous.
     line_ends : str
         How lines end in files of landmarks; the data set's own end with CR and LF.
+    tilt : str
+        What levels the discs: `none`, the tilt of the single `frame`, or the `run`'s (a constant
+        lean, and what frames are believed to deviate from it).
     """
 
     ids: OmitArgPrefixes[DiscIdOptions] = field(default_factory=DiscIdOptions)
     line_ids_from: MaybePath = None
+    tilt: Levelling = "none"
     line_ends: LineEnds = "lf"
     circles: CircleSettings = field(default_factory=CircleSettings)
     lines: LineSettings = field(default_factory=LineSettings)

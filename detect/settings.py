@@ -18,6 +18,8 @@ from storage.bounds import (
     whole,
 )
 
+#: By what positions are corrected for the tilt.
+Levelling = Literal["none", "frame", "run"]
 Polarity = Literal["any", "light", "dark"]
 
 

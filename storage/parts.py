@@ -85,6 +85,14 @@ class PartFile:
         os.ftruncate(self._handle, size)
         os.lseek(self._handle, size, os.SEEK_SET)
 
+    def rewind(self) -> None:
+        """Read on from the beginning."""
+        os.lseek(self._handle, 0, os.SEEK_SET)
+
+    def to_end(self) -> None:
+        """Grow on at the end."""
+        os.lseek(self._handle, 0, os.SEEK_END)
+
     def sync(self) -> None:
         """Have it on the disk."""
         try:

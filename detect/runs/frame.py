@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from detect.lines import LineDetections
     from detect.markers.detections import MarkerDetections
     from detect.markers.settings import MarkerSettings
-    from detect.settings import CircleSettings
+    from detect.settings import CircleSettings, Levelling
     from lut import DiscShape, DiscTable, VerticalTable
 
 
@@ -53,6 +53,9 @@ class FramePlan:
         that are no lines.
     draw_response : bool
         Whether the filter's response of the lines is drawn as well.
+    levelling : {"none", "frame", "run"}
+        By what the discs are corrected for the tilt: by nothing, by the frame's own, or, when all
+        frames are done, by the run's (`detect.runs.level_run`).
     known_level : bool
         Whether the discs whose IDs are carried over are corrected for the tilt.
     id_slack_m : float
@@ -68,6 +71,7 @@ class FramePlan:
     json: bool = False
     drawing: Literal["discs", "lines", "tracks", "markers"] | None = None
     draw_response: bool = False
+    levelling: Levelling = "frame"
     known_level: bool = False
     id_slack_m: float = 0.1
     working_folder: Path | None = None
@@ -171,7 +175,8 @@ def discs_in_image(
 
     assert tables.discs is not None
     assert plan.camera is not None
-    settings = plan.circles if tilt is None else _without_tilt(plan.circles)
+    levelled_later = plan.levelling == "run" or (plan.levelling == "frame" and tilt is not None)
+    settings = _without_tilt(plan.circles) if levelled_later else plan.circles
     return detect_circles(image, plan.camera, tables.discs, settings)
 
 
@@ -214,7 +219,7 @@ def seen_together(
     FrameDetections
     """
     seen = discs
-    if discs is not None and tilt is not None:
+    if discs is not None and tilt is not None and plan.levelling == "frame":
         from detect.levelling import levelled, with_prior
 
         assert plan.camera is not None

@@ -31,6 +31,8 @@ class RunOutput(Protocol):
     @property
     def between(self) -> bytes: ...
     @property
+    def placed(self) -> bool: ...
+    @property
     def crlf(self) -> bool: ...
 
 
@@ -48,6 +50,8 @@ class GrowingFile:
         What a frame gives it, from the frame's rows and prefix.
     overwrite : bool
         Whether an existing file may be replaced.
+    placed : bool
+        Whether it is a result; else others are made of it, and it goes when they are there.
     part : PartFile or None
         Where it grows.
     size : int
@@ -61,6 +65,7 @@ class GrowingFile:
     tail: bytes
     rows: Callable[[FrameRows, str], bytes]
     overwrite: bool
+    placed: bool = True
     part: PartFile | None = None
     size: int = 0
 

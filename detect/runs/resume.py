@@ -19,9 +19,11 @@ import errno
 import logging
 import os
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
+from typing import BinaryIO
 
 from detect.errors import DetectError
 from detect.runs.conduct import Conduct
@@ -55,6 +57,10 @@ from storage.parts import folder_locked, left_part, new_part, remove_left_part
 _log = logging.getLogger("redetect")
 
 
+#: Rows for the files that are made of others, from those (by their names): name and bytes.
+SecondPass = Callable[[Mapping[str, BinaryIO]], Iterable[tuple[str, bytes]]]
+
+
 class RunFiles:
     """The files of a run: a context manager that opens them, and keeps or removes what there is.
 
@@ -83,7 +89,14 @@ class RunFiles:
         self._under_way: deque[tuple[str, str]] = deque()
         self._resumes = self._goes_on = self._done = False
         self._files = [
-            GrowingFile(output.path, output.head, output.tail, self._rows_of(output), overwrite)
+            GrowingFile(
+                output.path,
+                output.head,
+                output.tail,
+                self._rows_of(output),
+                overwrite,
+                placed=output.placed,
+            )
             for output in outputs
         ]
         if conduct.log is not None:
@@ -136,6 +149,8 @@ class RunFiles:
     def _demand_new(self) -> None:
         """Refuse to replace what must not be, or cannot be."""
         for file in self._files:
+            if not file.placed:
+                continue
             if file.path.is_dir() and not file.path.is_symlink():
                 raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(file.path))
             if not file.overwrite and os.path.lexists(file.path):
@@ -171,7 +186,10 @@ class RunFiles:
             part = left_part(file.path, number)
             if part is not None:
                 try:
-                    part.place(overwrite=head.overwrite or file.overwrite)
+                    if file.placed:
+                        part.place(overwrite=head.overwrite or file.overwrite)
+                    else:
+                        part.discard()
                 finally:
                     part.close()
         if self._conduct.resume and head.made_by == self._made_by:
@@ -330,6 +348,8 @@ class RunFiles:
 
     def _rows_of(self, output: RunOutput) -> Callable[[FrameRows, str], bytes]:
         def rows_of(rows: FrameRows, _: str) -> bytes:
+            if output.part == "late":
+                return b""
             content = getattr(rows, output.part)
             assert isinstance(content, bytes)
             if output.crlf:
@@ -345,7 +365,7 @@ class RunFiles:
 
     # -- ending -----------------------------------------------------------------------------
 
-    def finish(self, found: Counted) -> None:
+    def finish(self, found: Counted, second_pass: SecondPass | None = None) -> None:
         """Write what stands after the frames, and have the files take their places.
 
         Raises
@@ -355,12 +375,15 @@ class RunFiles:
         """
         if self._done:  # by a run that was killed at its very end
             return
+        if second_pass is not None:
+            self._write_late(second_pass)
         written: list[WrittenFile] = []
         for file in self._files:
             is_log = file.path == self._conduct.log
             file.write(log_tail(found, written) if is_log else file.tail)
-            written.append(WrittenFile(file.path.name, file.size, file.digest.hexdigest()))
-        parts = [(file, file.part) for file in self._files if file.part is not None]
+            if file.placed:
+                written.append(WrittenFile(file.path.name, file.size, file.digest.hexdigest()))
+        parts = [(file, file.part) for file in self._files if file.part is not None and file.placed]
         sync_together([part for _, part in parts])
         with folder_locked(self._files[-1].path.parent):
             for file, _ in parts:
@@ -371,7 +394,26 @@ class RunFiles:
                     self._journal.complete()
                 for file, part in parts:
                     part.place(overwrite=file.overwrite)
+        for file in self._files:
+            if file.part is not None and not file.placed:
+                file.part.discard()
         self._done = True
+
+    def _write_late(self, second_pass: SecondPass) -> None:
+        """Fill the files that are made of the others. What a killed run left of them is cut off."""
+        files = {file.path.name: file for file in self._files}
+        with ExitStack() as stack:
+            first = {}
+            for name, file in files.items():
+                assert file.part is not None
+                file.part.rewind()
+                stream = open(file.part.fileno(), "rb", closefd=False)  # noqa: SIM115 - on the stack
+                first[name] = stack.enter_context(stream)
+            for name, rows in second_pass(first):
+                files[name].write(rows)
+        for file in files.values():
+            assert file.part is not None
+            file.part.to_end()
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None

@@ -193,7 +193,7 @@ def made_by(outputs: Sequence[RunOutput], plan: FramePlan, conduct: Conduct) -> 
         (np.__version__, cv2.__version__, version("numba")),
         settings,
         None if plan.camera is None else plan.camera.content_hash,
-        (plan.json, plan.drawing, plan.draw_response),
+        (plan.json, plan.drawing, plan.draw_response, plan.levelling),
         [(output.part, output.head, output.tail, output.between) for output in outputs],
     )
     return hashlib.sha256(repr(values).encode("utf-8", "surrogateescape")).hexdigest()

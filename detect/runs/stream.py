@@ -25,7 +25,7 @@ from detect.runs.dispatch import Workers, detect_chunks
 from detect.runs.frame import FramePlan, tables_of
 from detect.runs.frame_rows import FrameRows, FrameTask, KnownRows
 from detect.runs.garbage import settled
-from detect.runs.resume import RunFiles
+from detect.runs.resume import RunFiles, SecondPass
 from detect.runs.workers import local_workers, pixels_of
 from detect.sources.times import TIMES_HEAD
 from landmarks import CircleLandmark, FrameTilt, LineLandmark, format_head
@@ -99,21 +99,24 @@ class Output:
     ----------
     path : path
     part : str
-        Which part of `FrameRows` goes into it.
+        Which part of `FrameRows` goes into it; "late": none, a second pass fills it.
     head, tail : bytes
         What stands before and after the rows of all frames.
     between : bytes
         What stands between those of two frames.
     crlf : bool
         Whether rows end with CR and LF, as in the data set's own files.
+    placed : bool
+        Whether it is a result; else others are made of it, and it goes when they are there.
     """
 
     path: Path
-    part: Literal["circles", "lines", "tilt", "markers", "json", "times"]
+    part: Literal["circles", "lines", "tilt", "markers", "json", "times", "late"]
     head: bytes = b""
     tail: bytes = b""
     between: bytes = b""
     crlf: bool = False
+    placed: bool = True
 
 
 @dataclass
@@ -172,6 +175,7 @@ def detect_run(
     workers: Workers | None = None,
     on_progress: Callable[[], None] | None = None,
     conduct: Conduct = PLAIN,
+    second_pass: SecondPass | None = None,
 ) -> RunSummary:
     """Do with every frame of a run what a plan says, and write what comes of it.
 
@@ -198,6 +202,8 @@ def detect_run(
     conduct : Conduct
         Whether there are a log and a journal, how bad frames are met, and whether an unfinished run
         is resumed.
+    second_pass : callable, optional
+        Makes the files of the part "late" of the others, when all frames are done.
 
     Returns
     -------
@@ -246,7 +252,7 @@ def detect_run(
                     if on_progress is not None:
                         on_progress()
         summary.images_without_step = run.images_without_step
-        files.finish(summary)
+        files.finish(summary, second_pass)
     return summary
 
 

@@ -59,6 +59,7 @@ def in_one_pass(run: Path, output: Path, jobs: int) -> None:
         output / "detected.lines",
         output / "detected.tilt",
         output / "detected.circles",
+        levelling="frame",
         version="test",
         workers=local_workers(jobs),
     )

@@ -66,6 +66,7 @@ def detected(
         lines,
         tilt,
         circles,
+        levelling="frame",
         version="test",
         workers=workers,
         on_progress=on_progress,
