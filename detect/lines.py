@@ -31,7 +31,6 @@ from detect.line_settings import DEFAULT, LineSettings
 from detect.verticals.blur import widened, width_for
 from detect.verticals.detections import LineDetections
 from detect.verticals.filter import LineFilter, line_filter, start_band
-from detect.verticals.fit import LineFits
 from detect.verticals.judgement import (
     ACCEPTED,
     JOINED,
@@ -45,9 +44,7 @@ from detect.verticals.tilt import TiltEstimate
 from detect.verticals.tracks import LineTracks, padded_pixels
 from lut.verticals import VerticalTable
 
-__all__ = ["ACCEPTED", "JOINED", "LineDetections", "detect_lines", "line_ends", "tilt_beyond_doubt"]
-
-FloatArray = NDArray[np.float64]
+__all__ = ["ACCEPTED", "JOINED", "LineDetections", "detect_lines", "tilt_beyond_doubt"]
 
 #: A few edges tell the tilt beyond doubt if so many lines and such a part of the votes agree with
 #: it, and if it tells the lean of verticals as well as this everywhere in the image. A track that
@@ -177,31 +174,3 @@ def tilt_beyond_doubt(
     ):
         return judged.tilt
     return None
-
-
-def line_ends(
-    tracks: LineTracks, fits: LineFits, table: VerticalTable, chosen: NDArray[np.int64]
-) -> tuple[FloatArray, FloatArray]:
-    """Ends of fitted lines at the first and last row of their tracks, and their inclinations.
-
-    Parameters
-    ----------
-    tracks, fits, table
-        As elsewhere.
-    chosen : (N,) int64
-        Which tracks.
-
-    Returns
-    -------
-    ends : (N, 4) float64
-        xtop, ytop, xbottom, ybottom: undistorted normalised coordinates.
-    beta : (N,) float64
-        Inclinations of the normals of their planes (rad).
-    """
-    from detect.verticals.bearing_kernels import ends_of_lines
-
-    ends, beta = ends_of_lines(
-        table.bearing_rad, table.elevation_tan, table.robot_from_camera,
-        tracks.bounds, tracks.row, tracks.column, fits.reference_rad, fits.line, chosen,
-    )  # fmt: skip
-    return ends, beta

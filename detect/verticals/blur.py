@@ -11,12 +11,20 @@ import dataclasses
 import math
 from functools import lru_cache
 
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
 from detect.line_settings import LineSettings
+from detect.verticals.fit import FIT_NUMBERS
+from detect.verticals.order_kernels import descending
 
 #: A filter of this share of the blur's width is wide enough.
 _WIDE_ENOUGH = 0.68
 #: Refinement has no steps wider than this, pixels.
 _WIDEST_STEP_PX = 19.0
+#: Fewer edges than this tell nothing of the image.
+_LEAST_EDGES = 3
 #: What grows with the width of the filter: pixels across an edge. A line's standard deviation is
 #: among it: what stands beside an edge within the blur draws it by some part of that.
 _ACROSS = (
@@ -56,7 +64,7 @@ def width_for(sharpness: float, settings: LineSettings) -> float:
     Parameters
     ----------
     sharpness : float
-        Median sharpness of the edges (`detect.verticals.blur_kernels.median_sharpness`).
+        Median sharpness of the edges (`median_sharpness`).
     settings : LineSettings
         By which they were found.
 
@@ -84,3 +92,26 @@ def widened(settings: LineSettings, width: float) -> LineSettings:
     )
     wider = tuple(other / width for other in settings.blurred_widths if other > width)
     return dataclasses.replace(settings, refine_steps_px=steps, blurred_widths=wider, **across)
+
+
+@njit(cache=True, error_model="numpy")
+def median_sharpness(fits: NDArray[np.float64]) -> float:
+    """Median sharpness of the edges that were refined, lines or not; 1 where there are too few.
+
+    Of an even number the lower of the two in the middle.
+
+    Parameters
+    ----------
+    fits : (13 * T,) float64
+        See `detect.verticals.fit.LineFits`.
+    """
+    count = len(fits) // FIT_NUMBERS
+    sharpness = np.empty(count)
+    told = 0
+    for t in range(count):
+        if not math.isnan(fits[11 * count + t]):
+            sharpness[told] = fits[12 * count + t]
+            told += 1
+    if told < _LEAST_EDGES:
+        return 1.0
+    return float(sharpness[descending(sharpness[:told])[told // 2]])

@@ -108,7 +108,7 @@ class LineDetections:
 
     @property
     def sharpness(self) -> float:
-        """Median sharpness of the edges (`detect.verticals.blur_kernels.median_sharpness`)."""
+        """Median sharpness of the edges (`detect.verticals.blur.median_sharpness`)."""
         return float(self.numbers[-1])
 
     @cached_property

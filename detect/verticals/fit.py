@@ -83,29 +83,3 @@ class LineFits:
         It is 1 without refinement.
         """
         return self._part(12, 13)
-
-    @property
-    def normal(self) -> FloatArray:
-        """(T, 3) unit normals of the lines' planes, robot frame (`detect.verticals.bearing`)."""
-        return plane_normals_of_lines(self.reference_rad, self.line)
-
-
-def plane_normals_of_lines(reference_rad: FloatArray, line: FloatArray) -> FloatArray:
-    """Unit normals of the planes of lines in charts.
-
-    Parameters
-    ----------
-    reference_rad : (...) float64
-        Bearings of the charts' origins.
-    line : (..., 2) float64
-        a, b.
-
-    Returns
-    -------
-    (..., 3) float64
-        Robot frame, as `detect.verticals.bearing.plane_normals` has them.
-    """
-    sine, cosine = np.sin(reference_rad), np.cos(reference_rad)
-    a, b = line[..., 0], line[..., 1]
-    normal = np.stack([cosine - a * sine, sine + a * cosine, -b], axis=-1)
-    return np.asarray(normal / np.linalg.norm(normal, axis=-1, keepdims=True))

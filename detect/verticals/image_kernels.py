@@ -10,7 +10,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from detect.verticals.blur_kernels import median_sharpness
+from detect.verticals.blur import median_sharpness
 from detect.verticals.chain_kernels import tilt_of_chains
 from detect.verticals.detections import COUNTS
 from detect.verticals.follow_kernels import follow_edges

@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from detect.verticals.bearing_kernels import chain_neighbours, join_mixture, wrapped
+from detect.verticals.bearing import chain_neighbours, join_mixture, wrapped
 from detect.verticals.order_kernels import descending
 from detect.verticals.sum_kernels import sum_of
 

@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from detect.verticals.bearing_kernels import ends_of_lines, turned_bearings
+from detect.verticals.bearing import ends_of_lines, turned_bearings
 from detect.verticals.fit import FIT_NUMBERS
 from detect.verticals.fit_kernels import fit_eigenlines, refine_lines
 from detect.verticals.judgement_kernels import (

@@ -21,11 +21,11 @@ from detect.drawing.lines import draw_lines, draw_response, draw_tracks, track_p
 from detect.errors import DetectError, FrameError
 from detect.line_settings import DEFAULT, PUBLISHED, REPORT, LineSettings
 from detect.lines import ACCEPTED, JOINED, detect_lines, tilt_beyond_doubt
-from detect.verticals.bearing import compensated_bearings, inclinations, plane_normals
 from detect.verticals.judgement import judge_tracks
 from detect.verticals.tracks import line_response, line_starts, line_tracks
 from lut.verticals import build_vertical_table
 from tests.detect.line_scene import Edge, edge_columns, mirrored, pinhole, render, tilted
+from tests.reference.verticals import compensated_bearings, inclinations, plane_normals
 from tools.evaluation.published_lines import compare_printed_lines
 
 BARREL = (0.0, -0.1, 0.0, 0.0, 0.0)

@@ -12,7 +12,10 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from camera import Camera
-from detect.verticals.bearing import (
+from detect.verticals.bearing import chain_neighbours, join_mixture
+from detect.verticals.tilt import TiltEstimate
+from landmarks import LineLandmark, parse_record
+from tests.reference.verticals import (
     close_groups,
     compensated_bearings,
     inclinations,
@@ -20,8 +23,6 @@ from detect.verticals.bearing import (
     level_bearings,
     plane_normals,
 )
-from detect.verticals.tilt import TiltEstimate
-from landmarks import LineLandmark, parse_record
 
 #: Rows of one edge each (the joined ones have a larger sigma); the report's figures 10 and 11.
 UNJOINED = {"e.0000": (0, 2, 3, 4), "e.0001": (0, 1)}
@@ -119,7 +120,8 @@ def test_joining_conserves_mean_and_variance(
 ) -> None:
     offset, sigma, weight, turn, _ = mixture
     alpha = (offset + turn + np.pi) % (2 * np.pi) - np.pi
-    mean, deviation = join_bearings(alpha, sigma, weight)
+    mean, deviation = join_mixture(alpha, sigma, weight)
+    np.testing.assert_allclose((mean, deviation), join_bearings(alpha, sigma, weight), atol=1e-9)
     share = weight / weight.sum()
     expected = share @ offset
     assert abs((mean - turn - expected + np.pi) % (2 * np.pi) - np.pi) < 1e-9
@@ -132,20 +134,20 @@ def test_joining_does_not_depend_on_the_order(
     mixture: tuple[np.ndarray, np.ndarray, np.ndarray, float, list[int]],
 ) -> None:
     offset, sigma, weight, _, order = mixture
-    straight = join_bearings(offset, sigma, weight)
-    shuffled = join_bearings(offset[order], sigma[order], weight[order])
+    straight = join_mixture(offset, sigma, weight)
+    shuffled = join_mixture(offset[order], sigma[order], weight[order])
     np.testing.assert_allclose(shuffled, straight, rtol=1e-9, atol=1e-12)
     np.testing.assert_array_equal(
-        close_groups(offset[order], np.full(len(offset), 0.02)),
+        chain_neighbours(offset[order], np.full(len(offset), 0.02)),
         close_groups(offset, np.full(len(offset), 0.02))[order],
     )
 
 
-def test_close_groups_chain_neighbours_from_left_to_right() -> None:
+def test_chains_of_neighbours_from_left_to_right() -> None:
     alpha = np.array([0.10, -0.30, 0.105, 0.50, 0.114])
-    np.testing.assert_array_equal(close_groups(alpha, np.full(5, 0.01)), [1, 2, 1, 0, 1])
+    np.testing.assert_array_equal(chain_neighbours(alpha, np.full(5, 0.01)), [1, 2, 1, 0, 1])
     # The smaller of two distances decides: 0.105 is on its own.
     np.testing.assert_array_equal(
-        close_groups(alpha, np.array([0.01, 0.01, 0.002, 0.01, 0.01])), [3, 4, 2, 0, 1]
+        chain_neighbours(alpha, np.array([0.01, 0.01, 0.002, 0.01, 0.01])), [3, 4, 2, 0, 1]
     )
-    assert len(close_groups(np.zeros(0), np.zeros(0))) == 0
+    assert len(chain_neighbours(np.zeros(0), np.zeros(0))) == 0

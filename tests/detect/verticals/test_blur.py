@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from detect.errors import DetectError
 from detect.line_settings import DEFAULT, PUBLISHED, LineSettings
 from detect.lines import detect_lines
-from detect.verticals.blur import blur_of_sharpness, widened, width_for
-from detect.verticals.blur_kernels import median_sharpness
+from detect.verticals.blur import blur_of_sharpness, median_sharpness, widened, width_for
 from detect.verticals.fit import FIT_NUMBERS
 from lut.verticals import build_vertical_table
 from tests.detect.line_scene import Edge, pinhole, render, tilted

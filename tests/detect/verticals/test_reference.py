@@ -1,0 +1,101 @@
+"""Compiled stages against what they compute, written out (`tests.reference.verticals`)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from detect.line_settings import DEFAULT, PUBLISHED, LineSettings
+from detect.verticals.fit_kernels import fit_eigenlines
+from detect.verticals.strip import strip_of
+from detect.verticals.tracks import LineStarts, line_response, line_tracks, start_response
+from lut.verticals import build_vertical_table
+from tests.detect.line_scene import Edge, pinhole, render, tilted
+from tests.reference import verticals as reference
+
+CAMERA = pinhole(200, 130, 150.0, pitch_deg=12.0, roll_deg=2.0, coef=(0.0, -0.1, 0.0, 0.0, 0.0))
+TABLE = build_vertical_table(CAMERA)
+#: A shorter filter of the published kind: that of the preset is as high as a third of the image.
+SHORT = replace(PUBLISHED, sigma_along_rows=3.0, border_rows=6, least_rows=10)
+
+
+def images() -> dict[str, NDArray[np.uint8]]:
+    rng = np.random.default_rng(4)
+    shape = (CAMERA.height, CAMERA.width)
+    edges = [Edge(0.4, 60.0), Edge(0.2, -50.0), Edge(0.0, 80.0), Edge(-0.3, -40.0)]
+    seen = render(tilted(CAMERA, 0.02, -0.01), edges, noise=2.0, rng=rng)
+    return {
+        "random": rng.integers(0, 256, shape).astype(np.uint8),
+        "black": np.zeros(shape, np.uint8),
+        "white": np.full(shape, 255, np.uint8),
+        "saturated": np.clip(rng.normal(255.0, 60.0, shape), 0, 255).astype(np.uint8),
+        "edges": seen,
+        "saturated edges": np.where(seen > 120, 255, 0).astype(np.uint8),
+    }
+
+
+@pytest.mark.parametrize("settings", [DEFAULT, SHORT], ids=["default", "published"])
+@pytest.mark.parametrize("kind", images())
+def test_responses_are_those_of_the_reference(kind: str, settings: LineSettings) -> None:
+    image = images()[kind]
+    expected = reference.response(image, TABLE, settings)
+    found = line_response(image, TABLE, settings)
+    np.testing.assert_allclose(found, expected, atol=2e-4)
+    # On the band round the horizon the window is laid over the strip: a few percent.
+    band_response, band = start_response(image, TABLE, settings)
+    level, column = np.nonzero(band.row >= 0)
+    own = expected[band.row[level, column], column]
+    off = np.abs(band_response[level, column] - own)
+    assert np.quantile(off, 0.99) <= 0.05
+
+
+@pytest.mark.parametrize("settings", [DEFAULT, SHORT], ids=["default", "published"])
+@pytest.mark.parametrize("kind", ["random", "saturated", "edges", "saturated edges"])
+def test_tracks_are_those_of_the_reference(kind: str, settings: LineSettings) -> None:
+    image = images()[kind]
+    response = line_response(image, TABLE, settings).astype(np.float64)
+    rows = np.rint(np.where(TABLE.usable, TABLE.anchor_row, 0.0)).astype(np.intp)
+    columns = np.arange(5, CAMERA.width - 5)
+    score = np.abs(response[rows[columns], columns])
+    peak = (score >= settings.threshold) & TABLE.usable[columns]
+    peak[1:-1] &= (score[1:-1] > score[:-2]) & (score[1:-1] > score[2:])
+    compared = 0
+    for column in columns[peak][:20]:
+        row = rows[column]
+        start = LineStarts(
+            np.array([row], np.int32),
+            np.array([column], np.int32),
+            np.sign(response[row, column : column + 1]).astype(np.float32),
+            score[columns == column].astype(np.float32),
+        )
+        tracks = line_tracks(image, start, TABLE, settings)
+        expected = reference.follow(response, int(row), int(column), settings)
+        assert len(tracks.row) == len(expected)
+        if not expected:
+            continue
+        compared += 1
+        np.testing.assert_array_equal(tracks.row, [v for v, _, _ in expected])
+        np.testing.assert_allclose(tracks.column, [c for _, c, _ in expected], atol=2e-3)
+        np.testing.assert_allclose(tracks.score, [s for _, _, s in expected], atol=2e-4)
+    # In noise the long filter has no maximum that is high enough.
+    assert compared >= (3 if "edges" in kind or settings is DEFAULT else 0)
+
+
+def test_lines_through_tracks_are_those_of_the_reference() -> None:
+    table, strip = TABLE, strip_of(TABLE)
+    rng = np.random.default_rng(8)
+    columns = np.arange(CAMERA.width)
+    for middle in (40.0, 90.0, 150.0):
+        row = np.arange(30, 100, dtype=np.int32)
+        column = middle + 0.02 * (row - 60) + rng.normal(0.0, 0.2, len(row))
+        reference_rad, _, line, *_ = fit_eigenlines(
+            table.bearing_rad, strip.rise, np.array([0, len(row)]), row, column,
+            np.ones(len(row), np.float32), 5, 0.0,
+        )  # fmt: skip
+        bearing = np.interp(column, columns, table.bearing_rad)
+        rise = [np.interp(c, columns, table.elevation_tan[v]) for v, c in zip(row, column)]
+        expected = reference.eigenline(bearing, np.array(rise), float(reference_rad[0]))
+        np.testing.assert_allclose(line[0], expected, rtol=1e-5, atol=1e-7)
