@@ -14,6 +14,7 @@ import numpy as np
 import tyro
 from tyro.conf import Positional, subcommand
 
+from camera import read_camera
 from detect.line_settings import PRESETS as LINE_PRESETS
 from detect.line_settings import LineSettings
 from detect.settings import CircleSettings
@@ -22,6 +23,8 @@ from storage.exit_codes import exit_code_of
 from tools.evaluation.markers_command import Markers, MarkersCommand
 from tools.evaluation.markers_command import perform as evaluate_markers
 from tools.evaluation.published_lines import print_printed_lines
+from tools.evaluation.real_run import measure_run, table_of
+from tools.evaluation.tilt_of_discs import compare_tilts, report_of
 
 _BLURS_PX = (0.3, 0.7, 1.2)
 _BINS_M = ((0.0, 1.5), (1.5, 2.5), (2.5, 4.0), (4.0, 7.0))
@@ -114,6 +117,47 @@ class PublishedLines:
 
 
 @dataclass(frozen=True)
+class RealRun:
+    """Detect a recorded run by several presets, compare with its shipped rows, and map the rows.
+
+    Parameters
+    ----------
+    run : Path
+        Run folder with images, calibration and `map.circles`.
+    """
+
+    run: Positional[Path] = Path("../shared/data/dlr/e")
+
+
+@dataclass(frozen=True)
+class TiltOfDiscs:
+    """Hold the tilt that verticals show against the tilt that the discs of a map show.
+
+    Parameters
+    ----------
+    rows : Path
+        Raw rows of discs with the map's identifiers (`detect circles --ids-from`).
+    tilts : Path
+        Tilts of single frames (`detect lines`).
+    camera : Path
+        Calibration.
+    map : Path
+        `map.csv` of `slam map`.
+    path : Path
+        Its `path.csv`.
+    raised_m : float
+        How much higher the camera is than calibrated.
+    """
+
+    rows: Positional[Path]
+    tilts: Positional[Path]
+    camera: Path
+    map: Path
+    path: Path
+    raised_m: float = 0.0
+
+
+@dataclass(frozen=True)
 class RenderedLines:
     """Detect the verticals and the tilt of a rendered run; score both, and the discs levelled.
 
@@ -153,6 +197,8 @@ def main(arguments: list[str] | None = None) -> int:
         | Annotated[Rendered, subcommand("rendered")]
         | Annotated[Buildings, subcommand("buildings")]
         | Annotated[PublishedLines, subcommand("published-lines")]
+        | Annotated[RealRun, subcommand("real-run")]
+        | Annotated[TiltOfDiscs, subcommand("tilt-of-discs")]
         | Annotated[RenderedLines, subcommand("rendered-lines")]
         | Annotated[Tilt, subcommand("tilt")]
         | MarkersCommand,
@@ -169,6 +215,8 @@ def _carry_out(
     | Rendered
     | Buildings
     | PublishedLines
+    | RealRun
+    | TiltOfDiscs
     | RenderedLines
     | Tilt
     | Markers,
@@ -187,13 +235,27 @@ def _carry_out(
         data = command.data
         print_printed_lines(data / "published.json", data / "dlr/e", LINE_PRESETS[command.preset])
         return 0
+    if isinstance(command, RealRun):
+        with tempfile.TemporaryDirectory() as folder:
+            print(table_of(measure_run(command.run, Path(folder))))
+        return 0
+    if isinstance(command, TiltOfDiscs):
+        compared = compare_tilts(
+            read_camera(command.camera),
+            command.rows,
+            command.tilts,
+            command.map,
+            command.path,
+            raised_m=command.raised_m,
+        )
+        print("\n".join(report_of(compared)))
+        return 0
     if isinstance(command, RenderedLines):
         return _rendered_lines(command)
     return _tilt(command)
 
 
 def _accuracy(command: Accuracy) -> int:
-    from camera import read_camera
     from tools.evaluation.accuracy import measure_accuracy
 
     camera = read_camera(command.camera)

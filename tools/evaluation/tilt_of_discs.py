@@ -1,0 +1,188 @@
+"""The tilt that the discs of a map show, beside the tilt that the verticals of a run show."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from camera import Camera
+from detect.runs.image_names import image_name
+from detect.seen import image_positions
+from landmarks import Frame, read_frames, read_tilts
+from landmarks.map_file import read_map, read_path
+
+FloatArray = NDArray[np.float64]
+
+#: An error of the image smaller than this is not believed, pixels along u.
+_LEAST_SIGMA_PX = 0.15
+_UNKNOWNS = 5
+#: A frame whose two tilts differ by more than this many standard deviations is listed.
+_FAR_SIGMAS = 4.0
+
+
+class DiscTilt(NamedTuple):
+    """Pitch and roll of one frame by its discs."""
+
+    discs: int
+    pitch_rad: float
+    roll_rad: float
+    covariance: FloatArray
+    """(2, 2), from the residuals, square radians."""
+
+
+@dataclass(frozen=True, eq=False)
+class TiltComparison:
+    """The two tilts of the frames that have enough lines and discs.
+
+    Attributes
+    ----------
+    prefixes : list of str
+    by_lines, by_discs : (N, 2) float64
+        Pitch and roll, radians.
+    squared : (N,) float64
+        Squared difference in units of both covariances; 2 is expected.
+    """
+
+    prefixes: list[str]
+    by_lines: FloatArray
+    by_discs: FloatArray
+    squared: FloatArray
+
+
+def tilt_of_discs(
+    camera: Camera, rows_xy: FloatArray, map_xy: FloatArray, pose: FloatArray, raised_m: float = 0.0
+) -> DiscTilt:
+    """Pose, pitch and roll that put discs of a map where the camera saw them, robustly.
+
+    Parameters
+    ----------
+    camera : Camera
+        The camera as calibrated.
+    rows_xy : (N, 2) float64
+        Rows that nothing levelled, robot frame, metres; at least 4.
+    map_xy : (N, 2) float64
+        Their discs in the map, metres.
+    pose : (3,) float64
+        About where the robot is: x, y (m), heading (rad).
+    raised_m : float
+        How much higher the camera is than calibrated: it trades with the pitch.
+    """
+    seen = image_positions(camera, rows_xy)
+    # Errors are about equal in all directions of the lens, whatever the shape of a pixel.
+    per_px = np.array([1.0, camera.scale_x / camera.scale_y])
+
+    def residuals(unknowns: FloatArray) -> FloatArray:
+        x, y, heading, pitch, roll = unknowns
+        cosine, sine = np.cos(heading), np.sin(heading)
+        level = (map_xy - (x, y)) @ np.array([[cosine, -sine], [sine, cosine]])
+        off = image_positions(camera, level, (pitch, roll), raised_m) - seen
+        return np.asarray(np.nan_to_num(off * per_px, nan=100.0).ravel())
+
+    start = np.array([*pose, 0.0, 0.0])
+    found = least_squares(residuals, start, loss="soft_l1", x_scale=[0.1, 0.1, 0.1, 0.01, 0.01])
+    # From there, errors beyond a pixel are another disc's.
+    found = least_squares(residuals, found.x, loss="cauchy", x_scale=[0.1, 0.1, 0.1, 0.01, 0.01])
+    freedom = max(2 * len(rows_xy) - _UNKNOWNS, 1)
+    variance = max(2.0 * found.cost / freedom, _LEAST_SIGMA_PX**2)
+    covariance = variance * np.linalg.pinv(found.jac.T @ found.jac)
+    return DiscTilt(len(rows_xy), found.x[3], found.x[4], covariance[3:, 3:])
+
+
+def compare_tilts(
+    camera: Camera,
+    rows: Path,
+    tilts: Path,
+    map_path: Path,
+    path_path: Path,
+    *,
+    raised_m: float = 0.0,
+    least: int = 5,
+) -> TiltComparison:
+    """Hold the tilts of a `.tilt` file against those of the discs of a map.
+
+    Parameters
+    ----------
+    camera : Camera
+    rows : path
+        `.circles` of raw rows with the map's identifiers.
+    tilts : path
+        Single frames' tilts (`.tilt`).
+    map_path, path_path : path
+        As `slam map` writes them.
+    raised_m : float
+        See `tilt_of_discs`.
+    least : int
+        Lines and discs that a frame needs.
+    """
+    discs = read_map(map_path).discs
+    place = dict(zip(discs.ids.tolist(), discs.xy, strict=True))
+    path = read_path(path_path)
+    poses = {image_name(p): pose for p, pose in zip(path.prefixes, path.poses, strict=True)}
+    by_lines = {image_name(prefix): tilt for prefix, tilt in read_tilts(tilts).items()}
+    prefixes, first, second, squared = [], [], [], []
+    for frame in read_frames(rows):
+        name = image_name(frame.step.prefix)
+        tilt, pose = by_lines.get(name), poses.get(name)
+        known = _known(frame, place)
+        if tilt is None or pose is None or tilt.lines < least or len(known) < least:
+            continue
+        rows_xy, map_xy = (np.array(side) for side in zip(*known, strict=True))
+        shown = tilt_of_discs(camera, rows_xy, map_xy, pose, raised_m)
+        lines_covariance = np.array([[tilt.cpp, tilt.cpr], [tilt.cpr, tilt.crr]])
+        off = np.array([tilt.pitch - shown.pitch_rad, tilt.roll - shown.roll_rad])
+        prefixes.append(name)
+        first.append((tilt.pitch, tilt.roll))
+        second.append((shown.pitch_rad, shown.roll_rad))
+        squared.append(float(off @ np.linalg.solve(lines_covariance + shown.covariance, off)))
+    return TiltComparison(
+        prefixes,
+        np.array(first).reshape(-1, 2),
+        np.array(second).reshape(-1, 2),
+        np.array(squared),
+    )
+
+
+def report_of(result: TiltComparison, worst: int = 10) -> list[str]:
+    """The comparison in lines: medians, means, spread, and the frames that differ most."""
+    off = np.degrees(result.by_lines - result.by_discs)
+    lines = [f"{len(off)} frames; pitch and roll in degrees, verticals and discs of the map"]
+    if not len(off):
+        return lines
+    for name, values in (
+        ("verticals", np.degrees(result.by_lines)),
+        ("discs", np.degrees(result.by_discs)),
+        ("difference", off),
+    ):
+        median, mean, spread = np.median(values, axis=0), values.mean(axis=0), values.std(axis=0)
+        lines.append(
+            f"{name:<11} median {median[0]:+.3f} {median[1]:+.3f}  mean {mean[0]:+.3f} "
+            f"{mean[1]:+.3f}  spread {spread[0]:.3f} {spread[1]:.3f}"
+        )
+    far = result.squared > _FAR_SIGMAS**2
+    lines.append(
+        f"difference^2 in both covariances, per axis: mean {result.squared.mean() / 2.0:.2f}, "
+        f"median {np.median(result.squared) / (2.0 * np.log(2.0)):.2f} of the expected; "
+        f"{far.sum()} frames beyond {_FAR_SIGMAS:g} sigma"
+    )
+    for k in np.argsort(-result.squared)[:worst]:
+        lines.append(
+            f"  {result.prefixes[k]}: {off[k, 0]:+.2f} {off[k, 1]:+.2f}, "
+            f"{np.sqrt(result.squared[k]):.1f} sigma"
+        )
+    return lines
+
+
+def _known(
+    frame: Frame, place: dict[int, FloatArray]
+) -> list[tuple[tuple[float, float], FloatArray]]:
+    """Rows of a frame whose disc is in the map, with its place there."""
+    return [
+        ((row.px, row.py), place[row.ids[0]])
+        for row in frame.circles
+        if row.ids and row.ids[0] in place
+    ]
