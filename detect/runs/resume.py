@@ -409,8 +409,14 @@ class RunFiles:
                 file.part.rewind()
                 stream = open(file.part.fileno(), "rb", closefd=False)  # noqa: SIM115 - on the stack
                 first[name] = stack.enter_context(stream)
+            begun = set()
             for name, rows in second_pass(first):
-                files[name].write(rows)
+                file = files[name]
+                if name not in begun:
+                    assert file.part is not None
+                    file.part.cut(len(file.head))
+                    begun.add(name)
+                file.write(rows)
         for file in files.values():
             assert file.part is not None
             file.part.to_end()

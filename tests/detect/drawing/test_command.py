@@ -222,7 +222,7 @@ def test_settings_and_tilt_are_read_from_the_head(small_run: Path) -> None:
     head = read_head(small_run / "detected.circles")
     assert head.circle_settings == CircleSettings(outer_ring=1.5)
     assert not head.level
-    assert main(["all", str(small_run), "--force"]) == 0
+    assert main(["all", str(small_run), "--tilt", "frame", "--force"]) == 0
     assert read_head(small_run / "detected.circles").level
 
 

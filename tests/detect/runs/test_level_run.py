@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
+import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from camera import Camera
+from detect.cli import main
 from detect.levelling import level_positions
 from detect.run_tilt import LEAST_FRAMES
 from detect.runs.level_run import LevelRun
@@ -55,6 +59,17 @@ def test_few_frames_are_levelled_each_by_itself(published_camera: Camera) -> Non
     assert (first.circles[0].px, first.circles[0].py) == (0.5, -2.5)
     assert all(frame.levelled_by is not None for frame in others)
     assert written["tilt"].startswith(b"NOTILT 0 2\n")
+
+
+@pytest.mark.parametrize("way", ["frame", "run"])
+def test_files_keep_their_heads(small_run: Path, way: str) -> None:
+    assert main(["all", str(small_run), "--tilt", way]) == 0
+    for name in ("detected.circles", "detected.tilt", "detected.lines"):
+        assert (small_run / name).read_text().startswith("# "), name
+    log = json.loads((small_run / "detected.log.json").read_text())
+    for written in log["outputs"]:
+        content = (small_run / written["name"]).read_bytes()
+        assert hashlib.sha256(content).hexdigest() == written["sha256"]
 
 
 def test_rows_end_as_demanded(published_camera: Camera) -> None:

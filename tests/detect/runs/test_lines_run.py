@@ -75,7 +75,7 @@ def test_bad_frame_costs_its_frame_only(
 
 
 def test_all_corrects_discs_for_the_tilt(short_run: Path) -> None:
-    assert main(["all", str(short_run), "--circles.polarity", "light"]) == 0
+    assert main(["all", str(short_run), "--tilt", "frame", "--circles.polarity", "light"]) == 0
     levelled = [f.circles for f in read_frames(short_run / "detected.circles")]
     assert main(["circles", str(short_run), "--polarity", "light", "--force"]) == 0
     plain = [f.circles for f in read_frames(short_run / "detected.circles")]
@@ -91,7 +91,20 @@ def test_all_corrects_discs_for_the_tilt(short_run: Path) -> None:
 def test_what_is_known_of_the_tilt_beforehand_makes_no_disc_less_certain(short_run: Path) -> None:
     variances = []
     for sigma in ("0", "0.5"):
-        assert main(["all", str(short_run), "--force", "--circles.tilt-sigma-deg", sigma]) == 0
+        assert (
+            main(
+                [
+                    "all",
+                    str(short_run),
+                    "--tilt",
+                    "frame",
+                    "--force",
+                    "--circles.tilt-sigma-deg",
+                    sigma,
+                ]
+            )
+            == 0
+        )
         frames = list(read_frames(short_run / "detected.circles"))
         variances.append([disc.cxx + disc.cyy for frame in frames for disc in frame.circles])
     without, known = map(np.array, variances)
@@ -103,13 +116,18 @@ def test_what_is_known_of_the_tilt_beforehand_makes_no_disc_less_certain(short_r
 def test_frames_that_count_as_level_are_told(
     short_run: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["all", str(short_run)]) == 0
+    assert main(["all", str(short_run), "--tilt", "frame"]) == 0
     assert "the tilt of 4 frames\n" in capsys.readouterr().out
     (short_run / "images" / "e.0001.jpg").write_bytes(b"not an image")
     cv2.imwrite(str(short_run / "images" / "e.0002.jpg"), np.full((288, 768), 90, np.uint8))
-    assert main(["all", str(short_run), "--force"]) == 3
+    assert main(["all", str(short_run), "--tilt", "frame", "--force"]) == 3
     assert "the tilt of 2 frames; the other 1 count as level beyond" in capsys.readouterr().out
-    assert main(["all", str(short_run), "--force", "--circles.tilt-sigma-deg", "0.5"]) == 3
+    assert (
+        main(
+            ["all", str(short_run), "--tilt", "frame", "--force", "--circles.tilt-sigma-deg", "0.5"]
+        )
+        == 3
+    )
     assert "the other 1 count as level within 0.5 degrees\n" in capsys.readouterr().out
 
 
