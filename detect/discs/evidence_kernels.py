@@ -76,8 +76,9 @@ def evidence_with_rim(
     """Log-odds that a candidate is a disc, from its fit and its rim together.
 
     The fit of a disc that something hides or touches explains little; then the rim decides. The
-    weights are a logistic regression on candidates of real images and renders that the fit alone
-    leaves in doubt (`python -m tools.evaluation rim-weights`).
+    weights are a logistic regression on some 5,000 candidates that the fit alone leaves in doubt,
+    of real images, renders and photographs. They are constants: that fitting is not part of the
+    project.
 
     Parameters
     ----------
