@@ -1,0 +1,127 @@
+"""The rim of rendered discs against the truth: whole, cut, and of things that are no discs."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from camera import Camera
+from camera.kernels import camera_numbers
+from detect.circles import CircleDetections, detect_circles, disc_shape
+from detect.discs.rim import Rim, follow_rim, invert
+from detect.settings import CircleSettings
+from lut import DiscTable, build_disc_table
+from tests.detect.painted_floor import DARK, LIGHT, PaintedFloor
+
+SETTINGS = CircleSettings()
+PLACES = np.array([(0.0, -1.2), (0.5, -1.5), (-0.6, -1.9), (0.4, -2.3)])
+RADIUS = 0.1
+#: Of a door or a cupboard before a disc.
+DOOR = 140.0
+
+
+@pytest.fixture(scope="module")
+def table(published_camera: Camera) -> DiscTable:
+    return build_disc_table(published_camera, disc_shape(SETTINGS))
+
+
+def rim_of(camera: Camera, image: NDArray[np.uint8], near: NDArray[np.float64], grey: float) -> Rim:
+    contrast = 100.0 if grey == LIGHT else -100.0
+    return follow_rim(image, camera_numbers(camera), near[0], near[1], RADIUS, contrast)
+
+
+def door_over(
+    camera: Camera, floor: PaintedFloor, place: NDArray[np.float64], share: float
+) -> None:
+    """Hide what lies to the right of a share of the disc's radius from its middle."""
+    u, _ = camera.project_floor(place)
+    ends = camera.project_floor(place + np.array([[-RADIUS, 0.0], [RADIUS, 0.0]]))
+    half_width = abs(ends[1, 0] - ends[0, 0]) / 2.0
+    first = round(u + share * half_width)
+    floor.grey[:, first : first + 80] = DOOR
+
+
+@pytest.mark.parametrize("grey", [LIGHT, DARK])
+def test_a_whole_rim_lies_on_one_circle(published_camera: Camera, grey: float) -> None:
+    for seed, place in enumerate(PLACES):
+        image = PaintedFloor(published_camera).disc(place, grey).image(seed=seed)
+        rim = rim_of(published_camera, image, place + np.array([0.015, -0.01]), grey)
+        assert rim.agreeing > 0.8
+        assert rim.visible == 1.0
+        assert rim.runs <= 2
+        assert np.hypot(rim.x - place[0], rim.y - place[1]) < 0.003
+        assert rim.radius == pytest.approx(RADIUS, rel=0.06)
+
+
+def test_a_door_takes_a_stretch_of_the_rim_and_leaves_the_circle(published_camera: Camera) -> None:
+    for seed, place in enumerate(PLACES):
+        floor = PaintedFloor(published_camera).disc(place, LIGHT)
+        door_over(published_camera, floor, place, 0.4)
+        rim = rim_of(published_camera, floor.image(seed=seed), place + np.array([0.02, 0.0]), LIGHT)
+        assert 0.5 < rim.agreeing < 0.9
+        assert rim.runs <= 2
+        assert np.hypot(rim.x - place[0], rim.y - place[1]) < 0.008
+
+
+def test_what_is_no_disc_has_no_such_rim(published_camera: Camera) -> None:
+    place = PLACES[1]
+    plate = PaintedFloor(published_camera).disc(place, LIGHT, 0.14).image(seed=1)
+    assert rim_of(published_camera, plate, place, LIGHT).radius > 0.12
+    rng = np.random.default_rng(3)
+    noise = rng.integers(0, 255, plate.shape, dtype=np.uint8)
+    assert rim_of(published_camera, noise, place, LIGHT).agreeing < 0.6
+    flat = np.full_like(plate, 90)
+    assert rim_of(published_camera, flat, place, LIGHT).agreeing == 0.0
+
+
+def test_outside_the_image_nothing_is_visible(published_camera: Camera) -> None:
+    image = np.full((published_camera.height, published_camera.width), 90, np.uint8)
+    rim = follow_rim(image, camera_numbers(published_camera), 0.0, 3.0, RADIUS, 50.0)
+    assert rim.agreeing == 0.0
+
+
+def test_matrices_are_inverted() -> None:
+    rng = np.random.default_rng(1)
+    for _ in range(20):
+        half = rng.standard_normal((3, 3))
+        matrix = half @ half.T + 0.1 * np.eye(3)
+        inverse = np.empty((3, 3))
+        invert(matrix, inverse)
+        np.testing.assert_allclose(inverse @ matrix, np.eye(3), atol=1e-9)
+
+
+def found_in(camera: Camera, table: DiscTable, floor: PaintedFloor, seed: int) -> CircleDetections:
+    return detect_circles(floor.image(seed=seed), camera, table, SETTINGS)
+
+
+def test_a_disc_behind_a_door_is_found_where_it_is(
+    published_camera: Camera, table: DiscTable
+) -> None:
+    for seed, place in enumerate(PLACES):
+        floor = PaintedFloor(published_camera).disc(place, LIGHT)
+        door_over(published_camera, floor, place, 0.5)
+        off = np.linalg.norm(
+            found_in(published_camera, table, floor, seed).floor_xy - place, axis=1
+        )
+        assert off.min(initial=1.0) < 0.01, place
+
+
+def test_covariances_of_the_rim_fit_its_errors(published_camera: Camera) -> None:
+    rng = np.random.default_rng(5)
+    squares = []
+    for seed in range(80):
+        place = PLACES[seed % len(PLACES)] + rng.uniform(-0.05, 0.05, 2)
+        floor = PaintedFloor(published_camera).disc(place, LIGHT)
+        door_over(published_camera, floor, place, 0.4)
+        rim = rim_of(published_camera, floor.image(seed=seed), place, LIGHT)
+        error = np.array([rim.x, rim.y]) - place
+        covariance = np.array([[rim.cov_xx, rim.cov_xy], [rim.cov_xy, rim.cov_yy]])
+        squares.append(error @ np.linalg.solve(covariance, error) / 2.0)
+    assert 0.4 < np.median(squares) / np.log(2.0) < 1.6
+
+
+def test_a_larger_plate_is_not_found(published_camera: Camera, table: DiscTable) -> None:
+    for seed, place in enumerate(PLACES):
+        floor = PaintedFloor(published_camera).disc(place, LIGHT, 0.14)
+        assert len(found_in(published_camera, table, floor, seed)) == 0
