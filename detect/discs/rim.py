@@ -44,6 +44,13 @@ _ITERATIONS = 8
 
 _ANGLES = 2.0 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
 _COS, _SIN = np.cos(_ANGLES), np.sin(_ANGLES)
+#: Weights of a parabola's beginning, middle and end at the steps.
+_SHARES = np.linspace(NEAREST, FARTHEST, STEPS) / FARTHEST
+_BEGIN, _MIDDLE, _END = (
+    (1.0 - _SHARES) * (1.0 - 2.0 * _SHARES),
+    4.0 * _SHARES * (1.0 - _SHARES),
+    _SHARES * (2.0 * _SHARES - 1.0),
+)
 
 
 class Rim(NamedTuple):
@@ -75,19 +82,6 @@ class Rim(NamedTuple):
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _grey(image: NDArray[np.uint8], u: float, v: float) -> float:
-    """Bilinear grey value; NaN outside the image."""
-    height, width = image.shape
-    if not (0.0 <= u <= width - 1.0 and 0.0 <= v <= height - 1.0):
-        return math.nan
-    i, j = min(int(u), width - 2), min(int(v), height - 2)
-    a, b = u - i, v - j
-    upper = (1.0 - a) * image[j, i] + a * image[j, i + 1]
-    lower = (1.0 - a) * image[j + 1, i] + a * image[j + 1, i + 1]
-    return float((1.0 - b) * upper + b * lower)
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
 def profiles(
     image: NDArray[np.uint8], camera_numbers: NDArray[np.float64], x: float, y: float, radius: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -112,6 +106,7 @@ def profiles(
     scale = np.ones(DIRECTIONS)
     u0, v0 = project_floor_point(camera_numbers, x, y)
     half = 0.5 * FARTHEST
+    right, bottom = image.shape[1] - 1.0, image.shape[0] - 1.0
     for k in range(DIRECTIONS):
         # The image of a direction is a parabola to well below a tenth of a pixel.
         dx, dy = radius * _COS[k], radius * _SIN[k]
@@ -119,9 +114,14 @@ def profiles(
         u2, v2 = project_floor_point(camera_numbers, x + FARTHEST * dx, y + FARTHEST * dy)
         scale[k] = math.hypot(u1 - u0, v1 - v0) / half
         for m in range(STEPS):
-            s = (NEAREST + m * (FARTHEST - NEAREST) / (STEPS - 1)) / FARTHEST
-            a, b, c = (1.0 - s) * (1.0 - 2.0 * s), 4.0 * s * (1.0 - s), s * (2.0 * s - 1.0)
-            grey[k, m] = _grey(image, a * u0 + b * u1 + c * u2, a * v0 + b * v1 + c * v2)
+            u = _BEGIN[m] * u0 + _MIDDLE[m] * u1 + _END[m] * u2
+            v = _BEGIN[m] * v0 + _MIDDLE[m] * v1 + _END[m] * v2
+            if 0.0 <= u < right and 0.0 <= v < bottom:
+                i, j = np.int32(u), np.int32(v)
+                a, b = np.float32(u - i), np.float32(v - j)
+                upper = image[j, i] + a * (np.float32(image[j, i + 1]) - image[j, i])
+                lower = image[j + 1, i] + a * (np.float32(image[j + 1, i + 1]) - image[j + 1, i])
+                grey[k, m] = upper + b * (lower - upper)
     return grey, scale
 
 

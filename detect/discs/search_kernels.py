@@ -16,6 +16,7 @@ from detect.discs.descent_kernels import PATIENT, Hope, Work, work_in
 from detect.discs.evidence_kernels import (
     CLEAR_EVIDENCE,
     LEAST_MIDDLE_STEP,
+    LEAST_RIM,
     LEAST_RIM_PX,
     RADIUS_RANGE,
     evidence_of,
@@ -169,6 +170,20 @@ def _evidence(result: NDArray[np.float64], radius: float, optics_px: float) -> f
 def _slack(quality: float) -> float:
     """How much less than the required evidence a first look may promise."""
     return _FIRST_LOOK_SLACK + _SLACK_PER_QUALITY * max(quality - _ORDINARY_QUALITY, 0.0)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _shows_rim(
+    image: NDArray[np.uint8],
+    camera_numbers: NDArray[np.float64],
+    search: DiscSearch,
+    result: NDArray[np.float64],
+) -> bool:
+    """Whether enough of a rim is in view round a poor first look to be worth a fit."""
+    rim = follow_rim(
+        image, camera_numbers, result[fit.X], result[fit.Y], search.radius, result[fit.CONTRAST]
+    )
+    return bool(rim.agreeing >= LEAST_RIM or rim.radius_px < LEAST_RIM_PX)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -331,8 +346,7 @@ def _fit_all(
             start[1] = (at_y - floor_xy[v, u, 1]) / radius
         start[3] = log_blur
         if search.verify:
-            slack = _slack(quality[i]) if looking else _slack(1.0)
-            hope = Hope(_LEAST_SHARE, search.least_evidence - slack, search.optics_px)
+            hope = Hope(_LEAST_SHARE, search.least_evidence - _slack(quality[i]), search.optics_px)
         fitted = fit_disc(
             image, floor_xy, u, v, radius, settings, start, blur,
             detail, hope, work, result,
@@ -346,7 +360,10 @@ def _fit_all(
             if not search.verify:
                 if fitted:
                     promise[i] = told if told > -math.inf else -1e9
-            elif told >= search.least_evidence - _slack(quality[i]):
+            elif told >= search.least_evidence - _FIRST_LOOK_SLACK or (
+                told >= search.least_evidence - _slack(quality[i])
+                and _shows_rim(image, camera_numbers, search, result)
+            ):
                 promise[i] = told
                 if told >= search.least_evidence + _CLEAR:
                     clear[clear_count, 0] = result[fit.X]
