@@ -57,7 +57,7 @@ from storage.parts import folder_locked, left_part, new_part, remove_left_part
 _log = logging.getLogger("redetect")
 
 
-#: Rows for the files that are made of others, from those (by their names): name and bytes.
+# Rows for the files that are made of others, from those (by their names): name and bytes.
 SecondPass = Callable[[Mapping[str, BinaryIO]], Iterable[tuple[str, bytes]]]
 
 
