@@ -12,6 +12,7 @@ from typing import Literal
 from tyro.conf import OmitArgPrefixes, Positional
 
 from detect.comparison.result import CompareOptions
+from detect.errors import DetectError
 from detect.flags import (
     DiscPreset,
     LineEnds,
@@ -27,6 +28,7 @@ from detect.markers.settings import MarkerSettings
 from detect.runs.conduct import ConductOptions
 from detect.settings import CircleSettings, Levelling
 from detect.sources.options import SourceOptions
+from storage.bounds import NOT_NEGATIVE, demand
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,6 +78,9 @@ class DiscIdOptions:
     ids_from_map: MaybePath = None
     path: MaybePath = None
     id_slack_m: float = 0.1
+
+    def __post_init__(self) -> None:
+        demand(self, DetectError, id_slack_m=NOT_NEGATIVE)
 
 
 @dataclass(frozen=True, kw_only=True)

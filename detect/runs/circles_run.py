@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from detect.errors import DetectError
 from detect.run import Run
 from detect.runs.conduct import PLAIN, Conduct
 from detect.runs.dispatch import Workers
@@ -23,6 +24,7 @@ from detect.runs.stream import (
 )
 from detect.settings import CircleSettings
 from landmarks import format_head
+from storage.bounds import NOT_NEGATIVE, demand
 
 
 @dataclass(frozen=True)
@@ -46,6 +48,9 @@ class DiscIds:
     level: bool = False
     mapped: MapSource | None = None
     slack_m: float = 0.1
+
+    def __post_init__(self) -> None:
+        demand(self, DetectError, slack_m=NOT_NEGATIVE)
 
 
 #: No row has an ID.

@@ -24,7 +24,7 @@ NO_SETTINGS = frozenset(
 
 #: Where infinity stands for "no limit".
 ENDLESS = {
-    "CircleSettings": {"far_limit_m_per_px"},
+    "CircleSettings": {"far_limit"},
     "DiscShape": {"far_limit_m_per_px"},
     "LineSettings": {
         "largest_horizon_gap_px", "largest_scatter_px", "largest_shift_px", "largest_noise_px",
