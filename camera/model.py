@@ -39,7 +39,13 @@ from camera.distortion import (
     radial_factor_derivative,
     undistorted_radius,
 )
-from camera.model_checks import check_numbers, check_one_to_one, checked_pose, checked_whole
+from camera.model_checks import (
+    check_numbers,
+    check_one_to_one,
+    checked_pose,
+    checked_whole,
+    seen_share,
+)
 
 FloatArray = NDArray[np.float64]
 Pose = tuple[tuple[float, float, float, float], ...]
@@ -78,7 +84,8 @@ class Camera:
     ------
     CameraError
         If a number is not finite, a size or scale not positive, the rotation not a rotation, or the
-        distortion folds inside the image. The message calls things by the file's names.
+        distortion folds so that less than half of the image sees anything. The message calls things
+        by the file's names.
 
     References
     ----------
@@ -139,6 +146,11 @@ class Camera:
     def r_max(self) -> float:
         """Undistorted radius up to which the projection is defined."""
         return one_to_one_radius(self.coef, self.brown)
+
+    @cached_property
+    def seen_share(self) -> float:
+        """Share of the image that sees anything: less than 1 where the distortion folds in it."""
+        return seen_share(self)
 
     @cached_property
     def decentred(self) -> bool:

@@ -18,8 +18,10 @@ if TYPE_CHECKING:
 
 _ROTATION_TOLERANCE = 1e-3
 _LARGEST_SIDE_PX = 65536
-# Places on each side of the image's border at which it is looked whether anything is seen.
-_BORDER_PLACES = 65
+#: Least share of the image that must see anything.
+LEAST_SEEN_SHARE = 0.5
+# Places along each side of the image at which it is looked whether anything is seen.
+_PLACES = 65
 
 
 def check_numbers(camera: Camera) -> None:
@@ -61,48 +63,72 @@ def check_numbers(camera: Camera) -> None:
 
 
 def check_one_to_one(camera: Camera) -> None:
-    """Refuse a distortion that folds inside the image.
+    """Refuse a distortion that folds so far inside the image that less than half of it is left.
 
     Raises
     ------
     CameraError
         The message says where it folds.
     """
+    fold = _fold_inside(camera)
+    share = seen_share(camera) if fold else 1.0
+    if share < LEAST_SEEN_SHARE:
+        raise CameraError(
+            f"the distortion folds inside the image: {fold}; {100.0 * share:.0f} % of the image "
+            f"see anything, expected {100.0 * LEAST_SEEN_SHARE:.0f}"
+        )
+
+
+def seen_share(camera: Camera) -> float:
+    """Share of the image's pixels that see anything: 1, if the distortion folds beyond the image.
+
+    Fits of few coefficients often fold in the corners, where no board was.
+    """
+    if not _fold_inside(camera):
+        return 1.0
+    middles = (np.arange(_PLACES) + 0.5) / _PLACES
+    u, v = camera.width * middles - 0.5, camera.height * middles - 0.5
+    with np.errstate(over="ignore", invalid="ignore"):
+        seen = camera.undistort(np.stack(np.meshgrid(u, v), axis=-1))
+    return float(np.isfinite(seen[..., 0]).mean())
+
+
+def _fold_inside(camera: Camera) -> str:
+    """Where the distortion folds, if it does so inside the image; else nothing."""
     if any(camera.tangential):
-        _check_border(camera)
-        return
+        return _fold_inside_border(camera)
     x = max(abs(camera.offset_x), abs(camera.width - 1 - camera.offset_x)) / camera.scale_x
     y = max(abs(camera.offset_y), abs(camera.height - 1 - camera.offset_y)) / camera.scale_y
     corner = math.hypot(x, y)
     seen = largest_distorted_radius(camera.coef, camera.polynomial)
-    if not corner < seen:
-        fold = fold_radius(camera.coef, camera.polynomial)
-        k1, k2, k3 = camera.polynomial
-        values = f"with polynomial k1 = {k1:g}, k2 = {k2:g} and k3 = {k3:g} "
-        raise CameraError(
-            f"the distortion folds inside the image: {values if any(camera.polynomial) else ''}it "
-            f"grows only up to r = {fold:.6g}, seen at {seen:.6g}, while the image's corner lies "
-            f"at {corner:.6g}"
-        )
+    if corner < seen:
+        return ""
+    fold = fold_radius(camera.coef, camera.polynomial)
+    k1, k2, k3 = camera.polynomial
+    values = f"with polynomial k1 = {k1:g}, k2 = {k2:g} and k3 = {k3:g} "
+    return (
+        f"{values if any(camera.polynomial) else ''}it grows only up to r = {fold:.6g}, seen at "
+        f"{seen:.6g}, while the image's corner lies at {corner:.6g}"
+    )
 
 
-def _check_border(camera: Camera) -> None:
+def _fold_inside_border(camera: Camera) -> str:
     """What is one-to-one is so within a circle: its image holds the whole image, or it folds."""
-    pixels = border_pixels(camera.width, camera.height, _BORDER_PLACES)
+    pixels = border_pixels(camera.width, camera.height, _PLACES)
     with np.errstate(over="ignore"):
         border = (pixels - [camera.offset_x, camera.offset_y]) / [camera.scale_x, camera.scale_y]
     unseen = first_unseen(border, camera.coef, camera.brown)
-    if unseen >= 0:
-        k1, k2, p1, p2, k3 = camera.brown
-        more = f", polynomial k1 = {k1:g}, k2 = {k2:g} and k3 = {k3:g}"
-        more = more if any(camera.polynomial) else ""
-        u, v = pixels[unseen]
-        r_max = one_to_one_radius(camera.coef, camera.brown)
-        raise CameraError(
-            f"the distortion folds inside the image: with tangential p1 = {p1:g} and p2 = {p2:g}"
-            f"{more} it is one-to-one only up to r = {r_max:.6g}, which pixel ({u:g}, {v:g}) lies "
-            "beyond"
-        )
+    if unseen < 0:
+        return ""
+    k1, k2, p1, p2, k3 = camera.brown
+    more = f", polynomial k1 = {k1:g}, k2 = {k2:g} and k3 = {k3:g}"
+    more = more if any(camera.polynomial) else ""
+    u, v = pixels[unseen]
+    r_max = one_to_one_radius(camera.coef, camera.brown)
+    return (
+        f"with tangential p1 = {p1:g} and p2 = {p2:g}{more} it is one-to-one only up to "
+        f"r = {r_max:.6g}, which pixel ({u:g}, {v:g}) lies beyond"
+    )
 
 
 def border_pixels(width: int, height: int, places: int) -> NDArray[np.float64]:

@@ -212,4 +212,34 @@ class Convert:
     force: bool = False
 
 
-Command = Calibrate | Floor | Convert
+@dataclass(frozen=True)
+class Level:
+    """Find how a camera is mounted by a drive: its constant lean, and its height over the floor.
+
+    The lean is that of the building's verticals; the height follows from discs of known size. The
+    lens is taken as calibrated.
+
+    Example: camera level images/e -o level.cam
+
+    Parameters
+    ----------
+    run : Path
+        Images of the drive: what `detect all` takes.
+    output : Path
+        The .cam file to write.
+    camera : Path
+        The calibration, if it is not the one beside the images.
+    radius_m : float
+        Radius of the discs.
+    force : bool
+        Replace an existing file.
+    """
+
+    run: Positional[Path]
+    output: Annotated[Path, arg(aliases=["-o"])]
+    camera: MaybePath = None
+    radius_m: float = 0.10
+    force: bool = False
+
+
+Command = Calibrate | Floor | Level | Convert

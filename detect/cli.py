@@ -13,11 +13,10 @@ import atexit
 import os
 import sys
 from collections.abc import Sequence
-from typing import Annotated
 
 import tyro
-from tyro.conf import arg, subcommand
 
+from detect.announcing import show_announcements
 from detect.errors import WorkerError
 from detect.exports.options import Export
 from detect.line_settings import PRESETS as LINE_PRESETS
@@ -29,6 +28,7 @@ from detect.runs.interrupts import interrupts_noted
 from detect.settings import PRESETS as CIRCLE_PRESETS
 from detect.settings import CircleSettings
 from detect.viewing_options import Draw, Report, Tune, View
+from storage.command_line import Program
 from storage.exit_codes import say_error, say_interrupted
 
 # Numba's words where neither the program's folder nor the user's cache can be written to.
@@ -40,6 +40,21 @@ _WHERE_KERNELS_GO = (
 
 Command = Circles | Lines | Markers | All | Compare | Export | Draw | View | Report | Tune
 
+PROGRAM = Program(
+    "detect",
+    "Landmarks with covariances out of a calibrated camera's images.\n\n"
+    "Example: detect all images/e",
+    {
+        **dict.fromkeys((Circles, Lines, Markers, All), "detect.runs.command"),
+        Compare: "detect.comparison.command",
+        Export: "detect.exports.command",
+        Draw: "detect.drawing.command",
+        View: "detect.view_command",
+        Report: "detect.report.command",
+        Tune: "detect.tune.command",
+    },
+)
+
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
@@ -47,8 +62,6 @@ def main(arguments: list[str] | None = None) -> int:
         try:
             try:
                 command = parsed(sys.argv[1:] if arguments is None else arguments)
-                from detect.commands import carry_out
-
                 return carry_out(command)
             finally:
                 sys.stdout.flush()
@@ -71,43 +84,44 @@ def main(arguments: list[str] | None = None) -> int:
     return code
 
 
+def carry_out(command: Command) -> int:
+    """Carry out a command; returns the exit code."""
+    show_announcements()
+    return PROGRAM.carry_out(command)
+
+
 def parsed(arguments: Sequence[str]) -> Command:
     """What a command line says; exits, as `--help` does, where it says nothing that can be done."""
+    arguments = _with_radius_found(arguments)
     preset = _preset(arguments)
     circles = CIRCLE_PRESETS.get(preset, CircleSettings())
     lines = LINE_PRESETS.get(preset, LineSettings())
     markers = MARKER_PRESETS.get(preset, MarkerSettings())
-    return tyro.cli(
-        Annotated[
-            Annotated[
-                Circles,
-                subcommand("circles", default=Circles(run=tyro.MISSING, settings=circles)),
-            ]
-            | Annotated[
-                Lines,
-                subcommand("lines", default=Lines(run=tyro.MISSING, settings=lines)),
-            ]
-            | Annotated[
-                Markers,
-                subcommand("markers", default=Markers(run=tyro.MISSING, settings=markers)),
-            ]
-            | Annotated[
-                All,
-                subcommand("all", default=All(run=tyro.MISSING, circles=circles, lines=lines)),
-            ]
-            | Annotated[Compare, subcommand("compare")]
-            | Annotated[Export, subcommand("export")]
-            | Annotated[Draw, subcommand("draw")]
-            | Annotated[View, subcommand("view")]
-            | Annotated[Report, subcommand("report")]
-            | Annotated[Tune, subcommand("tune")],
-            arg(name=""),
-        ],
-        prog="detect",
-        description="Landmarks with covariances out of a calibrated camera's images.\n\n"
-        "Example: detect all images/e",
-        args=arguments,
+    command: Command = PROGRAM.parsed(
+        arguments,
+        {
+            Circles: Circles(run=tyro.MISSING, settings=circles),
+            Lines: Lines(run=tyro.MISSING, settings=lines),
+            Markers: Markers(run=tyro.MISSING, settings=markers),
+            All: All(run=tyro.MISSING, circles=circles, lines=lines),
+        },
     )
+    return command
+
+
+def _with_radius_found(arguments: Sequence[str]) -> list[str]:
+    """The command line with `--find-radius` in the place of a radius that is `auto`."""
+    found, rest = [], list(arguments)
+    while rest:
+        word = rest.pop(0)
+        name, equals, value = word.partition("=")
+        if name in ("--radius-m", "--circles.radius-m"):
+            if not equals and rest[:1] == ["auto"]:
+                value = rest.pop(0)
+            if value == "auto":
+                word = "--find-radius"
+        found.append(word)
+    return found
 
 
 def _preset(arguments: Sequence[str]) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from functools import lru_cache
 
 import numpy as np
@@ -15,9 +14,6 @@ from detect.latest import kept_for_latest
 from landmarks import FrameTilt
 
 FloatArray = NDArray[np.float64]
-
-#: Chi-squared of two degrees of freedom exceeds this once in a thousand.
-_CONTRADICTION = 2.0 * math.log(1000.0)
 
 
 def levelled(found: CircleDetections, camera: Camera, tilt: FrameTilt) -> CircleDetections:
@@ -48,45 +44,6 @@ def levelled(found: CircleDetections, camera: Camera, tilt: FrameTilt) -> Circle
         quality=found.quality[down],
         evidence=found.evidence[down],
         levelled_by=by,
-    )
-
-
-def with_prior(tilt: FrameTilt, sigma_rad: float) -> FrameTilt:
-    """The tilt, from what its frame shows of it and from what was known of it before.
-
-    Parameters
-    ----------
-    tilt : FrameTilt
-        What the frame shows: a measurement of pitch and roll with its covariance.
-    sigma_rad : float
-        Standard deviation of pitch and of roll about level, independent of each other; 0 says that
-        nothing is known before.
-
-    Returns
-    -------
-    FrameTilt
-        Mean and covariance of both together: nearer to level where few verticals tell the tilt
-        badly. The same tilt where the two contradict each other (beyond the 99.9 % of chi-squared):
-        a camera that is mounted otherwise than calibrated leans in every frame.
-    """
-    if sigma_rad == 0.0:
-        return tilt
-    prior = sigma_rad * sigma_rad
-    # (C + prior I)^-1 times prior is how far the measurement is believed.
-    cpp, cpr, crr = tilt.cpp + prior, tilt.cpr, tilt.crr + prior
-    determinant = cpp * crr - cpr * cpr
-    squares = crr * tilt.pitch**2 - 2.0 * cpr * tilt.pitch * tilt.roll + cpp * tilt.roll**2
-    if squares > _CONTRADICTION * determinant:
-        return tilt
-    weight = prior / determinant
-    return FrameTilt(
-        tilt.prefix,
-        pitch=weight * (crr * tilt.pitch - cpr * tilt.roll),
-        roll=weight * (cpp * tilt.roll - cpr * tilt.pitch),
-        cpp=prior - prior * weight * crr,
-        cpr=prior * weight * cpr,
-        crr=prior - prior * weight * cpp,
-        lines=tilt.lines,
     )
 
 

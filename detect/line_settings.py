@@ -153,8 +153,8 @@ class LineSettings:
     least_lines : int
         With fewer lines that agree there is no tilt.
     stray_share : float
-        Share of edges that agree on the tilt and are no verticals: its covariance covers the tilts
-        without any one of them as far as that one may be such.
+        Share of lines that are no verticals: the tilt's covariance is then the mean square error
+        of `detect.verticals.tilt_error`; 0 for that of least squares.
     weight_limit : float
         Votes of a line in the consensus grow with its evidence up to this.
     same_edge_px : float
@@ -214,12 +214,12 @@ class LineSettings:
     largest_lean_deg: float = 0.7
     largest_lean_sigmas: float = 8.0
     largest_lean_px: float = 1.5
-    largest_tilt_deg: float = 5.0
+    largest_tilt_deg: float = 8.0
     tilt_prior_deg: float = 2.0
     building_deg: float = 0.025
     proposers: int = 24
     least_lines: int = 3
-    stray_share: float = 0.06
+    stray_share: float = 0.15
     weight_limit: float = 3.0
     same_edge_px: float = 2.0
     join_px: float = 2.7
@@ -261,7 +261,6 @@ class LineSettings:
         return ConsensusSettings(
             largest_rad=math.radians(self.largest_tilt_deg),
             prior_rad=math.radians(self.tilt_prior_deg),
-            building_rad=math.radians(self.building_deg),
             proposers=self.proposers,
             least_lines=self.least_lines,
             stray_share=self.stray_share,

@@ -11,40 +11,63 @@ The path of an image, each step a function of its own:
     lines           bearings; one line for each edge, close ones joined
 
 The first time is left out where the starts themselves, of which an edge has one on each of several
-rows, leave no doubt about the tilt (`detect.verticals.chain_kernels`); a few edges will do if these
-leave none. Where all edges turn out to be blurred, everything is done again with filters as wide as
-the blur (`detect.verticals.blur`).
-`detect_lines` goes it in one compiled call (`detect.verticals.image_kernels`).
+rows, leave no doubt about the tilt (`detect.verticals.judgement.tilt_of_chains`); a few edges will
+do if these leave none. Where all edges turn out to be blurred, everything is done again with
+filters as wide as the blur (`detect.verticals.blur`).
+`detect_lines` goes it in one compiled call (`find_lines`).
 """
 
 from __future__ import annotations
 
 import math
 from functools import lru_cache
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from detect.errors import FrameError
 from detect.line_settings import DEFAULT, LineSettings
-from detect.verticals.blur import widened, width_for
+from detect.verticals.blur import median_sharpness, widened, width_for
 from detect.verticals.detections import LineDetections
-from detect.verticals.filter import LineFilter, line_filter, start_band
+from detect.verticals.joining import JoiningLimits, Lines, joining_of, lines_of_tracks
 from detect.verticals.judgement import (
-    ACCEPTED,
-    JOINED,
-    grouping_of,
+    FATES,
+    Judgement,
+    JudgementLimits,
+    fit_and_judge,
     judge_tracks,
     limits_of,
-    refinement_of,
+    tilt_of_chains,
 )
-from detect.verticals.strip import strip_of
-from detect.verticals.tilt import TiltEstimate
-from detect.verticals.tracks import LineTracks, padded_pixels
+from detect.verticals.refinement import StepFilters, refinement_of
+from detect.verticals.response import (
+    LineFilter,
+    StartBand,
+    Strip,
+    line_filter,
+    padded_pixels,
+    response_on_demand,
+    start_band,
+    strip_of,
+)
+from detect.verticals.response_kernels import band_response
+from detect.verticals.tilt import TiltEstimate, largest_lean, no_tilt, with_error
+from detect.verticals.tracking import (
+    Following,
+    LineTracks,
+    find_maxima,
+    follow_edges,
+    following_of,
+    ordered_starts,
+)
 from lut.verticals import VerticalTable
 
 __all__ = ["ACCEPTED", "JOINED", "LineDetections", "detect_lines", "tilt_beyond_doubt"]
+
+#: What becomes of a track that is a line, or part of one.
+ACCEPTED, JOINED = FATES[:2]
 
 #: A few edges tell the tilt beyond doubt if so many lines and such a part of the votes agree with
 #: it, and if it tells the lean of verticals as well as this everywhere in the image. A track that
@@ -60,6 +83,48 @@ _BAND_PX = 60.0
 _LAG_PX = 0.1
 #: The refinement's steps that lines need for that.
 _FIRST_STEPS = 2
+
+
+class Search(NamedTuple):
+    """What `find_lines` knows besides the image.
+
+    Attributes
+    ----------
+    strip, window, band
+        The table, the filter, the rows on which tracks start.
+    filters, few_filters : StepFilters
+        Steps of the refinement, and those for the few edges that are followed first.
+    free, few, guided : Following
+        How edges are followed: all wherever they go, a few of them, and by a tilt.
+    limits, joining
+        By what tracks are judged and lines are joined.
+    is_guided : bool
+        Whether edges are followed by a tilt at all.
+    by_few : bool
+        Whether a few are followed first.
+    by_chains : bool
+        Whether the band is high enough for chains of starts.
+    lag_rad : float
+        Edges followed by a tilt are followed again if theirs makes more difference to the lean.
+    least_sharpness : float
+        Images of less are done again with wider filters.
+    """
+
+    strip: Strip
+    window: LineFilter
+    band: StartBand
+    filters: StepFilters
+    few_filters: StepFilters
+    free: Following
+    few: Following
+    guided: Following
+    limits: JudgementLimits
+    joining: JoiningLimits
+    is_guided: bool
+    by_few: bool
+    by_chains: bool
+    lag_rad: float
+    least_sharpness: float
 
 
 def detect_lines(
@@ -91,59 +156,102 @@ def detect_lines(
             f"image is {image.dtype} of shape {image.shape}: expected uint8 of the table's shape "
             f"{table.column.shape}"
         )
-    from detect.verticals.image_kernels import find_lines
-
     image = np.ascontiguousarray(image)
-    window, told = _told_beforehand(table, settings)
-    found = LineDetections(find_lines(image, padded_pixels(image, window), *told))
-    if settings.blurred_widths and found.sharpness < settings.blurred_sharpness:
+    search = _search(table, settings)
+    found = LineDetections(*find_lines(image, padded_pixels(image, search.window), search))
+    if found.sharpness < search.least_sharpness:
         wider = widened(settings, width_for(found.sharpness, settings))
         return detect_lines(image, table, wider)
     return found
 
 
 @lru_cache(maxsize=16)
-def _told_beforehand(
-    table: VerticalTable, settings: LineSettings
-) -> tuple[LineFilter, tuple[Any, ...]]:
-    """The filter, and what `find_lines` takes besides the image."""
-    window, band, strip = line_filter(settings), start_band(table, settings), strip_of(table)
-    filters, farthest = refinement_of(settings)
-    few = [*range(len(farthest))[:_FIRST_STEPS], -2, -1]
-    level = settings.alpha == "level"
-    following = (
-        window.regulariser,
-        band.spacing,
-        settings.threshold,
-        window.weights.shape[1] // 2,
-        settings.gap_rows,
-        settings.border_rows,
-        table.row_aspect,
-        settings.guided_pull,
-        settings.guided_reach_px,
-        settings.guided,
-        settings.first_edges,
-        1.0 if level else -1.0,
-        settings.consensus.building_rad if level else math.inf,
-        band.supported,
-        band.supported and 2.0 * settings.start_band_rows * table.row_aspect >= _BAND_PX,
-        settings.blurred_sharpness if settings.blurred_widths else 0.0,
+def _search(table: VerticalTable, settings: LineSettings) -> Search:
+    band, aspect = start_band(table, settings), table.row_aspect
+    band_px = 2.0 * settings.start_band_rows * aspect
+    by_few = settings.guided and settings.first_edges > 0
+    return Search(
+        strip=strip_of(table),
+        window=line_filter(settings),
+        band=band,
+        filters=refinement_of(settings),
+        few_filters=refinement_of(settings, _FIRST_STEPS),
+        free=following_of(settings, aspect, guided=False),
+        few=following_of(settings, aspect, guided=False, enough=settings.first_edges),
+        guided=following_of(settings, aspect, guided=True),
+        limits=limits_of(settings, aspect),
+        joining=joining_of(settings),
+        is_guided=settings.guided,
+        by_few=by_few,
+        by_chains=by_few and band.supported and band_px >= _BAND_PX,
+        # A track follows a lean that is wrong by so much that what it yields in a row makes up for
+        # it.
+        lag_rad=_LAG_PX * settings.guided_pull / aspect,
+        least_sharpness=float(settings.blurred_sharpness) if settings.blurred_widths else 0.0,
     )
-    of_chains = (_CHAINS, _FIRST_VOTES, _FIRST_LEAN_RAD)
-    # A track follows a lean that is wrong by so much that what it yields in a row makes up for it.
-    lean = _LAG_PX * settings.guided_pull / table.row_aspect
-    doubt = np.array([_FIRST_LINES, _FIRST_VOTES, _FIRST_LEAN_RAD, *of_chains, lean])
-    told = (
-        table.elevation_tan, table.bearing_rad, table.anchor_row, table.first_row,
-        table.last_row, table.robot_from_camera, strip.column, strip.ends, strip.rise,
-        strip.lean_by_pitch, strip.lean_by_roll, band.row, band.pixel, band.runs, band.lengths,
-        band.odd, band.odd_bounds, band.part, band.scale, band.visible, band.weights,
-        window.weights_between, window.along, filters.half, filters.begin, filters.height,
-        filters.derivatives, farthest, filters.half[few], filters.begin[few],
-        farthest[:_FIRST_STEPS], np.array(following, np.float64),
-        limits_of(settings, table.row_aspect), doubt, grouping_of(settings),
-    )  # fmt: skip
-    return window, told
+
+
+@njit(cache=True, error_model="numpy")
+def beyond_doubt(tilt: TiltEstimate, least_lines: int) -> bool:
+    """Whether a tilt of at least so many lines is good enough to follow all edges by."""
+    # NaN is not.
+    sure = tilt.lines >= least_lines and tilt.votes >= _FIRST_VOTES
+    return bool(sure and tilt.lean_rad <= _FIRST_LEAN_RAD)
+
+
+@njit(cache=True, error_model="numpy")
+def find_lines(
+    image: NDArray[np.uint8], pixels: NDArray[np.uint8], search: Search
+) -> tuple[Lines, LineTracks, Judgement, float]:
+    """`detect_lines`, compiled; `pixels` see `detect.verticals.response.ResponseOnDemand`.
+
+    Results as of `detect.verticals.detections.LineDetections`.
+    """
+    strip, band = search.strip, search.band
+    response = band_response(image, band, search.window)
+    maxima = find_maxima(response, band.row, search.free.threshold, band.supported)
+    tilt = no_tilt()
+    # Of images full of maxima everywhere the band tells nothing.
+    if search.by_chains and len(maxima.level) <= image.shape[1]:
+        tilt = tilt_of_chains(response, band.row, maxima, strip, search.limits)
+    starts = ordered_starts(response, band.row, maxima)
+
+    lazy = response_on_demand(pixels, strip, search.window)
+    # All by the tilt of the band, if that leaves no doubt about it, and once more if they show
+    # another one. Else a few edges, if they leave none; else all; then all by their tilt.
+    by_tilt = beyond_doubt(tilt, _CHAINS)
+    few = search.by_few and not by_tilt
+    times = 0
+    most = 2 if by_tilt else 1
+    while True:
+        pitch, roll = 0.0, 0.0
+        following = search.few if few else search.free
+        if by_tilt:
+            pitch, roll = tilt.pitch_rad, tilt.roll_rad
+            following = search.guided
+            times += 1
+        tracks = follow_edges(lazy, starts, following, pitch, roll)
+        few = not tracks.complete
+        filters = search.few_filters if few else search.filters
+        judged, verticals, edge = fit_and_judge(image, strip, tracks, filters, search.limits)
+        tilt = judged.tilt
+        sharpness = median_sharpness(judged.fits)
+        if sharpness < search.least_sharpness:
+            # All of it will be done again with wider filters.
+            break
+        if few and not beyond_doubt(tilt, _FIRST_LINES):
+            few = False
+            continue
+        few = False
+        if not search.is_guided or np.isnan(tilt.pitch_rad) or times == most:
+            break
+        changed = largest_lean(strip.bearing, tilt.pitch_rad - pitch, tilt.roll_rad - roll)
+        if by_tilt and changed <= search.lag_rad:
+            break
+        by_tilt = True
+    tilt = with_error(tilt, verticals, edge, search.limits.consensus)
+    judged = Judgement(judged.fits, judged.evidence, judged.fate, tilt)
+    return lines_of_tracks(strip, tracks, judged, search.joining), tracks, judged, sharpness
 
 
 def tilt_beyond_doubt(
@@ -165,12 +273,5 @@ def tilt_beyond_doubt(
     TiltEstimate or None
         None where it is in doubt. Lines are not refined to the end for it.
     """
-    judged = judge_tracks(image, tracks, table, settings, steps=_FIRST_STEPS)
-    if (
-        judged.tilt is not None
-        and judged.tilt.lines >= _FIRST_LINES
-        and judged.votes >= _FIRST_VOTES
-        and judged.lean_deviation_rad <= _FIRST_LEAN_RAD
-    ):
-        return judged.tilt
-    return None
+    tilt = judge_tracks(image, tracks, table, settings, steps=_FIRST_STEPS).tilt
+    return tilt if beyond_doubt(tilt, _FIRST_LINES) else None

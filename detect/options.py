@@ -104,12 +104,15 @@ class Circles(DetectorFlags):
         Folder for images with the outlines and qualities drawn in.
     json : Path
         Write the rows with their pixels and evidence as JSON as well.
+    find_radius : bool
+        Find the radius of the discs in some of the images first; so says --radius-m auto, too.
     line_ends : str
         How lines end; the data set's own end with CR and LF.
     """
 
     preset: DiscPreset = "default"  # type: ignore[assignment]
     tilt: MaybePath = None
+    find_radius: bool = False
     ids: OmitArgPrefixes[DiscIdOptions] = field(default_factory=DiscIdOptions)
     line_ends: LineEnds = "lf"
     draw: MaybePath = None
@@ -200,6 +203,9 @@ class All(DetectorFlags):
         named after the video or bag and beside it.
     line_ids_from : Path
         A .lines file whose IDs are carried over where the match is unambiguous.
+    find_radius : bool
+        Find the radius of the discs in some of the images first; so says --circles.radius-m auto,
+        too.
     line_ends : str
         How lines end in files of landmarks; the data set's own end with CR and LF.
     tilt : str
@@ -209,7 +215,8 @@ class All(DetectorFlags):
 
     ids: OmitArgPrefixes[DiscIdOptions] = field(default_factory=DiscIdOptions)
     line_ids_from: MaybePath = None
-    tilt: Levelling = "none"
+    tilt: Levelling = "run"
+    find_radius: bool = False
     line_ends: LineEnds = "lf"
     circles: CircleSettings = field(default_factory=CircleSettings)
     lines: LineSettings = field(default_factory=LineSettings)

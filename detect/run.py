@@ -24,15 +24,7 @@ from numpy.typing import NDArray
 from camera import Camera, read_camera
 from detect.errors import DetectError, FrameError
 from detect.runs.image_bounds import bounded_content
-from detect.runs.image_names import IMAGE_SUFFIXES, ImageNames
-from detect.runs.run_images import (
-    FileStamp,
-    demand_no_link_out,
-    homes_of,
-    image_of,
-    images_of_folder,
-    place_of,
-)
+from detect.runs.image_names import IMAGE_SUFFIXES, FileStamp, ImageNames, images_of_folder
 from detect.sources.gray import decode_gray
 from landmarks import Step, iterate_prefixes, iterate_steps
 
@@ -138,13 +130,11 @@ class RunFrames:
         return self._count
 
     def __iter__(self) -> Generator[RunFrame, None, None]:
-        homes = homes_of(self._images)
         if self._odometry is None:
             for place in range(len(self._images)):
-                path = self._images.path(place)
-                step = _standing_still(path.stem)
+                step = _standing_still(self._images.path(place).stem)
                 try:
-                    stamp = demand_no_link_out(path, homes)
+                    path, stamp = self._images.checked(place)
                 except FrameError as error:
                     yield RunFrame(step, None, failure=str(error))
                     continue
@@ -152,11 +142,11 @@ class RunFrames:
             return
         for step in iterate_steps(self._odometry):
             try:
-                found = image_of(step.prefix, self._images, homes)
+                found = self._images.place_of(step.prefix)
+                image, stamp = (None, None) if found is None else self._images.checked(found)
             except FrameError as error:
                 yield RunFrame(step, None, failure=str(error))
                 continue
-            image, stamp = (None, None) if found is None else found
             yield RunFrame(step, image, bits=self._bits, stamp=stamp)
 
 
@@ -294,14 +284,13 @@ def _image_run(folder: Path, bits: int | None) -> ImageRun:
     else:
         named = np.zeros(len(images), bool)
         count = 0
-        homes = homes_of(images)
         for prefix in iterate_prefixes(odometry):
             count += 1
             try:
-                found = place_of(prefix, images, homes)
+                found = images.place_of(prefix)
                 if found is not None:
                     if images.has_links:
-                        demand_no_link_out(images.path(found), homes)
+                        images.checked(found)
                     named[found] = True
             except FrameError:
                 continue  # told when it is the frame's turn

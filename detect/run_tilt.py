@@ -1,9 +1,11 @@
 """The tilt of the frames of a run: a constant lean, and what a frame deviates from it.
 
 One frame's verticals are easily wrong together: trunks, folds of a curtain, a board that leans.
-Over a run they tell how the camera leans against its calibration, and how far a single frame is to
-be believed. Each axis is an autoregression about a constant, seen through errors that last as long
-as their scene is in view (`detect.run_tilt_kernels`); its constants are those of the largest
+Over a run they tell how the camera leans against its calibration, and how far the robot tilts about
+that. The outlines of discs (`detect.discs.outline_tilt`) tell how a frame deviates, too; their
+constant is that of the verticals, for theirs depends on the camera's height. Each axis is an
+autoregression about a constant, seen through errors that last as long as their scene is in view
+(`detect.run_tilt_kernels`). The constant and the spread about it are those of the largest
 likelihood.
 """
 
@@ -11,6 +13,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,14 +24,24 @@ FloatArray = NDArray[np.float64]
 LEAST_FRAMES = 20
 #: The model's constants are learned from no more frames than this, evenly spaced runs of them.
 LEARNED_FROM = 4000
-#: Prior of the spread of the true tilt about its constant: a robot on an even floor, within e.
-_SPREAD_RAD = math.radians(0.3)
-_SEARCH = {"maxfev": 3000, "fatol": 1e-4, "xatol": 1e-4, "adaptive": True}
-#: Standard deviation of strays: other tilts that the consensus finds (rad).
-_STRAY_RAD = math.radians(2.0)
+#: See `_joined`.
+_OUTLIER_SIGMAS, _STATED_FRAMES = 3.0, 4.0
+#: Prior of the spread of the true tilt about its constant, a robot on an even floor (rad), and the
+#: standard deviation of its logarithm.
+_SPREAD_RAD, _LOG_SPREAD_SIGMA = math.radians(0.3), 0.3
+_SEARCH = {"fatol": 1e-4, "xatol": 1e-3}
 #: What verticals cannot know, however many: what the lens does to all of them alike towards the
 #: image's border (rad). It is stated, not learned: a run shows the sum of it and the true lean.
-COMMON_RAD = math.radians(0.2)
+COMMON_RAD = math.radians(0.15)
+
+
+class FrameTilts(NamedTuple):
+    """Pitch and roll of frames (rad), NaN where there are none, and their variances (rad^2)."""
+
+    tilt: FloatArray
+    """(N, 2)"""
+    variance: FloatArray
+    """(N, 2)"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,13 +52,13 @@ class AxisModel:
     ----------
     lean, lean_sigma : float
         The constant, and its standard deviation (rad).
-    numbers : (7,) float64
-        See `detect.run_tilt_kernels.smooth_axis`.
+    spread : float
+        Standard deviation of true tilts about it (rad).
     """
 
     lean: float
     lean_sigma: float
-    numbers: FloatArray
+    spread: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,35 +91,60 @@ class RunTilt:
         )
 
 
-def tilt_of_run(measured: FloatArray, variance: FloatArray) -> RunTilt | None:
+def tilt_of_run(verticals: FrameTilts, outlines: FrameTilts | None = None) -> RunTilt | None:
     """The tilt of a run's frames from what each of them shows.
 
     Parameters
     ----------
-    measured : (N, 2) float64
-        Pitch and roll by the verticals of each frame (rad), in the frames' order; NaN where there
-        are none.
-    variance : (N, 2) float64
-        Of them (rad^2).
+    verticals : FrameTilts
+        By the verticals of each frame, in the frames' order.
+    outlines : FrameTilts, optional
+        By the outlines of its discs.
 
     Returns
     -------
     RunTilt or None
-        None if fewer than `LEAST_FRAMES` frames have a tilt.
+        None if fewer than `LEAST_FRAMES` frames have a tilt by verticals.
     """
-    if np.count_nonzero(np.isfinite(measured[:, 0])) < LEAST_FRAMES:
+    if np.count_nonzero(np.isfinite(verticals.tilt[:, 0])) < LEAST_FRAMES:
         return None
+    measured, variance = verticals if outlines is None else _joined(verticals, outlines)
     from detect.run_tilt_kernels import smooth_axis
 
     axes, tilts, variances = [], [], []
     for values, of_values in zip(measured.T, variance.T):
         sigma = np.sqrt(of_values)
         axis = _learned(*_part(values, sigma))
-        _, deviation, of_deviation = smooth_axis(values - axis.lean, sigma, axis.numbers)
+        _, deviation, of_deviation = smooth_axis(values - axis.lean, sigma, axis.spread)
         axes.append(axis)
         tilts.append(axis.lean + deviation)
         variances.append(of_deviation + axis.lean_sigma**2)
     return RunTilt((axes[0], axes[1]), np.stack(tilts, -1), np.stack(variances, -1))
+
+
+def _joined(verticals: FrameTilts, outlines: FrameTilts) -> FrameTilts:
+    """Means of both, weighed by their variances; outlines are moved onto the verticals' lean.
+
+    Two measurements that know nothing of each other show how far their variances hold in this run:
+    both are scaled by the mean square of what is between them, in units of what they state. Frames
+    beyond `_OUTLIER_SIGMAS` are strays, and `_STATED_FRAMES` frames stand for what is stated.
+    """
+    both = np.isfinite(verticals.tilt[:, 0]) & np.isfinite(outlines.tilt[:, 0])
+    if np.count_nonzero(both) < LEAST_FRAMES:
+        return verticals
+    between = outlines.tilt - verticals.tilt
+    apart = np.median(between[both], axis=0)
+    squared = (between[both] - apart) ** 2 / (verticals.variance + outlines.variance)[both]
+    found = np.minimum(squared, _OUTLIER_SIGMAS**2).mean(axis=1).sum()
+    scale = (found + _STATED_FRAMES) / (np.count_nonzero(both) + _STATED_FRAMES)
+    values = np.stack([verticals.tilt, outlines.tilt - apart])
+    information = np.where(
+        np.isfinite(values), 1.0 / np.stack([verticals.variance, outlines.variance]), 0.0
+    )
+    total = information.sum(axis=0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        mean = (information * np.nan_to_num(values)).sum(axis=0) / total
+        return FrameTilts(mean, scale / total)
 
 
 def _part(values: FloatArray, sigma: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -122,22 +160,6 @@ def _part(values: FloatArray, sigma: FloatArray) -> tuple[FloatArray, FloatArray
     )
 
 
-def _model(unknowns: FloatArray) -> FloatArray:
-    """The kernel's constants from numbers without bounds."""
-    _, spread, memory, scale, lasting, noise, share = np.clip(unknowns, -30.0, 30.0).tolist()
-    return np.array(
-        [
-            math.exp(spread),
-            0.99 / (1.0 + math.exp(-memory)),
-            math.exp(scale),
-            0.99 / (1.0 + math.exp(-lasting)),
-            math.exp(noise),
-            0.001 + 0.4 / (1.0 + math.exp(-share)),
-            _STRAY_RAD,
-        ]
-    )
-
-
 def _learned(values: FloatArray, sigma: FloatArray) -> AxisModel:
     """The constants of the largest likelihood, and how well the lean among them is known."""
     from scipy.optimize import minimize
@@ -145,27 +167,19 @@ def _learned(values: FloatArray, sigma: FloatArray) -> AxisModel:
     from detect.run_tilt_kernels import smooth_axis
 
     unit = math.radians(0.1)
-    typical = float(np.nanmedian(sigma))
 
     def cost(unknowns: FloatArray) -> float:
-        log_likelihood, _, _ = smooth_axis(values - unit * unknowns[0], sigma, _model(unknowns))
-        prior = (
-            (unknowns[1] - math.log(_SPREAD_RAD)) ** 2
-            + (unknowns[3] / 2.0) ** 2
-            + (unknowns[5] - math.log(typical)) ** 2 / 4.0
-            + (unknowns[2] ** 2 + unknowns[4] ** 2 + (unknowns[6] + 1.0) ** 2) / 8.0
-        )
-        return float(0.5 * prior - log_likelihood)
+        lean, log_spread = unknowns.tolist()
+        spread = _SPREAD_RAD * math.exp(log_spread)
+        log_likelihood, _, _ = smooth_axis(values - unit * lean, sigma, spread)
+        return float(0.5 * (log_spread / _LOG_SPREAD_SIGMA) ** 2 - log_likelihood)
 
-    lean = float(np.nanmedian(values)) / unit
-    begin = [
-        np.array([lean, math.log(_SPREAD_RAD), 0.5, scale, 0.5, math.log(typical), -1.0])
-        for scale in (-1.0, 1.5)
-    ]
-    found = [minimize(cost, x, method="Nelder-Mead", options=_SEARCH) for x in begin]
-    best = min(found, key=lambda result: float(result.fun))
-    step = np.zeros(len(best.x))
-    step[0] = 0.2
-    curvature = (cost(best.x + step) - 2.0 * best.fun + cost(best.x - step)) / (0.2 * unit) ** 2
+    start = np.array([float(np.nanmedian(values)) / unit, 0.0])
+    found = minimize(cost, start, method="Nelder-Mead", options=_SEARCH)
+    step = np.array([0.2, 0.0])
+    curvature = (cost(found.x + step) - 2.0 * found.fun + cost(found.x - step)) / (0.2 * unit) ** 2
     own = 1.0 / max(curvature, 1e-6)
-    return AxisModel(float(best.x[0]) * unit, math.sqrt(own + COMMON_RAD**2), _model(best.x))
+    lean, log_spread = found.x.tolist()
+    return AxisModel(
+        unit * lean, math.sqrt(own + COMMON_RAD**2), _SPREAD_RAD * math.exp(log_spread)
+    )

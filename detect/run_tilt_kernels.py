@@ -8,37 +8,53 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+#: Correlation of true deviations from frame to frame: a robot swings on its springs.
+MEMORY = 0.65
+#: Share of the variance of a frame's error that lasts, and its correlation: a scene stays in view.
+LASTING_SHARE, LASTING = 0.5, 0.9
+#: How often, and how far, a frame shows another tilt than the robot's (rad): a consensus of strays.
+STRAY_SHARE, STRAY_RAD = 0.02, math.radians(2.0)
+#: How often, and how far, the robot tilts for a moment (rad): a wheel is on a sill or a cable.
+JUMP_SHARE, JUMP_RAD = 0.03, math.radians(2.0)
+#: No frame tells its tilt better than this (rad).
+_LEAST_RAD = math.radians(0.03)
+
+
+@njit(cache=True, error_model="numpy")
+def _weighed(share: float, off: float, variance: float) -> float:
+    """A share of a normal density."""
+    return share * math.exp(-0.5 * min(off * off / variance, 1000.0)) / math.sqrt(variance)
+
 
 @njit(cache=True, error_model="numpy")
 def smooth_axis(
-    deviation: NDArray[np.float64], sigma: NDArray[np.float64], model: NDArray[np.float64]
+    deviation: NDArray[np.float64], sigma: NDArray[np.float64], spread: float
 ) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
     """True deviations of one angle from the run's constant lean, by all frames.
 
-    The state is the deviation x and the error u of the verticals in units of their standard
+    The state is the deviation x and the lasting error u of the verticals in units of its standard
     deviation; both are first-order autoregressions: what is wrong with verticals (a tree, a
-    curtain) stays in view. A measurement is x + scale sigma u + white noise, or a stray. The two
-    filtered densities are merged into the normal one of the same moments before the next frame.
+    curtain) stays in view. A measurement is x + a u + white noise, or a stray. The two filtered
+    densities are merged into the normal one of the same moments before the next frame. What is left
+    of a frame's measurement in the end may be a stray or a jump of the robot; the mean and the
+    variance are those of the mixture.
 
     Parameters
     ----------
     deviation : (N,) float64
         Measured angles less the constant lean (rad); NaN where there is none.
     sigma : (N,) float64
-        Their standard deviations as measured (rad).
-    model : (7,) float64
-        Standard deviation of x (rad), its correlation from frame to frame, scale and correlation of
-        the verticals' lasting error, standard deviation of white noise beyond `sigma` (rad), share
-        of strays, their standard deviation (rad).
+        Their standard deviations (rad).
+    spread : float
+        Standard deviation of x (rad).
 
     Returns
     -------
     log_likelihood : float
         Of the measurements.
-    smoothed, variance : (N,) float64
-        x (rad) given all frames, and its variance (rad^2).
+    mean, variance : (N,) float64
+        Of the deviations given all frames (rad, rad^2).
     """
-    spread, memory, scale, lasting, noise, stray_share, stray = model
     count = len(deviation)
     # Filtered and predicted: means of x and u, variances of both and their covariance.
     after, before = np.empty((count, 5)), np.empty((count, 5))
@@ -46,19 +62,20 @@ def smooth_axis(
     x, u, xx, xu, uu = 0.0, 0.0, spread * spread, 0.0, 1.0
     for k in range(count):
         if k > 0:
-            x, u = memory * x, lasting * u
-            xx = memory * memory * xx + (1.0 - memory * memory) * spread * spread
-            xu = memory * lasting * xu
-            uu = lasting * lasting * uu + 1.0 - lasting * lasting
+            x, u = MEMORY * x, LASTING * u
+            xx = MEMORY * MEMORY * xx + (1.0 - MEMORY * MEMORY) * spread * spread
+            xu = MEMORY * LASTING * xu
+            uu = LASTING * LASTING * uu + 1.0 - LASTING * LASTING
         before[k, 0], before[k, 1], before[k, 2], before[k, 3], before[k, 4] = x, u, xx, xu, uu
         if not math.isnan(deviation[k]):
-            load = scale * sigma[k]
+            load = math.sqrt(LASTING_SHARE) * sigma[k]
             off = deviation[k] - x - load * u
             to_x, to_u = xx + load * xu, xu + load * uu
-            good = to_x + load * to_u + sigma[k] ** 2 + noise * noise
-            bad = good + stray * stray
-            log_good = math.log((1.0 - stray_share) / math.sqrt(good)) - 0.5 * off * off / good
-            log_bad = math.log(stray_share / math.sqrt(bad)) - 0.5 * off * off / bad
+            white = (1.0 - LASTING_SHARE) * sigma[k] ** 2 + _LEAST_RAD**2
+            good = to_x + load * to_u + white
+            bad = good + STRAY_RAD**2
+            log_good = math.log((1.0 - STRAY_SHARE) / math.sqrt(good)) - 0.5 * off * off / good
+            log_bad = math.log(STRAY_SHARE / math.sqrt(bad)) - 0.5 * off * off / bad
             larger = max(log_good, log_bad)
             total = math.exp(log_good - larger) + math.exp(log_bad - larger)
             log_likelihood += larger + math.log(total)
@@ -77,7 +94,7 @@ def smooth_axis(
             fx, fu, fxx, fxu, fuu = after[k]
             determinant = pxx * puu - pxu * pxu
             # Rows of the smoother's gain, for x and for u.
-            cxx, cxu, cux, cuu = memory * fxx, lasting * fxu, memory * fxu, lasting * fuu
+            cxx, cxu, cux, cuu = MEMORY * fxx, LASTING * fxu, MEMORY * fxu, LASTING * fuu
             gxx = (cxx * puu - cxu * pxu) / determinant
             gxu = (cxu * pxx - cxx * pxu) / determinant
             gux = (cux * puu - cuu * pxu) / determinant
@@ -89,4 +106,18 @@ def smooth_axis(
             xu = fxu + gxx * gux * dxx + (gxx * guu + gxu * gux) * dxu + gxu * guu * duu
             uu = fuu + gux * gux * dxx + 2.0 * gux * guu * dxu + guu * guu * duu
         smoothed[k], variance[k] = x, xx
+        if math.isnan(deviation[k]):
+            variance[k] += JUMP_SHARE * JUMP_RAD**2
+            continue
+        # What is left of the measurement: noise, a stray, or a jump.
+        left = deviation[k] - x
+        good = xx + sigma[k] ** 2
+        jumped = _weighed(JUMP_SHARE, left, good + JUMP_RAD**2)
+        others = _weighed(1.0 - JUMP_SHARE - STRAY_SHARE, left, good)
+        others += _weighed(STRAY_SHARE, left, good + STRAY_RAD**2)
+        share = jumped / (jumped + others)
+        believed = JUMP_RAD**2 / (good + JUMP_RAD**2)
+        smoothed[k] += share * believed * left
+        variance[k] += share * (1.0 - believed) * JUMP_RAD**2
+        variance[k] += share * (1.0 - share) * (believed * left) ** 2
     return log_likelihood, smoothed, variance

@@ -81,8 +81,7 @@ class CircleSettings:
         Systematic error of a refined position, pixels: added to its covariance.
     tilt_sigma_deg : float
         Standard deviation of the robot's pitch and of its roll about level, degrees: added to a
-        refined position's covariance. Where the frame's verticals tell the tilt, both are put
-        together instead (`detect.levelling.with_prior`).
+        refined position's covariance where nothing tells the frame's tilt.
     """
 
     radius_m: float = 0.10
@@ -105,7 +104,7 @@ class CircleSettings:
     blur_px: float = 1.0
     refine: bool = True
     systematic_px: float = 0.002
-    tilt_sigma_deg: float = 0.0
+    tilt_sigma_deg: float = 0.3
 
     def __post_init__(self) -> None:
         demand(

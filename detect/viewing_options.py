@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import OmitArgPrefixes, arg
 
 from detect.comparison.result import CompareError, CompareOptions
-from detect.exports.options import Export
 from detect.flags import MaybeFloat, MaybeInt, MaybePath, MaybeStr, PickedFrames, Preset, RunFlags
 from detect.line_settings import LineSettings
 from detect.settings import CircleSettings
@@ -226,13 +225,3 @@ class Tune(PickedFrames, RowsFlags):
     jobs: MaybeInt = None
     gates: OmitArgPrefixes[Gates] = field(default_factory=Gates)
     grid: OmitArgPrefixes[Grid] = field(default_factory=Grid)
-
-
-#: The module whose `perform` carries a command out.
-PERFORMED_BY: dict[type, str] = {
-    Draw: "detect.drawing.command",
-    Export: "detect.exports.command",
-    View: "detect.view_command",
-    Report: "detect.report.command",
-    Tune: "detect.tune.command",
-}

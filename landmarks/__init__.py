@@ -41,6 +41,7 @@ from landmarks.records import (
 from landmarks.tilts import (
     FrameTilt,
     format_no_tilt,
+    format_outline_tilt,
     format_tilt,
     iterate_tilts,
     read_tilts,
@@ -81,6 +82,7 @@ __all__ = [
     "format_head",
     "format_levelling",
     "format_no_tilt",
+    "format_outline_tilt",
     "format_record",
     "format_tilt",
     "frames_of_rows",

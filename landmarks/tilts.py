@@ -4,10 +4,12 @@ One row per frame, ``#`` comments and blank lines skipped:
 
     TILT <image> <pitch> <roll> <cPP> <cPR> <cRR> <lines>
     NOTILT <image> <lines>
+    TILT_D <image> <pitch> <roll> <cPP> <cPR> <cRR> <discs>
 
 Pitch and roll (radians) are the rotation vector (pitch, roll, 0) about the robot's X and Y axes
 that turns measured directions level; then its covariance and the number of verticals that agree
-with it. A frame with too few of them has a NOTILT row.
+with it. A frame with too few of them has a NOTILT row. A TILT_D row after either is what the
+outlines of discs show of the same frame; whoever reads the tilts of a file passes over it.
 """
 
 from __future__ import annotations
@@ -36,7 +38,7 @@ class FrameTilt:
     cpp, cpr, crr : float
         Its covariance (rad^2).
     lines : int
-        Verticals that agree with it.
+        Verticals that agree with it, or discs that show it.
     """
 
     prefix: str
@@ -54,6 +56,11 @@ def format_tilt(tilt: FrameTilt) -> str:
         f"TILT {tilt.prefix} {tilt.pitch:.6f} {tilt.roll:.6f} "
         f"{tilt.cpp:.6g} {tilt.cpr:.6g} {tilt.crr:.6g} {tilt.lines}"
     )
+
+
+def format_outline_tilt(tilt: FrameTilt) -> str:
+    """The row of what the outlines of a frame's discs show, without line end."""
+    return f"TILT_D{format_tilt(tilt).removeprefix('TILT')}"
 
 
 def format_no_tilt(prefix: str, lines: int) -> str:
@@ -106,7 +113,7 @@ def numbered_tilts(path: str | os.PathLike[str]) -> Iterator[tuple[int, FrameTil
                     raise LandmarkFileError(str(path), number, "the row is too long")
                 line = source.decode("utf-8", "surrogateescape")
                 words = line.partition("#")[0].split()
-                if not words:
+                if not words or words[0] == "TILT_D":
                     continue
                 frame += 1
                 if words[0] != "NOTILT":

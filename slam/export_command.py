@@ -24,8 +24,9 @@ from slam.g2o import write_g2o
 from slam.g2o_frames import demand_readable, frames_of_graph, graph_of_frames, poses_of_run
 from slam.g2o_reading import read_g2o
 from slam.options import Export, Import
-from slam.recording import Recording, demand_landmarks, landmark_file, read_recording
+from slam.recording import demand_landmarks, landmark_file
 from slam.run_camera import camera_of_run
+from slam.run_rows import recording_of
 from slam.tables import (
     identified_discs,
     identified_lines,
@@ -85,7 +86,7 @@ def _export_tum(command: Export) -> int:
         path = read_path(source)
     else:
         source = command.run
-        path = poses_of_run(_recording(command), None)
+        path = poses_of_run(recording_of(command), None)
     comments = [_made_by(source), "t counts the steps"]
     write_tum(command.output, path, axes=command.axes, comments=comments, overwrite=command.force)
     print(f"{command.output}: {len(path.poses)} poses")
@@ -93,7 +94,7 @@ def _export_tum(command: Export) -> int:
 
 
 def _export_tables(command: Export) -> int:
-    recording = _recording(command)
+    recording = recording_of(command)
     bearings = len(recording.lines) > 0
     camera_xy = np.zeros(2)
     if bearings:
@@ -166,15 +167,6 @@ def _first_word(path: Path) -> str:
         if not text.startswith("#"):
             return text.split()[0]
     return ""
-
-
-def _recording(command: Export) -> Recording:
-    return read_recording(
-        command.run,
-        circles=command.circles or not command.lines,
-        lines=command.lines,
-        stem=command.stem,
-    )
 
 
 def _turned_path(path: Path2D, axes: Axes) -> Path2D:

@@ -11,27 +11,15 @@ from landmarks.map_file import Path2D, read_path
 from slam.errors import SlamError
 from slam.filter_frames import NO_CAMERA
 from slam.options import RunFlags
-from slam.recording import Recording, read_recording
+from slam.recording import Recording
 from slam.run_camera import camera_of_run
+from slam.run_rows import recording_of
 
 FloatArray = NDArray[np.float64]
 
 
-def read_run(
-    run: Path, *, circles: bool, lines: bool, stem: str | None, camera: Path | None
-) -> tuple[Recording, FloatArray]:
-    """Rows of a run, and where its camera is.
-
-    Parameters
-    ----------
-    run : Path
-        Run folder or landmark file.
-    circles, lines : bool
-        What to use; discs where neither is asked for.
-    stem : str or None
-        Name of the landmark files.
-    camera : Path or None
-        Calibration; by default the one in the folder.
+def read_run_of(flags: RunFlags) -> tuple[Recording, FloatArray]:
+    """Rows of the run that a command names, and where its camera is.
 
     Returns
     -------
@@ -47,22 +35,16 @@ def read_run(
     camera.CameraError
         If the calibration is malformed.
     """
-    recording = read_recording(run, circles=circles or not lines, lines=lines, stem=stem)
+    recording = recording_of(flags)
+    return recording, camera_xy_of(recording, flags.run, flags.camera)
+
+
+def camera_xy_of(recording: Recording, run: Path, camera: Path | None = None) -> FloatArray:
+    """(2,) the camera's centre in the robot frame (m); zero where no line needs it."""
     if not len(recording.lines):
-        return recording, NO_CAMERA
+        return NO_CAMERA
     mounting = camera_of_run(run, camera).robot_from_camera
-    return recording, np.array([mounting[0][3], mounting[1][3]])
-
-
-def read_run_of(flags: RunFlags) -> tuple[Recording, FloatArray]:
-    """`read_run` of the run that a command names."""
-    return read_run(
-        flags.run,
-        circles=flags.circles,
-        lines=flags.lines,
-        stem=flags.stem,
-        camera=flags.camera,
-    )
+    return np.array([mounting[0][3], mounting[1][3]])
 
 
 def read_reference(path: Path, poses: Path2D) -> Path2D:

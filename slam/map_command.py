@@ -19,8 +19,9 @@ from slam.graph_terms import Weighting
 from slam.map_covariance import covariance_file, joint_covariance, write_joint_covariance
 from slam.mapping import LeftOut, MappedRun, Mounting, landmark_map, map_run, path_of
 from slam.options import Map
-from slam.recording import Recording, read_recording
+from slam.recording import Recording
 from slam.run_camera import camera_of_run
+from slam.run_rows import recording_of
 from storage import OutputExistsError, write_whole
 
 MAP_NAME, PATH_NAME, TABLE_NAME, PICTURE_NAME = "map.csv", "path.csv", "table.json", "map.png"
@@ -40,12 +41,7 @@ def perform(command: Map) -> int:
     for name in (MAP_NAME, joint_name, PATH_NAME, TABLE_NAME, PICTURE_NAME):
         if (output / name).exists() and not command.force:
             raise OutputExistsError(output / name)
-    recording = read_recording(
-        command.run,
-        circles=command.circles or not command.lines,
-        lines=command.lines,
-        stem=command.stem,
-    )
+    recording = recording_of(command)
     weighting = Weighting(
         loss=command.loss,
         loss_scale=command.loss_scale,

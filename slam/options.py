@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal, Optional
 
 from tyro.conf import Positional, arg
+
+from slam.odometry_noise import OdometryNoise
 
 # For `X | None` tyro imports another library that takes a tenth of a second.
 MaybePath = Optional[Path]  # noqa: UP045
@@ -31,6 +33,8 @@ class RunFlags:
         Calibration, if it is not the one in the run folder (lines need one).
     force : bool
         Replace existing files.
+    odometry_noise : OdometryNoise
+        Of the steps that state no covariance.
     """
 
     run: Positional[Path]
@@ -39,6 +43,7 @@ class RunFlags:
     stem: MaybeStr = None
     camera: MaybePath = None
     force: bool = False
+    odometry_noise: OdometryNoise = field(default_factory=OdometryNoise)
 
 
 @dataclass(frozen=True, kw_only=True)

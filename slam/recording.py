@@ -12,11 +12,15 @@ from numpy.typing import NDArray
 
 from landmarks import CircleLandmark, Frame, LineLandmark, read_frames
 from slam.errors import SlamError
+from slam.odometry_noise import OdometryNoise
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 UNKNOWN_ID = -1
+
+#: The noise of odometry that states none.
+ASSUMED = OdometryNoise()
 
 _PICTURES = {".bmp", ".gif", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff"}
 _STEP_COLUMNS = (
@@ -96,6 +100,8 @@ class Recording:
     circles : CircleRows
     lines : LineRows
         Without rows where they were not asked for.
+    unstated_steps : int
+        Steps whose covariance their source does not state: it is an assumed one.
     """
 
     prefixes: tuple[str, ...]
@@ -103,6 +109,7 @@ class Recording:
     step_covariance: FloatArray
     circles: CircleRows
     lines: LineRows
+    unstated_steps: int = 0
 
     def __len__(self) -> int:
         return len(self.steps)
@@ -184,6 +191,7 @@ def read_recording(
     circles: bool = True,
     lines: bool = False,
     stem: str | None = None,
+    noise: OdometryNoise = ASSUMED,
 ) -> Recording:
     """Read a run's rows.
 
@@ -195,6 +203,8 @@ def read_recording(
         Which landmarks to read from a folder. A file's own rows are all read.
     stem : str, optional
         Name of the files in the folder without suffix; see `landmark_file`.
+    noise : OdometryNoise
+        Of the steps that state no covariance.
 
     Returns
     -------
@@ -210,7 +220,9 @@ def read_recording(
     """
     path = Path(run)
     if not path.is_dir():
-        return recording_of_frames(list(read_frames(demand_landmarks(path))), os.fspath(path))
+        return recording_of_frames(
+            list(read_frames(demand_landmarks(path))), os.fspath(path), noise
+        )
     if not circles and not lines:
         raise SlamError(f"{path}: neither circles nor lines: expected at least one to be used")
     files = [
@@ -221,10 +233,12 @@ def read_recording(
     frames = list(read_frames(files[0]))
     for other in files[1:]:
         frames = _merged(frames, list(read_frames(other)), files[0], other)
-    return recording_of_frames(frames, " and ".join(map(os.fspath, files)))
+    return recording_of_frames(frames, " and ".join(map(os.fspath, files)), noise)
 
 
-def recording_of_frames(frames: Sequence[Frame], name: str) -> Recording:
+def recording_of_frames(
+    frames: Sequence[Frame], name: str, noise: OdometryNoise = ASSUMED
+) -> Recording:
     """Gather frames to arrays.
 
     Parameters
@@ -233,6 +247,8 @@ def recording_of_frames(frames: Sequence[Frame], name: str) -> Recording:
         The run in order.
     name : str
         What stands for the file in messages.
+    noise : OdometryNoise
+        Of the steps that state no covariance: zeros.
 
     Returns
     -------
@@ -253,6 +269,8 @@ def recording_of_frames(frames: Sequence[Frame], name: str) -> Recording:
             f"{name}: no odometry: all {len(steps)} steps and their covariances are 0; expected "
             "the robot's movements: `detect` takes them along, --odometry says where from"
         )
+    unstated = ~np.any(covariance, axis=(1, 2))
+    covariance[unstated] = noise.covariance(numbers[unstated, :3])
     for bad in _not_positive_definite(covariance):
         raise SlamError(
             f"{name}: step {bad + 1} ({steps[bad].prefix}): its covariance is not positive "
@@ -264,6 +282,7 @@ def recording_of_frames(frames: Sequence[Frame], name: str) -> Recording:
         step_covariance=covariance,
         circles=_circle_rows(frames, name),
         lines=_line_rows(frames, name),
+        unstated_steps=int(np.count_nonzero(unstated)),
     )
 
 

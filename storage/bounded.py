@@ -39,9 +39,11 @@ def read_bounded(path: str | os.PathLike[str], largest_bytes: int) -> bytes:
             raise OSError(errno.EINVAL, "is a pipe, socket or device: expected a file")
         if state.st_size > largest_bytes:
             raise OSError(errno.EFBIG, f"larger than {largest_bytes} bytes")
-        with os.fdopen(handle, "rb", closefd=False) as stream:
-            # Memory is taken for as much as is asked for, whatever there is.
-            content = stream.read(state.st_size + 1)
+        # Memory is taken for as much as is asked for, whatever there is; and some file systems give
+        # no more than so much at once.
+        content = os.read(handle, state.st_size + 1)
+        while more := os.read(handle, state.st_size + 1 - len(content)):
+            content += more
     finally:
         os.close(handle)
     if len(content) > state.st_size:

@@ -33,6 +33,13 @@ class OutputExistsError(FileExistsError):
         super().__init__(f"{path}: exists already: give --force to overwrite it")
 
 
+class NotAFileError(OSError):
+    """What stands where a result should go is a device, a pipe or a socket."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(f"{path}: is a device, pipe or socket: expected the name of a file")
+
+
 class PartFile:
     """A result while it grows: locked, and removed unless it is kept or takes its place.
 
@@ -101,7 +108,7 @@ class PartFile:
             raise named(error, self.path) from None
 
     def place(self, *, overwrite: bool) -> None:
-        """Take the place of the result.
+        """Take the place of the result; where a link stands, of what it leads to.
 
         Raises
         ------
@@ -112,7 +119,7 @@ class PartFile:
             self.close()  # a file that is open keeps its name there
         try:
             if overwrite:
-                self.temporary.replace(self.path)
+                self.temporary.replace(os.path.realpath(self.path))
             else:
                 _place_new(self.temporary, self.path)
         except OutputExistsError:
@@ -146,9 +153,12 @@ def new_part(path: Path) -> PartFile:
 
     Raises
     ------
+    NotAFileError
+        If what stands there is no regular file.
     OSError
         If the folder cannot be written to; names the result.
     """
+    demand_file(path)
     try:
         number = 0
         while (handle := new_locked(part_place(path, number))) is None:
@@ -158,6 +168,12 @@ def new_part(path: Path) -> PartFile:
     except OSError as error:
         raise named(error, path) from None
     return PartFile(path, number, handle)
+
+
+def demand_file(path: Path) -> None:
+    """Refuse to replace a device, a pipe or a socket (`NotAFileError`)."""
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise NotAFileError(path)
 
 
 def left_part(path: Path, number: int = 0) -> PartFile | None:

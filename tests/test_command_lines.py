@@ -79,14 +79,14 @@ COMPILED_AS_SAID = """
 import sys
 from importlib import import_module
 from pathlib import Path
-cli = import_module(sys.argv[1] + ".cli")
-for command, module in cli.PERFORMED_BY.items():
-    if command not in cli.COMPILED:
+program = import_module(sys.argv[1] + ".cli").PROGRAM
+for command, module in program.performed_by.items():
+    if command not in program.compiled:
         import_module(module)
         if "numba" in sys.modules:
             sys.exit(f"{command.__name__} is compiled")
-for command in cli.COMPILED:
-    import_module(cli.PERFORMED_BY[command])
+for command in program.compiled:
+    import_module(program.performed_by[command])
 if "numba" not in sys.modules:
     sys.exit("none is compiled")
 """
@@ -102,3 +102,11 @@ def test_what_is_said_to_be_compiled_is_and_nothing_else(program: str) -> None:
         check=False,
     )
     assert (process.returncode, process.stderr) == (0, "")
+
+
+@pytest.mark.parametrize("program", PROGRAMS)
+def test_every_program_says_its_version(program: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as end:
+        import_module(f"{program}.cli").main(["--version"])
+    assert end.value.code == 0
+    assert re.fullmatch(rf"{program} \d+\.\d+\.\d+\S*\n", capsys.readouterr().out)

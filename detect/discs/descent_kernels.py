@@ -38,9 +38,12 @@ from detect.uncounted import uncounted
 
 #: A step that promises less than this, in variances of the noise, is the last,
 _CONVERGED = 0.3
-#: and one that is shorter than this share of the blur's width, and changes the blur by less than
-#: this share: what is left is less than the square of it.
+#: and one that is shorter than this share of the blur's width, and changes that by less than this
+#: share: what is left is less than the square of it.
 _SHORT = 0.05
+#: After so many evaluations, the step after one that made it worse is damped at least so much:
+#: mostly it was the blur of a sharp edge, of which the grey values tell little.
+_EARLY, _LATE_DAMPING = 3, 0.2
 #: What the first step of a fit promises may be this much less evidence than is needed.
 _FIRST_STEP_SLACK = 2.0
 
@@ -273,6 +276,8 @@ def descend(
             done = gain <= 1e-3 * variance
         else:
             damping *= 10.0
+            if evaluations > _EARLY:
+                damping = max(damping, _LATE_DAMPING)
             done = damping > 1e6
             if not factor_rows(kept, 0, normal.LOG_BLUR, factor):
                 return Descent(False, contrast, variance, evaluations)
@@ -295,14 +300,16 @@ def descend(
                 # How wide a blur is on the floor: the first pixels tell it for all blurs.
                 blur = math.exp(best[3])
                 width_per_px = blur_width(patch, best, settings.blur_ratio, work) / sigma_of(blur)
-            width = width_per_px * sigma_of(math.exp(p[3]))
+            sigma = sigma_of(math.exp(p[3]))
+            width = width_per_px * sigma
             if hope.least_evidence > -math.inf:
                 slack = _FIRST_STEP_SLACK if evaluations == 1 else 0.0
                 promise = evidence_of(share, p[2], 0.0, 1.0, 1.0, width / p[2], hope.optics_px)
                 if promise < hope.least_evidence - slack:
                     return Descent(False, contrast, variance, evaluations)
             longest = max(math.hypot(p[0] - best[0], p[1] - best[1]), abs(p[2] - best[2]))
-            short = longest < _SHORT * width and abs(p[3] - best[3]) < _SHORT
+            wider = abs(sigma - sigma_of(math.exp(best[3])))
+            short = longest < _SHORT * width and wider < _SHORT * sigma
             done = promised <= _CONVERGED * variance or short or evaluations == most_evaluations
         if done:
             if current:

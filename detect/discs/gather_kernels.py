@@ -18,6 +18,9 @@ LOOK, ALL = range(2)
 #: About how many for a look.
 _LOOK_PIXELS = 160
 
+#: Of windows of more pixels than this, not all are used.
+_DENSE_WINDOW = 2048
+
 LEAST_BLUR, MOST_BLUR = 0.1, 8.0
 
 
@@ -82,8 +85,8 @@ def gather(
             )  # fmt: skip
             most_blur = min((margin - 1.0) / (2.5 * across), MOST_BLUR)
             return Gathered(shape, n, count, margin, most_blur)
-    # All of them, but for discs that are larger than a patch: all at the edge, and some others.
-    every = 1 + window // CAPACITY
+    # All of them at the edge, and some of the others: those tell no more than grey levels.
+    every = 1 + window // _DENSE_WINDOW
     count = gather_list(
         image, floor_xy, u0, v0, radius, blur, settings, half_u, half_v, every, patch
     )

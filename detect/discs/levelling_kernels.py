@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from detect.verticals.tilt_kernels import level_matrix
+from detect.verticals.tilt import level_matrix
 
 #: Over which angle the levelled positions are differenced, either way.
 _STEP_RAD = 1e-6

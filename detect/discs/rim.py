@@ -38,9 +38,22 @@ TOLERANCE_RADII, TOLERANCE_PX = 0.04, 0.4
 RADIUS_SIGMA = 0.06
 #: Standard deviation of a point of the rim along its direction, pixels.
 POINT_SIGMA_PX = 0.25
-#: How far the starts of the circle are from the candidate, nominal radii.
+#: Fewer points than this make no circle.
+LEAST_POINTS = 6
+#: How far the starts of the circle are from the candidate, nominal radii; the first is at it.
 _START = 0.3
+_STARTS = 9
+_START_X, _START_Y = (
+    np.append(0.0, _START * of(2.0 * np.pi * np.arange(_STARTS - 1) / (_STARTS - 1)))
+    for of in (np.cos, np.sin)
+)
+#: Steps from each start, and the longest of them, nominal radii.
 _ITERATIONS = 8
+_LONGEST_STEP = 0.3
+#: A step that is shorter than this, to the same points, is the last, nominal radii.
+_ARRIVED = 1e-4
+#: With this share of the points on it, no other circle has more.
+_CERTAINLY_BEST = 0.9
 
 _ANGLES = 2.0 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
 _COS, _SIN = np.cos(_ANGLES), np.sin(_ANGLES)
@@ -176,69 +189,143 @@ def rim_points(
     return distance, step
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def invert(a: NDArray[np.float64], inverse: NDArray[np.float64]) -> None:
-    """Invert a symmetric 3x3 matrix by its cofactors."""
-    for i in range(3):
-        for j in range(3):
-            p, q = (i + 1) % 3, (i + 2) % 3
-            r, s = (j + 1) % 3, (j + 2) % 3
-            inverse[j, i] = a[p, r] * a[q, s] - a[p, s] * a[q, r]
-    determinant = a[0, 0] * inverse[0, 0] + a[0, 1] * inverse[1, 0] + a[0, 2] * inverse[2, 0]
-    for i in range(3):
-        for j in range(3):
-            inverse[i, j] /= determinant
+class Circle(NamedTuple):
+    """A circle about a candidate, nominal radii."""
+
+    x: float
+    y: float
+    radius: float
+    cov_xx: float
+    """Covariance of the centre, for points as scattered as `POINT_SIGMA_PX`."""
+    cov_xy: float
+    cov_yy: float
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def _circle_of(
-    distance: NDArray[np.float64],
-    weight: NDArray[np.float64],
-    on: NDArray[np.bool_],
-    circle: NDArray[np.float64],
-    covariance: NDArray[np.float64],
-) -> None:
-    """One Gauss-Newton step of centre and radius to the points that are on the circle."""
-    normal = np.zeros((3, 3))
-    right = np.zeros(3)
+@njit(cache=True, error_model="numpy", nogil=True, fastmath={"contract", "reassoc"})
+def fit_circle(
+    x: NDArray[np.float64], y: NDArray[np.float64], weight: NDArray[np.float64], circle: Circle
+) -> Circle:
+    """One Gauss-Newton step of centre and radius to weighed points, from a circle near to them.
+
+    Points that are not to be fitted have the weight 0.
+    """
+    s_x = s_y = s_w = s_xx = s_xy = s_yy = 0.0
+    r_x = r_y = r_w = 0.0
+    # All alike, without branches: so several are worked on at a time.
+    for k in range(np.uint64(len(x))):
+        dx = x[k] - circle.x
+        dy = y[k] - circle.y
+        d = math.sqrt(dx * dx + dy * dy) + 1e-12
+        dx /= d
+        dy /= d
+        w = weight[k]
+        off = w * (d - circle.radius)
+        s_w += w
+        s_x += w * dx
+        s_y += w * dy
+        s_xx += w * dx * dx
+        s_xy += w * dx * dy
+        s_yy += w * dy * dy
+        r_w += off
+        r_x += off * dx
+        r_y += off * dy
     prior = 1.0 / RADIUS_SIGMA**2
-    normal[2, 2] = prior
-    right[2] = prior * (1.0 - circle[2])
-    for k in range(DIRECTIONS):
-        if on[k]:
-            px = distance[k] * _COS[k] - circle[0]
-            py = distance[k] * _SIN[k] - circle[1]
-            d = math.hypot(px, py)
-            row = (px / d, py / d, 1.0)
-            for i in range(3):
-                right[i] += weight[k] * row[i] * (d - circle[2])
-                for j in range(3):
-                    normal[i, j] += weight[k] * row[i] * row[j]
-    normal[0, 0] += 1e-9
-    normal[1, 1] += 1e-9
-    invert(normal, covariance)
-    for i in range(3):
-        move = 0.0
-        for j in range(3):
-            move += covariance[i, j] * right[j]
-        circle[i] += min(max(move, -0.3), 0.3)
+    s_w += prior
+    r_w += prior * (1.0 - circle.radius)
+    s_xx += 1e-9
+    s_yy += 1e-9
+    # The inverse of [[xx, xy, x], [xy, yy, y], [x, y, w]] by its cofactors.
+    xx, xy, yy = s_yy * s_w - s_y * s_y, s_x * s_y - s_xy * s_w, s_xx * s_w - s_x * s_x
+    xw, yw = s_xy * s_y - s_yy * s_x, s_xy * s_x - s_xx * s_y
+    ww = s_xx * s_yy - s_xy * s_xy
+    scale = 1.0 / (s_xx * xx + s_xy * xy + s_x * xw)
+    return Circle(
+        circle.x + _bounded(scale * (xx * r_x + xy * r_y + xw * r_w)),
+        circle.y + _bounded(scale * (xy * r_x + yy * r_y + yw * r_w)),
+        circle.radius + _bounded(scale * (xw * r_x + yw * r_y + ww * r_w)),
+        scale * xx,
+        scale * xy,
+        scale * yy,
+    )
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _on_circle(
-    distance: NDArray[np.float64],
+def _bounded(step: float) -> float:
+    return min(max(step, -_LONGEST_STEP), _LONGEST_STEP)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _choose(
+    x: NDArray[np.float64],
+    y: NDArray[np.float64],
+    weight: NDArray[np.float64],
     tolerance: NDArray[np.float64],
-    circle: NDArray[np.float64],
-    on: NDArray[np.bool_],
-) -> int:
-    """Mark the points on the circle; how many there are."""
+    circle: Circle,
+    wide: float,
+    chosen: NDArray[np.float64],
+) -> tuple[int, bool]:
+    """Weights of the points on a circle, 0 of others; how many are on it, and whether others were.
+
+    Points with the weight 0 are nowhere.
+    """
     count = 0
-    for k in range(DIRECTIONS):
-        px = distance[k] * _COS[k] - circle[0]
-        py = distance[k] * _SIN[k] - circle[1]
-        on[k] = abs(math.hypot(px, py) - circle[2]) < tolerance[k]
-        count += on[k]
-    return count
+    changed = 0
+    for k in range(np.uint64(len(x))):
+        dx = x[k] - circle.x
+        dy = y[k] - circle.y
+        off = abs(math.sqrt(dx * dx + dy * dy) - circle.radius)
+        now = weight[k] if off < wide * tolerance[k] else 0.0
+        count += 1 if now > 0.0 else 0
+        changed |= 1 if now != chosen[k] else 0
+        chosen[k] = now
+    return count, changed != 0
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def best_circle(
+    x: NDArray[np.float64],
+    y: NDArray[np.float64],
+    weight: NDArray[np.float64],
+    tolerance: NDArray[np.float64],
+    best_chosen: NDArray[np.float64],
+) -> tuple[Circle, int]:
+    """The circle that most of some points are on, and how many they are.
+
+    Parameters
+    ----------
+    x, y : (DIRECTIONS,) float64
+        Points about the candidate, nominal radii.
+    weight : (DIRECTIONS,) float64
+        0 where there is no point.
+    tolerance : (DIRECTIONS,) float64
+        What is nearer than this to a circle is on it, nominal radii.
+    best_chosen : (DIRECTIONS,) float64
+        Result: the weights of the points on the circle, 0 of the others.
+    """
+    points = np.sum(weight > 0.0)
+    chosen = np.zeros(DIRECTIONS)
+    best = Circle(0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
+    best_count = 0
+    for start in range(_STARTS):
+        circle = Circle(_START_X[start], _START_Y[start], 1.0, 0.0, 0.0, 0.0)
+        count, _ = _choose(x, y, weight, tolerance, circle, 2.5, chosen)
+        for i in range(_ITERATIONS):
+            if count < LEAST_POINTS:
+                break
+            before = circle
+            circle = fit_circle(x, y, chosen, before)
+            count, changed = _choose(x, y, weight, tolerance, circle, 1.6 if i < 2 else 1.0, chosen)
+            moved = max(abs(circle.x - before.x), abs(circle.y - before.y))
+            if i > 2 and not changed and moved < _ARRIVED:
+                break
+        if count > best_count:
+            best_count = count
+            best = circle
+            best_chosen[:] = chosen
+            # What has more points than this shares most of them: it is the same circle.
+            if count >= _CERTAINLY_BEST * points:
+                break
+    return best, best_count
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -272,33 +359,18 @@ def follow_rim(
     grey, scale = profiles(image, camera_numbers, x, y, radius)
     distance, step = rim_points(grey, scale, contrast)
     tolerance = TOLERANCE_RADII + TOLERANCE_PX / scale
-    weight = (scale / POINT_SIGMA_PX) ** 2
-    best = np.zeros(3)
-    best_on = np.zeros(DIRECTIONS, np.bool_)
-    best_count = 0
-    best_covariance = np.zeros((3, 3))
-    covariance = np.zeros((3, 3))
-    on = np.zeros(DIRECTIONS, np.bool_)
-    circle = np.zeros(3)
-    for start in range(9):
-        circle[0] = 0.0 if start == 0 else _START * _COS[(start - 1) * DIRECTIONS // 8]
-        circle[1] = 0.0 if start == 0 else _START * _SIN[(start - 1) * DIRECTIONS // 8]
-        circle[2] = 1.0
-        count = _on_circle(distance, 2.5 * tolerance, circle, on)
-        for i in range(_ITERATIONS):
-            if count < 6:
-                break
-            _circle_of(distance, weight, on, circle, covariance)
-            wide = 1.6 if i < 2 else 1.0
-            count = _on_circle(distance, wide * tolerance, circle, on)
-        if count > best_count:
-            best_count = count
-            best[:] = circle
-            best_on[:] = on
-            best_covariance[:, :] = covariance
+    at_x = np.zeros(DIRECTIONS)
+    at_y = np.zeros(DIRECTIONS)
+    weight = np.zeros(DIRECTIONS)
+    for k in range(DIRECTIONS):
+        if distance[k] == distance[k]:
+            at_x[k], at_y[k] = distance[k] * _COS[k], distance[k] * _SIN[k]
+            weight[k] = (scale[k] / POINT_SIGMA_PX) ** 2
+    chosen = np.zeros(DIRECTIONS)
+    best, best_count = best_circle(at_x, at_y, weight, tolerance, chosen)
     radius_px = math.exp(np.mean(np.log(scale)))
     nothing = Rim(0.0, 0.0, 0, 0.0, 0.0, 0.0, x, y, radius, 0.0, 0.0, 0.0, radius_px)
-    if best_count < 6:
+    if best_count < LEAST_POINTS:
         return nothing
     height, width = image.shape
     squares = 0.0
@@ -309,16 +381,15 @@ def follow_rim(
     for k in range(DIRECTIONS):
         u, v = project_floor_point(
             camera_numbers,
-            x + radius * (best[0] + best[2] * _COS[k]),
-            y + radius * (best[1] + best[2] * _SIN[k]),
+            x + radius * (best.x + best.radius * _COS[k]),
+            y + radius * (best.y + best.radius * _SIN[k]),
         )
         inside = 0.0 <= u <= width - 1.0 and 0.0 <= v <= height - 1.0
         visible += inside
         outside[k] = not inside
-        if best_on[k]:
-            px = distance[k] * _COS[k] - best[0]
-            py = distance[k] * _SIN[k] - best[1]
-            squares += ((math.hypot(px, py) - best[2]) / tolerance[k]) ** 2
+        if chosen[k] > 0.0:
+            off = math.hypot(at_x[k] - best.x, at_y[k] - best.y) - best.radius
+            squares += (off / tolerance[k]) ** 2
             mean += step[k]
             mean_2 += step[k] ** 2
     mean /= best_count
@@ -327,15 +398,13 @@ def follow_rim(
     for k in range(DIRECTIONS):
         # A stretch begins after a direction that agrees, and has two that do not.
         last, following = (k - 1) % DIRECTIONS, (k + 1) % DIRECTIONS
-        off = not best_on[k] and not outside[k]
-        if off and best_on[last] and not best_on[following]:
-            runs += 1
+        hidden = chosen[k] == 0.0 and chosen[following] == 0.0 and not outside[k]
+        runs += 1 if hidden and chosen[last] > 0.0 else 0
     scatter = math.sqrt(squares / best_count)
-    inverse = best_covariance
     scale_2 = radius * radius * max(1.0, squares / best_count * 4.0)
     return Rim(
         best_count / DIRECTIONS, visible / DIRECTIONS, runs, scatter,
         math.sqrt(mean_2) / max(abs(mean), 1e-9), mean,
-        x + radius * best[0], y + radius * best[1], radius * best[2],
-        inverse[0, 0] * scale_2, inverse[0, 1] * scale_2, inverse[1, 1] * scale_2, radius_px,
+        x + radius * best.x, y + radius * best.y, radius * best.radius,
+        best.cov_xx * scale_2, best.cov_xy * scale_2, best.cov_yy * scale_2, radius_px,
     )  # fmt: skip

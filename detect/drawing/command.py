@@ -19,7 +19,7 @@ from detect.drawing.selection import select_frames
 from detect.errors import EXIT_FRAMES_FAILED, DetectError, FrameError
 from detect.run import Run, read_image
 from detect.runs.progress import print_failures, progress_bar
-from detect.runs.stream import KEPT_FAILURES
+from detect.runs.rows import KEPT_FAILURES
 from detect.settings import CircleSettings
 from detect.sources.opening import demand_recording, open_source
 from detect.viewing_options import Draw

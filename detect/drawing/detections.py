@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera
-from detect.drawing.strokes import Colour, draw_curve, draw_text, enlargement
+from detect.drawing.strokes import Colour, canvas_of, draw_curve, draw_text, enlargement
 from detect.seen import circle_on_floor
 from detect.settings import CircleSettings
 
@@ -47,7 +47,7 @@ def draw_circles(
     (H, W, 3) uint8
         In OpenCV's order blue, green, red.
     """
-    canvas = np.repeat(image[:, :, None], 3, axis=2)
+    canvas = canvas_of(image, camera)
     for centre, quality in zip(found.floor_xy, found.quality):
         outline_disc(canvas, camera.project_floor, centre, settings, f"{quality:.2f}")
     return canvas

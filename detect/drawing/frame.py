@@ -22,7 +22,7 @@ from detect.comparison.lines_result import LineCompareOptions
 from detect.comparison.result import CompareOptions
 from detect.drawing.detections import EDGE_COLOUR, outline_disc
 from detect.drawing.inputs import SeenRows
-from detect.drawing.strokes import Colour, draw_curve, draw_text, enlargement
+from detect.drawing.strokes import Colour, canvas_of, draw_curve, draw_text, enlargement
 from detect.seen import FrameView, circle_on_floor, image_positions
 from detect.settings import CircleSettings
 from landmarks import (
@@ -75,7 +75,7 @@ def draw_rows(
     (H + h, W, 3) uint8
         In OpenCV's order blue, green, red; h is the height of the line of words.
     """
-    canvas = np.repeat(image[:, :, None], 3, axis=2)
+    canvas = canvas_of(image, camera)
     words = [title] if title else []
     if camera is not None:
         if rows.lines is not None:

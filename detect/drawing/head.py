@@ -10,7 +10,7 @@ from typing import Any
 
 from detect.errors import DetectError
 from detect.line_settings import LineSettings
-from detect.runs.circles_run import LEVEL, LEVELLED
+from detect.runs.outputs import LEVEL, LEVELLED
 from detect.settings import CircleSettings
 from detect.tune.grid import parameter_value
 from storage.messages import excerpt

@@ -6,9 +6,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera
-from detect.drawing.strokes import Colour, draw_curve, draw_text, enlargement, with_legend
+from detect.drawing.strokes import (
+    Colour,
+    canvas_of,
+    draw_curve,
+    draw_text,
+    enlargement,
+    with_legend,
+)
 from detect.lines import ACCEPTED, JOINED, LineDetections
-from detect.verticals.tracks import LineTracks
+from detect.verticals.tracking import LineTracks
 from lut.verticals import VerticalTable
 
 FloatArray = NDArray[np.float64]
@@ -56,7 +63,7 @@ def draw_lines(
     (H, W, 3) uint8
         In OpenCV's order blue, green, red.
     """
-    canvas = np.repeat(image[:, :, None], 3, axis=2)
+    canvas = canvas_of(image, camera)
     times = enlargement(canvas)
     tick = times * np.array([[0.0, -2.0], [0.0, 2.0]])
     share = np.linspace(0.0, 1.0, _POINTS)[:, None]
@@ -106,7 +113,7 @@ def draw_tracks(
     (H + h, W, 3) uint8
         In OpenCV's order blue, green, red; h is the height of the legend.
     """
-    canvas = np.repeat(image[:, :, None], 3, axis=2)
+    canvas = canvas_of(image)
     counts: dict[str, int] = {}
     for t, fate in enumerate(found.fate):
         if not rejected and fate not in (ACCEPTED, JOINED):
@@ -126,7 +133,7 @@ def draw_response(response: NDArray[np.float32], table: VerticalTable) -> NDArra
     Parameters
     ----------
     response : (H, W) float32
-        See `detect.verticals.tracks.line_response`.
+        See `detect.verticals.response.line_response`.
     table : VerticalTable
         Its camera's verticals; the horizon is drawn in green.
 

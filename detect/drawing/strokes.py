@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
+
+from camera import Camera
 
 FloatArray = NDArray[np.float64]
 Colour = tuple[int, int, int]
@@ -15,6 +18,35 @@ _SUBPIXEL_BITS = 4
 _FARTHEST_PX = 1e6
 # Pictures of so many columns are drawn into by strokes of one pixel; those of telephones have more.
 _COLUMNS = 1500
+
+
+def canvas_of(image: NDArray[np.uint8], camera: Camera | None = None) -> NDArray[np.uint8]:
+    """A picture to draw into; pixels that see nothing through the camera's lens are dark and red.
+
+    Parameters
+    ----------
+    image : (H, W) uint8
+        The grey image.
+    camera : Camera, optional
+        The calibrated camera, of the image's size.
+
+    Returns
+    -------
+    (H, W, 3) uint8
+        In OpenCV's order blue, green, red.
+    """
+    canvas = np.repeat(image[:, :, None], 3, axis=2)
+    if camera is not None and camera.seen_share < 1.0:
+        unseen = _unseen(camera)
+        canvas[unseen] //= 3
+        canvas[unseen] += np.array([0, 0, 80], np.uint8)
+    return canvas
+
+
+@lru_cache(maxsize=2)
+def _unseen(camera: Camera) -> NDArray[np.bool_]:
+    u, v = np.arange(camera.width, dtype=np.float64), np.arange(camera.height, dtype=np.float64)
+    return np.isnan(camera.undistort(np.stack(np.meshgrid(u, v), axis=-1))[..., 0])
 
 
 def enlargement(canvas: NDArray[np.uint8]) -> int:

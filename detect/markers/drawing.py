@@ -5,7 +5,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.drawing.strokes import Colour, draw_curve, draw_text, enlargement, with_legend
+from detect.drawing.strokes import (
+    Colour,
+    canvas_of,
+    draw_curve,
+    draw_text,
+    enlargement,
+    with_legend,
+)
 from detect.markers.detections import ACCEPTED, SAME_MARKER, MarkerDetections
 
 FloatArray = NDArray[np.float64]
@@ -42,7 +49,7 @@ def draw_markers(
     (H + h, W, 3) uint8
         In OpenCV's order blue, green, red; h is the height of the legend.
     """
-    canvas = np.repeat(image[:, :, None], 3, axis=2)
+    canvas = canvas_of(image)
     if rejected:
         for candidate in found.candidates:
             if candidate.fate not in (ACCEPTED, SAME_MARKER):

@@ -15,7 +15,7 @@ from detect.drawing.inputs import SeenFiles, SeenRows, find_files, open_rows
 from detect.errors import DetectError, FrameError
 from detect.report.statistics import FramePair
 from detect.run import ImageRun, Run, RunFrame, read_image
-from detect.runs.frame import FramePlan, detect_frame, tables_of
+from detect.runs.frame import FramePlan, FrameTask, detect_batch, tables_of
 from detect.seen import FrameView
 from detect.viewing_options import Gates, RowFiles
 from landmarks import CircleLandmark, Frame, LineLandmark, Step
@@ -189,7 +189,7 @@ def _timing(run: ImageRun, files: SeenFiles, count: int, wanted: int) -> Timing 
             start = time.thread_time()
             read_image(frame, run.camera)
             between = time.thread_time()
-            detect_frame(frame, plan, tables)
+            detect_batch([FrameTask(frame)], plan, tables)
             end = time.thread_time()
         except FrameError:
             continue

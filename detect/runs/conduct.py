@@ -28,27 +28,24 @@ class Conduct:
 
     Attributes
     ----------
+    version : str
+        The program's version, for the heads of files.
+    overwrite : bool
+        Whether existing files may be replaced.
+    crlf : bool
+        Whether the lines of files of landmarks end with CR and LF.
     log : path or None
-        Where the log goes. A run with a log keeps a journal beside it (see `detect.runs.resume`).
-    command, version : str
-        What the log calls the run, and the program's version.
-    strict : bool
-        Whether the first frame that cannot be worked on ends the run.
-    resume : bool
-        Whether the frames that an unfinished run kept are taken over.
+        Where the log goes. A run with a log keeps a journal beside it (see `detect.runs.journal`).
+    command : str
+        What the log calls the run.
+    faults : ConductOptions
+        Whether the first frame that cannot be worked on ends the run, and whether the frames that
+        an unfinished run kept are taken over.
     """
 
+    version: str = ""
+    overwrite: bool = False
+    crlf: bool = False
     log: Path | None = None
     command: str = ""
-    version: str = ""
-    strict: bool = False
-    resume: bool = False
-
-
-#: Without a log or a journal, as the library does it unless it is told otherwise.
-PLAIN = Conduct()
-
-
-def conduct_of(options: ConductOptions, log: Path, command: str, version: str) -> Conduct:
-    """How a command is carried out."""
-    return Conduct(log, command, version, options.strict, options.resume)
+    faults: ConductOptions = ConductOptions()

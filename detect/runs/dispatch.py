@@ -15,13 +15,14 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future
-from contextlib import AbstractContextManager, ExitStack, closing
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import islice
 
 from detect.errors import WorkerError
-from detect.runs.frame import FramePlan, tables_of
-from detect.runs.frame_rows import FrameRows, FrameTask, rows_of_failure, rows_of_frames
+from detect.runs.frame import FramePlan, FrameTask, tables_of
+from detect.runs.rows import FrameRows, rows_of_failure, rows_of_frames
 
 Chunk = tuple[FrameTask, ...]
 
@@ -56,18 +57,9 @@ class Workers:
     tell_of_tables: bool = False
 
 
-def detect_frames(
-    tasks: Iterable[FrameTask], plan: FramePlan, workers: Workers
-) -> Generator[FrameRows, None, None]:
-    """The frames of `detect_chunks`, one by one."""
-    with closing(detect_chunks(tasks, plan, workers)) as chunks:
-        for chunk in chunks:
-            yield from chunk
-
-
 def detect_chunks(
     tasks: Iterable[FrameTask], plan: FramePlan, workers: Workers
-) -> Generator[list[FrameRows], None, None]:
+) -> Generator[list[tuple[FrameTask, FrameRows]], None, None]:
     """Work on frames, some at a time.
 
     Parameters
@@ -81,10 +73,9 @@ def detect_chunks(
 
     Yields
     ------
-    list of FrameRows
-        One for each task, in their order, as many at a time as a worker gives back. Close the
-        generator (`contextlib.closing`) when it is not asked for all of them: that ends the
-        workers.
+    list of (FrameTask, FrameRows)
+        In the order of the tasks, as many at a time as a worker gives back. Close the generator
+        (`contextlib.closing`) when it is not asked for all of them: that ends the workers.
 
     Raises
     ------
@@ -99,8 +90,7 @@ def detect_chunks(
         while True:
             suspects = any(future is None for _, future in under_way)
             room = 0 if suspects else max(0, workers.window() - len(under_way))
-            for chunk in islice(chunks, room):
-                under_way.append((chunk, crew.submit(chunk)))
+            under_way.extend((chunk, crew.submit(chunk)) for chunk in islice(chunks, room))
             if not under_way:
                 return
             chunk, future = under_way.popleft()
@@ -111,12 +101,19 @@ def detect_chunks(
                 under_way.appendleft((chunk, None))
                 under_way = deque((c, None if crew.lost(f) else f) for c, f in under_way)
                 continue
-            yield rows
+            yield list(zip(chunk, rows))
 
 
 def work_on_chunk(plan: FramePlan, chunk: Chunk) -> list[FrameRows]:
     """What a worker does with a task; all it needs, and all that it gives back, is small."""
+    plan = _known(plan)
     return rows_of_frames(chunk, plan, tables_of(plan))
+
+
+@lru_cache(maxsize=4)
+def _known(plan: FramePlan) -> FramePlan:
+    """The first of equal plans, which come with every task: what is made of it is kept."""
+    return plan
 
 
 class _Crew:
@@ -183,12 +180,11 @@ class _Crew:
         if len(chunk) > 1:
             return [rows for task in chunk for rows in self.alone((task,))]
         (task,) = chunk
-        name = task.frame.image or task.frame.step.prefix
         self._deadly += 1
         if self._deadly == _DEADLY_FRAMES:
             raise WorkerError(
-                f"{name}: every worker died that was given this frame or one of the "
+                f"{task.name}: every worker died that was given this frame or one of the "
                 f"{_DEADLY_FRAMES - 1} before it: killed, or out of memory?"
             )
-        reason = f"{name}: every worker died that was given this frame: out of memory?"
+        reason = f"{task.name}: every worker died that was given this frame: out of memory?"
         return [rows_of_failure(task, reason)]

@@ -1,24 +1,28 @@
-"""One frame of a run: its image in, its verticals, its tilt, its discs and its markers out.
+"""Frames of a run: their images in, their verticals, tilts, discs and markers out.
 
-The way of one frame, top to bottom, is `detect_frame`.
+The way of a frame, top to bottom, is `STAGES`; `detect_batch` goes it with any number of frames,
+one by one or many together.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import math
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera
-from detect.latest import kept_for_latest
+from detect.errors import FrameError
 from detect.run import RunFrame, read_image
-from landmarks import FrameTilt, tilt_as_written
+from detect.runs.interrupts import interrupts_deferred
+from detect.runs.known import NOTHING, KnownOfFrame
+from landmarks import FrameTilt, Step, tilt_as_written
 
 # Detectors and tables are imported when they are asked for: loading them all takes a tenth of a
 # second each, and a process that has others do the work needs neither them nor a compiler.
@@ -30,6 +34,11 @@ if TYPE_CHECKING:
     from detect.markers.settings import MarkerSettings
     from detect.settings import CircleSettings, Levelling
     from lut import DiscShape, DiscTable, VerticalTable
+
+Drawing = Literal["discs", "lines", "tracks", "markers"]
+
+#: What is wrong with one frame, not with the run.
+COSTS_THE_FRAME = (FrameError, ArithmeticError, np.linalg.LinAlgError, MemoryError)
 
 
 @dataclass(frozen=True)
@@ -47,7 +56,7 @@ class FramePlan:
     markers : MarkerSettings or None
         Which square markers are looked for, if any.
     json : bool
-        Whether the discs are wanted as JSON as well.
+        Whether the discs are wanted as JSON as well: `detect_run` sees to it.
     drawing : {"discs", "lines", "tracks", "markers"} or None
         What is drawn into the image; "tracks" are all tracks of lines, with the reason of those
         that are no lines.
@@ -56,10 +65,6 @@ class FramePlan:
     levelling : {"none", "frame", "run"}
         By what the discs are corrected for the tilt: by nothing, by the frame's own, or, when all
         frames are done, by the run's (`detect.runs.level_run`).
-    known_level : bool
-        Whether the discs whose IDs are carried over are corrected for the tilt.
-    id_slack_m : float
-        Standard deviation of where a map and a path expect discs, besides the covariances, metres.
     working_folder : path or None
         What relative image paths are relative to, on whatever machine; by default a process's own.
     """
@@ -69,12 +74,60 @@ class FramePlan:
     circles: CircleSettings | None = None
     markers: MarkerSettings | None = None
     json: bool = False
-    drawing: Literal["discs", "lines", "tracks", "markers"] | None = None
+    drawing: Drawing | None = None
     draw_response: bool = False
     levelling: Levelling = "frame"
-    known_level: bool = False
-    id_slack_m: float = 0.1
     working_folder: Path | None = None
+
+
+class FrameTask(NamedTuple):
+    """A frame to be worked on, and what is known of it beforehand. Small."""
+
+    frame: RunFrame
+    known: KnownOfFrame = NOTHING
+
+    @property
+    def name(self) -> object:
+        """What messages call it."""
+        return self.frame.image or self.frame.step.prefix
+
+
+@dataclass
+class FrameDetections:
+    """What was found in one image; None is what was not looked for.
+
+    Attributes
+    ----------
+    image : (H, W) uint8 or None
+        None where it cannot be read.
+    lines : LineDetections or None
+    tilt : FrameTilt or None
+        None also where too few lines tell.
+    seen : CircleDetections or None
+        The discs where they would be on a level robot.
+    discs : CircleDetections or None
+        The same, corrected for the tilt where there is one and the plan says so.
+    outline_tilt : FrameTilt or None
+        What the outlines of the discs show of the tilt, where a run is levelled by all frames.
+    markers : MarkerDetections or None
+    error : str or None
+        Why the frame cannot be worked on.
+    """
+
+    image: NDArray[np.uint8] | None = None
+    lines: LineDetections | None = None
+    tilt: FrameTilt | None = None
+    seen: CircleDetections | None = None
+    discs: CircleDetections | None = None
+    outline_tilt: FrameTilt | None = None
+    markers: MarkerDetections | None = None
+    error: str | None = None
+
+    @property
+    def pixels(self) -> NDArray[np.uint8]:
+        """The image, where there is one."""
+        assert self.image is not None
+        return self.image
 
 
 @dataclass(frozen=True)
@@ -85,148 +138,126 @@ class Tables:
     discs: DiscTable | None
 
 
-@dataclass(frozen=True)
-class FrameDetections:
-    """What was found in one image; None is what was not looked for.
+def detect_batch(
+    tasks: Sequence[FrameTask], plan: FramePlan, tables: Tables
+) -> list[FrameDetections]:
+    """Find what a plan asks for in the images of some frames.
 
-    Attributes
-    ----------
-    image : (H, W) uint8
-    lines : LineDetections or None
-    tilt : FrameTilt or None
-        None also where too few lines tell.
-    discs : CircleDetections or None
-        Corrected for the tilt, where there is one.
-    markers : MarkerDetections or None
-    seen : CircleDetections or None
-        The discs before that.
-    """
-
-    image: NDArray[np.uint8]
-    lines: LineDetections | None
-    tilt: FrameTilt | None
-    discs: CircleDetections | None
-    markers: MarkerDetections | None = None
-    seen: CircleDetections | None = None
-
-
-def detect_frame(
-    frame: RunFrame, plan: FramePlan, tables: Tables, tilt: FrameTilt | None = None
-) -> FrameDetections:
-    """Find what a plan asks for in the image of a frame, which is decoded once.
+    Every stage is done with all frames before the next one: a decoder, the detectors and Python
+    drive each other's instructions and tables out of the processor's caches. A frame that cannot be
+    worked on costs itself only.
 
     Parameters
     ----------
-    frame : RunFrame
-        The frame.
+    tasks : sequence of FrameTask
+        The frames; as many images are in memory at once.
     plan : FramePlan
         What to look for.
     tables : Tables
         See `tables_of`.
-    tilt : FrameTilt, optional
-        The frame's tilt, where it is known and no lines are looked for.
 
     Returns
     -------
-    FrameDetections
-
-    Raises
-    ------
-    FrameError
-        If there is no such image, or none of the calibration's size.
+    list of FrameDetections
+        One for each.
     """
-    image = read_image(frame, plan.camera, plan.working_folder)
-    lines = lines_in_image(image, plan, tables)
-    tilt = tilt_of_frame(frame.step.prefix, lines, tilt)
-    discs = discs_in_image(image, plan, tables, tilt)
-    markers = markers_in_image(image, plan)
-    return seen_together(image, plan, lines, tilt, discs, markers)
+    batch = [FrameDetections() for _ in tasks]
+    for stage in STAGES:
+        for task, found in zip(tasks, batch):
+            if found.error is None:
+                try:
+                    stage(task, found, plan, tables)
+                except COSTS_THE_FRAME as error:
+                    found.error = reason_of(error, task)
+    return batch
 
 
-def lines_in_image(
-    image: NDArray[np.uint8], plan: FramePlan, tables: Tables
-) -> LineDetections | None:
-    """The lines of an image, if a plan asks for lines."""
-    if plan.lines is None:
-        return None
-    from detect.lines import detect_lines
-
-    assert tables.verticals is not None
-    return detect_lines(image, tables.verticals, plan.lines)
+def reason_of(error: Exception, task: FrameTask) -> str:
+    """Why a frame cannot be worked on, in words."""
+    if isinstance(error, FrameError):
+        return str(error)
+    return f"{task.name}: {type(error).__name__}: {error}"
 
 
-def tilt_of_frame(
-    prefix: str, lines: LineDetections | None, known: FrameTilt | None
-) -> FrameTilt | None:
-    """The tilt of the frame of an image: what its lines show, or else what is known of it."""
-    return known if lines is None else tilt_of_lines(prefix, lines)
+def _decode(task: FrameTask, found: FrameDetections, plan: FramePlan, _: Tables) -> None:
+    found.image = read_image(task.frame, plan.camera, plan.working_folder)
 
 
-def discs_in_image(
-    image: NDArray[np.uint8], plan: FramePlan, tables: Tables, tilt: FrameTilt | None
-) -> CircleDetections | None:
-    """The discs of an image, if a plan asks for discs, where they would be on a level robot.
+def _find_lines(_: FrameTask, found: FrameDetections, plan: FramePlan, tables: Tables) -> None:
+    if plan.lines is not None:
+        from detect.lines import detect_lines, find_lines
 
-    If there is a tilt, `seen_together` corrects them for it and adds what it leaves in doubt.
-    """
-    if plan.circles is None:
-        return None
-    from detect.circles import detect_circles
-
-    assert tables.discs is not None
-    assert plan.camera is not None
-    levelled_later = plan.levelling == "run" or (plan.levelling == "frame" and tilt is not None)
-    settings = _without_tilt(plan.circles) if levelled_later else plan.circles
-    return detect_circles(image, plan.camera, tables.discs, settings)
+        assert tables.verticals is not None
+        # Numba makes named tuples by Python code, and does not look whether an interrupt ended it.
+        # What is not compiled yet may take a minute, which nobody should have to wait for.
+        with interrupts_deferred() if find_lines.signatures else nullcontext():
+            found.lines = detect_lines(found.pixels, tables.verticals, plan.lines)
 
 
-@kept_for_latest
-def _without_tilt(settings: CircleSettings) -> CircleSettings:
-    """The same, but the tilt adds nothing to covariances: levelling does."""
-    return dataclasses.replace(settings, tilt_sigma_deg=0.0)
+def _tell_tilt(task: FrameTask, found: FrameDetections, _: FramePlan, __: Tables) -> None:
+    found.tilt = task.known.tilt
+    if found.lines is not None:
+        found.tilt = tilt_of_lines(task.frame.step.prefix, found.lines)
 
 
-def markers_in_image(image: NDArray[np.uint8], plan: FramePlan) -> MarkerDetections | None:
-    """The markers of an image, if a plan asks for markers."""
-    if plan.markers is None:
-        return None
-    from detect.markers.detect import detect_markers
+def _find_discs(_: FrameTask, found: FrameDetections, plan: FramePlan, tables: Tables) -> None:
+    if plan.circles is not None:
+        from detect.circles import detect_circles
 
-    return detect_markers(image, plan.markers, plan.camera)
+        assert tables.discs is not None
+        assert plan.camera is not None
+        levelled = plan.levelling == "run" or (plan.levelling == "frame" and found.tilt is not None)
+        settings = _without_tilt(plan.circles) if levelled else plan.circles
+        found.seen = detect_circles(found.pixels, plan.camera, tables.discs, settings)
 
 
-def seen_together(
-    image: NDArray[np.uint8],
-    plan: FramePlan,
-    lines: LineDetections | None,
-    tilt: FrameTilt | None,
-    discs: CircleDetections | None,
-    markers: MarkerDetections | None,
-) -> FrameDetections:
-    """What was found in an image, its discs corrected for the tilt.
+def _level_discs(_: FrameTask, found: FrameDetections, plan: FramePlan, __: Tables) -> None:
+    found.discs = found.seen
+    if found.seen is not None and found.tilt is not None and plan.levelling == "frame":
+        from detect.levelling import levelled
 
-    Parameters
-    ----------
-    image : (H, W) uint8
-        See `detect.run.read_image`.
-    plan : FramePlan
-        What was looked for.
-    lines, tilt, discs, markers
-        Of `lines_in_image`, `tilt_of_frame`, `discs_in_image` and `markers_in_image`.
+        assert plan.camera is not None
+        found.discs = levelled(found.seen, plan.camera, found.tilt)
 
-    Returns
-    -------
-    FrameDetections
-    """
-    seen = discs
-    if discs is not None and tilt is not None and plan.levelling == "frame":
-        from detect.levelling import levelled, with_prior
+
+def _tell_tilt_by_outlines(
+    task: FrameTask, found: FrameDetections, plan: FramePlan, _: Tables
+) -> None:
+    if found.seen is not None and plan.levelling == "run":
+        from detect.discs.outline_tilt import tilt_of_outlines
 
         assert plan.camera is not None
         assert plan.circles is not None
-        prior_rad = math.radians(plan.circles.tilt_sigma_deg)
-        discs = levelled(discs, plan.camera, with_prior(tilt, prior_rad))
-    return FrameDetections(image, lines, tilt, discs, markers, seen)
+        tilt = tilt_of_outlines(
+            found.pixels, plan.camera, found.seen.floor_xy, plan.circles.radius_m
+        )
+        if tilt is not None:
+            found.outline_tilt = FrameTilt(task.frame.step.prefix, *tilt)
+
+
+def _find_markers(_: FrameTask, found: FrameDetections, plan: FramePlan, __: Tables) -> None:
+    if plan.markers is not None:
+        from detect.markers.detect import detect_markers
+
+        found.markers = detect_markers(found.pixels, plan.markers, plan.camera)
+
+
+#: The way of a frame: what each of them finds is there for those that follow.
+STAGES: tuple[Callable[[FrameTask, FrameDetections, FramePlan, Tables], None], ...] = (
+    _decode,
+    _find_lines,
+    _tell_tilt,
+    _find_discs,
+    _level_discs,
+    _tell_tilt_by_outlines,
+    _find_markers,
+)
+
+
+@lru_cache(maxsize=4)
+def _without_tilt(settings: CircleSettings) -> CircleSettings:
+    """The same, but the tilt adds nothing to covariances: levelling does."""
+    return dataclasses.replace(settings, tilt_sigma_deg=0.0)
 
 
 def tilt_of_lines(prefix: str, lines: LineDetections) -> FrameTilt | None:
@@ -240,7 +271,6 @@ def tilt_of_lines(prefix: str, lines: LineDetections) -> FrameTilt | None:
     )
 
 
-@kept_for_latest
 def tables_of(plan: FramePlan) -> Tables:
     """The tables that a plan needs: a process makes them or takes them from the cache once.
 
@@ -289,8 +319,6 @@ def rehearse(plan: FramePlan) -> None:
         detect_markers(specimen_image(plan.markers), plan.markers)
     if plan.camera is None:
         return
-    from detect.runs.row_text import unknown_circles, unknown_lines
-
     column = np.arange(plan.camera.width)
     bars = np.where(column // 40 % 2, 180, 60).astype(np.uint8)
     image = np.repeat(bars[None, :], plan.camera.height, axis=0)
@@ -300,16 +328,9 @@ def rehearse(plan: FramePlan) -> None:
         floor = np.isfinite(seen).all(axis=-1)
         off = np.hypot(*(np.mod(seen[floor], pitch) - 0.5 * pitch).T)
         image[floor] = np.where(off < plan.circles.radius_m, 200, 60)
-        from detect.circles import detect_circles
-
-        discs = detect_circles(image, plan.camera, tables.discs, plan.circles)
-        unknown_circles(discs.floor_xy, discs.quality, discs.covariance)
-        # Tilts may come from a file as well.
-        from detect.levelling import levelled
-
-        levelled(discs, plan.camera, FrameTilt("rehearsal", 0.0, 0.0, 1e-6, 0.0, 1e-6, 0))
-    if plan.lines is not None and tables.verticals is not None:
-        from detect.lines import detect_lines
-
-        lines = detect_lines(image, tables.verticals, plan.lines)
-        unknown_lines(lines.line_numbers)
+    step = Step("rehearsal", *[0.0] * 9)
+    task = FrameTask(RunFrame(step, None, content=image))
+    (found,) = detect_batch([task], dataclasses.replace(plan, markers=None), tables)
+    if found.discs is not None:  # tilts may come from a file as well
+        found.tilt = FrameTilt("rehearsal", 0.0, 0.0, 1e-6, 0.0, 1e-6, 0)
+        _level_discs(task, found, dataclasses.replace(plan, levelling="frame"), tables)

@@ -1,4 +1,4 @@
-"""The images of a folder, as compact as they can be looked up in.
+"""The images of a folder, and which of them belongs to a step: never one outside the run.
 
 A run may have a million frames: what is kept of one is the name of its image, twice, and 4 bytes.
 """
@@ -8,14 +8,21 @@ from __future__ import annotations
 import fnmatch
 import os
 import re
+import stat
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from detect.errors import DetectError, FrameError
 from detect.runs.name_index import NameIndex
+from storage.inside import leads_out, link_out
+from storage.messages import excerpt
 
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".pgm", ".ppm", ".tif", ".tiff", ".bmp"})
+
+#: Size in bytes and time of change in nanoseconds: what tells one state of a file from another.
+FileStamp = tuple[int, int]
 
 _DIGITS = re.compile(r"[0-9]+")
 
@@ -48,6 +55,10 @@ class ImageNames:
     def __init__(self, folder: Path, pattern: str = "*") -> None:
         self.folder = folder
         self.has_links = False
+        # Where a run's images may be: in their folder, or that of the run.
+        own = os.path.abspath(folder)  # noqa: PTH100 - links are not followed yet
+        above, name = os.path.split(own)
+        self._homes = (own, above) if name == "images" else (own,)
         suffixes = set()
         keys = []
         matches = re.compile("" if pattern == "*" else fnmatch.translate(pattern)).match
@@ -82,6 +93,60 @@ class ImageNames:
             return self._index.find(names[0])
         places = [self._index.find(name) for name in names]
         return min((place for place in places if place is not None), default=None)
+
+    def place_of(self, prefix: str) -> int | None:
+        """The place of a step's image, by its name alone; None if there is none.
+
+        Raises
+        ------
+        FrameError
+            If the step's prefix leads out of the run: whoever made the file of steps does not
+            decide which other files are read.
+        """
+        name = prefix.strip('"')
+        why = leads_out(name, *self._homes)
+        if why is not None:
+            raise FrameError(f"{excerpt(prefix)}: the prefix {why}: expected an image of the run")
+        return self.find(name.replace("\\", "/").rsplit("/", 1)[-1])
+
+    def checked(self, index: int) -> tuple[Path, FileStamp | None]:
+        """The image at a place, and its file's stamp: None if it is a link, or nothing is there.
+
+        Raises
+        ------
+        FrameError
+            If it is a link that leads out of the run.
+        """
+        path = self.path(index)
+        try:
+            status = os.lstat(path)
+        except (OSError, ValueError):
+            return path, None
+        if not stat.S_ISLNK(status.st_mode):
+            return path, (status.st_size, status.st_mtime_ns)
+        if link_out(path, *map(Path, self._homes)):
+            raise FrameError(
+                f"{path}: cannot be read: is a link that leads out of the run: expected an image "
+                "in it"
+            )
+        return path, None
+
+
+def images_of_folder(folder: Path) -> ImageNames:
+    """The images in ``images/`` or, failing that, in the folder itself.
+
+    Raises
+    ------
+    DetectError
+        If there are none.
+    """
+    for place in (folder / "images", folder):
+        if place.is_dir():
+            found = ImageNames(place)
+            if len(found):
+                return found
+    kinds = " ".join(sorted(IMAGE_SUFFIXES))
+    raise DetectError(f"{folder}: no images: expected {kinds} in it or in {folder / 'images'}")
 
 
 def _natural_order(name: str) -> str:

@@ -3,165 +3,136 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Iterable, Iterator, Mapping
 from typing import BinaryIO
 
 import numpy as np
 
 from camera import Camera
-from detect.run_tilt import RunTilt, tilt_of_run
-from detect.runs.stream import Output
-from landmarks import (
-    FrameTilt,
-    format_head,
-    format_levelling,
-    format_no_tilt,
-    format_tilt,
-    tilt_as_written,
-)
+from detect.discs.levelling_kernels import level_discs
+from detect.run_tilt import FrameTilts, RunTilt, tilt_of_run
+from detect.runs.outputs import LEVEL_CIRCLES, LEVEL_TILT
+from detect.runs.rows import RunSummary, disc_numbers, encoded, landmark_rows
+from landmarks import FrameTilt, format_levelling, format_no_tilt, format_tilt, tilt_as_written
 
 #: So many bytes of rows are gathered before they are written.
 _AT_ONCE = 1 << 18
 
+#: Prefix, lines and tilt of a frame.
+_Tilted = tuple[str, int, FrameTilt | None]
 
-@dataclass(frozen=True)
-class LevelRun:
-    """Levels the rows of a run, once they are all there (`detect.runs.resume.SecondPass`).
+
+def level_run(
+    camera: Camera, tilt_sigma_rad: float, summary: RunSummary, files: Mapping[str, BinaryIO]
+) -> Iterator[tuple[str, bytes]]:
+    """Level the discs of a run, once they are all there.
 
     Where too few frames have a tilt to learn from (`detect.run_tilt.LEAST_FRAMES`), each frame is
     levelled by its own.
 
-    Attributes
+    Parameters
     ----------
     camera : Camera
     tilt_sigma_rad : float
-        What is known of the tilt about level beforehand (`detect.levelling.with_prior`).
-    frames_tilt, raw : str
-        Names of the files that are read: the frames' tilts, and their discs as seen.
-    tilt, circles : str
-        Names of those that are written: the tilts applied, and the discs levelled by them.
-    crlf : bool
-        Whether rows of discs end with CR and LF.
-    on_lean : callable or None
-        Called with the tilt of the run.
+        Standard deviation of pitch and roll of frames whose tilt nothing tells.
+    summary : RunSummary
+        Is given the tilt of the run, if there is one.
+    files : mapping of str to binary stream
+        By kind: "tilt" has the frames' tilts, "circles" their discs as seen.
+
+    Yields
+    ------
+    (str, bytes)
+        `LEVEL_TILT`, or `LEVEL_CIRCLES`, and rows of the file of that kind.
     """
-
-    camera: Camera
-    tilt_sigma_rad: float
-    frames_tilt: str
-    raw: str
-    tilt: str
-    circles: str
-    crlf: bool = False
-    on_lean: Callable[[RunTilt], None] | None = None
-
-    def __call__(self, first: Mapping[str, BinaryIO]) -> Iterator[tuple[str, bytes]]:
-        """The rows of the files that are written, some at a time."""
-        frames = [_tilt_of_row(row) for row in first[self.frames_tilt] if _counts(row)]
-        applied = self._applied(frames)
-        tilts, circles = bytearray(), bytearray()
-        for (prefix, lines, _), tilt, rows in zip(
-            frames, applied, _frames_of(first[self.raw]), strict=True
-        ):
-            text = format_no_tilt(prefix, lines) if tilt is None else format_tilt(tilt)
-            tilts += _bytes(text)
-            circles += self._levelled(rows, tilt)
-            if len(circles) > _AT_ONCE:
-                yield self.circles, self._ended(circles)
-                yield self.tilt, bytes(tilts)
-                tilts, circles = bytearray(), bytearray()
-        yield self.circles, self._ended(circles)
-        yield self.tilt, bytes(tilts)
-
-    def _applied(
-        self, frames: list[tuple[str, int, FrameTilt | None]]
-    ) -> Iterator[FrameTilt | None]:
-        """What each frame's discs are levelled by."""
-        measured = np.array(
-            [(math.nan, math.nan) if t is None else (t.pitch, t.roll) for _, _, t in frames]
-        ).reshape(-1, 2)
-        variance = np.array(
-            [(math.nan, math.nan) if t is None else (t.cpp, t.crr) for _, _, t in frames]
-        ).reshape(-1, 2)
-        run = tilt_of_run(measured, variance)
-        if run is None:
-            yield from (self._by_itself(prefix, tilt) for prefix, _, tilt in frames)
-            return
-        if self.on_lean is not None:
-            self.on_lean(run)
-        for (prefix, lines, _), (pitch, roll), (cpp, crr) in zip(
-            frames, run.tilt.tolist(), run.variance.tolist()
-        ):
-            yield tilt_as_written(FrameTilt(prefix, pitch, roll, cpp, 0.0, crr, lines))
-
-    def _by_itself(self, prefix: str, tilt: FrameTilt | None) -> FrameTilt | None:
-        from detect.levelling import with_prior
-
-        if tilt is not None:
-            return with_prior(tilt, self.tilt_sigma_rad)
-        if self.tilt_sigma_rad == 0.0:
-            return None
-        variance = self.tilt_sigma_rad**2
-        return FrameTilt(prefix, 0.0, 0.0, variance, 0.0, variance, 0)
-
-    def _levelled(self, rows: list[bytes], tilt: FrameTilt | None) -> bytes:
-        """A frame's rows, its STEP first."""
-        if tilt is None:
-            return b"".join(rows)
-        out = rows[0] + _bytes(format_levelling((tilt.pitch, tilt.roll)))
-        if len(rows) == 1:
-            return out
-        from detect.discs.levelling_kernels import level_discs
-
-        words = [row.split(maxsplit=7) for row in rows[1:]]
-        x, y, quality, cxx, cxy, cyy = np.array([word[1:7] for word in words], np.float64).T
-        covariance = np.stack([np.stack([cxx, cxy], -1), np.stack([cxy, cyy], -1)], -2)
-        floor_xy, level_covariance = np.empty((len(x), 2)), np.empty((len(x), 2, 2))
-        down = np.empty(len(x), np.bool_)
-        level_discs(
-            np.stack([x, y], -1),
-            covariance,
-            np.array(self.camera.centre),
-            (tilt.pitch, tilt.roll, tilt.cpp, tilt.cpr, tilt.crr),
-            floor_xy,
-            level_covariance,
-            down,
-        )
-        for k in np.flatnonzero(down):
-            (xx, xy), (_, yy) = level_covariance[k].tolist()
-            px, py = floor_xy[k].tolist()
-            ids = words[k][7].strip().decode() if len(words[k]) > 7 else ""
-            out += _bytes(
-                f"LANDMARK_C {px:g} {py:g} {quality[k]:g} {xx:g} {xy:g} {yy:g} {ids}".rstrip()
-            )
-        return out
-
-    def _ended(self, rows: bytearray) -> bytes:
-        return bytes(rows).replace(b"\n", b"\r\n") if self.crlf else bytes(rows)
+    frames, outlines = _tilts_of_rows(files["tilt"])
+    summary.tilt, applied = _applied(frames, outlines, tilt_sigma_rad)
+    tilts, circles = bytearray(), bytearray()
+    seen = _frames_of(files["circles"])
+    for (prefix, lines, _), tilt, rows in zip(frames, applied, seen, strict=True):
+        tilts += encoded(format_no_tilt(prefix, lines) if tilt is None else format_tilt(tilt))
+        circles += b"".join(rows) if tilt is None else _levelled(rows, tilt, camera)
+        if len(circles) > _AT_ONCE:
+            yield LEVEL_CIRCLES, bytes(circles)
+            yield LEVEL_TILT, bytes(tilts)
+            tilts, circles = bytearray(), bytearray()
+    yield LEVEL_CIRCLES, bytes(circles)
+    yield LEVEL_TILT, bytes(tilts)
 
 
-def applied_tilt_file(path: Path, version: str) -> Output:
-    """The file of the tilts that discs were levelled by: what the rows mean stands at its head."""
-    lines = [
-        f"Pitch and roll that the discs of each frame were levelled by, by redetect {version}:",
-        "  the constant lean of the run and what the frame is believed to deviate from it",
-        "TILT <image> <pitch> <roll> <cPP> <cPR> <cRR> <lines>",
-        "  rotation vector (pitch, roll, 0) about the robot's X (left) and Y (backward), radians:",
-        "  it turns directions measured with the calibrated mounting level; its covariance;",
-        "  and the number of verticals that agree with the tilt of the frame by itself",
-        "NOTILT <image> <lines>: its discs are as they were seen",
-    ]
-    return Output(path, "tilt", format_head("\n".join(lines)))
+def _applied(
+    frames: list[_Tilted], outlines: list[FrameTilt | None], sigma_rad: float
+) -> tuple[RunTilt | None, Iterable[FrameTilt | None]]:
+    """The tilt of the run, and what each frame's discs are levelled by."""
+    run = tilt_of_run(_measured([tilt for _, _, tilt in frames]), _measured(outlines))
+    if run is None:
+        return None, (_by_itself(prefix, tilt, sigma_rad) for prefix, _, tilt in frames)
+    numbers = zip(frames, run.tilt.tolist(), run.variance.tolist())
+    return run, (
+        tilt_as_written(FrameTilt(prefix, pitch, roll, cpp, 0.0, crr, lines))
+        for (prefix, lines, _), (pitch, roll), (cpp, crr) in numbers
+    )
+
+
+def _measured(tilts: list[FrameTilt | None]) -> FrameTilts:
+    """Pitch and roll of frames, and their variances; NaN where there are none."""
+    unknown = FrameTilt("", math.nan, math.nan, math.nan, 0.0, math.nan, 0)
+    known = [tilt or unknown for tilt in tilts]
+    return FrameTilts(
+        np.array([(tilt.pitch, tilt.roll) for tilt in known]).reshape(-1, 2),
+        np.array([(tilt.cpp, tilt.crr) for tilt in known]).reshape(-1, 2),
+    )
+
+
+def _by_itself(prefix: str, tilt: FrameTilt | None, sigma_rad: float) -> FrameTilt | None:
+    if tilt is not None or sigma_rad == 0.0:
+        return tilt
+    return FrameTilt(prefix, 0.0, 0.0, sigma_rad**2, 0.0, sigma_rad**2, 0)
+
+
+def _levelled(rows: list[bytes], tilt: FrameTilt, camera: Camera) -> bytes:
+    """A frame's rows, its STEP first."""
+    head = rows[0] + encoded(format_levelling((tilt.pitch, tilt.roll)))
+    if len(rows) == 1:
+        return head
+    words = [row.split() for row in rows[1:]]
+    numbers = np.array([word[1:7] for word in words], np.float64)
+    covariance = np.ascontiguousarray(numbers[:, [3, 4, 4, 5]]).reshape(-1, 2, 2)
+    floor_xy, level_covariance = np.empty((len(rows) - 1, 2)), np.empty_like(covariance)
+    down = np.empty(len(floor_xy), np.bool_)
+    level_discs(
+        np.ascontiguousarray(numbers[:, :2]),
+        covariance,
+        np.array(camera.centre),
+        (tilt.pitch, tilt.roll, tilt.cpp, tilt.cpr, tilt.crr),
+        floor_xy,
+        level_covariance,
+        down,
+    )
+    level = disc_numbers(floor_xy[down], numbers[down, 2], level_covariance[down])
+    ids = [tuple(map(int, words[k][7:])) for k in np.flatnonzero(down)]
+    return head + landmark_rows("LANDMARK_C", level, ids)
 
 
 def _counts(row: bytes) -> bool:
     return bool(row.strip()) and not row.startswith(b"#")
 
 
-def _tilt_of_row(row: bytes) -> tuple[str, int, FrameTilt | None]:
-    """Prefix, lines and tilt of a row that this run wrote."""
+def _tilts_of_rows(rows: BinaryIO) -> tuple[list[_Tilted], list[FrameTilt | None]]:
+    """Prefix, lines and tilt of each frame, and what the outlines of its discs show."""
+    frames: list[_Tilted] = []
+    outlines: list[FrameTilt | None] = []
+    for row in filter(_counts, rows):
+        found = _tilt_of_row(row)
+        if row.startswith(b"TILT_D"):
+            outlines[-1] = found[2]
+        else:
+            frames.append(found)
+            outlines.append(None)
+    return frames, outlines
+
+
+def _tilt_of_row(row: bytes) -> _Tilted:
     keyword, prefix, *words = row.decode("utf-8", "surrogateescape").split()
     if keyword == "NOTILT":
         return prefix, int(words[0]), None
@@ -182,7 +153,3 @@ def _frames_of(rows: BinaryIO) -> Iterator[list[bytes]]:
             frame.append(row)
     if frame:
         yield frame
-
-
-def _bytes(text: str) -> bytes:
-    return f"{text}\n".encode("utf-8", "surrogateescape")

@@ -10,38 +10,17 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
-from collections import Counter
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from detect.errors import EXIT_FRAMES_FAILED, DetectError
 from detect.runs.conduct import Conduct
 from detect.runs.frame import FramePlan
+from detect.runs.rows import RunSummary
+from storage import OutputExistsError
 
 _BEGIN = b'{\n "program": "redetect",'
-
-
-class Counted(Protocol):
-    """The counts of a run: `detect.runs.stream.RunSummary`."""
-
-    frames: int
-    discs: int
-    lines: int
-    tilts: int
-    markers: int
-    rejected: Counter[str]
-    failed: int
-    images_without_step: int
-
-
-@dataclass(frozen=True)
-class WrittenFile:
-    """A file as the log names it."""
-
-    name: str
-    size_bytes: int
-    sha256: str
 
 
 class FailedFrameError(DetectError):
@@ -64,8 +43,6 @@ def demand_log_place(place: Path, *, overwrite: bool) -> None:
     storage.OutputExistsError
         If something else than a log stands there, and must not be overwritten.
     """
-    from storage import OutputExistsError
-
     if overwrite or not os.path.lexists(place):
         return
     if place.is_symlink() or not place.is_file():
@@ -93,28 +70,21 @@ def log_head(plan: FramePlan, conduct: Conduct) -> bytes:
     return json.dumps(document, indent=1).rsplit("]", 1)[0].encode()
 
 
-def log_failure(place: int, prefix: str, reason: str, *, first: bool) -> bytes:
+def log_failure(place: int, prefix: str, reason: str) -> bytes:
     """A frame that could not be worked on: its place in the run, from 0, its name and why."""
     record = json.dumps({"frame": place, "prefix": prefix, "reason": reason})
-    return f"{'' if first else ','}\n  {record}".encode()
+    return f"\n  {record}".encode()
 
 
-def log_tail(found: Counted, files: list[WrittenFile]) -> bytes:
-    """What stands after the failures."""
+def log_tail(found: RunSummary, outputs: Sequence[Mapping[str, object]]) -> bytes:
+    """What stands after the failures; of each output the name, the size and the hash."""
     document = {
         "frames": found.frames,
         "failed": found.failed,
         "images_left_out": found.images_without_step,
-        "found": {
-            "discs": found.discs,
-            "lines": found.lines,
-            "tilts": found.tilts,
-            "markers": found.markers,
-        },
+        "found": {kind: found.found[kind] for kind in ("discs", "lines", "tilts", "markers")},
         "rejected": dict(sorted(found.rejected.items())),
-        "outputs": [
-            {"name": file.name, "bytes": file.size_bytes, "sha256": file.sha256} for file in files
-        ],
+        "outputs": outputs,
         "exit_code": EXIT_FRAMES_FAILED if found.failed else 0,
     }
     end = "\n ]," if found.failed else "],"

@@ -8,202 +8,65 @@ at all.
 
 from __future__ import annotations
 
-import dataclasses
-import json
-from collections import Counter
-from collections.abc import Callable, Generator, Iterable, Sequence
+import math
+from collections.abc import Callable, Generator, Mapping
 from contextlib import ExitStack, closing
-from dataclasses import dataclass, field
-from itertools import islice
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import Literal, Protocol
 
-from detect.discs.identity import MappedDisc
+from detect.errors import DetectError
+from detect.markers.templates import templates_of
 from detect.run import ImageRun
-from detect.runs.conduct import PLAIN, Conduct
+from detect.runs.conduct import Conduct
 from detect.runs.dispatch import Workers, detect_chunks
-from detect.runs.frame import FramePlan, tables_of
-from detect.runs.frame_rows import FrameRows, FrameTask, KnownRows
-from detect.runs.garbage import settled
-from detect.runs.resume import RunFiles, SecondPass
-from detect.runs.workers import local_workers, pixels_of
-from detect.sources.times import TIMES_HEAD
-from landmarks import CircleLandmark, FrameTilt, LineLandmark, format_head
+from detect.runs.frame import FramePlan, FrameTask, tables_of
+from detect.runs.known import Known
+from detect.runs.outputs import outputs_of
+from detect.runs.rows import FrameRows, RunSummary
+from detect.runs.run_files import RunFiles, SecondPass
+from detect.runs.workers import local_workers
 from storage import write_whole
-
-#: Endings of files of landmarks.
-LANDMARK_SUFFIXES = frozenset({".circles", ".lines", ".markers"})
-
-#: So many failures are kept word for word.
-KEPT_FAILURES = 100
-
-_TASKS_AHEAD = 128
-
-
-class TiltSource(Protocol):
-    """Tilts by image prefix: a dict, or a file that is looked into."""
-
-    def get(self, prefix: str, /) -> FrameTilt | None: ...
-
-
-class LineSource(Protocol):
-    """Lines with IDs by image prefix: a dict, or a file that is looked into."""
-
-    def get(self, prefix: str, /) -> Sequence[LineLandmark] | None: ...
-
-
-class DiscSource(Protocol):
-    """Rows of discs with IDs by image prefix: a dict, or a file that is looked into."""
-
-    def get(self, prefix: str, /) -> Sequence[CircleLandmark] | None: ...
-
-
-class MapSource(Protocol):
-    """Discs that a map and a path let each frame see, by image prefix."""
-
-    def get(self, prefix: str, /) -> Sequence[MappedDisc] | None: ...
-
-
-@dataclass(frozen=True)
-class IdSources:
-    """Where the IDs of a run's rows come from.
-
-    Attributes
-    ----------
-    lines : mapping, optional
-        Lines with IDs by image prefix: carried over where the match is unambiguous.
-    discs : mapping, optional
-        Discs with IDs by image prefix.
-    mapped : mapping, optional
-        Discs of a map by image prefix, for rows that `discs` knows nothing of.
-    """
-
-    lines: LineSource | None = None
-    discs: DiscSource | None = None
-    mapped: MapSource | None = None
-
-    def of(self, prefix: str) -> KnownRows:
-        """What is known of a frame."""
-        return KnownRows(
-            lines=None if self.lines is None else tuple(self.lines.get(prefix) or ()),
-            discs=None if self.discs is None else tuple(self.discs.get(prefix) or ()),
-            mapped=None if self.mapped is None else tuple(self.mapped.get(prefix) or ()),
-        )
-
-
-@dataclass(frozen=True)
-class Output:
-    """A file that a run is written to.
-
-    Attributes
-    ----------
-    path : path
-    part : str
-        Which part of `FrameRows` goes into it; "late": none, a second pass fills it.
-    head, tail : bytes
-        What stands before and after the rows of all frames.
-    between : bytes
-        What stands between those of two frames.
-    crlf : bool
-        Whether rows end with CR and LF, as in the data set's own files.
-    placed : bool
-        Whether it is a result; else others are made of it, and it goes when they are there.
-    """
-
-    path: Path
-    part: Literal["circles", "lines", "tilt", "markers", "json", "times", "late"]
-    head: bytes = b""
-    tail: bytes = b""
-    between: bytes = b""
-    crlf: bool = False
-    placed: bool = True
-
-
-@dataclass
-class RunSummary:
-    """What came of a run.
-
-    Attributes
-    ----------
-    frames, discs, lines, tilts, markers : int
-        Frames looked at, discs and lines found in them, frames whose tilt could be told, and
-        markers found.
-    rejected : Counter
-        How many candidates for markers were rejected, by cause.
-    failed : int
-        Frames that could not be worked on.
-    failures : list of str
-        A line for each of the first `KEPT_FAILURES` of them.
-    images_without_step : int
-        Images that are no part of the run: the odometry knows nothing of them.
-    """
-
-    frames: int = 0
-    discs: int = 0
-    lines: int = 0
-    tilts: int = 0
-    markers: int = 0
-    rejected: Counter[str] = field(default_factory=Counter)
-    failed: int = 0
-    failures: list[str] = field(default_factory=list)
-    images_without_step: int = 0
-
-    def add(self, rows: FrameRows) -> None:
-        """Count a frame."""
-        self.frames += 1
-        self.discs += rows.disc_count
-        self.lines += rows.line_count
-        self.tilts += rows.has_tilt
-        self.markers += rows.marker_count
-        if rows.rejected:
-            self.rejected.update(dict(rows.rejected))
-        if rows.error is not None:
-            self.failed += 1
-            if len(self.failures) < KEPT_FAILURES:
-                self.failures.append(rows.error)
 
 
 def detect_run(
     run: ImageRun,
     plan: FramePlan,
-    outputs: Sequence[Output],
+    places: Mapping[str, Path],
     *,
-    overwrite: bool = False,
-    tilts: TiltSource | None = None,
-    ids: IdSources | None = None,
+    known: Known | None = None,
     pictures: Path | None = None,
     workers: Workers | None = None,
     on_progress: Callable[[], None] | None = None,
-    conduct: Conduct = PLAIN,
-    second_pass: SecondPass | None = None,
+    conduct: Conduct | None = None,
 ) -> RunSummary:
     """Do with every frame of a run what a plan says, and write what comes of it.
+
+    Each image is decoded once. Levelled by frames, discs and lines together give the files that
+    they give one after the other, with the tilts that were written. Levelled by the run, the tilt
+    file has the tilts that the discs were levelled by, and the single frames' are in another one
+    (`detect.runs.outputs.frames_tilt_place`).
 
     Parameters
     ----------
     run : ImageRun
-        The run.
+        The run; without a calibration, only markers can be looked for.
     plan : FramePlan
         What to look for.
-    outputs : sequence of Output
-        The files to write. Where the frames' times are known, they go beside them.
-    overwrite : bool
-        Whether existing files may be replaced.
-    tilts : mapping, optional
-        Tilts by image prefix, for frames whose verticals are not looked for.
-    ids : IdSources, optional
-        Where the rows' IDs come from.
+    places : mapping
+        The files to write, by kind: "circles", "lines", "tilt", "markers", "json" (the discs once
+        more). Where the frames' times are known, they go beside them.
+    known : Known, optional
+        What is known of the frames beforehand.
     pictures : path, optional
         Folder for what the plan has drawn.
     workers : Workers, optional
         Who does the work; by default this process (see `detect.runs.workers`).
     on_progress : callable, optional
         Called once after every frame.
-    conduct : Conduct
-        Whether there are a log and a journal, how bad frames are met, and whether an unfinished run
-        is resumed.
-    second_pass : callable, optional
-        Makes the files of the part "late" of the others, when all frames are done.
+    conduct : Conduct, optional
+        Whether files may be replaced, whether there are a log and a journal, how bad frames are
+        met, and whether an unfinished run is resumed.
 
     Returns
     -------
@@ -218,92 +81,78 @@ def detect_run(
     WorkerError
         If there is nobody to do the work.
     DetectError
-        If another run is writing the same files, or a frame fails where every frame is demanded.
+        If another run is writing the same files, a frame fails where every frame is demanded, or
+        there is no such dictionary of markers.
     """
+    known = Known() if known is None else known
+    conduct = Conduct() if conduct is None else conduct
+    plan = replace(plan, json="json" in places, working_folder=Path.cwd())
+    levelled = plan.levelling != "none" and (plan.lines is not None or known.tilts is not None)
+    outputs = outputs_of(run, plan, places, conduct, levelled=levelled)
+    files = RunFiles(outputs, plan, conduct)
+    if pictures is not None:
+        make_folder(pictures)
     if workers is None:
         large = pictures is not None or run.frames.ships_images
-        workers = local_workers(1, pictures=large, frame_pixels=pixels_of(plan.camera))
-    if not workers.tell_of_tables:
-        tables_of(plan)  # whatever is wrong with them is wrong with every frame
+        workers = local_workers(1, large=large, camera=plan.camera)
+    _demand_possible(plan, workers)
     summary = RunSummary()
-    if run.has_times:
-        outputs = [*outputs, times_file([output.path for output in outputs])]
+
+    def count(rows: FrameRows) -> None:
+        summary.add(rows)
+        if on_progress is not None:
+            on_progress()
+
     with ExitStack() as stack:
-        stack.enter_context(settled())
-        files = stack.enter_context(RunFiles(outputs, plan, conduct, overwrite=overwrite))
-        tasks = stack.enter_context(closing(_tasks(run, tilts, ids)))
-        for rows in files.kept(tasks):
-            summary.add(rows)
-            if on_progress is not None:
-                on_progress()
-        left = files.left(tasks)
-        if not run.frames.ships_images:
-            left = stack.enter_context(closing(_ahead(left)))
-        found = stack.enter_context(closing(detect_chunks(left, plan, workers)))
-        for chunk in found:
+        stack.enter_context(files)
+        tasks = files.take_over(stack.enter_context(closing(_tasks(run, known))), count)
+        for chunk in stack.enter_context(closing(detect_chunks(tasks, plan, workers))):
             # A frame whose picture is there is noted before the next picture is.
-            for frames in [chunk] if pictures is None else [[rows] for rows in chunk]:
+            for frames in [chunk] if pictures is None else [[frame] for frame in chunk]:
                 if pictures is not None:
-                    redraw = overwrite or files.may_be_drawn_already
-                    _write_pictures(frames, pictures, overwrite=redraw)
+                    _write_pictures(frames[0][1], pictures, overwrite=files.may_replace_pictures)
                 files.add(frames)
-                for rows in frames:
-                    summary.add(rows)
-                    if on_progress is not None:
-                        on_progress()
+                for _, rows in frames:
+                    count(rows)
         summary.images_without_step = run.images_without_step
-        files.finish(summary, second_pass)
+        files.finish(summary, _second_pass(plan, summary))
     return summary
 
 
-def times_file(results: Sequence[Path]) -> Output:
-    """The file of the frames' times that stands beside results.
-
-    It is called like the file of landmarks, with ``.times`` behind; where there are several, like
-    what they have in common: ``detected.circles.times``, but ``detected.times``.
-    """
-    landmarks = [path for path in results if path.suffix in LANDMARK_SUFFIXES]
-    path = landmarks[0] if landmarks else results[-1]
-    name = f"{path.stem if len(landmarks) > 1 else path.name}.times"
-    return Output(path.with_name(name), "times", format_head(TIMES_HEAD))
+def make_folder(folder: Path) -> None:
+    """A folder for results, if there is none yet."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError):
+        raise DetectError(
+            f"{folder}: is no folder: expected one, or the name of a new one"
+        ) from None
 
 
-def json_file(path: Path, plan: FramePlan, version: str) -> Output:
-    """The file of the discs as JSON: what `json.dumps` with an indent of 1 gives."""
-    assert plan.circles is not None
-    assert plan.camera is not None
-    document = {
-        "version": version,
-        "settings": dataclasses.asdict(plan.circles),
-        "camera": plan.camera.content_hash,
-        "frames": [],
-    }
-    head, tail = json.dumps(document, indent=1).rsplit("]", 1)
-    return Output(path, "json", head.encode(), f"\n ]{tail}\n".encode(), b",")
+def _demand_possible(plan: FramePlan, workers: Workers) -> None:
+    """Refuse what would be wrong with every frame, as far as this process can tell soon."""
+    if plan.markers is not None:
+        templates_of(plan.markers.dictionary, plan.markers.ids)
+    if not workers.tell_of_tables:
+        tables_of(plan)
 
 
-def _ahead(tasks: Iterable[FrameTask]) -> Generator[FrameTask, None, None]:
-    """The same tasks, made some at a time: what makes them is in the processor's caches then."""
-    source = iter(tasks)
-    while batch := tuple(islice(source, _TASKS_AHEAD)):
-        yield from batch
+def _second_pass(plan: FramePlan, summary: RunSummary) -> SecondPass | None:
+    """What makes files of those of the frames, if anything."""
+    if plan.levelling != "run" or not (plan.camera and plan.lines and plan.circles):
+        return None
+    from detect.runs.level_run import level_run
+
+    return partial(level_run, plan.camera, math.radians(plan.circles.tilt_sigma_deg), summary)
 
 
-def _write_pictures(frames: Sequence[FrameRows], folder: Path, *, overwrite: bool) -> None:
-    for rows in frames:
-        for name, picture in rows.pictures:
-            with write_whole(folder / name, overwrite=overwrite) as stream:
-                stream.write(picture)
+def _write_pictures(rows: FrameRows, folder: Path, *, overwrite: bool) -> None:
+    for name, picture in rows.pictures:
+        with write_whole(folder / name, overwrite=overwrite) as stream:
+            stream.write(picture)
 
 
-def _tasks(
-    run: ImageRun, tilts: TiltSource | None, ids: IdSources | None
-) -> Generator[FrameTask, None, None]:
+def _tasks(run: ImageRun, known: Known) -> Generator[FrameTask, None, None]:
     with closing(iter(run.frames)) as frames:
         for frame in frames:
-            prefix = frame.step.prefix
-            yield FrameTask(
-                frame,
-                tilt=None if tilts is None else tilts.get(prefix),
-                known=None if ids is None else ids.of(prefix),
-            )
+            yield FrameTask(frame, known.of(frame.step.prefix))

@@ -6,22 +6,26 @@ Each is a standard executor with its number of frames per task, put together as
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import re
+import signal
+import threading
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import Executor, Future
-from contextlib import ExitStack, contextmanager
-from typing import TYPE_CHECKING, ParamSpec, TypeVar
+from concurrent.futures import Executor, Future, ProcessPoolExecutor
+from contextlib import ExitStack, contextmanager, suppress
+from multiprocessing.connection import wait
+from multiprocessing.synchronize import Event, Lock
+from typing import TYPE_CHECKING, NamedTuple, ParamSpec, TypeVar, cast
 
-from detect.announcing import announce_compiling, announcements_are_shown
+from detect.announcing import announce_compiling, announcements_are_shown, show_announcements
 from detect.errors import WorkerError
 from detect.runs.dispatch import Workers
-from detect.runs.frame import FramePlan
-from detect.runs.frame_rows import PIXELS_AT_ONCE
-from detect.runs.garbage import tidy_now_and_then
+from detect.runs.frame import FramePlan, import_detectors, rehearse, tables_of
 from detect.runs.interrupts import interrupts_deferred
-from detect.runs.processes import WorkerProcesses
+from detect.runs.rows import PIXELS_AT_ONCE
+from storage.kernel_loading import load_kernels_alone, waiting_before_compiling
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -34,17 +38,18 @@ R = TypeVar("R")
 #: Fewer frames than this are not worth another process's start.
 FRAMES_PER_PROCESS = 500
 
-#: One job works on so many frames together at most.
-_LOCAL_CHUNK = 128
-#: A task of a process has so many frames; the larger one where there are enough for many of them.
+#: A task has so many frames at most; one of a process so many at least, and more where each
+#: process has so many tasks nevertheless.
+_MOST_TOGETHER = 128
 _PROCESS_CHUNK = 16
-_LARGE_PROCESS_CHUNK = 128
 _TASKS_PER_PROCESS = 32
 _CLUSTER_CHUNK = 16
 _WINDOW_PER_WORKER = 3
 _CLUSTER_ANSWER_S = 10.0
 _CLUSTER_PATIENCE_S = 60.0
 _CLUSTER_LOOK_S = 5.0
+#: Processes have so long to end by themselves.
+_GRACE_S = 1.0
 
 
 def default_jobs(frames: int) -> int:
@@ -54,13 +59,8 @@ def default_jobs(frames: int) -> int:
     return max(1, min(cores, frames // FRAMES_PER_PROCESS))
 
 
-def pixels_of(camera: Camera | None) -> int:
-    """How large a camera's images are; 0 if nobody knows."""
-    return 0 if camera is None else camera.width * camera.height
-
-
 def local_workers(
-    jobs: int, *, pictures: bool = False, frame_pixels: int = 0, frames: int | None = None
+    jobs: int, *, large: bool = False, camera: Camera | None = None, frames: int | None = None
 ) -> Workers:
     """Workers on this machine.
 
@@ -68,11 +68,10 @@ def local_workers(
     ----------
     jobs : int
         How many processes; 1 is this process itself.
-    pictures : bool
-        Whether frames give pictures: tasks are kept small then.
-    frame_pixels : int
-        How large an image is, if that is known: no more are worked on together than are decoded at
-        once.
+    large : bool
+        Whether tasks carry images, or bring pictures back: they have one frame each then.
+    camera : Camera, optional
+        Says how large an image is: no more are worked on together than are decoded at once.
     frames : int, optional
         How many there are, if that is known: the longer the run, the more are worked on together.
 
@@ -83,27 +82,19 @@ def local_workers(
     """
     if jobs < 1:
         raise WorkerError(f"jobs is {jobs}: expected 1 or more")
-    decoded_at_once = max(PIXELS_AT_ONCE // max(frame_pixels, 1), 1)
+    chunk = _MOST_TOGETHER
+    if jobs > 1:  # few where the last tasks would be waited for
+        chunk = max((frames or 0) // (jobs * _TASKS_PER_PROCESS), _PROCESS_CHUNK)
+    if camera is not None:
+        chunk = min(chunk, PIXELS_AT_ONCE // (camera.width * camera.height))
+    chunk = 1 if large else max(1, min(chunk, _MOST_TOGETHER))
     if jobs == 1:
-        together = min(decoded_at_once, _LOCAL_CHUNK)
-        return Workers(_in_process, chunk=1 if pictures else together, window=lambda: 1)
+        return Workers(_in_process, chunk, window=lambda: 1)
     window = 2 + _WINDOW_PER_WORKER * jobs
-    return Workers(
-        lambda plan: _processes(jobs, plan),
-        chunk=1 if pictures else min(decoded_at_once, _frames_per_task(jobs, frames)),
-        window=lambda: window,
-        tell_of_tables=True,
-    )
+    return Workers(lambda plan: _processes(jobs, plan), chunk, lambda: window, tell_of_tables=True)
 
 
-def _frames_per_task(jobs: int, frames: int | None) -> int:
-    """How many frames a process works on together: few where the last tasks would be waited for."""
-    if frames is None:
-        return _PROCESS_CHUNK
-    return min(max(frames // (jobs * _TASKS_PER_PROCESS), _PROCESS_CHUNK), _LARGE_PROCESS_CHUNK)
-
-
-def cluster_workers(address: str, *, pictures: bool = False) -> Workers:
+def cluster_workers(address: str, *, large: bool = False) -> Workers:
     """The workers of a dask cluster.
 
     They have this program installed, in the same version, and see the images under the same
@@ -113,8 +104,8 @@ def cluster_workers(address: str, *, pictures: bool = False) -> Workers:
     ----------
     address : str
         The scheduler's, as ``tcp://host:8786``.
-    pictures : bool
-        Whether frames give pictures: tasks are kept small then.
+    large : bool
+        Whether tasks carry images, or bring pictures back: they have one frame each then.
 
     Raises
     ------
@@ -133,7 +124,7 @@ def cluster_workers(address: str, *, pictures: bool = False) -> Workers:
     size = _ClusterSize()
     return Workers(
         lambda plan: _cluster(address, size),
-        chunk=1 if pictures else _CLUSTER_CHUNK,
+        chunk=1 if large else _CLUSTER_CHUNK,
         window=size.window,
         died=(KilledWorker,),
     )
@@ -146,7 +137,6 @@ class _InProcess(Executor):
     """Does what it is given at once, before it gives the future back."""
 
     def submit(self, fn: Callable[P, R], /, *args: P.args, **kwargs: P.kwargs) -> Future[R]:
-        tidy_now_and_then()
         future: Future[R] = Future()
         future.set_result(fn(*args, **kwargs))
         return future
@@ -158,16 +148,116 @@ def _in_process(plan: FramePlan) -> Iterator[Executor]:
     yield _InProcess()
 
 
-# -- processes ------------------------------------------------------------------------------
+# -- processes of this machine ---------------------------------------------------------------
+
+# They are spawned, not forked: compiled kernels, OpenCV and the libraries of linear algebra have
+# threads of their own, which no fork survives. They take no notice of an interrupt from the
+# keyboard; the process that started them does, and ends them. If that process is killed, they end
+# by themselves.
 
 
 @contextmanager
-def _processes(jobs: int, plan: FramePlan) -> Iterator[Executor]:
+def _processes(count: int, plan: FramePlan) -> Iterator[Executor]:
+    """Processes that get ready for a plan; they have ended when the block has."""
     with ExitStack() as ending:
-        with interrupts_deferred():
-            pool = WorkerProcesses(jobs, plan, show=announcements_are_shown())
+        with interrupts_deferred():  # else one would be left half started
+            pool = _ProcessPool(count, plan)
             ending.callback(pool.end)
         yield pool
+
+
+class _ProcessPool(ProcessPoolExecutor):
+    """Processes that inherit a blocked interrupt: it would reach them even while they start."""
+
+    def __init__(self, count: int, plan: FramePlan) -> None:
+        context = multiprocessing.get_context("spawn")
+        beginning = _Beginning(context.Lock(), context.Event(), context.Event())
+        show = announcements_are_shown()
+        super().__init__(
+            count, mp_context=context, initializer=_begin, initargs=(plan, beginning, show)
+        )
+
+    def submit(self, fn: Callable[P, R], /, *args: P.args, **kwargs: P.kwargs) -> Future[R]:
+        with interrupts_deferred():
+            return super().submit(fn, *args, **kwargs)
+
+    def end(self) -> None:
+        """End them, whatever they are doing; a further interrupt waits for that.
+
+        The thread that looks after them is waited for: an interrupted program leaves threads
+        behind, and this one would be stopped between the removal of a semaphore and the note of
+        that.
+        """
+        with interrupts_deferred():
+            processes = list((self._processes or {}).values())
+            caretaker = cast("threading.Thread | None", self._executor_manager_thread)
+            self.shutdown(wait=False, cancel_futures=True)
+            latest_s = time.monotonic() + _GRACE_S
+            for process in processes:
+                process.join(max(0.0, latest_s - time.monotonic()))
+            for process in processes:  # they may still be starting
+                process.terminate()
+            for process in processes:
+                process.join(_GRACE_S)
+                if process.is_alive():
+                    process.kill()
+                    process.join()
+            if caretaker is not None:
+                caretaker.join(_GRACE_S)
+
+
+class _Beginning(NamedTuple):
+    """What new worker processes share: one of them makes what is not in the caches yet, for all.
+
+    Attributes
+    ----------
+    first : Lock
+        Taken by that one.
+    tables, kernels : Event
+        Set when tables are in the cache, and when kernels are.
+    """
+
+    first: Lock
+    tables: Event
+    kernels: Event
+
+
+def _begin(plan: FramePlan, beginning: _Beginning, show: bool) -> None:
+    """Make a new process a worker."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    if show:
+        show_announcements()
+    import cv2
+
+    cv2.setNumThreads(1)
+    announce_compiling()
+    with suppress(Exception):  # whatever it is: the first task will tell
+        _rehearse_together(plan, beginning)
+
+
+def _rehearse_together(plan: FramePlan, beginning: _Beginning) -> None:
+    if beginning.first.acquire(block=False):
+        try:
+            load_kernels_alone()
+            tables_of(plan)
+            beginning.tables.set()
+            rehearse(plan)
+        finally:  # the others see for themselves what is wrong
+            beginning.tables.set()
+            beginning.kernels.set()
+        return
+    with waiting_before_compiling(beginning.kernels.wait) as waits:
+        import_detectors(plan)
+        (beginning.tables if waits else beginning.kernels).wait()
+        rehearse(plan)
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        wait([parent.sentinel])
+        os._exit(1)
 
 
 # -- a cluster ------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ from detect.comparison.lines_result import LineCompareOptions
 from detect.drawing.selection import select_frames
 from detect.errors import EXIT_FRAMES_FAILED, DetectError
 from detect.line_settings import PRESETS, LineSettings
-from detect.runs.by_image import FramesByImage, TiltsByImage
+from detect.runs.known import FramesByImage, TiltsByImage
 from detect.runs.progress import print_failures, progress_bar
 from detect.settings import PUBLISHED, CircleSettings
 from detect.sources.opening import demand_recording, open_calibrated

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 
 from detect.comparison.circles import compare_frames
@@ -15,12 +16,11 @@ from detect.comparison.lines_result import LineCompareOptions
 from detect.comparison.result import CompareOptions
 from detect.line_settings import LineSettings
 from detect.run import Run, RunFrame
-from detect.runs.dispatch import Workers, detect_frames
-from detect.runs.frame import FramePlan, tables_of
-from detect.runs.frame_rows import FrameTask
-from detect.runs.stream import TiltSource
+from detect.runs.dispatch import Workers, detect_chunks
+from detect.runs.frame import FramePlan, FrameTask, tables_of
+from detect.runs.known import ByPrefix, Known
 from detect.settings import CircleSettings
-from landmarks import Frame, frames_of_rows, parse_rows
+from landmarks import Frame, FrameTilt, frames_of_rows, parse_rows
 
 Settings = CircleSettings | LineSettings
 
@@ -62,7 +62,7 @@ def tune_run(
     gate: CompareOptions | LineCompareOptions,
     workers: Workers,
     *,
-    tilts: TiltSource | None = None,
+    tilts: ByPrefix[FrameTilt] | None = None,
     on_progress: Callable[[], None] | None = None,
 ) -> Iterator[Trial]:
     """Detect with each setting in turn, and compare.
@@ -100,19 +100,17 @@ def tune_run(
         If there is nobody to do the work.
     """
     plans = [_plan(run, each) for each in settings]
-    tasks = [
-        FrameTask(frame, tilt=None if tilts is None else tilts.get(frame.step.prefix))
-        for frame in frames
-    ]
+    known = Known(tilts=tilts)
+    tasks = [FrameTask(frame, known.of(frame.step.prefix)) for frame in frames]
     tables_of(plans[0])
     with _kept(workers, plans[0]) as same:
         for plan in plans:
             found: list[Frame] = []
             failures: list[str] = []
-            with closing(detect_frames(tasks, plan, same())) as rows:
-                for each in rows:
-                    text = each.circles if plan.circles is not None else each.lines
-                    found += frames_of_rows(parse_rows(io.BytesIO(text)))
+            kind = "circles" if plan.circles is not None else "lines"
+            with closing(detect_chunks(tasks, plan, same())) as chunks:
+                for _, each in chain.from_iterable(chunks):
+                    found += frames_of_rows(parse_rows(io.BytesIO(each.rows[kind])))
                     failures += [] if each.error is None else [each.error]
                     if on_progress is not None:
                         on_progress()

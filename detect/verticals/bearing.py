@@ -1,4 +1,4 @@
-"""Bearings and inclinations of lines: from their planes, in both conventions, and joined.
+"""Bearings, inclinations and ends of lines: from their planes, in both conventions.
 
 A line's row holds its ends in undistorted normalised image coordinates. The plane through the
 camera's centre and both ends has a unit normal n in the robot frame; beta = asin(n_z). alpha is the
@@ -15,7 +15,11 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from detect.verticals.order_kernels import descending
+from detect.verticals.refinement import LineFits
+from detect.verticals.response import Strip
+from detect.verticals.tracking import LineTracks
+
+FloatArray = NDArray[np.float64]
 
 
 @njit(cache=True, error_model="numpy")
@@ -25,82 +29,15 @@ def wrapped(angle: float) -> float:
 
 
 @njit(cache=True, error_model="numpy")
-def join_mixture(
-    alpha: NDArray[np.float64], sigma: NDArray[np.float64], weight: NDArray[np.float64]
-) -> tuple[float, float]:
-    """Mean and standard deviation of a mixture of Gaussians of bearings.
-
-    Parameters
-    ----------
-    alpha, sigma : (N,) float64
-        Means and standard deviations of the components (rad); all means within half a turn.
-    weight : (N,) float64
-        Their weights, not negative, of any sum.
-
-    Returns
-    -------
-    alpha, sigma : float
-        Of the mixture (rad).
-    """
-    total = 0.0
-    mean = 0.0
-    for k in range(len(alpha)):
-        total += weight[k]
-        mean += weight[k] * wrapped(alpha[k] - alpha[0])
-    mean /= total
-    variance = 0.0
-    for k in range(len(alpha)):
-        off = wrapped(alpha[k] - alpha[0]) - mean
-        variance += weight[k] * (sigma[k] * sigma[k] + off * off)
-    return wrapped(alpha[0] + mean), math.sqrt(variance / total)
-
-
-@njit(cache=True, error_model="numpy")
-def chain_neighbours(
-    alpha: NDArray[np.float64], distance: NDArray[np.float64]
-) -> NDArray[np.int64]:
-    """Number the groups of bearings whose neighbours are close.
-
-    Parameters
-    ----------
-    alpha : (N,) float64
-        Bearings (rad).
-    distance : (N,) float64
-        Two neighbours belong together if they are closer than the smaller of their two distances.
-
-    Returns
-    -------
-    (N,) int64
-        The group of each, counted from 0 at the largest bearing (leftmost in the image).
-    """
-    order = descending(alpha)
-    group = np.zeros(len(alpha), np.int64)
-    number = 0
-    for k in range(1, len(alpha)):
-        left = order[k - 1]
-        right = order[k]
-        if alpha[left] - alpha[right] >= min(distance[left], distance[right]):
-            number += 1
-        group[right] = number
-    return group
-
-
-@njit(cache=True, error_model="numpy")
 def turned_bearings(
-    reference: NDArray[np.float64],
-    line: NDArray[np.float64],
-    covariance: NDArray[np.float64],
-    rotation: NDArray[np.float64],
-    pitch: float,
-    roll: float,
-    building: float,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    fits: LineFits, rotation: FloatArray, pitch: float, roll: float, building: float
+) -> tuple[FloatArray, FloatArray]:
     """Bearings of lines after a rotation, and their noise.
 
     Parameters
     ----------
-    reference, line, covariance
-        The lines (see `detect.verticals.fit.LineFits`).
+    fits : LineFits
+        The lines.
     rotation : (3, 3) float64
         What turns the normals of their planes.
     pitch, roll : float
@@ -115,6 +52,7 @@ def turned_bearings(
     alpha, noise : (T,) float64
         Bearings and their standard deviations (rad).
     """
+    reference, line, covariance = fits.reference_rad, fits.line, fits.covariance
     alpha = np.empty(len(reference))
     noise = np.empty(len(reference))
     for t in range(len(reference)):
@@ -136,26 +74,14 @@ def turned_bearings(
 
 @njit(cache=True, error_model="numpy")
 def ends_of_lines(
-    bearing: NDArray[np.float64],
-    elevation_tan: NDArray[np.float32],
-    robot_from_camera: NDArray[np.float64],
-    bounds: NDArray[np.int64],
-    row: NDArray[np.int32],
-    column: NDArray[np.float64],
-    reference: NDArray[np.float64],
-    line: NDArray[np.float64],
-    chosen: NDArray[np.int64],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    strip: Strip, tracks: LineTracks, fits: LineFits, chosen: NDArray[np.int64]
+) -> tuple[FloatArray, FloatArray]:
     """Where lines cross the first and the last row of their tracks, and how they are inclined.
 
     Parameters
     ----------
-    bearing, elevation_tan, robot_from_camera
-        The table.
-    bounds, row, column
-        The tracks.
-    reference, line
-        Their lines (see `detect.verticals.fit.LineFits`).
+    strip, tracks, fits
+        The table, the tracks, their lines.
     chosen : (N,) int64
         Which tracks.
 
@@ -166,6 +92,9 @@ def ends_of_lines(
     beta : (N,) float64
         Inclinations of the normals of their planes (rad).
     """
+    bearing, elevation, robot_from_camera = strip.bearing, strip.rise, strip.robot_from_camera
+    bounds, row, column = tracks.bounds, tracks.row, tracks.column
+    reference, line = fits.reference_rad, fits.line
     width = len(bearing)
     ends = np.empty((len(chosen), 4))
     beta = np.empty(len(chosen))
@@ -185,7 +114,7 @@ def ends_of_lines(
             for _ in range(3):
                 j = min(max(int(near), 0), width - 2)
                 f = near - j
-                moved = (1.0 - f) * elevation_tan[v, j] + f * elevation_tan[v, j + 1]
+                moved = (1.0 - f) * elevation[j, v] + f * elevation[j + 1, v]
                 # At the verticals' own ends the neighbouring column may end a row earlier.
                 if math.isfinite(moved):
                     rise = moved

@@ -13,11 +13,10 @@ from functools import lru_cache
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from detect.line_settings import LineSettings
-from detect.verticals.fit import FIT_NUMBERS
-from detect.verticals.order_kernels import descending
+from detect.verticals.refinement import LineFits
+from detect.verticals.tilt_error import descending
 
 #: A filter of this share of the blur's width is wide enough.
 _WIDE_ENOUGH = 0.68
@@ -95,23 +94,12 @@ def widened(settings: LineSettings, width: float) -> LineSettings:
 
 
 @njit(cache=True, error_model="numpy")
-def median_sharpness(fits: NDArray[np.float64]) -> float:
+def median_sharpness(fits: LineFits) -> float:
     """Median sharpness of the edges that were refined, lines or not; 1 where there are too few.
 
     Of an even number the lower of the two in the middle.
-
-    Parameters
-    ----------
-    fits : (13 * T,) float64
-        See `detect.verticals.fit.LineFits`.
     """
-    count = len(fits) // FIT_NUMBERS
-    sharpness = np.empty(count)
-    told = 0
-    for t in range(count):
-        if not math.isnan(fits[11 * count + t]):
-            sharpness[told] = fits[12 * count + t]
-            told += 1
-    if told < _LEAST_EDGES:
+    sharpness = fits.sharpness[~np.isnan(fits.contrast)]
+    if len(sharpness) < _LEAST_EDGES:
         return 1.0
-    return float(sharpness[descending(sharpness[:told])[told // 2]])
+    return float(sharpness[descending(sharpness)[len(sharpness) // 2]])

@@ -112,7 +112,7 @@ def moments_across(
     left, right : float32
         Columns from and below which windows lie inside the image; elsewhere moments are 0.
     weights : (4, T) float32, contiguous
-        See `detect.verticals.filter.LineFilter.weights_between`.
+        See `detect.verticals.response.LineFilter.weights_between`.
     words : int64
         T / `WORD`.
     moments : float32, contiguous

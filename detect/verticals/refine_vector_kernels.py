@@ -25,9 +25,11 @@ from detect.vector_code import (
     constant,
     operation,
 )
-from detect.verticals.step_filters import SUBPIXELS
 
-__all__ = ["ROWS", "heights", "move_crossings", "newton_sums"]
+__all__ = ["ROWS", "SUBPIXELS", "heights", "move_crossings", "newton_sums"]
+
+#: Positions in a pixel for which weights are tabulated; between them the derivative helps out.
+SUBPIXELS = 64
 
 #: Rows that are looked at together.
 ROWS = LANES
@@ -115,7 +117,7 @@ def newton_sums(
     blocks : int64
         Number of rows / `ROWS`.
     weights : float32, contiguous
-        See `detect.verticals.step_filters.StepFilters.derivatives`.
+        See `detect.verticals.refinement.StepFilters.derivatives`.
     begin : int64
         Index of the filter's first weight.
     half : int64
@@ -278,7 +280,7 @@ def heights(
     pixels, row_begin, crossing, blocks, left, right
         As for `newton_sums`.
     weights : float32, contiguous
-        See `detect.verticals.step_filters.StepFilters.height`.
+        See `detect.verticals.refinement.StepFilters.height`.
     fine_begin, coarse_begin : int64
         Index of each filter's first weight.
     fine_half, coarse_half : int64

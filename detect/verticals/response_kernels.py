@@ -1,20 +1,20 @@
-"""Compiled loops that evaluate the filter: everywhere, and on the rows near the horizon.
+"""Compiled: the filter everywhere, on the rows near the horizon, and where tracks go.
 
-A *strip* image has a pixel (v, c) for row v of the vertical that crosses the horizon at column c
-(see `lut.verticals`): the building's verticals are its columns, whatever the camera's pose and
-distortion.
-
-The response at a pixel of the strip is the signed squared correlation of grey value and distance
-across the vertical in a Gaussian window, cov |cov| / (variance + regulariser). Tracks evaluate it
-where they go (`detect.verticals.follow_kernels.follow_edges`).
+Groups of `LANES` neighbouring verticals begin `STEP` columns apart and overlap: whoever follows an
+edge finds the columns round it in one of them. What the vectors do not reach, windows that are cut
+off, is done number by number.
 """
 
 from __future__ import annotations
+
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from detect.uncounted import uncounted_contracting
+from detect.vector_code import LANES, WORD
 from detect.verticals.band_vector_kernels import (
     BLOCK,
     RUN,
@@ -24,6 +24,20 @@ from detect.verticals.band_vector_kernels import (
     response_across,
     sums_along,
 )
+from detect.verticals.filter_vector_kernels import (
+    moments_across,
+    moments_across_two,
+    response_along,
+    response_along_two,
+)
+
+if TYPE_CHECKING:
+    from detect.verticals.response import LineFilter, ResponseOnDemand, StartBand, Strip
+
+#: Groups of verticals begin so many columns apart, and so many before the first that is theirs:
+#: whoever asks for a column may ask for two more on either side.
+STEP = 4
+MARGIN = 2
 
 _ZERO = np.float32(0.0)
 #: Grey values about 0 keep the small variances exact in single precision.
@@ -32,17 +46,10 @@ _MIDDLE = np.float32(128.0)
 
 @njit(cache=True, error_model="numpy")
 def _cut_response(
-    mean_strip: NDArray[np.float32],
-    cov_strip: NDArray[np.float32],
-    square_strip: NDArray[np.float32],
-    along: NDArray[np.float32],
-    noise: np.float32,
-    v: int,
-    c: int,
-    first: int,
-    last: int,
-) -> np.float32:
-    """Response in a window that is cut off at a vertical's ends."""
+    moments: NDArray[np.float32], along: NDArray[np.float32], noise: np.float32, v: int,
+    first: int, last: int,
+) -> np.float32:  # fmt: skip
+    """Response in a window that is cut off at a vertical's ends, from its (3, H) moments."""
     s = (len(along) - 1) // 2
     share = np.float32(0.0)
     mean = np.float32(0.0)
@@ -51,9 +58,9 @@ def _cut_response(
     for k in range(max(-s, first - v), min(s, last - v) + 1):
         w = along[k + s]
         share += w
-        mean += w * mean_strip[v + k, c]
-        cov += w * cov_strip[v + k, c]
-        square += w * square_strip[v + k, c]
+        mean += w * moments[0, v + k]
+        cov += w * moments[1, v + k]
+        square += w * moments[2, v + k]
     mean /= share
     cov /= share
     return cov * abs(cov) / (abs(square / share - mean * mean) + noise)
@@ -61,36 +68,34 @@ def _cut_response(
 
 @njit(cache=True, error_model="numpy")
 def strip_response(
-    image: NDArray[np.uint8],
-    column: NDArray[np.float32],
-    first_row: NDArray[np.int32],
-    last_row: NDArray[np.int32],
-    weights: NDArray[np.float32],
-    along: NDArray[np.float32],
-    regulariser: np.float32,
-    response: NDArray[np.float32],
-) -> None:
-    """Signed squared correlation of grey value and column, in a window along each vertical.
+    image: NDArray[np.uint8], column: NDArray[np.float32], strip: Strip, window: LineFilter
+) -> NDArray[np.float32]:
+    """The response at each pixel of the strip.
 
     Parameters
     ----------
     image : (H, W) uint8
         Grey values.
-    column, first_row, last_row
-        The table (see `lut.verticals.VerticalTable`).
-    weights, along, regulariser
-        The filter (see `detect.verticals.filter.LineFilter`). Along the line it is cut off, and
-        made up for, where the vertical ends.
-    response : (H, W) float32
-        Result: ``cov |cov| / (variance + regulariser)``, in [-1, 1]; positive where the image is
-        brighter on the right; 0 where the window leaves the image.
+    column : (H, W) float32
+        Column at which each vertical crosses each row (see `lut.verticals.VerticalTable`).
+    strip, window
+        Ends of the verticals; the filter. Along the line it is cut off, and made up for, where the
+        vertical ends.
+
+    Returns
+    -------
+    (H, W) float32
+        ``cov |cov| / (variance + regulariser)``, in [-1, 1]; positive where the image is brighter
+        on the right; 0 where the window leaves the image.
     """
     height, width = image.shape
+    weights, along, regulariser = window.weights, window.along, window.regulariser
     r = weights.shape[1] // 2
     s = (len(along) - 1) // 2
-    mean_strip = np.zeros((height, width), np.float32)
-    cov_strip = np.zeros((height, width), np.float32)
-    square_strip = np.zeros((height, width), np.float32)
+    response = np.empty((height, width), np.float32)
+    # Means, covariances and mean squares.
+    moments = np.zeros((3, height, width), np.float32)
+    mean_strip, cov_strip, square_strip = moments[0], moments[1], moments[2]
     grey = np.empty(width, np.float32)
     mean = np.zeros(width, np.float32)
     cov = np.zeros(width, np.float32)
@@ -98,9 +103,8 @@ def strip_response(
     leftmost = np.float32(r)
     rightmost = np.float32(width - 1 - r)
     for v in range(height):
-        # Grey values about 0 keep the small variances exact in single precision.
         for u in range(width):
-            grey[u] = np.float32(image[v, u]) - np.float32(128.0)
+            grey[u] = np.float32(image[v, u]) - _MIDDLE
         centre = weights[0, r]
         for u in range(r, width - r):
             g = grey[u]
@@ -145,8 +149,8 @@ def strip_response(
             response[v, c] = grey[c] if (x >= leftmost) & (x < rightmost) else np.float32(0.0)
     # Near a vertical's ends the window is cut off.
     for c in range(width):
-        first = first_row[c]
-        last = last_row[c]
+        first = strip.first_row[c]
+        last = strip.last_row[c]
         for end in range(2):
             lowest = first if end == 0 else max(last - s + 1, first + s)
             highest = min(first + s - 1, last) if end == 0 else last
@@ -154,8 +158,9 @@ def strip_response(
                 x = column[v, c]
                 if x >= leftmost and x < rightmost:
                     response[v, c] = _cut_response(
-                        mean_strip, cov_strip, square_strip, along, regulariser, v, c, first, last
+                        moments[:, :, c], along, regulariser, v, first, last
                     )
+    return response
 
 
 @njit(cache=True, error_model="numpy")
@@ -166,21 +171,8 @@ def _from_cache_line(numbers: NDArray[np.float32]) -> NDArray[np.float32]:
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def band_response(
-    image: NDArray[np.uint8],
-    pixel: NDArray[np.int32],
-    runs: NDArray[np.int32],
-    lengths: NDArray[np.uint8],
-    odd: NDArray[np.int32],
-    odd_bounds: NDArray[np.int32],
-    part: NDArray[np.float32],
-    scale: NDArray[np.float32],
-    visible: NDArray[np.bool_],
-    spacing: int,
-    weights: NDArray[np.float32],
-    along: NDArray[np.float32],
-    regulariser: np.float32,
-    response: NDArray[np.float32],
-) -> None:
+    image: NDArray[np.uint8], band: StartBand, window: LineFilter
+) -> NDArray[np.float32]:
     """Responses on rows parallel to the horizon, with the window laid over the strip itself.
 
     Near the horizon the strip's columns are a pixel wide. There it hardly matters whether the
@@ -191,37 +183,32 @@ def band_response(
     ----------
     image : (H, W) uint8
         Grey values.
-    pixel, runs, lengths, odd, odd_bounds, part
-        See `detect.verticals.filter.StartBand`.
-    scale : (K, P) float32
-        One over the sum of the weights along the vertical that lie on it, for each row of the
-        result.
-    visible : (K, W) bool
-        Where the result is to be other than 0.
-    spacing : int
-        Rows of the strip from one row of the result to the next; the first of them is row s.
-    weights : (K, 2, 2r + 1) float32
-        Weights across the vertical, as those of the filter, for each row of the result.
-    along, regulariser
-        The filter (see `detect.verticals.filter.LineFilter`).
-    response : (K, W) float32
-        Result: as `strip_response`.
+    band, window
+        The rows; the filter.
+
+    Returns
+    -------
+    (K, W) float32
+        As `strip_response`.
     """
+    along = window.along
     width = image.shape[1]
-    tiles, rows = pixel.shape[:2]
+    tiles, rows = band.pixel.shape[:2]
     padded = tiles * TILE
+    response = np.empty(band.row.shape, np.float32)
     levels = len(response)
-    taps = weights.shape[2]
+    taps = band.weights.shape[2]
     r = taps // 2
     inner = width - 2 * r
     if inner <= 0 or image.size <= RUN:
         response[:] = _ZERO
-        return
+        return response
     flat = image.reshape(-1)
-    flat_pixel = pixel.reshape(-1)
-    flat_part = part.reshape(-1)
-    flat_scale = scale.reshape(-1)
-    flat_weights = weights.reshape(-1)
+    flat_pixel = band.pixel.reshape(-1)
+    flat_part = band.part.reshape(-1)
+    flat_scale = band.scale.reshape(-1)
+    flat_weights = band.weights.reshape(-1)
+    runs, lengths, odd = band.runs, band.lengths, band.odd
     # Some columns at a time: what is between the pixels stays in the innermost cache.
     plane = rows * TILE
     between = _from_cache_line(np.empty(2 * plane + 16, np.float32))
@@ -235,13 +222,13 @@ def band_response(
                 flat, runs, lengths, flat_part, (tile * rows + row) * (TILE // RUN), between, plane,
                 row * TILE,
             )  # fmt: skip
-        for n in range(odd_bounds[tile], odd_bounds[tile + 1]):
+        for n in range(band.odd_bounds[tile], band.odd_bounds[tile + 1]):
             interpolate(flat, flat_pixel, flat_part, odd[n], between, plane, odd[n] - tile * plane)
         for k in range(levels):
             for own in range(0, TILE, BLOCK):
                 sums_along(
-                    between, plane, k * spacing * TILE + own, TILE, along, len(along), flat_scale,
-                    k * padded + left + own, sums, sums_plane, k * length + left + own,
+                    between, plane, k * band.spacing * TILE + own, TILE, along, len(along),
+                    flat_scale, k * padded + left + own, sums, sums_plane, k * length + left + own,
                 )  # fmt: skip
     for row in range(2 * levels):
         # What is computed of it is not looked at, but may take long.
@@ -250,12 +237,131 @@ def band_response(
     for k in range(levels):
         for c in range(0, inner, BLOCK):
             response_across(
-                sums, sums_plane, k * length + c, flat_weights, 2 * k * taps, taps, regulariser,
-                values, c,
+                sums, sums_plane, k * length + c, flat_weights, 2 * k * taps, taps,
+                window.regulariser, values, c,
             )  # fmt: skip
         response[k, :r] = _ZERO
         response[k, r + inner :] = _ZERO
         out = response[k, r : r + inner]
-        shown = visible[k, r : r + inner]
+        shown = band.visible[k, r : r + inner]
         for c in range(inner):
             out[c] = values[c] if shown[c] else _ZERO
+    return response
+
+
+@uncounted_contracting
+def _cut_responses(lazy: ResponseOnDemand, group: int, v: int) -> None:
+    """Responses of a group in a row where windows are cut off at each vertical's own ends."""
+    strip, window, moments = lazy.strip, lazy.window, lazy.moments
+    along = window.along
+    width, height = strip.rise.shape
+    plane = height * LANES
+    half_width = window.weights.shape[1] // 2
+    leftmost = np.float32(half_width)
+    rightmost = np.float32(width - 1 - half_width)
+    s = len(along) // 2
+    to = group * plane + v * LANES
+    base = min(max(group * STEP - MARGIN, 0), width - LANES)
+    for lane in range(LANES):
+        c = base + lane
+        lazy.response[to + lane] = np.float32(0.0)
+        x = strip.column[to + lane]
+        if not (x >= leftmost and x < rightmost):
+            continue
+        share = np.float32(0.0)
+        mean = np.float32(0.0)
+        cov = np.float32(0.0)
+        square = np.float32(0.0)
+        for y in range(max(strip.first_row[c], v - s), min(strip.last_row[c], v + s) + 1):
+            w = along[y - v + s]
+            at = LANES * y + lane
+            share += w
+            mean += w * moments[at]
+            cov += w * moments[at + plane]
+            square += w * moments[at + 2 * plane]
+        mean /= share
+        cov /= share
+        variance = abs(square / share - mean * mean)
+        lazy.response[to + lane] = cov * abs(cov) / (variance + window.regulariser)
+
+
+@uncounted_contracting
+def _moments_of_rows(lazy: ResponseOnDemand, group: int, first: int, after: int) -> None:
+    """Moments across the verticals of a group in some rows."""
+    column, weights = lazy.strip.column, lazy.window.weights_between
+    width, height = lazy.strip.rise.shape
+    plane = height * LANES
+    half_width = lazy.window.weights.shape[1] // 2
+    leftmost = np.float32(half_width)
+    rightmost = np.float32(width - 1 - half_width)
+    words = weights.shape[1] // WORD
+    at_group = group * plane
+    y = first
+    while y + 1 < after:
+        moments_across_two(
+            lazy.pixels, y * width - half_width, width, column, at_group + y * LANES, leftmost,
+            rightmost, weights, words, lazy.moments, plane, y * LANES,
+        )  # fmt: skip
+        y += 2
+    if y < after:
+        moments_across(
+            lazy.pixels, y * width - half_width, width, column, at_group + y * LANES, leftmost,
+            rightmost, weights, words, lazy.moments, plane, y * LANES,
+        )  # fmt: skip
+
+
+@uncounted_contracting
+def respond(lazy: ResponseOnDemand, group: int, begin: int, end: int) -> None:
+    """Evaluate the filter in some rows of a group of verticals."""
+    strip, along, moments, rows = lazy.strip, lazy.window.along, lazy.moments, lazy.moment_rows
+    response, regulariser = lazy.response, lazy.window.regulariser
+    width, height = strip.rise.shape
+    half_width = lazy.window.weights.shape[1] // 2
+    plane = height * LANES
+    s = len(along) // 2
+    leftmost = np.float32(half_width)
+    rightmost = np.float32(width - 1 - half_width)
+    top = strip.ends[group, 0]
+    bottom = strip.ends[group, 1]
+    full_top = strip.ends[group, 2]
+    full_bottom = strip.ends[group, 3]
+    first = max(begin - s, top)
+    after = min(end - 1 + s, bottom) + 1
+    if rows[0] != group or first > rows[2] or after < rows[1]:
+        rows[0] = group
+        rows[1] = first
+        rows[2] = first
+    _moments_of_rows(lazy, group, first, min(after, rows[1]))
+    _moments_of_rows(lazy, group, max(first, rows[2]), after)
+    rows[1] = min(rows[1], first)
+    rows[2] = max(rows[2], after)
+    alike = top == full_top and bottom == full_bottom
+    one = np.float32(1.0)
+    v = begin
+    while v < end:
+        at = group * plane + v * LANES
+        if v - s >= full_top and v + s <= full_bottom:
+            if v + 1 < end and v + 1 + s <= full_bottom:
+                response_along_two(
+                    moments, plane, (v - s) * LANES, along, 0, len(along), one, regulariser,
+                    strip.column, at, leftmost, rightmost, response, at,
+                )  # fmt: skip
+                v += 1
+            else:
+                response_along(
+                    moments, plane, (v - s) * LANES, along, 0, len(along), one, regulariser,
+                    strip.column, at, leftmost, rightmost, response, at,
+                )  # fmt: skip
+        elif alike:
+            highest = max(v - s, top)
+            share = np.float32(0.0)
+            for k in range(highest - v + s, min(v + s, bottom) - v + s + 1):
+                share += along[k]
+            response_along(
+                moments, plane, highest * LANES, along, highest - v + s,
+                min(v + s, bottom) - highest + 1, one / share, regulariser, strip.column, at,
+                leftmost, rightmost, response, at,
+            )  # fmt: skip
+        else:
+            _cut_responses(lazy, group, v)
+        v += 1

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import math
+from typing import Any
 
 import numpy as np
 from hypothesis import strategies as st
@@ -14,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from camera import Camera, CameraError
 from camera.distortion import Coef, fold_radius, largest_distorted_radius
 from camera.model import Pose
+from camera.model_checks import border_pixels
 
 #: No camera of these tests looks farther to the side than this (80 deg off the axis).
 WIDEST = math.tan(math.radians(80.0))
@@ -91,15 +93,23 @@ def cameras(
     )
     if draw(st.booleans()):
         tangential = draw(st.tuples(st.floats(-0.01, 0.01), st.floats(-0.01, 0.01)))
-        with contextlib.suppress(CameraError):
-            camera = dataclasses.replace(camera, tangential=tangential)
+        camera = _where_it_stays_whole(camera, tangential=tangential)
     if draw(st.booleans()):
         # Of an image that reaches to 80 degrees only a small share would still be one-to-one.
         reach = min(farthest_px / scale_x, 3.0)
         k1, k2, k3 = draw(st.tuples(*[st.floats(-0.1, 0.2)] * 3))
         polynomial = (k1 / reach**2, k2 / reach**4, k3 / reach**6)
-        with contextlib.suppress(CameraError):
-            camera = dataclasses.replace(camera, polynomial=polynomial)
+        camera = _where_it_stays_whole(camera, polynomial=polynomial)
+    return camera
+
+
+def _where_it_stays_whole(camera: Camera, **changes: Any) -> Camera:
+    """The camera with changes, unless its image is no longer seen up to its border then."""
+    with contextlib.suppress(CameraError):
+        changed = dataclasses.replace(camera, **changes)
+        border = border_pixels(camera.width, camera.height, 65)
+        if np.isfinite(changed.undistort(border)).all():
+            return changed
     return camera
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import pickle
 from typing import Any
 
@@ -177,13 +178,34 @@ def test_what_cannot_be_is_refused_by_name(
         replace(published_camera, **changes)
 
 
-def test_the_fold_is_refused_exactly_when_a_corner_sees_nothing(published_camera: Camera) -> None:
+def test_a_fold_is_inside_exactly_when_a_corner_sees_nothing(published_camera: Camera) -> None:
     # The fold is seen at 1.26803 times the focal length; the farthest corner is pixel (0, 0).
     for factor, possible in ((1.0001, True), (0.9999, False)):
         scale = factor * np.hypot(384.0, 288.0) / 1.268031070
-        if possible:
-            camera = replace(published_camera, scale_x=scale, scale_y=0.5 * scale)
-            assert np.isfinite(camera.undistort([0, 0])).all()
-        else:
-            with pytest.raises(CameraError, match="folds inside the image"):
-                replace(published_camera, scale_x=scale, scale_y=0.5 * scale)
+        camera = replace(published_camera, scale_x=scale, scale_y=0.5 * scale)
+        assert np.isfinite(camera.undistort([0, 0])).all() == possible
+        assert camera.seen_share > 0.999
+
+
+@pytest.mark.parametrize(("share", "possible"), [(0.55, True), (0.45, False)])
+def test_half_of_the_image_must_see_something(
+    published_camera: Camera, share: float, possible: bool
+) -> None:
+    """A distortion that is seen up to a circle which holds that share of the image."""
+    half = np.array([published_camera.width - 1, published_camera.height - 1]) / 2.0
+    along = np.stack(np.meshgrid(*(np.linspace(-s, s, 801) for s in half * [1.0, 2.0])), axis=-1)
+    radius_px = np.quantile(np.hypot(*np.moveaxis(along, -1, 0)), share)
+    # x (1 - k r^2) grows up to r = 1 / sqrt(3 k), which is seen at two thirds of that.
+    scale = radius_px * 1.5 / math.sqrt(1.0 / (3.0 * 0.2))
+
+    def camera() -> Camera:
+        return replace(
+            published_camera, scale_x=scale, scale_y=0.5 * scale, offset_x=half[0],
+            offset_y=half[1], coef=(0.0,) * 5, polynomial=(-0.2, 0.0, 0.0),
+        )  # fmt: skip
+
+    if possible:
+        assert camera().seen_share == pytest.approx(share, abs=0.01)
+    else:
+        with pytest.raises(CameraError, match=r"folds inside .* 4\d % of the image see anything"):
+            camera()

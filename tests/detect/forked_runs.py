@@ -24,7 +24,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 if TYPE_CHECKING:
-    from detect.runs.frame_rows import FrameRows
+    from detect.runs.frame import FrameTask
+    from detect.runs.rows import FrameRows
 
 #: Nothing takes that long, but to compile kernels on a slow machine.
 PATIENCE_S = 600.0
@@ -77,15 +78,15 @@ class StopAfter:
         self.frames = frames
 
     def __call__(self) -> None:
-        from detect.runs.resume import RunFiles
+        from detect.runs.run_files import RunFiles
 
         add, count = RunFiles.add, [0]
         if self.frames == 0:
             os.kill(os.getpid(), signal.SIGSTOP)
 
-        def stopped(files: RunFiles, frames: Sequence[FrameRows]) -> None:
-            for rows in frames:
-                add(files, [rows])
+        def stopped(files: RunFiles, frames: Sequence[tuple[FrameTask, FrameRows]]) -> None:
+            for frame in frames:
+                add(files, [frame])
                 count[0] += 1
                 if count[0] == self.frames:
                     os.kill(os.getpid(), signal.SIGSTOP)
@@ -102,7 +103,7 @@ class Room:
     def __call__(self) -> None:
         from detect.runs import workers
 
-        workers._LOCAL_CHUNK = 8
+        workers._MOST_TOGETHER = 8
         resource.setrlimit(resource.RLIMIT_FSIZE, (self.size, resource.RLIM_INFINITY))
 
 

@@ -15,9 +15,11 @@ from detect.comparison.lines_result import LineComparison
 from detect.comparison.result import CompareOptions, Comparison
 from detect.line_settings import LineSettings
 from detect.run import open_run
-from detect.runs.by_image import DiscsByImage
-from detect.runs.circles_run import DiscIds, detect_circles_run
-from detect.runs.lines_run import detect_lines_run
+from detect.runs.conduct import Conduct
+from detect.runs.frame import FramePlan
+from detect.runs.known import FramesByImage, Known
+from detect.runs.rows import RunSummary
+from detect.runs.stream import detect_run
 from detect.settings import PUBLISHED, REPORT, CircleSettings
 from landmarks import read_frames
 
@@ -25,9 +27,21 @@ from landmarks import read_frames
 LIKE_SHIPPED = replace(CircleSettings(), polarity="light", far_limit=PUBLISHED.far_limit)
 
 
+def detected(
+    run: Path, settings: CircleSettings, output: Path, known: Path | None = None, crlf: bool = False
+) -> RunSummary:
+    """The discs of a run, with the IDs of known rows."""
+    opened = open_run(run)
+    plan = FramePlan(opened.camera, circles=settings)
+    ids = Known() if known is None else Known(discs=FramesByImage(known))
+    return detect_run(
+        opened, plan, {"circles": output}, known=ids, conduct=Conduct("test", crlf=crlf)
+    )
+
+
 def redetected(run: Path, settings: CircleSettings, folder: Path) -> Comparison:
     output = folder / "detected.circles"
-    summary = detect_circles_run(open_run(run), settings, output, version="test")
+    summary = detected(run, settings, output)
     assert summary.failures == []
     return compare_runs(run, detected=output, options=CompareOptions(sigma=4.0))
 
@@ -71,14 +85,8 @@ def test_given_runs_come_out_byte_for_byte(given_runs: list[Path], tmp_path: Pat
     for number, run in enumerate(given_runs):
         output = tmp_path / f"{number}.circles"
         shipped = rows_of(run / "map.circles")
-        summary = detect_circles_run(
-            open_run(run),
-            PUBLISHED,
-            output,
-            version="test",
-            ids=DiscIds(DiscsByImage(run / "map.circles")),
-            crlf=shipped[0].endswith(b"\r\n"),
-        )
+        crlf = shipped[0].endswith(b"\r\n")
+        summary = detected(run, PUBLISHED, output, run / "map.circles", crlf)
         assert summary.failures == []
         differing = [
             (ours, theirs)
@@ -97,14 +105,13 @@ def test_default_finds_given_runs_again(given_runs: list[Path], tmp_path: Path) 
     """A row is found again where a detected one gets its ID, or several of them."""
     for number, run in enumerate(given_runs):
         output = tmp_path / f"{number}.circles"
-        reference = DiscsByImage(run / "map.circles")
-        detect_circles_run(
-            open_run(run), CircleSettings(), output, version="test", ids=DiscIds(reference)
-        )
+        reference = FramesByImage(run / "map.circles")
+        detected(run, CircleSettings(), output, run / "map.circles")
         wanted = found = 0
         for frame in read_frames(output):
             own = {identifier for row in frame.circles for identifier in row.ids} - {-1}
-            known = [row.ids for row in reference.get(frame.step.prefix) or ()]
+            rows = reference.get(frame.step.prefix)
+            known = [] if rows is None else [row.ids for row in rows.circles]
             named = [ids for ids in known if ids and ids != (-1,)]
             wanted += len(named)
             found += sum(not own.isdisjoint(ids) for ids in named)
@@ -114,9 +121,9 @@ def test_default_finds_given_runs_again(given_runs: list[Path], tmp_path: Path) 
 
 def redetected_lines(run: Path, folder: Path) -> LineComparison:
     output = folder / "detected.lines"
-    summary = detect_lines_run(
-        open_run(run), LineSettings(), output, folder / "detected.tilt", version="test"
-    )
+    opened = open_run(run)
+    plan = FramePlan(opened.camera, lines=LineSettings())
+    summary = detect_run(opened, plan, {"lines": output, "tilt": folder / "detected.tilt"})
     assert summary.failures == []
     return compare_line_runs(run, detected=output)
 
@@ -157,6 +164,6 @@ def test_same_run_gives_the_same_bytes(project_root: Path, tmp_path: Path) -> No
     written = []
     for name in ("first", "second"):
         output = tmp_path / f"{name}.circles"
-        detect_circles_run(open_run(short), CircleSettings(), output, version="test")
+        detected(short, CircleSettings(), output)
         written.append(output.read_bytes())
     assert written[0] == written[1]

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from camera import Camera, parse_camera
 from detect.circles import CircleDetections
-from detect.levelling import level_covariances, level_positions, levelled, with_prior
+from detect.levelling import level_covariances, level_positions, levelled
 from landmarks import FrameTilt
 from tests.conftest import PUBLISHED_CAM
 
@@ -88,53 +88,3 @@ def test_discs_are_levelled_as_positions_and_covariances_are(
     np.testing.assert_array_equal(after.covariance, level_cov[down])
     for name in ("pixels", "quality", "evidence"):
         np.testing.assert_array_equal(getattr(after, name), getattr(found, name)[down])
-
-
-def tilt_of(mean: np.ndarray, covariance: np.ndarray) -> FrameTilt:
-    pitch, roll = map(float, mean)
-    cpp, cpr, _, crr = map(float, covariance.ravel())
-    return FrameTilt("e.0000", pitch, roll, cpp, cpr, crr, 7)
-
-
-@given(
-    pitch=st.floats(-0.003, 0.003),
-    sigmas=st.tuples(st.floats(1e-5, 0.05), st.floats(1e-5, 0.05)),
-    correlation=st.floats(-0.99, 0.99),
-    prior=st.floats(1e-3, 0.1),
-)
-def test_prior_and_measurement_add_their_information(
-    pitch: float, sigmas: tuple[float, float], correlation: float, prior: float
-) -> None:
-    off = correlation * sigmas[0] * sigmas[1]
-    measured = np.array([[sigmas[0] ** 2, off], [off, sigmas[1] ** 2]])
-    mean = np.array([pitch, -0.5 * pitch])
-    together = np.linalg.inv(np.linalg.inv(measured) + np.eye(2) / prior**2)
-    expected = together @ np.linalg.solve(measured, mean)
-    found = with_prior(tilt_of(mean, measured), prior)
-    covariance = np.array([[found.cpp, found.cpr], [found.cpr, found.crr]])
-    np.testing.assert_allclose(covariance, together, rtol=1e-6, atol=1e-6 * together.max())
-    contradiction = mean @ np.linalg.solve(measured + prior**2 * np.eye(2), mean) > 13.8
-    assert not contradiction
-    np.testing.assert_allclose([found.pitch, found.roll], expected, rtol=1e-6, atol=1e-9)
-    assert (found.prefix, found.lines) == ("e.0000", 7)
-
-
-def test_tilts_with_a_prior_are_nearer_to_the_truth_and_as_certain_as_they_say() -> None:
-    rng = np.random.default_rng(11)
-    sigma, covariance = 0.006, np.array([[1e-4, 3e-5], [3e-5, 2e-5]])
-    true = rng.normal(0.0, sigma, (4000, 2))
-    measured = true + rng.multivariate_normal([0.0, 0.0], covariance, len(true))
-    fused = [with_prior(tilt_of(mean, covariance), sigma) for mean in measured]
-    error = np.array([[tilt.pitch, tilt.roll] for tilt in fused]) - true
-    said = np.array([[[t.cpp, t.cpr], [t.cpr, t.crr]] for t in fused])
-    squares = np.einsum("ni,nij,nj->n", error, np.linalg.inv(said), error)
-    assert squares.mean() / 2.0 == pytest.approx(1.0, abs=0.05)
-    assert np.all(error.var(axis=0) < 0.8 * (measured - true).var(axis=0))
-
-
-def test_a_tilt_that_contradicts_what_was_known_is_believed() -> None:
-    covariance = np.diag([1e-6, 4e-6])
-    leaning = tilt_of(np.array([0.04, 0.0]), covariance)
-    assert with_prior(leaning, 0.005) == leaning
-    assert with_prior(leaning, 0.02) != leaning
-    assert with_prior(leaning, 0.0) == leaning

@@ -8,73 +8,132 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from detect.run_tilt import COMMON_RAD, LEAST_FRAMES, tilt_of_run
+from detect.run_tilt import COMMON_RAD, LEAST_FRAMES, FrameTilts, tilt_of_run
 
 FloatArray = NDArray[np.float64]
 FRAMES = 600
 LEAN = np.radians([-2.4, 0.7])
 
 
-def sequence(seed: int, scale: float, strays: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+def sequence(
+    seed: int, spread: float = 0.3, strays: float = 0.02, jumps: float = 0.02
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """True tilts, measured ones and their stated variances.
 
-    Errors are `scale` times what is stated, and last from frame to frame as scenes do.
+    Half of the variance of an error lasts from frame to frame as scenes do. `spread` is that of the
+    true tilts (degrees); `strays` and `jumps` are how often a measurement is of something else, and
+    how often the robot tilts for a moment.
     """
     rng = np.random.default_rng(seed)
-    sigma = np.radians(rng.uniform(0.03, 0.3, (FRAMES, 2)))
+    sigma = np.radians(rng.uniform(0.05, 0.6, (FRAMES, 2)))
     true, lasting = np.empty((2, FRAMES, 2))
     x, u = np.zeros(2), np.zeros(2)
     for k in range(FRAMES):
-        x = 0.7 * x + math.sqrt(1 - 0.7**2) * np.radians(0.3) * rng.standard_normal(2)
-        u = 0.6 * u + math.sqrt(1 - 0.6**2) * rng.standard_normal(2)
+        x = 0.7 * x + math.sqrt(1 - 0.7**2) * np.radians(spread) * rng.standard_normal(2)
+        u = 0.9 * u + math.sqrt(1 - 0.9**2) * rng.standard_normal(2)
         true[k], lasting[k] = LEAN + x, u
-    measured = true + scale * sigma * lasting + sigma * rng.standard_normal((FRAMES, 2))
+    jump = rng.random(FRAMES) < jumps
+    true[jump] += np.radians(2.0) * rng.standard_normal((int(jump.sum()), 2))
+    measured = true + sigma * (lasting + rng.standard_normal((FRAMES, 2))) / math.sqrt(2.0)
     stray = rng.random(FRAMES) < strays
     measured[stray] += np.radians(2.0) * rng.standard_normal((int(stray.sum()), 2))
     measured[rng.random(FRAMES) < 0.05] = np.nan
     return true, measured, sigma**2
 
 
-@pytest.mark.parametrize("seed", [1, 2])
-@pytest.mark.parametrize(("scale", "strays"), [(0.2, 0.0), (4.0, 0.1)])
-def test_errors_are_as_large_as_stated(seed: int, scale: float, strays: float) -> None:
-    true, measured, variance = sequence(seed, scale, strays)
+@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("spread", [0.2, 0.5])
+@pytest.mark.parametrize(("strays", "jumps"), [(0.0, 0.0), (0.02, 0.03)])
+def test_errors_are_as_large_as_stated(
+    seed: int, spread: float, strays: float, jumps: float
+) -> None:
+    true, measured, variance = sequence(seed, spread, strays, jumps)
 
-    run = tilt_of_run(measured, variance)
+    run = tilt_of_run(FrameTilts(measured, variance))
 
     assert run is not None
     # The simulated lens has no error that all verticals share.
     normalised = np.mean((run.tilt - true) ** 2 / (run.variance - COMMON_RAD**2), axis=0)
-    assert np.all((normalised > 0.5) & (normalised < 1.5)), normalised
+    assert np.all((normalised > 0.3) & (normalised < 2.0)), normalised
     for axis, lean in zip(run.axes, LEAN):
         assert abs(axis.lean - lean) < 3.0 * axis.lean_sigma
 
 
-def test_is_nearer_than_the_frames_and_than_the_constant() -> None:
-    true, measured, variance = sequence(3, 4.0, 0.1)
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_is_nearer_than_the_frames_and_than_the_constant(seed: int) -> None:
+    true, measured, variance = sequence(seed)
 
-    run = tilt_of_run(measured, variance)
+    run = tilt_of_run(FrameTilts(measured, variance))
 
     assert run is not None
-    error = np.sqrt(np.mean((run.tilt - true) ** 2))
-    assert error < 0.5 * np.sqrt(np.nanmean((measured - true) ** 2))
-    assert error < np.sqrt(np.mean((np.array([a.lean for a in run.axes]) - true) ** 2))
+    error = np.sqrt(np.nanmean((run.tilt - true) ** 2))
+    assert error < 0.75 * np.sqrt(np.nanmean((measured - true) ** 2))
+    assert error < 0.9 * np.sqrt(np.mean((np.array([a.lean for a in run.axes]) - true) ** 2))
 
 
 def test_verticals_that_lean_together_are_not_believed() -> None:
-    """Trunks in view for twenty frames, by three degrees, and sure of it."""
-    true, measured, variance = sequence(4, 0.2, 0.0)
+    """Trunks in view for twenty frames, by three degrees, and not sure of it."""
+    true, measured, variance = sequence(4, strays=0.0, jumps=0.0)
     measured[300:320, 0] += np.radians(3.0)
-    variance[300:320] = np.radians(0.3) ** 2
+    variance[300:320] = np.radians(1.0) ** 2
 
-    run = tilt_of_run(measured, variance)
+    run = tilt_of_run(FrameTilts(measured, variance))
 
     assert run is not None
-    assert np.degrees(np.abs(run.tilt - true)[300:320, 0]).max() < 2.0
+    assert np.degrees(np.abs(run.tilt - true)[300:320, 0]).max() < 1.5
+
+
+def test_a_sill_is_followed() -> None:
+    """One frame that is two degrees off, and sure of it: a wheel is on a sill."""
+    true, measured, variance = sequence(5, strays=0.0, jumps=0.0)
+    true[300, 0] += np.radians(2.0)
+    measured[300] = true[300]
+    variance[300] = np.radians(0.1) ** 2
+
+    run = tilt_of_run(FrameTilts(measured, variance))
+
+    assert run is not None
+    assert np.degrees(abs(run.tilt[300, 0] - true[300, 0])) < 1.0
+    # A stray would look the same: the error that is stated allows for it.
+    assert np.degrees(np.sqrt(run.variance[300, 0])) > 0.5
 
 
 def test_too_few_frames_have_no_run() -> None:
     measured = np.full((50, 2), np.nan)
     measured[: LEAST_FRAMES - 1] = 0.01
 
-    assert tilt_of_run(measured, np.full((50, 2), 1e-6)) is None
+    assert tilt_of_run(FrameTilts(measured, np.full((50, 2), 1e-6))) is None
+
+
+def test_outlines_tell_deviations_and_not_the_lean() -> None:
+    """Verticals are bad, and outlines good, but all of them are off by the same degree."""
+    true, measured, variance = sequence(6, spread=0.5, jumps=0.05)
+    rng = np.random.default_rng(7)
+    sigma = np.radians(0.1)
+    outlines = true + np.radians([1.0, -0.5]) + sigma * rng.standard_normal(true.shape)
+    outlines[::7] = np.nan
+
+    alone = tilt_of_run(FrameTilts(measured, variance))
+    run = tilt_of_run(
+        FrameTilts(measured, variance), FrameTilts(outlines, np.full(true.shape, sigma**2))
+    )
+
+    assert alone is not None
+    assert run is not None
+    error, error_alone = (np.sqrt(np.mean((r.tilt - true) ** 2)) for r in (run, alone))
+    assert error < 0.8 * error_alone
+    for axis, lean in zip(run.axes, LEAN):
+        assert abs(axis.lean - lean) < 3.0 * axis.lean_sigma
+
+
+def test_few_outlines_are_left_out() -> None:
+    true, measured, variance = sequence(8)
+    outlines = np.full(true.shape, np.nan)
+    outlines[: LEAST_FRAMES - 5] = 0.5
+
+    run = tilt_of_run(FrameTilts(measured, variance), FrameTilts(outlines, variance))
+    alone = tilt_of_run(FrameTilts(measured, variance))
+
+    assert run is not None
+    assert alone is not None
+    np.testing.assert_array_equal(run.tilt, alone.tilt)

@@ -8,7 +8,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from landmarks import FrameTilt, LandmarkFileError, format_no_tilt, format_tilt, read_tilts
+from landmarks import (
+    FrameTilt,
+    LandmarkFileError,
+    format_no_tilt,
+    format_outline_tilt,
+    format_tilt,
+    read_tilts,
+)
+from landmarks.tilts import numbered_tilts
 
 ANGLE = st.floats(-0.2, 0.2)
 VARIANCE = st.floats(1e-9, 1e-3)
@@ -55,3 +63,15 @@ def test_malformed_rows_are_named(tmp_path: Path, row: str) -> None:
 def test_missing_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(LandmarkFileError, match=r"none\.tilt: no such tilt file"):
         read_tilts(tmp_path / "none.tilt")
+
+
+def test_what_outlines_show_is_passed_over(tmp_path: Path) -> None:
+    tilt = FrameTilt("a/b", 0.01, -0.02, 1e-6, 0.0, 2e-6, 4)
+    path = tmp_path / "x.tilt"
+    rows = format_tilt(tilt), format_outline_tilt(tilt), "NOTILT c 2", "TILT d 0 0 1 0 1 3"
+    path.write_text("\n".join(rows) + "\n")
+
+    assert [(number, found.prefix) for number, found in numbered_tilts(path)] == [
+        (0, "a/b"),
+        (2, "d"),
+    ]

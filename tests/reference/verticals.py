@@ -10,6 +10,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import correlate1d, map_coordinates
+from scipy.special import logsumexp, softmax
 
 from detect.line_settings import LineSettings
 from detect.verticals.tilt import TiltEstimate, level_rotation
@@ -142,6 +143,58 @@ def eigenline(bearing_rad: FloatArray, rise: FloatArray, origin_rad: float) -> F
 
 
 # -- bearings --------------------------------------------------------------------------------------
+
+
+def tilt_error(
+    normal: FloatArray,
+    variance: FloatArray,
+    weight: FloatArray,
+    edge: NDArray[np.int64],
+    tilt: tuple[float, float],
+    prior: float,
+    stray_share: float,
+) -> FloatArray:
+    """(2, 2) mean square error of a tilt over the posterior of `detect.verticals.tilt_error`.
+
+    Summed over an even grid of 0.05 degrees, seven degrees to all sides.
+    """
+    from detect.verticals.tilt_error import SCATTER_RAD, SCATTER_SHARE, STRAY_RAD, TOGETHER_RAD
+
+    def merged(label: NDArray[np.int64]) -> list[tuple[FloatArray, float]]:
+        found = []
+        for one in np.unique(label):
+            own = label == one
+            share = 1.0 / (variance[own] + SCATTER_RAD[1] ** 2)
+            share /= share.sum()
+            found.append((share @ normal[own], float(share**2 @ variance[own])))
+        return found
+
+    bearing = np.arctan2(normal[:, 1], normal[:, 0])
+    group = np.full(len(bearing), -1)
+    for k in np.argsort(-weight, kind="stable"):
+        if group[k] < 0:
+            group[(group < 0) & (np.abs(bearing - bearing[k]) < TOGETHER_RAD)] = k
+    steps = np.radians(np.arange(-7.0, 7.0001, 0.05))
+    pitch, roll = np.meshgrid(tilt[0] + steps, tilt[1] + steps, indexing="ij")
+    before = -0.5 * (pitch**2 + roll**2) / prior**2
+
+    def log_posterior(lines: list[tuple[FloatArray, float]], scatter: float) -> FloatArray:
+        total = before
+        for (x, y, z), own in lines:
+            off = z + pitch * y - roll * x
+            spread = 3.0 * (own + scatter**2)
+            student = 2.0 / (math.pi * math.sqrt(spread)) / (1.0 + off**2 / spread) ** 2
+            stray = 1.0 / (math.pi * STRAY_RAD) / (1.0 + (off / STRAY_RAD) ** 2)
+            total = total + np.log((1.0 - stray_share) * student + stray_share * stray)
+        return np.asarray(total)
+
+    deviation = np.stack([pitch - tilt[0], roll - tilt[1]], axis=-1)
+    shares, errors = [], []
+    for scatter in SCATTER_RAD:
+        shares.append(logsumexp(log_posterior(merged(edge), scatter)))
+        density = softmax(log_posterior(merged(group), scatter))
+        errors.append(np.einsum("ij,ijk,ijl->kl", density, deviation, deviation))
+    return np.asarray(np.tensordot(softmax(np.log(SCATTER_SHARE) + shares), errors, 1))
 
 
 def plane_normals(ends: ArrayLike, robot_from_camera: ArrayLike) -> FloatArray:

@@ -21,7 +21,7 @@ from slam.measurement import (
     disc_jacobians,
 )
 from slam.motion import move, move_jacobians
-from slam.recording import CircleRows, LineRows, Recording
+from slam.recording import CircleRows, LineRows, Recording, read_recording
 
 FloatArray = NDArray[np.float64]
 CAMERA_XY = np.array([0.0179777, -0.0808609])
@@ -310,11 +310,12 @@ def test_the_demo_run_is_near_its_truth(project_root: Path) -> None:
     import json
 
     from slam.ekf import EkfSlam, run_ekf
-    from slam.filter_input import read_run
+    from slam.filter_input import camera_xy_of
     from slam.motion import relative_pose
 
     run_folder = project_root / "images" / "e"
-    recording, camera_xy = read_run(run_folder, circles=True, lines=True, stem=None, camera=None)
+    recording = read_recording(run_folder, circles=True, lines=True)
+    camera_xy = camera_xy_of(recording, run_folder)
     truth = json.loads((run_folder / "truth.json").read_text())
     start = np.array(truth["start"])
     poses = np.array([start] + [frame["pose"] for frame in truth["frames"]])

@@ -9,6 +9,7 @@ import pytest
 
 from landmarks import LandmarkFileError
 from slam.errors import SlamError
+from slam.odometry_noise import OdometryNoise
 from slam.recording import read_recording
 
 STEP = "STEP a.{k} 0.1 -0.2 0.05 1e-4 0 1e-4 0 0 1e-5\n"
@@ -66,7 +67,7 @@ def test_a_landmark_before_any_step_is_refused(tmp_path: Path) -> None:
         ("LANDMARK_C 1 -1 .9 0 0 0 3\n", "not positive definite"),
         ("LANDMARK_L 0 -1 0 1 0.5 0 0 0 3\n", "sigma 0: expected above 0"),
         ("LANDMARK_C nan -1 .9 .1 0 .1 3\n", "px is 'nan': expected a finite number"),
-        ("STEP a.1 0 0 0 0 0 0 0 0 0\n", r"step 2 \(a\.1\): its covariance is not positive"),
+        ("STEP a.1 0 0 0 1 0 0 0 0 0\n", r"step 2 \(a\.1\): its covariance is not positive"),
         ("STEP a.1 0 0 0 1 0 1 1 0 1\n", "not positive definite"),
     ],
 )
@@ -93,3 +94,21 @@ def test_a_folder_without_landmarks_says_what_was_expected(tmp_path: Path) -> No
         read_recording(tmp_path, stem="other")
     with pytest.raises(SlamError, match="no STEP row"):
         read_recording(write(tmp_path / "x.circles", "# nothing\n"))
+
+
+def test_steps_that_state_no_covariance_get_the_assumed_one(tmp_path: Path) -> None:
+    rows = "STEP a.0 0.3 -0.4 0.2 1e-4 0 1e-4 0 0 1e-4\nSTEP a.1 0.3 -0.4 0.2 0 0 0 0 0 0\n"
+    noise = OdometryNoise(0.1, 0.2, 0.3, 0.01, 0.02)
+
+    recording = read_recording(write(tmp_path / "x.circles", rows), noise=noise)
+
+    assert recording.unstated_steps == 1
+    np.testing.assert_allclose(recording.step_covariance[0], 1e-4 * np.eye(3))
+    of_way = (0.1 * 0.5) ** 2 + 0.01**2
+    of_turn = (0.2 * 0.2) ** 2 + (0.3 * 0.5) ** 2 + 0.02**2
+    np.testing.assert_allclose(recording.step_covariance[1], np.diag([of_way, of_way, of_turn]))
+
+
+def test_a_noise_that_cannot_be_is_refused() -> None:
+    with pytest.raises(SlamError, match="least_m is 0"):
+        OdometryNoise(least_m=0.0)

@@ -13,6 +13,7 @@ from threading import Barrier
 import pytest
 
 from storage import OutputExistsError, write_whole
+from storage.parts import NotAFileError
 
 
 def names(folder: Path) -> list[str]:
@@ -171,3 +172,27 @@ def test_a_path_may_be_text_and_relative(tmp_path: Path, monkeypatch: pytest.Mon
     with write_whole("result", overwrite=False) as stream:
         stream.write(b"here")
     assert (tmp_path / "result").read_bytes() == b"here"
+
+
+def test_a_link_is_written_through(tmp_path: Path) -> None:
+    target, link = tmp_path / "target", tmp_path / "link"
+    target.write_bytes(b"old")
+    link.symlink_to(target)
+    with write_whole(link, overwrite=True) as stream:
+        stream.write(b"new")
+    assert link.is_symlink()
+    assert target.read_bytes() == b"new"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["link", "target"]
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="makes a pipe")
+def test_what_is_no_file_is_not_replaced(tmp_path: Path) -> None:
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    with (
+        pytest.raises(NotAFileError, match="pipe: is a device, pipe or socket"),
+        write_whole(pipe, overwrite=True),
+    ):
+        pass
+    assert pipe.is_fifo()
+    assert list(tmp_path.iterdir()) == [pipe]

@@ -17,7 +17,7 @@ from detect.lines import detect_lines
 from detect.noise import estimate_noise
 from detect.runs.frame import tilt_of_lines
 from detect.settings import PUBLISHED, REPORT, CircleSettings
-from detect.verticals.tracks import line_response
+from detect.verticals.response import line_response
 from lut import cached_disc_table, cached_vertical_table
 from tools.benchmark.material import Picture, decode
 from tools.benchmark.plain_gather import gather_table, plain_quality_of_centres

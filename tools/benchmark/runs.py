@@ -12,7 +12,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.commands import carry_out
+from detect.cli import carry_out
 from detect.options import All, Circles, Lines
 from detect.run import open_run
 from detect.settings import PUBLISHED

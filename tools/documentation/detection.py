@@ -15,7 +15,7 @@ from detect.lines import detect_lines
 from detect.run import open_run, read_image
 from detect.seen import circle_on_floor
 from detect.settings import CircleSettings
-from detect.verticals.tracks import line_response
+from detect.verticals.response import line_response
 from lut import cached_disc_table, cached_vertical_table
 
 _EDGE, _RINGS, _LINE = "#e67e22", "#2ecc71", "#e67e22"

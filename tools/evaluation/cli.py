@@ -181,12 +181,12 @@ class Tilt:
     ----------
     run : Path
         Run made by `python -m tools.simulator`.
-    tilt_sigma_deg : float
+    tilt_prior_deg : float
         What is known of the tilt beforehand: its standard deviation about level, degrees.
     """
 
     run: Positional[Path] = Path("images/e")
-    tilt_sigma_deg: float = 0.0
+    tilt_prior_deg: float = LINE_PRESETS["default"].tilt_prior_deg
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -263,7 +263,7 @@ def _accuracy(command: Accuracy) -> int:
     for blur_px in _BLURS_PX:
         result = measure_accuracy(
             camera,
-            CircleSettings(),
+            CircleSettings(tilt_sigma_deg=0.0),
             discs=command.discs,
             light=command.light,
             dark=command.dark,
@@ -346,15 +346,11 @@ def _tilt(command: Tilt) -> int:
     options = CompareOptions(gate_m=0.3)
     with tempfile.TemporaryDirectory() as folder:
         output = Path(folder) / "detected.lines"
-        _detect_lines(command.run, LINE_PRESETS["default"], output)
+        lines = replace(LINE_PRESETS["default"], tilt_prior_deg=command.tilt_prior_deg)
+        _detect_lines(command.run, lines, output)
         tilts = read_tilts(output.with_suffix(".tilt"))
         _print_tilt_errors(command.run, tilts)
-        settings = replace(
-            CircleSettings(),
-            polarity="light",
-            far_limit=0.5,
-            tilt_sigma_deg=command.tilt_sigma_deg,
-        )
+        settings = replace(CircleSettings(), polarity="light", far_limit=0.5)
         for label, known in (("without", None), ("with", tilts)):
             discs = Path(folder) / f"{label}.circles"
             _detect(command.run, settings, discs, known)
@@ -395,10 +391,14 @@ def _print_tilt_errors(run: Path, tilts: dict[str, FrameTilt]) -> None:
 def _detect_lines(run: Path, settings: LineSettings, output: Path) -> None:
     from detect import __version__
     from detect.run import open_run
-    from detect.runs.lines_run import detect_lines_run
+    from detect.runs.conduct import Conduct
+    from detect.runs.frame import FramePlan
+    from detect.runs.stream import detect_run
 
-    tilts = output.with_suffix(".tilt")
-    summary = detect_lines_run(open_run(run), settings, output, tilts, version=__version__)
+    opened = open_run(run)
+    places = {"lines": output, "tilt": output.with_suffix(".tilt")}
+    plan = FramePlan(opened.camera, lines=settings)
+    summary = detect_run(opened, plan, places, conduct=Conduct(__version__))
     for failure in summary.failures:
         print(failure, file=sys.stderr)
 
@@ -408,9 +408,19 @@ def _detect(
 ) -> None:
     from detect import __version__
     from detect.run import open_run
-    from detect.runs.circles_run import detect_circles_run
+    from detect.runs.conduct import Conduct
+    from detect.runs.frame import FramePlan
+    from detect.runs.known import Known
+    from detect.runs.stream import detect_run
 
-    summary = detect_circles_run(open_run(run), settings, output, version=__version__, tilts=tilts)
+    opened = open_run(run)
+    summary = detect_run(
+        opened,
+        FramePlan(opened.camera, circles=settings),
+        {"circles": output},
+        known=Known(tilts=tilts),
+        conduct=Conduct(__version__),
+    )
     for failure in summary.failures:
         print(failure, file=sys.stderr)
 

@@ -20,12 +20,8 @@ WAYS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     ("--preset published", "circles", ("--preset", "published")),
     ("default", "circles", ()),
     ("default, tilt and lens stated", "circles", _SPREAD),
-    ("detect all --tilt run", "all", ("--tilt", "run")),
-    (
-        "detect all --tilt run, lens stated",
-        "all",
-        ("--tilt", "run", "--circles.systematic-px", "0.3"),
-    ),
+    ("detect all", "all", ()),
+    ("detect all, lens stated", "all", ("--circles.systematic-px", "0.3")),
 )
 
 

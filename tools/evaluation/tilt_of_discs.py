@@ -19,7 +19,10 @@ from landmarks.map_file import read_map, read_path
 FloatArray = NDArray[np.float64]
 
 #: An error of the image smaller than this is not believed, pixels along u.
-_LEAST_SIGMA_PX = 0.15
+_LEAST_SIGMA_PX = 0.3
+#: Standard deviation of the tilt of a frame about the run's median: discs that stand close together
+#: tell no tilt, and one mistaken identifier among five would tell any (rad).
+_SPREAD_RAD = np.radians(0.5)
 _UNKNOWNS = 5
 #: A frame whose two tilts differ by more than this many standard deviations is listed.
 _FAR_SIGMAS = 4.0
@@ -32,7 +35,7 @@ class DiscTilt(NamedTuple):
     pitch_rad: float
     roll_rad: float
     covariance: FloatArray
-    """(2, 2), from the residuals, square radians."""
+    """(2, 2), square radians."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +58,12 @@ class TiltComparison:
 
 
 def tilt_of_discs(
-    camera: Camera, rows_xy: FloatArray, map_xy: FloatArray, pose: FloatArray, raised_m: float = 0.0
+    camera: Camera,
+    rows_xy: FloatArray,
+    map_xy: FloatArray,
+    pose: FloatArray,
+    raised_m: float = 0.0,
+    usual: tuple[float, float] | None = None,
 ) -> DiscTilt:
     """Pose, pitch and roll that put discs of a map where the camera saw them, robustly.
 
@@ -71,24 +79,30 @@ def tilt_of_discs(
         About where the robot is: x, y (m), heading (rad).
     raised_m : float
         How much higher the camera is than calibrated: it trades with the pitch.
+    usual : (float, float), optional
+        Pitch and roll about which the frame's are known beforehand to `_SPREAD_RAD`.
     """
     seen = image_positions(camera, rows_xy)
     # Errors are about equal in all directions of the lens, whatever the shape of a pixel.
-    per_px = np.array([1.0, camera.scale_x / camera.scale_y])
+    per_sigma = np.array([1.0, camera.scale_x / camera.scale_y]) / _LEAST_SIGMA_PX
 
     def residuals(unknowns: FloatArray) -> FloatArray:
-        x, y, heading, pitch, roll = unknowns
+        x, y, heading, *tilt = unknowns
         cosine, sine = np.cos(heading), np.sin(heading)
         level = (map_xy - (x, y)) @ np.array([[cosine, -sine], [sine, cosine]])
-        off = image_positions(camera, level, (pitch, roll), raised_m) - seen
-        return np.asarray(np.nan_to_num(off * per_px, nan=100.0).ravel())
+        off = image_positions(camera, level, (tilt[0], tilt[1]), raised_m) - seen
+        of_discs = np.nan_to_num(off * per_sigma, nan=1000.0).ravel()
+        if usual is None:
+            return np.asarray(of_discs)
+        return np.concatenate([of_discs, (np.array(tilt) - usual) / _SPREAD_RAD])
 
-    start = np.array([*pose, 0.0, 0.0])
-    found = least_squares(residuals, start, loss="soft_l1", x_scale=[0.1, 0.1, 0.1, 0.01, 0.01])
-    # From there, errors beyond a pixel are another disc's.
-    found = least_squares(residuals, found.x, loss="cauchy", x_scale=[0.1, 0.1, 0.1, 0.01, 0.01])
-    freedom = max(2 * len(rows_xy) - _UNKNOWNS, 1)
-    variance = max(2.0 * found.cost / freedom, _LEAST_SIGMA_PX**2)
+    start = np.array([*pose, *(usual or (0.0, 0.0))])
+    scale = [0.1, 0.1, 0.1, 0.01, 0.01]
+    found = least_squares(residuals, start, loss="soft_l1", x_scale=scale)
+    # From there, errors beyond some standard deviations are another disc's.
+    found = least_squares(residuals, found.x, loss="cauchy", f_scale=3.0, x_scale=scale)
+    freedom = len(found.fun) - _UNKNOWNS
+    variance = max(2.0 * found.cost / max(freedom, 1), 1.0)
     covariance = variance * np.linalg.pinv(found.jac.T @ found.jac)
     return DiscTilt(len(rows_xy), found.x[3], found.x[4], covariance[3:, 3:])
 
@@ -124,7 +138,7 @@ def compare_tilts(
     path = read_path(path_path)
     poses = {image_name(p): pose for p, pose in zip(path.prefixes, path.poses, strict=True)}
     by_lines = {image_name(prefix): tilt for prefix, tilt in read_tilts(tilts).items()}
-    prefixes, first, second, squared = [], [], [], []
+    prefixes, first, measured = [], [], []
     for frame in read_frames(rows):
         name = image_name(frame.step.prefix)
         tilt, pose = by_lines.get(name), poses.get(name)
@@ -132,17 +146,24 @@ def compare_tilts(
         if tilt is None or pose is None or tilt.lines < least or len(known) < least:
             continue
         rows_xy, map_xy = (np.array(side) for side in zip(*known, strict=True))
-        shown = tilt_of_discs(camera, rows_xy, map_xy, pose, raised_m)
-        lines_covariance = np.array([[tilt.cpp, tilt.cpr], [tilt.cpr, tilt.crr]])
-        off = np.array([tilt.pitch - shown.pitch_rad, tilt.roll - shown.roll_rad])
         prefixes.append(name)
-        first.append((tilt.pitch, tilt.roll))
-        second.append((shown.pitch_rad, shown.roll_rad))
-        squared.append(float(off @ np.linalg.solve(lines_covariance + shown.covariance, off)))
+        first.append(tilt)
+        measured.append((rows_xy, map_xy, pose))
+    alone = [tilt_of_discs(camera, *given, raised_m) for given in measured]
+    usual = np.median([(one.pitch_rad, one.roll_rad) for one in alone] or [(0.0, 0.0)], axis=0)
+    shown = [
+        tilt_of_discs(camera, *given, raised_m, (float(usual[0]), float(usual[1])))
+        for given in measured
+    ]
+    squared = []
+    for tilt, disc in zip(first, shown, strict=True):
+        covariance = np.array([[tilt.cpp, tilt.cpr], [tilt.cpr, tilt.crr]]) + disc.covariance
+        off = np.array([tilt.pitch - disc.pitch_rad, tilt.roll - disc.roll_rad])
+        squared.append(float(off @ np.linalg.solve(covariance, off)))
     return TiltComparison(
         prefixes,
-        np.array(first).reshape(-1, 2),
-        np.array(second).reshape(-1, 2),
+        np.array([(tilt.pitch, tilt.roll) for tilt in first]).reshape(-1, 2),
+        np.array([(disc.pitch_rad, disc.roll_rad) for disc in shown]).reshape(-1, 2),
         np.array(squared),
     )
 

@@ -18,7 +18,7 @@ from camera.calibrate_images import read_grey
 from detect.drawing.head import read_head
 from detect.errors import DetectError, FrameError
 from detect.runs.image_bounds import bounded_content
-from detect.runs.resume_journal import left_journal
+from detect.runs.journal import digest_of, left_journal
 from detect.runs.run_log import demand_log_place
 from detect.sources.bag_images import pixels_of_message
 from detect.sources.gray import (
@@ -134,10 +134,18 @@ def _journal(path: Path) -> object:
     assert journal is not None
     try:
         journal.is_complete()
-        head, lines = journal.read()
-        return head, list(lines)
+        return journal.head(), list(journal.frames())
     finally:
         journal.close()
+
+
+def _journal_of(*records: bytes) -> bytes:
+    """Records, each behind its digest."""
+    lines, check = [], b""
+    for record in records:
+        check = digest_of([check, record]).encode()
+        lines.append(check + b" " + record + b"\n")
+    return b"".join(lines)
 
 
 def _log(path: Path) -> object:
@@ -259,8 +267,8 @@ DETECT_READERS: tuple[Reader, ...] = (
         _journal,
         (),
         (
-            b'["ab",[0,1],false]\n[[10,0],"cd",1,0,0,1,[["verified",2]],null,"ef"]\n"complete"\n',
-            b'["ab",[],true]\n[[],"cd",1,0,0,1,[],"no image","ef"]\n',
+            _journal_of(b'["ab",[0],false]', b'[[10],"c","d",{"discs":1},{},null]', b'"complete"'),
+            _journal_of(b'["ab",[],true]', b'[[],"c","d",{},{"size":2},"no image"]'),
         ),
         (b"[", b"]", b",", b'"', b"null", b"true", b"-1", b"1" * 30, b"1e999", b"NaN", b"{}"),
     ),

@@ -19,7 +19,7 @@ with atheris.instrument_imports(
     include=[
         "camera",
         "detect.drawing.head",
-        "detect.runs.resume_journal",
+        "detect.runs.journal",
         "detect.sources",
         "landmarks",
         "groundtruth",

@@ -20,8 +20,9 @@ from tyro.conf import Positional, arg
 from slam.associate import AssociateSettings, associate_run
 from slam.associate_command import score_run
 from slam.associate_local import LocalSettings
-from slam.filter_input import read_run
+from slam.filter_input import camera_xy_of
 from slam.noise import with_relative_noise
+from slam.recording import read_recording
 from storage import write_whole
 
 COLUMNS = (
@@ -82,13 +83,10 @@ def study(options: Study) -> list[dict[str, Any]]:
     results: list[dict[str, Any]] = []
     print("| " + " | ".join(COLUMNS) + " |\n|" + "---|" * len(COLUMNS), flush=True)
     for path in options.runs:
-        recording, centre = read_run(
-            path,
-            circles=options.circles or not options.lines,
-            lines=options.lines,
-            stem=None,
-            camera=None,
+        recording = read_recording(
+            path, circles=options.circles or not options.lines, lines=options.lines
         )
+        centre = camera_xy_of(recording, path)
         camera_xy = (float(centre[0]), float(centre[1]))
         for factor in options.noise:
             noisy = with_relative_noise(recording, factor, options.seed)

@@ -17,7 +17,7 @@ from detect.cli import main
 from detect.comparison.circles import Sight, compare_frames
 from detect.comparison.report import format_json, format_text
 from detect.comparison.result import CompareOptions, Comparison
-from detect.levelling import level_positions, levelled, with_prior
+from detect.levelling import level_positions, levelled
 from detect.seen import image_positions, level_seen
 from landmarks import (
     CircleLandmark,
@@ -89,7 +89,7 @@ def test_pixels_come_back_from_detection_and_levelling(
 
 
 def test_files_keep_what_levelled_a_frame(published_camera: Camera, tmp_path: Path) -> None:
-    """The tilt that was applied, prior and all; and pixels to the file's six digits."""
+    """The tilt that was applied, and pixels to the file's six digits."""
     pixels = np.array([[300.25, 250.5], [420.75, 180.125], [100.0, 160.0]])
     raw = published_camera.floor_from_pixel(pixels)
     count = len(raw)
@@ -101,9 +101,8 @@ def test_files_keep_what_levelled_a_frame(published_camera: Camera, tmp_path: Pa
         np.ones(count),
     )
     tilt = FrameTilt("s.0000", 0.031, -0.017, 1e-4, 0.0, 1e-4, 9)
-    applied = with_prior(tilt, np.radians(1.0))
-    discs = levelled(found, published_camera, applied)
-    assert discs.levelled_by == (applied.pitch, applied.roll) != (tilt.pitch, tilt.roll)
+    discs = levelled(found, published_camera, tilt)
+    assert discs.levelled_by == (tilt.pitch, tilt.roll)
     path = tmp_path / "detected.circles"
     write_frames(path, [frame(0, discs.floor_xy, discs.levelled_by), frame(1, raw)])
     first, second = read_frames(path)

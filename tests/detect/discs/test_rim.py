@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from camera import Camera
 from camera.kernels import camera_numbers
 from detect.circles import CircleDetections, detect_circles, disc_shape
-from detect.discs.rim import Rim, follow_rim, invert
+from detect.discs.rim import DIRECTIONS, RADIUS_SIGMA, Circle, Rim, fit_circle, follow_rim
 from detect.settings import CircleSettings
 from lut import DiscTable, build_disc_table
 from tests.detect.painted_floor import DARK, FLOOR, LIGHT, PaintedFloor
@@ -81,14 +81,30 @@ def test_outside_the_image_nothing_is_visible(published_camera: Camera) -> None:
     assert rim.agreeing == 0.0
 
 
-def test_matrices_are_inverted() -> None:
+def test_a_step_to_the_circle_is_that_of_the_normal_equations() -> None:
     rng = np.random.default_rng(1)
     for _ in range(20):
-        half = rng.standard_normal((3, 3))
-        matrix = half @ half.T + 0.1 * np.eye(3)
-        inverse = np.empty((3, 3))
-        invert(matrix, inverse)
-        np.testing.assert_allclose(inverse @ matrix, np.eye(3), atol=1e-9)
+        angle = rng.uniform(0.0, rng.uniform(1.0, 6.0), DIRECTIONS)
+        distance = 1.0 + 0.02 * rng.standard_normal(DIRECTIONS)
+        x, y = distance * np.cos(angle) + 0.05, distance * np.sin(angle) - 0.03
+        weight = rng.uniform(10.0, 400.0, DIRECTIONS) * (rng.random(DIRECTIONS) < 0.8)
+        beside = rng.normal(0.0, 0.02, 2)
+        before = Circle(beside[0], beside[1], 1.02, 0.0, 0.0, 0.0)
+        to = np.stack([x - before.x, y - before.y], axis=-1)
+        length = np.linalg.norm(to, axis=1)
+        slope = np.column_stack([to / length[:, None], np.ones(DIRECTIONS)])
+        normal = slope.T @ (weight[:, None] * slope)
+        right = slope.T @ (weight * (length - before.radius))
+        normal[2, 2] += 1.0 / RADIUS_SIGMA**2
+        right[2] += (1.0 - before.radius) / RADIUS_SIGMA**2
+        after = fit_circle(x, y, weight, before)
+        np.testing.assert_allclose(
+            np.subtract(after[:3], before[:3]), np.linalg.solve(normal, right), rtol=1e-6, atol=1e-9
+        )
+        covariance = np.linalg.inv(normal)
+        np.testing.assert_allclose(
+            after[3:], [covariance[0, 0], covariance[0, 1], covariance[1, 1]], rtol=1e-6, atol=1e-12
+        )
 
 
 def found_in(camera: Camera, table: DiscTable, floor: PaintedFloor, seed: int) -> CircleDetections:

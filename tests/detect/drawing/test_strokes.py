@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from detect.drawing.strokes import draw_curve, draw_text, enlargement, with_legend
+from camera import Camera
+from detect.drawing.strokes import canvas_of, draw_curve, draw_text, enlargement, with_legend
 
 WHITE = (255, 255, 255)
 HALF = 127
@@ -43,3 +46,16 @@ def test_so_do_legends() -> None:
     assert large.shape == (9 + 3 * (14 + 4), 4000, 3)  # one row of them, three times as large
     assert marked(large)[0] == pytest.approx(3 * marked(small[:25])[0], rel=0.15)
     assert with_legend(np.zeros((9, 50, 3), np.uint8), [], 190, 0.38).shape == (13, 50, 3)
+
+
+def test_what_the_lens_does_not_see_is_dark_and_red(published_camera: Camera) -> None:
+    folded = replace(published_camera, coef=(0.0,) * 5, polynomial=(-0.33, 0.0, 0.0))
+    image = np.full((288, 768), 120, np.uint8)
+
+    canvas = canvas_of(image, folded)
+
+    assert canvas[144, 384].tolist() == [120, 120, 120]
+    assert canvas[0, 0].tolist() == [40, 40, 120]
+    dark = np.all(canvas == [40, 40, 120], axis=-1)
+    assert 1.0 - dark.mean() == pytest.approx(folded.seen_share, abs=0.01)
+    np.testing.assert_array_equal(canvas_of(image, published_camera), canvas_of(image))

@@ -12,7 +12,8 @@ from camera import Camera, write_camera
 from detect.cli import main
 from detect.markers.settings import MarkerSettings
 from detect.run import Run, open_images
-from detect.runs.markers_run import detect_markers_run
+from detect.runs.frame import FramePlan
+from detect.runs.stream import detect_run
 from landmarks import read_frames
 from tests.detect.markers.rendering import View, exposed, render, view_corners
 
@@ -90,8 +91,9 @@ def test_a_calibration_is_used_where_there_is_one(folder: Path) -> None:
     run = open_images(folder)
     assert isinstance(run, Run)
     assert run.camera == camera
-    summary = detect_markers_run(run, MarkerSettings(), folder / "detected.markers", version="0")
-    assert summary.markers == 3
+    plan = FramePlan(run.camera, markers=MarkerSettings())
+    summary = detect_run(run, plan, {"markers": folder / "detected.markers"})
+    assert summary.found["markers"] == 3
     assert summary.frames == 3
 
 

@@ -6,13 +6,17 @@ import dataclasses
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from camera import Camera
-from detect.run import open_run
-from detect.runs.circles_run import detect_circles_run
+from detect.run import Run, open_run
+from detect.runs.conduct import Conduct
+from detect.runs.frame import FramePlan
+from detect.runs.rows import RunSummary
+from detect.runs.stream import detect_run
 from detect.settings import PUBLISHED, CircleSettings
 from landmarks import read_frames, read_rows, read_steps
 from lut import TableError
@@ -20,10 +24,24 @@ from storage import OutputExistsError
 from tests.detect.conftest import SMALL_RUN_DISCS
 
 
+def detected(
+    run: Run, settings: CircleSettings, output: Path, *, overwrite: bool = False, **others: Any
+) -> RunSummary:
+    """The discs of a run, and those as JSON if there is a place for them."""
+    plan = FramePlan(
+        run.camera, circles=settings, drawing="discs" if "pictures" in others else None
+    )
+    places = {"circles": output}
+    if "json_output" in others:
+        places["json"] = others.pop("json_output")
+    conduct = Conduct("1.2.3", overwrite=overwrite)
+    return detect_run(run, plan, places, conduct=conduct, **others)
+
+
 def test_rows_are_the_discs_of_each_image(small_run: Path) -> None:
     output = small_run / "out.circles"
-    summary = detect_circles_run(open_run(small_run), CircleSettings(), output, version="1.2.3")
-    assert (summary.frames, summary.discs, summary.failures) == (3, 3, [])
+    summary = detected(open_run(small_run), CircleSettings(), output)
+    assert (summary.frames, summary.found["discs"], summary.failures) == (3, 3, [])
     frames = list(read_frames(output))
     assert [frame.step.prefix for frame in frames] == list(SMALL_RUN_DISCS)
     for frame in frames:
@@ -40,7 +58,7 @@ def test_rows_are_the_discs_of_each_image(small_run: Path) -> None:
 
 def test_steps_are_those_of_the_odometry(small_run: Path) -> None:
     output = small_run / "out.circles"
-    detect_circles_run(open_run(small_run), CircleSettings(), output, version="1")
+    detected(open_run(small_run), CircleSettings(), output)
     written = [frame.step for frame in read_frames(output)]
     assert written == list(read_steps(small_run / "s.txt"))
     assert written[1].dx == -0.00375
@@ -51,7 +69,7 @@ def test_published_rows_are_printed_like_the_data_sets(
 ) -> None:
     """Position and covariance follow from the integer pixel in all 6 printed digits."""
     output = small_run / "out.circles"
-    detect_circles_run(open_run(small_run), PUBLISHED, output, version="1")
+    detected(open_run(small_run), PUBLISHED, output)
     rows = [row for frame in read_frames(output) for row in frame.circles]
     assert len(rows) >= 3
     for row in rows:
@@ -74,7 +92,7 @@ def test_published_rows_are_printed_like_the_data_sets(
 def test_head_tells_how_rows_were_made(small_run: Path) -> None:
     output = small_run / "out.circles"
     settings = dataclasses.replace(CircleSettings(), threshold=0.45, polarity="light")
-    detect_circles_run(open_run(small_run), settings, output, version="1.2.3")
+    detected(open_run(small_run), settings, output)
     rows = list(read_rows(output))
     head = [row.source.decode() for row in rows if row.record is None and row.source is not None]
     assert all(line.startswith("#") and not line.startswith("# #") for line in head)
@@ -90,7 +108,7 @@ def test_head_tells_how_rows_were_made(small_run: Path) -> None:
 def test_without_odometry_steps_are_zeros(small_run: Path) -> None:
     (small_run / "s.txt").unlink()
     output = small_run / "out.circles"
-    detect_circles_run(open_run(small_run), CircleSettings(), output, version="1")
+    detected(open_run(small_run), CircleSettings(), output)
     assert "the steps are zeros" in output.read_text()
     for frame, prefix in zip(read_frames(output), SMALL_RUN_DISCS, strict=True):
         assert dataclasses.astuple(frame.step) == (prefix, *[0.0] * 9)
@@ -106,18 +124,17 @@ def test_bad_images_cost_their_frames_only(small_run: Path, tmp_path: Path) -> N
     def tick() -> None:
         ticks[0] += 1
 
-    summary = detect_circles_run(
+    summary = detected(
         open_run(small_run),
         CircleSettings(),
         output,
-        version="1",
         json_output=as_json,
         pictures=pictures,
         on_progress=tick,
     )
     assert summary.frames == ticks[0] == 3
     assert summary.failed == 2
-    assert summary.discs == 2
+    assert summary.found["discs"] == 2
     broken, missing = summary.failures
     assert broken.startswith(str(small_run / "images" / "s.0001.png"))
     assert missing.startswith("s.0002: no image")
@@ -133,9 +150,9 @@ def test_bad_images_cost_their_frames_only(small_run: Path, tmp_path: Path) -> N
 def test_json_says_what_the_rows_say_and_more(small_run: Path, tmp_path: Path) -> None:
     output, as_json = tmp_path / "out.circles", tmp_path / "out.json"
     run = open_run(small_run)
-    detect_circles_run(run, CircleSettings(), output, version="7", json_output=as_json)
+    detected(run, CircleSettings(), output, json_output=as_json)
     document = json.loads(as_json.read_text())
-    assert document["version"] == "7"
+    assert document["version"] == "1.2.3"
     assert document["settings"] == dataclasses.asdict(CircleSettings())
     assert document["camera"] == run.camera.content_hash
     for record, frame in zip(document["frames"], read_frames(output), strict=True):
@@ -150,9 +167,7 @@ def test_json_says_what_the_rows_say_and_more(small_run: Path, tmp_path: Path) -
 
 def test_published_json_has_no_evidence(small_run: Path, tmp_path: Path) -> None:
     as_json = tmp_path / "out.json"
-    detect_circles_run(
-        open_run(small_run), PUBLISHED, tmp_path / "o.circles", version="1", json_output=as_json
-    )
+    detected(open_run(small_run), PUBLISHED, tmp_path / "o.circles", json_output=as_json)
     discs = [d for frame in json.loads(as_json.read_text())["frames"] for d in frame["discs"]]
     assert len(discs) >= 3
     assert all(disc["evidence"] is None for disc in discs)
@@ -168,10 +183,10 @@ def test_existing_output_stays(small_run: Path) -> None:
     run = open_run(small_run)
     before = left_in(small_run)
     with pytest.raises(OutputExistsError, match=r"out\.circles"):
-        detect_circles_run(run, CircleSettings(), output, version="1")
+        detected(run, CircleSettings(), output)
     assert output.read_bytes() == b"precious\n"
     assert left_in(small_run) == before
-    detect_circles_run(run, CircleSettings(), output, version="1", overwrite=True)
+    detected(run, CircleSettings(), output, overwrite=True)
     assert len(list(read_frames(output))) == 3
 
 
@@ -181,11 +196,10 @@ def test_all_outputs_or_none(small_run: Path, tmp_path: Path) -> None:
     output.write_bytes(b"precious\n")
     before = left_in(small_run)
     with pytest.raises(FileNotFoundError):
-        detect_circles_run(
+        detected(
             open_run(small_run),
             CircleSettings(),
             output,
-            version="1",
             overwrite=True,
             json_output=tmp_path / "nowhere" / "out.json",
         )
@@ -204,11 +218,10 @@ def test_an_interrupted_run_writes_nothing(small_run: Path, tmp_path: Path) -> N
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        detect_circles_run(
+        detected(
             open_run(small_run),
             CircleSettings(),
             output,
-            version="1",
             json_output=as_json,
             on_progress=interrupt,
         )
@@ -222,5 +235,5 @@ def test_settings_without_a_table_are_refused(small_run: Path) -> None:
     rows = run.camera.robot_from_camera
     under = replace(run.camera, robot_from_camera=(*rows[:2], (*rows[2][:3], -1.5)))
     with pytest.raises(TableError, match=r"the camera is -1\.5 m above the floor: expected more"):
-        detect_circles_run(replace(run, camera=under), CircleSettings(), output, version="1")
+        detected(replace(run, camera=under), CircleSettings(), output)
     assert not output.exists()

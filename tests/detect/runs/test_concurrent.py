@@ -87,7 +87,7 @@ def parts_in(output: Path) -> set[str]:
 def assert_one_run_wrote_all(folder: Path) -> None:
     """Every file is the one that the log names by its hash."""
     log = json.loads((folder / "detected.log.json").read_text())
-    assert len(log["outputs"]) == 3
+    assert len(log["outputs"]) == 4
     for file in log["outputs"]:
         content = (folder / file["name"]).read_bytes()
         assert hashlib.sha256(content).hexdigest() == file["sha256"]
@@ -130,7 +130,7 @@ def test_the_same_command_twice_is_refused(run_folder: Path, tmp_path: Path) -> 
         first.go_on()
         assert first.wait() == 0, first.said()
     assert_one_run_wrote_all(output)
-    assert len(results(output)) == 4
+    assert len(results(output)) == 5
 
 
 def test_of_two_runs_that_may_overwrite_one_is_the_last(
@@ -157,7 +157,7 @@ def test_of_two_runs_that_may_overwrite_one_is_the_last(
             code, said = ended(process)
             assert code == 0, said
     assert_one_run_wrote_all(output)
-    assert len(results(output)) == 4  # and nothing that is hidden
+    assert len(results(output)) == 5  # and nothing that is hidden
 
 
 def test_cold_kernels_compiled_by_two_at_once(run_folder: Path, tmp_path: Path) -> None:

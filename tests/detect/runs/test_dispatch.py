@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, ThreadPoolExecutor
 from contextlib import closing, contextmanager
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +16,9 @@ import pytest
 from camera import Camera
 from detect.errors import WorkerError
 from detect.run import RunFrame
-from detect.runs.dispatch import Chunk, Workers, detect_frames
-from detect.runs.frame import FramePlan
-from detect.runs.frame_rows import FrameRows, FrameTask
+from detect.runs.dispatch import Chunk, Workers, detect_chunks
+from detect.runs.frame import FramePlan, FrameTask
+from detect.runs.rows import FrameRows
 from landmarks import Step
 
 
@@ -32,11 +33,21 @@ def number_of(task: FrameTask) -> int:
 
 
 def rows_of(task: FrameTask) -> FrameRows:
-    return FrameRows(circles=task.frame.step.prefix.encode())
+    return FrameRows({"circles": task.frame.step.prefix.encode()})
 
 
 def expected(count: int) -> list[bytes]:
     return [task.frame.step.prefix.encode() for task in tasks(count)]
+
+
+def detect_frames(
+    tasks: Iterable[FrameTask], plan: FramePlan, workers: Workers
+) -> Generator[FrameRows, None, None]:
+    """The frames of all chunks, one by one; each comes with its own task."""
+    with closing(detect_chunks(tasks, plan, workers)) as chunks:
+        for task, rows in chain.from_iterable(chunks):
+            assert task.frame.step.prefix.encode() in rows.rows["circles"]
+            yield rows
 
 
 class Crew(Executor):
@@ -102,7 +113,7 @@ def test_rows_are_in_the_order_of_the_run(plan: FramePlan, count: int) -> None:
         return [rows_of(task) for task in chunk]
 
     hired = Hired(slow_at_first)
-    found = [rows.circles for rows in detect_frames(tasks(count), plan, hired.workers)]
+    found = [rows.rows["circles"] for rows in detect_frames(tasks(count), plan, hired.workers)]
     assert found == expected(count)
     assert hired.started == hired.ended == (1 if count else 0)
 
@@ -174,9 +185,9 @@ def test_a_frame_that_kills_its_worker_costs_itself(
         if number in deadly:
             assert rows.error is not None
             assert rows.error.startswith(f"k.{number:04d}.png: every worker died")
-            assert rows.circles.startswith(b"STEP ")
+            assert rows.rows["circles"].startswith(b"STEP ")
         else:
-            assert rows.circles == sound
+            assert rows.rows["circles"] == sound
     assert hired.started == hired.ended > len(deadly)
 
 
@@ -203,7 +214,7 @@ def test_a_worker_killed_once_costs_nothing(plan: FramePlan) -> None:
         return [rows_of(task) for task in chunk]
 
     hired = Hired(work)
-    found = [rows.circles for rows in detect_frames(tasks(50), plan, hired.workers)]
+    found = [rows.rows["circles"] for rows in detect_frames(tasks(50), plan, hired.workers)]
     assert found == expected(50)
     assert hired.started == hired.ended == 2
 

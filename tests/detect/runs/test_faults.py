@@ -36,7 +36,7 @@ REASONS = {
     "folder": "cannot be read: Is a directory",
     "dangling": "cannot be read: No such file",
     "loop": "cannot be read: Too many levels of symbolic links",
-    "pipe": "cannot be read: is no file",
+    "pipe": "cannot be read: is a pipe",
     "endless": "cannot be read: is a link that leads out of the run",
     "enormous-jpeg": f"claims {SIDE}x{SIDE} px",
     "enormous-png": f"claims {SIDE}x{SIDE} px",
@@ -121,11 +121,11 @@ def test_bad_frames_cost_themselves(spoilt_run: Path, capsys: Captured) -> None:
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="makes pipes with names")
 def test_every_command_goes_on(spoilt_run: Path) -> None:
-    """Verticals, tilt and markers as well; the log of `all` is one for its three files."""
+    """Verticals, tilt and markers as well; the log of `all` is one for its four files."""
     assert main(["all", str(spoilt_run)]) == 3
     log = json.loads((spoilt_run / "detected.log.json").read_text())
     assert [failure["prefix"] for failure in log["failures"]] == list(REASONS)
-    names = ["detected.tilt", "detected.lines", "detected.circles"]
+    names = [f"detected.{kind}" for kind in ("frames.tilt", "lines", "tilt", "circles")]
     assert [file["name"] for file in log["outputs"]] == names
     for file in log["outputs"]:
         content = (spoilt_run / file["name"]).read_bytes()

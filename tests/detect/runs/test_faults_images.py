@@ -171,7 +171,7 @@ def test_pipes_and_devices_are_no_images(tmp_path: Path, published_camera: Camer
     os.mkfifo(tmp_path / "pipe.png")
     (tmp_path / "zeros.png").symlink_to("/dev/zero")
     for name in ("pipe.png", "zeros.png"):
-        with pytest.raises(FrameError, match="cannot be read: is no file, but a pipe or a device"):
+        with pytest.raises(FrameError, match="cannot be read: is a pipe, socket or device"):
             read_image(frame_of(tmp_path / name), published_camera)
 
 
@@ -181,7 +181,7 @@ def test_files_larger_than_any_such_image_are_not_read(
     path = tmp_path / "a.png"
     with path.open("wb") as stream:
         stream.truncate(1 << 40)  # a file of nothing takes no room
-    with pytest.raises(FrameError, match="has 1099511627776 bytes: expected an image, at most"):
+    with pytest.raises(FrameError, match="cannot be read: larger than"):
         read_image(frame_of(path), published_camera)
 
 

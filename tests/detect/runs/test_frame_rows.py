@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import pickle
 import shutil
 import subprocess
@@ -12,9 +11,10 @@ from pathlib import Path
 import pytest
 
 from detect.run import RunFrame, open_run
-from detect.runs.frame import FramePlan, tables_of
-from detect.runs.frame_rows import FrameRows, FrameTask, rows_of_frames
-from detect.runs.resume_journal import Journal, JournalHead, line_of_frame, new_journal
+from detect.runs.frame import FramePlan, FrameTask, tables_of
+from detect.runs.journal import Journal, JournalFrame, JournalHead, left_journal, new_journal
+from detect.runs.known import KnownOfFrame
+from detect.runs.rows import rows_of_frames
 from detect.settings import PUBLISHED
 from landmarks import FrameTilt
 
@@ -45,8 +45,9 @@ def test_frames_have_the_same_rows_together_and_alone(
     assert together == [rows for t in tasks for rows in rows_of_frames([t], plan, tables_of(plan))]
     assert [place for place, rows in enumerate(together) if rows.error is not None] == [3, 9]
     for rows, task in zip(together, tasks):
-        assert rows.circles.startswith(f"STEP {task.frame.step.prefix} ".encode())
-        assert rows.disc_count == rows.circles.count(b"LANDMARK_C")
+        circles = rows.rows["circles"]
+        assert circles.startswith(f"STEP {task.frame.step.prefix} ".encode())
+        assert rows.found.get("discs", 0) == circles.count(b"LANDMARK_C")
 
 
 REHEARSAL = """
@@ -55,8 +56,8 @@ from pathlib import Path
 from storage.kernel_loading import load_kernels_alone
 from detect.line_settings import LineSettings
 from detect.run import open_run
-from detect.runs.frame import FramePlan, rehearse, tables_of
-from detect.runs.frame_rows import FrameTask, rows_of_frames
+from detect.runs.frame import FramePlan, FrameTask, rehearse, tables_of
+from detect.runs.rows import rows_of_frames
 from detect.settings import CircleSettings
 
 load_kernels_alone()
@@ -71,7 +72,7 @@ def told(cache, *others):
 Cache.load_overload = told
 frame = next(iter(run.frames))
 (rows,) = rows_of_frames([FrameTask(frame)], plan, tables_of(plan))
-print(rows.error, rows.disc_count > 0, rows.line_count > 0, rows.has_tilt)
+print(rows.error, *[rows.found[kind] > 0 for kind in ("discs", "lines", "tilts")])
 """
 
 
@@ -90,7 +91,8 @@ def test_after_a_rehearsal_no_kernel_is_missing(project_root: Path) -> None:
 
 def test_tasks_travel_whole(tasks_and_plan: tuple[list[FrameTask], FramePlan]) -> None:
     tasks, _ = tasks_and_plan
-    tasks[1] = FrameTask(tasks[1].frame, FrameTilt("e.0001", 0.1, 0.2, 1e-6, 0.0, 1e-6, 7))
+    tilt = FrameTilt("e.0001", 0.1, 0.2, 1e-6, 0.0, 1e-6, 7)
+    tasks[1] = FrameTask(tasks[1].frame, KnownOfFrame(tilt))
     shipped = RunFrame(tasks[2].frame.step, None, b"content", 1.5, 12, "why")
     assert pickle.loads(pickle.dumps(tasks)) == tasks
     arrived = pickle.loads(pickle.dumps(shipped))
@@ -98,28 +100,38 @@ def test_tasks_travel_whole(tasks_and_plan: tuple[list[FrameTask], FramePlan]) -
     assert arrived.content == b"content"
 
 
-@pytest.mark.parametrize(
-    "rows",
-    [
-        FrameRows(disc_count=3, line_count=21, has_tilt=True),
-        FrameRows(marker_count=2, rejected=(("size", 4), ("ink", 1))),
-        FrameRows(error='"e.0003": cannot be decoded:\n expected an image \\ \udcff'),
-    ],
+FRAMES_OF_JOURNAL = (
+    JournalFrame([120, 0], "ab", "cd", {"discs": 3, "lines": 21, "tilts": 1}, {}, None),
+    JournalFrame([0, 7], "ab", "cd", {"markers": 2}, {"size": 4, "ink": 1}, None),
+    JournalFrame([1, 1], "", "", {}, {}, '"e.0003": cannot be decoded:\n expected \\ \udcff'),
 )
-def test_a_journal_gives_back_what_was_noted(tmp_path: Path, rows: FrameRows) -> None:
-    place = tmp_path / ".a.journal"
-    journal = new_journal(place)
+
+
+def test_a_journal_gives_back_what_was_noted(tmp_path: Path) -> None:
+    journal = new_journal(tmp_path / ".a.journal")
     assert isinstance(journal, Journal)
-    journal.begin(JournalHead("program", (0, 1), overwrite=False))
-    content = [b"x" * 120, b""]
-    check, noted = line_of_frame("program", (120, 0), "0123456789abcdef", rows, content)
-    journal.write([noted])
-    head, lines = journal.read()
-    (line,) = lines
-    assert head == JournalHead("program", (0, 1), overwrite=False)
-    assert (line.lengths, line.task, line.rows) == ((120, 0), "0123456789abcdef", rows)
-    assert line.check == check
-    # Lines that are written sooner than others are written the same way.
-    written = place.read_bytes().splitlines()[1]
-    assert json.dumps(json.loads(written), separators=(",", ":")).encode() == written
+    head = JournalHead("program", [0, 1], overwrite=False)
+    journal.write([head, *FRAMES_OF_JOURNAL[:2]])
+    journal.write(FRAMES_OF_JOURNAL[2:])
+    assert (journal.head(), tuple(journal.frames())) == (head, FRAMES_OF_JOURNAL)
+    assert not journal.is_complete()
     journal.remove()
+
+
+def test_a_journal_goes_on_behind_what_is_taken_over(tmp_path: Path) -> None:
+    first, second, third = FRAMES_OF_JOURNAL
+    journal = new_journal(tmp_path / ".a.journal")
+    assert journal is not None
+    journal.write([JournalHead("program", [0], overwrite=True), first, second])
+    journal.close()
+    left = left_journal(tmp_path / ".a.journal")
+    assert left is not None
+    for frame in left.frames():
+        if frame == second:
+            break
+    left.cut()
+    left.write([third])
+    left.complete()
+    assert left.is_complete()
+    assert list(left.frames()) == [first, third]
+    left.remove()

@@ -20,10 +20,9 @@ pytestmark = pytest.mark.long
 #: Says how often a kernel was loaded from the cache instead of compiled.
 ONE_KERNEL = """
 import numpy as np
-from detect.runs.row_text_kernels import circle_numbers
-numbers = circle_numbers(np.ones((1, 2)), np.ones(1), np.ones((1, 2, 2)))
-assert (numbers == 1.0).all()
-print(sum(circle_numbers.stats.cache_hits.values()))
+from tests.detect.runs.one_kernel import doubled
+assert (doubled(np.ones(3)) == 2.0).all()
+print(sum(doubled.stats.cache_hits.values()))
 """
 
 

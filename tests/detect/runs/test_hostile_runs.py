@@ -174,8 +174,20 @@ def test_a_horizon_outside_the_image_means_no_verticals(
         frames = list(read_frames(run / name))
         assert [frame.step.prefix for frame in frames] == ["s.0000", "s.0001", "s.0002"]
         assert not any(frame.landmarks for frame in frames)
-    assert "NOTILT s.0000 0" in (run / "detected.tilt").read_text()
+    assert "NOTILT s.0000 0" in (run / "detected.frames.tilt").read_text()
     capsys.readouterr()
+
+
+def test_a_lens_that_folds_in_the_corners_is_used_where_it_sees(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = (run / "s.cam").read_text()
+    begin = text.index("coef:")
+    (run / "s.cam").write_text(text[:begin] + "coef: { 0 -0.33 0 0 0 } }\n")
+    assert main(["all", str(run), "--force"]) == 0
+    assert "67 % of the pixels see anything" in capsys.readouterr().err
+    assert main(["draw", str(run), "-o", str(tmp_path / "drawn")]) == 0
+    assert main(["report", str(run), "-o", str(tmp_path / "report.html")]) == 0
 
 
 def test_a_distortion_that_folds_inside_the_image_is_refused(

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from detect import commands
+from detect import cli
 from detect.cli import main
 from detect.runs.interrupts import interrupts_deferred, interrupts_noted, raise_if_interrupted
 from detect.runs.progress import progress_bar
@@ -32,7 +32,7 @@ def test_what_an_interrupt_turned_into(
             raise other("with an exception set") from None
         return 0
 
-    monkeypatch.setattr(commands, "carry_out", disguise)
+    monkeypatch.setattr(cli, "carry_out", disguise)
     before = signal.getsignal(signal.SIGINT)
     assert main(["compare", str(tmp_path)]) == 130
     assert capsys.readouterr().err == "interrupted\n"
@@ -54,7 +54,7 @@ def test_a_swallowed_interrupt_comes_back_after_the_frame(
                 advance()
         return 0
 
-    monkeypatch.setattr(commands, "carry_out", swallow)
+    monkeypatch.setattr(cli, "carry_out", swallow)
     assert main(["compare", str(tmp_path)]) == 130
     assert frames == [0, 1, 2]
     assert main(["compare", str(tmp_path)]) == 130  # the note of one run is none of the next
@@ -148,7 +148,7 @@ def test_nowhere_to_keep_kernels(
         return 0
 
     monkeypatch.setattr(FunctionCache._impl_class, "_locator_classes", [])
-    monkeypatch.setattr(commands, "carry_out", compile_one)
+    monkeypatch.setattr(cli, "carry_out", compile_one)
     assert main(["compare", str(tmp_path)]) == 1
     (line,) = capsys.readouterr().err.splitlines()
     assert "NUMBA_CACHE_DIR" in line
@@ -160,6 +160,6 @@ def test_an_error_of_the_program_is_no_interrupt(
     def slip(_: object) -> int:
         raise SystemError("a slip")
 
-    monkeypatch.setattr(commands, "carry_out", slip)
+    monkeypatch.setattr(cli, "carry_out", slip)
     with pytest.raises(SystemError, match="a slip"):
         main(["compare", str(tmp_path)])

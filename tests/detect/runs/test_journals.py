@@ -11,7 +11,9 @@ from pathlib import Path
 import pytest
 
 from detect.cli import main
-from detect.runs.frame_rows import FrameRows
+from detect.runs.frame import FrameTask
+from detect.runs.rows import FrameRows
+from detect.runs.run_files import RunFiles
 from tests.detect.interrupted_runs import (
     FRAMES,
     PREVIOUS,
@@ -32,13 +34,11 @@ class Kept:
         self.frames = self.interrupt_after(FRAMES // 2)
 
     def interrupt_after(self, frames: int) -> int:
-        from detect.runs.resume import RunFiles
-
         add = RunFiles.add
 
-        def interrupted(files: RunFiles, found: Sequence[FrameRows]) -> None:
-            for rows in found:
-                add(files, [rows])
+        def interrupted(files: RunFiles, found: Sequence[tuple[FrameTask, FrameRows]]) -> None:
+            for frame in found:
+                add(files, [frame])
                 if journalled(self.output) >= frames:
                     raise KeyboardInterrupt
 
@@ -193,8 +193,6 @@ def test_pictures_of_the_frame_under_way(run_folder: Path, tmp_path: Path) -> No
     rows = (tmp_path / "rows").read_bytes()
     shutil.rmtree(drawings)
     (tmp_path / "rows").unlink()
-
-    from detect.runs.resume import RunFiles
 
     add, count = RunFiles.add, [0]
 

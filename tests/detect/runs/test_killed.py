@@ -35,6 +35,7 @@ from tests.detect.forked_runs import (
 )
 from tests.detect.interrupted_runs import (
     FRAMES,
+    GROWING,
     KINDS,
     PREVIOUS,
     Captured,
@@ -236,7 +237,7 @@ def test_what_a_killed_run_left_is_removed(
     runs: ForkedRuns, run_folder: Path, output: Path, undisturbed: dict[str, bytes]
 ) -> None:
     killed(runs, run_folder, output, 10)
-    assert hidden(output) == {".detected.journal", *[f".detected.{kind}.part" for kind in KINDS]}
+    assert hidden(output) == {".detected.journal", *[f".detected.{kind}.part" for kind in GROWING]}
     assert main(command(run_folder, output)) == 3
     assert results(output) == undisturbed
     assert hidden(output) == set()

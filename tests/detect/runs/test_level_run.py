@@ -14,7 +14,8 @@ from camera import Camera
 from detect.cli import main
 from detect.levelling import level_positions
 from detect.run_tilt import LEAST_FRAMES
-from detect.runs.level_run import LevelRun
+from detect.runs.level_run import level_run
+from detect.runs.rows import RunSummary
 from landmarks.reading import frames_of_rows, parse_rows
 
 LEAN = -0.04, 0.01
@@ -22,17 +23,17 @@ STEP = "STEP {} 0.0 0.0 0.0 1e-6 0.0 1e-6 0.0 0.0 1e-6\n"
 DISC = "LANDMARK_C 0.5 -2.5 0.9 1e-06 0 1e-06 7\n"
 
 
-def level(camera: Camera, frames: int, crlf: bool = False) -> dict[str, bytes]:
+def level(camera: Camera, frames: int) -> dict[str, bytes]:
     rng = np.random.default_rng(5)
     tilts, circles = "# head\n", "# head\n"
     for k in range(frames):
         pitch, roll = np.array(LEAN) + 1e-4 * rng.standard_normal(2)
         tilts += f"TILT {k} {pitch:.6f} {roll:.6f} 1e-8 0 1e-8 9\n" if k else "NOTILT 0 2\n"
         circles += STEP.format(k) + DISC
-    second = LevelRun(camera, 0.0, "t", "r", "tilt", "circles", crlf)
-    written = {"tilt": b"", "circles": b""}
-    for name, rows in second({"t": io.BytesIO(tilts.encode()), "r": io.BytesIO(circles.encode())}):
-        written[name] += rows
+    written = {"level tilt": b"", "level circles": b""}
+    files = {"tilt": io.BytesIO(tilts.encode()), "circles": io.BytesIO(circles.encode())}
+    for kind, rows in level_run(camera, 0.0, RunSummary(), files):
+        written[kind] += rows
     return written
 
 
@@ -40,25 +41,25 @@ def test_discs_come_out_level_also_in_a_frame_without_verticals(published_camera
     written = level(published_camera, 3 * LEAST_FRAMES)
 
     expected = level_positions(published_camera, np.array([[0.5, -2.5]]), *LEAN)[0]
-    frames = list(frames_of_rows(parse_rows(io.BytesIO(written["circles"]))))
+    frames = list(frames_of_rows(parse_rows(io.BytesIO(written["level circles"]))))
     assert len(frames) == 3 * LEAST_FRAMES
     for frame in frames:
         (disc,) = frame.circles
         assert (disc.px, disc.py) == pytest.approx(expected, abs=2e-3)
         assert disc.ids == (7,)
         assert frame.levelled_by == pytest.approx(LEAN, abs=5e-4)
-    assert written["tilt"].count(b"TILT ") == 3 * LEAST_FRAMES
-    assert b"NOTILT" not in written["tilt"]
+    assert written["level tilt"].count(b"TILT ") == 3 * LEAST_FRAMES
+    assert b"NOTILT" not in written["level tilt"]
 
 
 def test_few_frames_are_levelled_each_by_itself(published_camera: Camera) -> None:
     written = level(published_camera, 4)
 
-    first, *others = frames_of_rows(parse_rows(io.BytesIO(written["circles"])))
+    first, *others = frames_of_rows(parse_rows(io.BytesIO(written["level circles"])))
     assert first.levelled_by is None
     assert (first.circles[0].px, first.circles[0].py) == (0.5, -2.5)
     assert all(frame.levelled_by is not None for frame in others)
-    assert written["tilt"].startswith(b"NOTILT 0 2\n")
+    assert written["level tilt"].startswith(b"NOTILT 0 2\n")
 
 
 @pytest.mark.parametrize("way", ["frame", "run"])
@@ -72,7 +73,7 @@ def test_files_keep_their_heads(small_run: Path, way: str) -> None:
         assert hashlib.sha256(content).hexdigest() == written["sha256"]
 
 
-def test_rows_end_as_demanded(published_camera: Camera) -> None:
-    rows = level(published_camera, 4, crlf=True)["circles"]
-
-    assert rows.count(b"\r\n") == rows.count(b"\n")
+def test_rows_end_as_demanded(small_run: Path) -> None:
+    assert main(["all", str(small_run), "--tilt", "run", "--line-ends", "crlf"]) == 0
+    rows = (small_run / "detected.circles").read_bytes()
+    assert rows.count(b"\r\n") == rows.count(b"\n") > 3

@@ -14,7 +14,8 @@ from camera import write_camera
 from detect.cli import main
 from detect.line_settings import LineSettings
 from detect.run import open_run
-from detect.runs.lines_run import detect_lines_run
+from detect.runs.frame import FramePlan
+from detect.runs.stream import detect_run
 from detect.verticals.identity import carry_ids
 from landmarks import LineLandmark, read_frames, read_tilts
 from tests.detect.line_scene import pinhole
@@ -50,12 +51,14 @@ def short_run(project_root: Path, tmp_path: Path) -> Path:
 
 def test_rows_and_tilts_are_written(short_run: Path, project_root: Path, tmp_path: Path) -> None:
     output, tilt = tmp_path / "out.lines", tmp_path / "out.tilt"
-    summary = detect_lines_run(open_run(short_run), LineSettings(), output, tilt, version="test")
+    run = open_run(short_run)
+    plan = FramePlan(run.camera, lines=LineSettings())
+    summary = detect_run(run, plan, {"lines": output, "tilt": tilt})
     frames = list(read_frames(output))
     assert [frame.step.prefix for frame in frames] == [f"e.{k:04d}" for k in range(4)]
-    assert sum(len(frame.lines) for frame in frames) == summary.lines >= 20
+    assert sum(len(frame.lines) for frame in frames) == summary.found["lines"] >= 20
     tilts = read_tilts(tilt)
-    assert len(tilts) == summary.tilts == 4
+    assert len(tilts) == summary.found["tilts"] == 4
     truth = json.loads((project_root / "images" / "e" / "truth.json").read_text())
     for frame in truth["frames"][:4]:
         found = tilts[frame["prefix"]]
@@ -88,7 +91,7 @@ def test_all_corrects_discs_for_the_tilt(short_run: Path) -> None:
     assert max(moved) > 0.005
 
 
-def test_what_is_known_of_the_tilt_beforehand_makes_no_disc_less_certain(short_run: Path) -> None:
+def test_frames_with_a_tilt_do_not_count_the_unknown_one(short_run: Path) -> None:
     variances = []
     for sigma in ("0", "0.5"):
         assert (
@@ -110,7 +113,7 @@ def test_what_is_known_of_the_tilt_beforehand_makes_no_disc_less_certain(short_r
     without, known = map(np.array, variances)
     assert len(without) == len(known) > 10
     # The verticals tell the tilt of all these frames: it is not in the covariances twice.
-    assert np.all(known <= without * 1.001)
+    np.testing.assert_array_equal(known, without)
 
 
 def test_frames_that_count_as_level_are_told(
@@ -121,14 +124,15 @@ def test_frames_that_count_as_level_are_told(
     (short_run / "images" / "e.0001.jpg").write_bytes(b"not an image")
     cv2.imwrite(str(short_run / "images" / "e.0002.jpg"), np.full((288, 768), 90, np.uint8))
     assert main(["all", str(short_run), "--tilt", "frame", "--force"]) == 3
-    assert "the tilt of 2 frames; the other 1 count as level beyond" in capsys.readouterr().out
     assert (
-        main(
-            ["all", str(short_run), "--tilt", "frame", "--force", "--circles.tilt-sigma-deg", "0.5"]
-        )
+        "the tilt of 2 frames; the other 1 count as level within 0.3 degrees"
+        in capsys.readouterr().out
+    )
+    assert (
+        main(["all", str(short_run), "--tilt", "frame", "--force", "--circles.tilt-sigma-deg", "0"])
         == 3
     )
-    assert "the other 1 count as level within 0.5 degrees\n" in capsys.readouterr().out
+    assert "the other 1 count as level beyond doubt" in capsys.readouterr().out
 
 
 def test_existing_outputs_are_kept(short_run: Path, capsys: pytest.CaptureFixture[str]) -> None:

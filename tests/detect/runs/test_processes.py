@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import subprocess
 import sys
 from dataclasses import replace
@@ -12,11 +11,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from camera import Camera
 from detect.cli import main
 from detect.run import open_run
-from detect.runs.circles_run import detect_circles_run
-from detect.runs.frame_rows import PIXELS_AT_ONCE
-from detect.runs.garbage import settling
+from detect.runs.frame import FramePlan
+from detect.runs.rows import PIXELS_AT_ONCE
+from detect.runs.stream import detect_run
 from detect.runs.workers import local_workers
 from detect.settings import CircleSettings
 from lut import TableError
@@ -88,12 +88,17 @@ def test_tasks_are_larger_where_there_are_many(
 @given(
     jobs=st.integers(1, 200),
     frames=st.none() | st.integers(0, 10**7),
-    pixels=st.integers(0, 10**9),
+    width=st.integers(1, 30_000),
 )
-def test_no_more_than_are_decoded_at_once(jobs: int, frames: int | None, pixels: int) -> None:
-    chunk = local_workers(jobs, frames=frames, frame_pixels=pixels).chunk
+def test_no_more_than_are_decoded_at_once(
+    published_camera: Camera, jobs: int, frames: int | None, width: int
+) -> None:
+    camera = replace(
+        published_camera, width=width, scale_x=width, offset_x=0.5 * width, coef=(0.0,) * 5
+    )
+    chunk = local_workers(jobs, frames=frames, camera=camera).chunk
     assert 1 <= chunk <= 128
-    assert chunk == 1 or chunk * pixels <= PIXELS_AT_ONCE
+    assert chunk == 1 or chunk * width * camera.height <= PIXELS_AT_ONCE
 
 
 # -- what they begin with -----------------------------------------------------------------------
@@ -128,25 +133,10 @@ def test_workers_tell_what_is_wrong_with_the_tables(small_run: Path) -> None:
     under = replace(run.camera, robot_from_camera=(*rows[:2], (*rows[2][:3], -1.5)))
     before = sorted(small_run.iterdir())
     with pytest.raises(TableError, match=r"the camera is -1\.5 m above the floor: expected more"):
-        detect_circles_run(
+        detect_run(
             replace(run, camera=under),
-            CircleSettings(),
-            small_run / "out.circles",
-            version="1",
+            FramePlan(under, circles=CircleSettings()),
+            {"circles": small_run / "out.circles"},
             workers=local_workers(2),
         )
     assert sorted(small_run.iterdir()) == before
-
-
-def test_a_process_that_settles_leaves_out_what_is_there() -> None:
-    thresholds = gc.get_threshold()
-    assert gc.get_freeze_count() == 0
-    try:
-        with settling():
-            assert not gc.isenabled()
-        assert gc.isenabled()
-        assert gc.get_freeze_count() > 1000
-        assert gc.get_threshold()[0] > thresholds[0]
-    finally:
-        gc.unfreeze()
-        gc.set_threshold(*thresholds)

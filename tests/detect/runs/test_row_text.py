@@ -2,57 +2,38 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
-from detect.runs.row_text import unknown_circles, unknown_lines
-from detect.runs.row_text_kernels import circle_numbers
+from detect.errors import FrameError
+from detect.runs.rows import disc_numbers, landmark_rows
 from landmarks import CircleLandmark, LineLandmark, circle_landmarks, format_record
 
 FINITE = st.floats(allow_nan=False, allow_infinity=False)
-#: Whatever has few decimals stands near numbers that end in 5, where rounding is a close call.
-DECIMALS = st.builds(
-    lambda n, k: n / 10**k, st.integers(-12_000_000, 12_000_000), st.integers(0, 20)
-)
+IDS = st.lists(st.integers(-1, 10**6), max_size=3).map(tuple)
 
 
-def circle_rows(numbers: NDArray[np.float64]) -> bytes | None:
-    """Rows of (N, 6) numbers, in the order in which they stand there."""
-    px, py, quality, cxx, cxy, cyy = numbers.T
-    covariance = np.stack([cxx, cxy, cxy, cyy], axis=-1).reshape(-1, 2, 2)
-    return unknown_circles(np.stack([px, py], axis=-1), quality, covariance)
+@given(rows=st.lists(st.tuples(st.lists(FINITE, min_size=6, max_size=6), IDS), max_size=4))
+def test_discs_are_written_as_their_records(
+    rows: list[tuple[list[float], tuple[int, ...]]],
+) -> None:
+    numbers = np.array([values for values, _ in rows]).reshape(-1, 6)
+    written = landmark_rows("LANDMARK_C", numbers, [ids for _, ids in rows])
+    records = [CircleLandmark(x, y, q, a, b, c, ids) for (x, y, q, a, b, c), ids in rows]
+    assert written == "".join(f"{format_record(record)}\n" for record in records).encode()
 
 
-def expected(numbers: list[float]) -> bytes:
-    px, py, quality, cxx, cxy, cyy = numbers
-    record = CircleLandmark(px, py, quality, cxx, cxy, cyy, ids=(-1,))
-    return f"{format_record(record)}\n".encode()
-
-
-@given(rows=st.lists(st.lists(FINITE | DECIMALS, min_size=6, max_size=6), max_size=4))
-def test_rows_are_those_of_records_or_none(rows: list[list[float]]) -> None:
-    numbers = np.array(rows, np.float64).reshape(-1, 6)
-    written = circle_rows(numbers)
-    assert written in (None, b"".join(map(expected, rows)))
-
-
-def test_what_a_frame_holds_is_written() -> None:
-    rng = np.random.default_rng(5)
-    sizes = 10.0 ** rng.uniform(-12.0, 7.0, (400, 6))
-    numbers = rng.choice([-1.0, 1.0], sizes.shape) * sizes
-    numbers[::7] = [0.0, -0.0, 1.0, 1e-5, 123456.0, 1e6]
-    numbers[1::7] = [0.999999, 0.9999999, 9.999996e-5, 999999.4, 999999.6, 100000.0]
-    written = circle_rows(numbers)
-    assert written == b"".join(expected(row) for row in numbers.tolist())
-    assert circle_rows(numbers[:0]) == b""
-
-
-@pytest.mark.parametrize("number", [np.nan, np.inf, -np.inf, 1.000005, -0.1234565, 1e-300, 1e300])
-def test_what_needs_a_second_look_gets_it(number: float) -> None:
-    assert circle_rows(np.full((1, 6), number)) is None
+def test_lines_are_written_as_their_records() -> None:
+    numbers = np.random.default_rng(7).normal(size=(5, 8))
+    rows: list[Any] = numbers.tolist()
+    records = [replace(LineLandmark(*row), ids=(-1,)) for row in rows]
+    written = landmark_rows("LANDMARK_L", numbers, [(-1,)] * 5)
+    assert written == "".join(f"{format_record(record)}\n" for record in records).encode()
 
 
 def test_numbers_of_discs_stand_in_the_order_of_their_rows() -> None:
@@ -60,16 +41,10 @@ def test_numbers_of_discs_stand_in_the_order_of_their_rows() -> None:
     xy, quality, spread = rng.normal(size=(5, 2)), rng.random(5), rng.normal(size=(5, 2, 2))
     landmarks = circle_landmarks(xy, quality, spread)
     expected = [(c.px, c.py, c.quality, c.cxx, c.cxy, c.cyy) for c in landmarks]
-    np.testing.assert_array_equal(circle_numbers(xy, quality, spread), expected)
+    np.testing.assert_array_equal(disc_numbers(xy, quality, spread), expected)
 
 
-def test_lines_are_written_as_their_records() -> None:
-    lines = np.random.default_rng(7).normal(size=(8, 5))
-    landmarks = [
-        LineLandmark(xtop, ytop, xbottom, ybottom, alpha, beta, 0.0, sigma, (-1,))
-        for xtop, ytop, xbottom, ybottom, alpha, beta, sigma, _ in lines.T.tolist()
-    ]
-    assert unknown_lines(lines) == "".join(f"{format_record(r)}\n" for r in landmarks).encode()
-    assert unknown_lines(lines[:, :0]) == b""
-    lines[3, 2] = np.nan
-    assert unknown_lines(lines) is None
+@pytest.mark.parametrize("number", [np.nan, np.inf, -np.inf])
+def test_what_is_not_finite_costs_the_frame(number: float) -> None:
+    with pytest.raises(FrameError, match="not finite"):
+        landmark_rows("LANDMARK_C", np.full((1, 6), number), [(-1,)])

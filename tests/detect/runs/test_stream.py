@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-import gc
 import json
 import shutil
 from collections.abc import Generator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from detect.line_settings import LineSettings
 from detect.run import RunFrame, open_run
-from detect.runs.all_run import detect_all_run
-from detect.runs.by_image import LinesByImage, TiltsByImage
-from detect.runs.circles_run import detect_circles_run
-from detect.runs.lines_run import detect_lines_run
-from detect.runs.stream import KEPT_FAILURES
+from detect.runs.frame import FramePlan
+from detect.runs.known import FramesByImage, Known, TiltsByImage
+from detect.runs.rows import KEPT_FAILURES, RunSummary
+from detect.runs.stream import detect_run
 from detect.runs.workers import local_workers
 from detect.settings import CircleSettings
 from landmarks import read_frames
@@ -42,30 +41,33 @@ def run_folder(project_root: Path, tmp_path: Path) -> Path:
     return run
 
 
-def in_two_passes(run: Path, output: Path) -> None:
+def detect(
+    run: Path, places: dict[str, Path], jobs: int = 1, known: Known | None = None, **plan: Any
+) -> RunSummary:
+    """Detect in one pass, with a plan of discs or lines or both."""
     opened = open_run(run)
-    lines, tilt = output / "detected.lines", output / "detected.tilt"
-    detect_lines_run(opened, LineSettings(), lines, tilt, version="test")
-    detect_circles_run(
-        opened, LIGHT, output / "detected.circles", version="test", tilts=TiltsByImage(tilt)
-    )
+    wanted = FramePlan(opened.camera, **plan)
+    pictures = places.pop("pictures", None)
+    workers = local_workers(jobs, large=pictures is not None)
+    return detect_run(opened, wanted, places, known=known, pictures=pictures, workers=workers)
+
+
+def in_folder(folder: Path, *kinds: str) -> dict[str, Path]:
+    return {kind: folder / f"detected.{kind}" for kind in kinds}
+
+
+def in_two_passes(run: Path, output: Path) -> None:
+    detect(run, in_folder(output, "lines", "tilt"), lines=LineSettings())
+    tilts = Known(tilts=TiltsByImage(output / "detected.tilt"))
+    detect(run, in_folder(output, "circles"), known=tilts, circles=LIGHT)
 
 
 def in_one_pass(run: Path, output: Path, jobs: int) -> None:
-    summary = detect_all_run(
-        open_run(run),
-        LineSettings(),
-        LIGHT,
-        output / "detected.lines",
-        output / "detected.tilt",
-        output / "detected.circles",
-        levelling="frame",
-        version="test",
-        workers=local_workers(jobs),
-    )
+    places = in_folder(output, "lines", "tilt", "circles")
+    summary = detect(run, places, jobs, lines=LineSettings(), circles=LIGHT)
     assert (summary.frames, summary.failed) == (FRAMES, 2)
-    assert summary.tilts >= 4
-    assert summary.discs >= 5
+    assert summary.found["tilts"] >= 4
+    assert summary.found["discs"] >= 5
 
 
 def files_in(folder: Path) -> dict[str, bytes]:
@@ -102,45 +104,30 @@ def test_processes_write_what_one_does(run_folder: Path, tmp_path: Path) -> None
 
 def all_there_is(run: Path, output: Path, jobs: int) -> dict[str, bytes]:
     """Every kind of file: rows, tilts, IDs carried over, JSON, drawings."""
-    opened = open_run(run)
     pictures = {kind: folder_of(output / kind) for kind in ("discs", "lines", "tracks")}
-    detect_lines_run(
-        opened,
-        LineSettings(),
-        output / "plain.lines",
-        output / "plain.tilt",
-        version="test",
-        pictures=pictures["lines"],
-        workers=local_workers(jobs, pictures=True),
-    )
+    plain = {"lines": output / "plain.lines", "tilt": output / "plain.tilt"}
+    places = {**plain, "pictures": pictures["lines"]}
+    detect(run, places, jobs, lines=LineSettings(), drawing="lines")
     reference = output / "reference.lines"
     numbered = (
         row[:-2] + f"{number}" if row.startswith("LANDMARK_L") else row
         for number, row in enumerate((output / "plain.lines").read_text().splitlines())
     )
     reference.write_text("\n".join(numbered) + "\n")
-    detect_lines_run(
-        opened,
-        LineSettings(),
-        output / "known.lines",
-        output / "known.tilt",
-        version="test",
-        reference=LinesByImage(reference),
-        pictures=pictures["tracks"],
-        drawing="tracks",
-        draw_response=True,
-        workers=local_workers(jobs, pictures=True),
-    )
-    detect_circles_run(
-        opened,
-        LIGHT,
-        output / "level.circles",
-        version="test",
-        json_output=output / "level.json",
-        tilts=TiltsByImage(output / "plain.tilt"),
-        pictures=pictures["discs"],
-        workers=local_workers(jobs, pictures=True),
-    )
+    places = {
+        "lines": output / "known.lines",
+        "tilt": output / "known.tilt",
+        "pictures": pictures["tracks"],
+    }
+    known = Known(lines=FramesByImage(reference))
+    detect(run, places, jobs, known, lines=LineSettings(), drawing="tracks", draw_response=True)
+    places = {
+        "circles": output / "level.circles",
+        "json": output / "level.json",
+        "pictures": pictures["discs"],
+    }
+    known = Known(tilts=TiltsByImage(plain["tilt"]))
+    detect(run, places, jobs, known, circles=LIGHT, drawing="discs")
     return files_in(output)
 
 
@@ -157,9 +144,7 @@ def test_drawings_ids_and_json_are_the_same_by_any_number(run_folder: Path, tmp_
 
 def test_json_is_what_the_library_writes(run_folder: Path, tmp_path: Path) -> None:
     as_json = tmp_path / "rows.json"
-    detect_circles_run(
-        open_run(run_folder), LIGHT, tmp_path / "o", version="test", json_output=as_json
-    )
+    detect(run_folder, {"circles": tmp_path / "o", "json": as_json}, circles=LIGHT)
     text = as_json.read_text()
     assert text == json.dumps(json.loads(text), indent=1) + "\n"
 
@@ -167,9 +152,7 @@ def test_json_is_what_the_library_writes(run_folder: Path, tmp_path: Path) -> No
 def test_a_run_without_frames(small_run: Path, tmp_path: Path) -> None:
     (small_run / "s.txt").write_text("# nothing yet\n")
     as_json = tmp_path / "rows.json"
-    summary = detect_circles_run(
-        open_run(small_run), LIGHT, tmp_path / "o", version="test", json_output=as_json
-    )
+    summary = detect(small_run, {"circles": tmp_path / "o", "json": as_json}, circles=LIGHT)
     assert (summary.frames, summary.images_without_step) == (0, 3)
     assert json.loads(as_json.read_text())["frames"] == []
     assert list(read_frames(tmp_path / "o")) == []
@@ -180,7 +163,7 @@ def test_failures_are_counted_but_not_all_kept(small_run: Path, tmp_path: Path) 
     with (small_run / "s.txt").open("a") as steps:
         for number in range(count):
             steps.write(f"STEP none.{number} 0.25 0 0.01 1e-5 0 1e-5 0 0 1e-4\n")
-    summary = detect_circles_run(open_run(small_run), LIGHT, tmp_path / "o", version="test")
+    summary = detect(small_run, {"circles": tmp_path / "o"}, circles=LIGHT)
     assert (summary.frames, summary.failed) == (count + 3, count)
     assert len(summary.failures) == KEPT_FAILURES
     assert summary.failures[0].startswith("none.0: no image")
@@ -215,27 +198,14 @@ def test_only_files_are_asked_for_ahead(
     opened = open_run(run_folder)
     frames = Arriving([*opened.frames] * 5, ships_images=ships_images)
     run = replace(opened, frames=frames)
-    summary = detect_circles_run(
-        run, LIGHT, tmp_path / "a.circles", version="test", on_progress=frames.advance
+    summary = detect_run(
+        run,
+        FramePlan(run.camera, circles=LIGHT),
+        {"circles": tmp_path / "a.circles"},
+        on_progress=frames.advance,
     )
     assert summary.frames == frames.done == 5 * FRAMES
     if ships_images:
         assert frames.largest_lead == 0
     else:
         assert 0 < frames.largest_lead <= 128
-
-
-def test_what_was_there_is_collected_again_after_a_run(run_folder: Path, tmp_path: Path) -> None:
-    assert gc.get_freeze_count() == 0
-    thresholds = gc.get_threshold()
-    during = []
-    detect_circles_run(
-        open_run(run_folder),
-        LIGHT,
-        tmp_path / "a.circles",
-        version="test",
-        on_progress=lambda: during.append(gc.get_freeze_count()),
-    )
-    assert min(during) > 0
-    assert gc.get_freeze_count() == 0
-    assert gc.get_threshold() == thresholds

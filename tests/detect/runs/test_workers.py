@@ -24,11 +24,12 @@ from detect.cli import main
 from detect.errors import WorkerError
 from detect.line_settings import LineSettings
 from detect.run import open_run
-from detect.runs.all_run import detect_all_run
 from detect.runs.dispatch import Workers
 from detect.runs.frame import FramePlan
+from detect.runs.stream import detect_run
 from detect.runs.workers import FRAMES_PER_PROCESS, cluster_workers, default_jobs, local_workers
 from detect.settings import CircleSettings
+from tests.detect.interrupted_runs import GROWING
 
 KINDS = ("lines", "tilt", "circles")
 FRAMES = 48
@@ -58,21 +59,12 @@ def detected(
     run: Path, output: Path, workers: Workers, on_progress: Callable[[], None] | None = None
 ) -> list[bytes]:
     output.mkdir()
-    lines, tilt, circles = (output / f"detected.{kind}" for kind in KINDS)
-    summary = detect_all_run(
-        open_run(run),
-        LineSettings(),
-        CircleSettings(polarity="light"),
-        lines,
-        tilt,
-        circles,
-        levelling="frame",
-        version="test",
-        workers=workers,
-        on_progress=on_progress,
-    )
+    places = {kind: output / f"detected.{kind}" for kind in KINDS}
+    opened = open_run(run)
+    plan = FramePlan(opened.camera, LineSettings(), CircleSettings(polarity="light"))
+    summary = detect_run(opened, plan, places, workers=workers, on_progress=on_progress)
     assert (summary.frames, summary.failures) == (FRAMES, [])
-    return [path.read_bytes() for path in (lines, tilt, circles)]
+    return [path.read_bytes() for path in places.values()]
 
 
 def at_frame(number: int, act: Callable[[], None]) -> Callable[[], None]:
@@ -192,7 +184,7 @@ def test_an_interrupt_ends_everything(run_folder: Path, jobs: int, delay_s: floa
     assert err.splitlines()[-1] == "interrupted"
     assert "Traceback" not in err
     left = {path.name for path in run_folder.iterdir()} - set(before)
-    kept = {f".detected.{kind}.part" for kind in (*KINDS, "log.json")} | {".detected.journal"}
+    kept = {f".detected.{kind}.part" for kind in GROWING} | {".detected.journal"}
     assert left in (set(), kept)  # whether a frame was done: `--resume` goes on after it
     assert ("--resume" in err) == bool(left)
     wait_until(lambda: not processes_with(mark), "its processes to end")

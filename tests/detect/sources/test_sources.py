@@ -65,16 +65,15 @@ def test_a_video_gives_the_rows_of_its_images(
 def test_all_of_a_video_is_named_after_it(video: Path) -> None:
     assert main(["all", str(video)]) == 0
     names = sorted(path.name for path in video.parent.iterdir() if "log" not in path.name)
-    endings = ("detected.circles", "detected.lines", "detected.tilt", "detected.times")
-    assert names == sorted(["s.avi", "s.cam", *(f"s.{ending}" for ending in endings)])
+    endings = ("circles", "frames.tilt", "lines", "tilt", "times")
+    assert names == sorted(["s.avi", "s.cam", *(f"s.detected.{ending}" for ending in endings)])
     assert main(["all", str(video)]) == 1  # nothing is overwritten unasked
     lines = video.parent / "s.detected.lines"
     assert main(["export", str(lines)]) == 0
     times = [row.split(",")[2] for row in Path(f"{lines}.csv").read_text().splitlines()[1:]]
     assert set(times) <= {"0.0", "0.1", "0.2"}
-    (video.parent / "s.detected.circles").unlink()
-    (video.parent / "s.detected.lines").unlink()
-    (video.parent / "s.detected.tilt").unlink()
+    for ending in endings[:-1]:
+        (video.parent / f"s.detected.{ending}").unlink()
     assert main(["all", str(video)]) == 1  # the times stand there
 
 

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from camera import Camera
-from detect.verticals.bearing import chain_neighbours, join_mixture
-from detect.verticals.tilt import TiltEstimate
+from detect.verticals.joining import chain_neighbours, join_mixture
+from detect.verticals.tilt import TiltEstimate, level_rotation
 from landmarks import LineLandmark, parse_record
 from tests.reference.verticals import (
     close_groups,
@@ -80,8 +80,6 @@ def test_compensation_gives_the_bearing_of_a_vertical_back(
     bearing: float, low: float, high: float, pitch: float, roll: float
 ) -> None:
     """A camera that is tilted by R sees directions R' times the level ones."""
-    from detect.verticals.tilt import level_rotation
-
     level = np.array([np.sin(bearing), -np.cos(bearing), 0.0])
     ends = [level + np.array([0.0, 0.0, z]) for z in (high, low)]
     seen = [end @ level_rotation(pitch, roll) for end in ends]

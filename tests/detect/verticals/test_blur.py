@@ -16,7 +16,7 @@ from detect.errors import DetectError
 from detect.line_settings import DEFAULT, PUBLISHED, LineSettings
 from detect.lines import detect_lines
 from detect.verticals.blur import blur_of_sharpness, median_sharpness, widened, width_for
-from detect.verticals.fit import FIT_NUMBERS
+from detect.verticals.refinement import LineFits
 from lut.verticals import build_vertical_table
 from tests.detect.line_scene import Edge, pinhole, render, tilted
 
@@ -52,16 +52,22 @@ def test_sharpness_beyond_its_bounds() -> None:
     assert math.isinf(blur_of_sharpness(0.2, 0.8, 1.6))
 
 
+def fits(contrast: NDArray[np.float64], sharpness: NDArray[np.float64]) -> LineFits:
+    one, two = np.ones(len(contrast)), np.ones((len(contrast), 2))
+    four = np.ones((len(contrast), 2, 2))
+    return LineFits(one, one, two, four, one, one, one, contrast, sharpness)
+
+
 def test_the_median_is_that_of_the_edges_that_were_refined() -> None:
     rng = np.random.default_rng(3)
     for count, missing in [(7, 2), (8, 0), (12, 5), (5, 2)]:
-        numbers = rng.random((FIT_NUMBERS, count))
-        numbers[11, rng.permutation(count)[:missing]] = np.nan
-        told = np.sort(numbers[12, np.isfinite(numbers[11])])
-        assert median_sharpness(numbers.ravel()) == told[(len(told) - 1) // 2]
-    numbers[11, 2:] = np.nan
-    assert median_sharpness(numbers.ravel()) == 1.0
-    assert median_sharpness(np.empty(0)) == 1.0
+        contrast, sharpness = rng.random((2, count))
+        contrast[rng.permutation(count)[:missing]] = np.nan
+        told = np.sort(sharpness[np.isfinite(contrast)])
+        assert median_sharpness(fits(contrast, sharpness)) == told[(len(told) - 1) // 2]
+    contrast[2:] = np.nan
+    assert median_sharpness(fits(contrast, sharpness)) == 1.0
+    assert median_sharpness(fits(np.empty(0), np.empty(0))) == 1.0
 
 
 def test_filters_become_as_wide_as_the_blur() -> None:
@@ -103,7 +109,9 @@ def test_sharp_images_are_looked_at_once() -> None:
     found = detect_lines(image, TABLE)
     assert len(found) == len(EDGES)
     assert found.sharpness > DEFAULT.blurred_sharpness
-    np.testing.assert_array_equal(found.numbers, detect_lines(image, TABLE, NEVER_WIDER).numbers)
+    again = detect_lines(image, TABLE, NEVER_WIDER)
+    np.testing.assert_array_equal(found.line_numbers, again.line_numbers)
+    np.testing.assert_array_equal(found.tracks.column, again.tracks.column)
 
 
 @pytest.mark.parametrize("widths", [(1.0,), (2.0, 11.0), (math.nan,)])

@@ -10,11 +10,10 @@ from hypothesis import strategies as st
 from camera import Camera
 from detect.line_settings import DEFAULT
 from detect.lines import detect_lines
-from detect.verticals.chain_kernels import chain_maxima, tilt_of_chains
-from detect.verticals.judgement import limits_of
-from detect.verticals.start_kernels import find_maxima, strongest_first
-from detect.verticals.strip import strip_of
-from detect.verticals.tracks import start_response
+from detect.verticals.judgement import chain_maxima, limits_of, tilt_of_chains
+from detect.verticals.response import start_response, strip_of
+from detect.verticals.tilt import TiltEstimate, known
+from detect.verticals.tracking import find_maxima, strongest_first
 from lut.verticals import build_vertical_table
 from tests.detect.line_scene import Edge, pinhole, render, tilted
 
@@ -31,27 +30,24 @@ def scene(camera: Camera, count: int) -> np.ndarray:
     return render(camera, edges(count), noise=1.0, rng=np.random.default_rng(count))
 
 
-def told_by_the_band(image: np.ndarray) -> np.ndarray:
+def told_by_the_band(image: np.ndarray) -> TiltEstimate:
     response, band = start_response(image, TABLE, DEFAULT)
     maxima = find_maxima(response, band.row, DEFAULT.threshold, band.supported)
-    tilt: np.ndarray = tilt_of_chains(
-        response, band.row, *maxima, TABLE.bearing_rad, strip_of(TABLE).rise,
-        limits_of(DEFAULT, TABLE.row_aspect),
-    )  # fmt: skip
-    return tilt
+    limits = limits_of(DEFAULT, TABLE.row_aspect)
+    return tilt_of_chains(response, band.row, maxima, strip_of(TABLE), limits)
 
 
 @pytest.mark.parametrize("tilt_deg", [(0.0, 0.0), (2.3, 0.5), (-1.5, 2.0), (3.5, -3.0)])
 def test_the_band_tells_the_tilt_of_a_camera(tilt_deg: tuple[float, float]) -> None:
     pitch, roll = np.radians(tilt_deg)
     tilt = told_by_the_band(scene(tilted(CAMERA, pitch, roll), 16))
-    assert tilt[6] >= 14
-    np.testing.assert_allclose(np.degrees(tilt[:2]), tilt_deg, atol=0.35)
+    assert tilt.lines >= 14
+    np.testing.assert_allclose(np.degrees([tilt.pitch_rad, tilt.roll_rad]), tilt_deg, atol=0.35)
 
 
 @pytest.mark.parametrize("count", [0, 2])
 def test_a_band_with_hardly_an_edge_tells_none(count: int) -> None:
-    assert np.isnan(told_by_the_band(scene(CAMERA, count))).all()
+    assert known(told_by_the_band(scene(CAMERA, count))) is None
 
 
 def test_lines_are_those_that_all_edges_tell() -> None:
@@ -70,10 +66,10 @@ def test_chains_go_on_with_the_nearest_maximum_of_their_sign() -> None:
     for k, row in enumerate([{10: 0.5, 20: -0.5}, {9: -0.5, 11: 0.5, 23: -0.5}, {12: 0.5}]):
         for c, value in row.items():
             response[k, c - 1 : c + 2] = value * np.array([0.2, 1.0, 0.2], np.float32)
-    level, column, sign = find_maxima(response, np.zeros((3, 40), np.int32), 0.1, False)
-    np.testing.assert_array_equal(column, [10, 20, 9, 11, 23, 12])
-    np.testing.assert_array_equal(sign, [1.0, -1.0, -1.0, 1.0, -1.0, 1.0])
-    place, below = chain_maxima(response, level, column, sign)
+    maxima = find_maxima(response, np.zeros((3, 40), np.int32), 0.1, False)
+    np.testing.assert_array_equal(maxima.column, [10, 20, 9, 11, 23, 12])
+    np.testing.assert_array_equal(maxima.sign, [1.0, -1.0, -1.0, 1.0, -1.0, 1.0])
+    place, below = chain_maxima(response, maxima)
     np.testing.assert_allclose(place[[0, 1, 4, 5]], [10.0, 20.0, 23.0, 12.0], atol=0.3)
     np.testing.assert_array_equal(below, [3, -1, -1, 5, -1, -1])
 

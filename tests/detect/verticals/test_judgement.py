@@ -8,17 +8,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from detect.vector_code import WORD
-from detect.verticals import judgement_kernels as kernels
+from detect.verticals import judgement
 from detect.verticals.judgement import FATES
-from detect.verticals.order_kernels import descending
-from detect.verticals.step_filters import SUBPIXELS, step_filters
+from detect.verticals.refine_vector_kernels import SUBPIXELS
+from detect.verticals.refinement import step_filters
+from detect.verticals.tilt_error import descending
 
 
 def test_numbers_of_fates_are_places_of_their_names() -> None:
     numbers = {
         name: value
-        for name, value in vars(kernels).items()
-        if name.isupper() and isinstance(value, int)
+        for name, value in vars(judgement).items()
+        if name.isupper() and name[0] != "_" and isinstance(value, int)
     }
     assert sorted(numbers.values()) == list(range(len(FATES)))
     for name, number in numbers.items():
@@ -27,7 +28,7 @@ def test_numbers_of_fates_are_places_of_their_names() -> None:
 
 @pytest.mark.parametrize("sigma", [0.8, 1.2, 1.8, 3.0])
 def test_tabulated_filters_are_derivatives(sigma: float) -> None:
-    filters = step_filters((1.0, sigma))
+    filters = step_filters((1.0, sigma), ())
     half, begin = filters.half[1], filters.begin[1]
     taps = np.arange(-half + 1, half + 1)
     rows = slice(begin, begin + SUBPIXELS * 2 * half)

@@ -9,9 +9,9 @@ import pytest
 from numpy.typing import NDArray
 
 from detect.line_settings import DEFAULT, PUBLISHED, LineSettings
-from detect.verticals.fit_kernels import fit_eigenlines
-from detect.verticals.strip import strip_of
-from detect.verticals.tracks import LineStarts, line_response, line_tracks, start_response
+from detect.verticals.refinement import fit_eigenlines
+from detect.verticals.response import line_response, start_response, strip_of
+from detect.verticals.tracking import LineStarts, LineTracks, line_tracks
 from lut.verticals import build_vertical_table
 from tests.detect.line_scene import Edge, pinhole, render, tilted
 from tests.reference import verticals as reference
@@ -85,17 +85,16 @@ def test_tracks_are_those_of_the_reference(kind: str, settings: LineSettings) ->
 
 
 def test_lines_through_tracks_are_those_of_the_reference() -> None:
-    table, strip = TABLE, strip_of(TABLE)
+    table = TABLE
     rng = np.random.default_rng(8)
     columns = np.arange(CAMERA.width)
     for middle in (40.0, 90.0, 150.0):
         row = np.arange(30, 100, dtype=np.int32)
         column = middle + 0.02 * (row - 60) + rng.normal(0.0, 0.2, len(row))
-        reference_rad, _, line, *_ = fit_eigenlines(
-            table.bearing_rad, strip.rise, np.array([0, len(row)]), row, column,
-            np.ones(len(row), np.float32), 5, 0.0,
-        )  # fmt: skip
+        bounds, score = np.array([0, len(row)]), np.ones(len(row), np.float32)
+        tracks = LineTracks(np.ones(1), bounds, row, column, score, True)
+        fits = fit_eigenlines(strip_of(table), tracks, 5, 0.0)
         bearing = np.interp(column, columns, table.bearing_rad)
         rise = [np.interp(c, columns, table.elevation_tan[v]) for v, c in zip(row, column)]
-        expected = reference.eigenline(bearing, np.array(rise), float(reference_rad[0]))
-        np.testing.assert_allclose(line[0], expected, rtol=1e-5, atol=1e-7)
+        expected = reference.eigenline(bearing, np.array(rise), float(fits.reference[0]))
+        np.testing.assert_allclose(fits.line[0], expected, rtol=1e-5, atol=1e-7)

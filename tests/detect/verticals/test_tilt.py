@@ -12,21 +12,23 @@ from scipy.ndimage import gaussian_filter
 
 from detect.line_settings import DEFAULT
 from detect.lines import detect_lines
-from detect.verticals.judgement_kernels import share_edges
+from detect.verticals.judgement import share_edges
+from detect.verticals.refinement import LineFits
 from detect.verticals.tilt import (
-    STRAY_RAD,
     ConsensusSettings,
     TiltEstimate,
+    Verticals,
+    agree_on_tilt,
     consensus,
-    lean,
+    largest_lean,
     level_rotation,
 )
-from detect.verticals.tilt_kernels import agree_on_tilt, cover_strays
 from lut.verticals import build_vertical_table
 from tests.detect.line_scene import Edge, pinhole, render, tilted
 
 SETTINGS = ConsensusSettings()
-PRIOR_RAD, SOFTENING = SETTINGS.prior_rad, 2.0
+#: The covariance is that of least squares: lines err one by one.
+ONE_BY_ONE = ConsensusSettings(stray_share=0.0)
 
 
 def seen_normals(
@@ -54,7 +56,7 @@ def test_exact_verticals_give_the_tilt_back(pitch: float, roll: float, seed: int
     true = np.radians(pitch), np.radians(roll)
     normal = seen_normals(rng, 20, true, np.zeros(20))
     tilt, consistent = consensus(
-        normal, np.full(20, 1e-10), np.full(20, 0.01), np.full(20, 3.0), SETTINGS
+        Verticals(normal, np.full(20, 1e-10), np.full(20, 0.01), np.full(20, 3.0)), SETTINGS
     )
     assert tilt is not None
     assert consistent.all()
@@ -72,11 +74,13 @@ def test_normalised_error_is_one_among_outliers(true_deg: tuple[float, float]) -
         furniture = rng.normal(size=(4, 3)) * [1.0, 1.0, 0.15]
         furniture /= np.linalg.norm(furniture, axis=1, keepdims=True)
         tilt, consistent = consensus(
-            np.concatenate([normal, furniture]),
-            np.radians(np.concatenate([deviation, np.full(4, 0.1)])) ** 2,
-            np.full(16, np.radians(0.9)),
-            np.full(16, 2.0),
-            SETTINGS,
+            Verticals(
+                np.concatenate([normal, furniture]),
+                np.radians(np.concatenate([deviation, np.full(4, 0.1)])) ** 2,
+                np.full(16, np.radians(0.9)),
+                np.full(16, 2.0),
+            ),
+            ONE_BY_ONE,
         )
         assert tilt is not None
         assert tilt.lines == consistent.sum()
@@ -92,10 +96,12 @@ def test_largest_set_wins_over_the_smallest_tilt() -> None:
     tilted = seen_normals(rng, 8, (0.05, -0.04), np.zeros(8))
     upright = seen_normals(rng, 4, (0.0, 0.0), np.zeros(4))
     tilt, consistent = consensus(
-        np.concatenate([upright, tilted]),
-        np.full(12, 1e-8),
-        np.full(12, 0.01),
-        np.full(12, 3.0),
+        Verticals(
+            np.concatenate([upright, tilted]),
+            np.full(12, 1e-8),
+            np.full(12, 0.01),
+            np.full(12, 3.0),
+        ),
         SETTINGS,
     )
     assert tilt is not None
@@ -110,8 +116,8 @@ def test_order_of_lines_does_not_matter() -> None:
     variance, weight = np.full(15, 4e-6), rng.uniform(1.0, 3.0, 15)
     tolerance = np.full(15, 0.015)
     order = rng.permutation(15)
-    first, _ = consensus(normal, variance, tolerance, weight, SETTINGS)
-    second, _ = consensus(normal[order], variance, tolerance, weight[order], SETTINGS)
+    first, _ = consensus(Verticals(normal, variance, tolerance, weight), SETTINGS)
+    second, _ = consensus(Verticals(normal[order], variance, tolerance, weight[order]), SETTINGS)
     assert isinstance(first, TiltEstimate)
     assert isinstance(second, TiltEstimate)
     assert second.pitch_rad == pytest.approx(first.pitch_rad, abs=1e-12)
@@ -122,7 +128,7 @@ def test_order_of_lines_does_not_matter() -> None:
 def test_too_few_lines_give_no_estimate(count: int) -> None:
     normal = seen_normals(np.random.default_rng(3), count, (0.0, 0.0), np.zeros(count))
     tilt, consistent = consensus(
-        normal, np.full(count, 1e-6), np.full(count, 0.01), np.ones(count), SETTINGS
+        Verticals(normal, np.full(count, 1e-6), np.full(count, 0.01), np.ones(count)), SETTINGS
     )
     assert tilt is None
     assert consistent.all()
@@ -133,104 +139,20 @@ def test_lines_that_no_small_tilt_explains_give_none() -> None:
     normal = seen_normals(np.random.default_rng(4), 10, (0.3, 0.0), np.zeros(10))
     normal = normal[np.abs(normal[:, 1]) > 0.2]
     tilt, consistent = consensus(
-        normal,
-        np.full(len(normal), 1e-8),
-        np.full(len(normal), 0.01),
-        np.ones(len(normal)),
+        Verticals(
+            normal, np.full(len(normal), 1e-8), np.full(len(normal), 0.01), np.ones(len(normal))
+        ),
         SETTINGS,
     )
     assert tilt is None or tilt.lines < len(normal)
     assert not consistent.all()
 
 
-def test_normalised_error_is_one_where_some_edges_are_strays() -> None:
-    """Of few edges one is often all that tells a part of the tilt, and now and then a stray."""
-    rng = np.random.default_rng(6)
-    count, tolerance = 6, np.radians(0.9)
-    known: list[float] = []
-    taken: list[float] = []
-    for _ in range(1500):
-        inclination = rng.normal(0.0, np.radians(0.05), count)
-        stray = rng.random(count) < SETTINGS.stray_share
-        leans = STRAY_RAD * rng.standard_cauchy(count)
-        inclination[stray] = np.where(np.abs(leans) < tolerance, leans, 0.0)[stray]
-        bearing = np.append(rng.uniform(-0.1, 0.1, count - 1), rng.uniform(0.3, 0.6))
-        normal = np.stack([np.cos(bearing), np.sin(bearing), inclination], axis=-1)
-        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-        for share, squared in ((SETTINGS.stray_share, known), (0.0, taken)):
-            tilt, _ = consensus(
-                normal,
-                np.full(count, np.radians(0.03) ** 2),
-                np.full(count, tolerance),
-                np.full(count, 2.0),
-                ConsensusSettings(stray_share=share, building_rad=np.radians(0.04)),
-            )
-            assert tilt is not None
-            error = np.array([tilt.pitch_rad, tilt.roll_rad])
-            squared.append(float(error @ np.linalg.solve(tilt.covariance, error)) / 2.0)
-    assert 0.7 < np.mean(known) < 1.5
-    assert np.quantile(known, 0.98) < 8.0
-    # What it would be if all were taken for verticals.
-    assert np.quantile(taken, 0.98) > 16.0
-
-
-def test_a_stray_that_others_contradict_changes_little() -> None:
-    """Where verticals stand all over the image, none of them is missed."""
-    rng = np.random.default_rng(7)
-    normal = seen_normals(rng, 20, (0.02, -0.01), np.full(20, np.radians(0.05)))
-    given = (
-        normal,
-        np.full(20, np.radians(0.05) ** 2),
-        np.full(20, np.radians(0.9)),
-        np.full(20, 2.0),
-    )
-    tilt, _ = consensus(*given, SETTINGS)
-    without, _ = consensus(*given, ConsensusSettings(stray_share=0.0))
-    assert tilt is not None
-    assert without is not None
-    assert (tilt.pitch_rad, tilt.roll_rad) == (without.pitch_rad, without.roll_rad)
-    ratio = np.linalg.det(tilt.covariance) / np.linalg.det(without.covariance)
-    assert 0.9 < ratio < 1.3
-
-
-@given(seed=st.integers(0, 2**31), share=st.floats(0.001, 0.4))
-@settings(max_examples=25, deadline=None)
-def test_covariance_with_strays_is_that_of_the_mixture(seed: int, share: float) -> None:
-    """Against sums over all edges but one, solved by themselves."""
-    rng = np.random.default_rng(seed)
-    count = 9
-    normal = seen_normals(rng, count, (0.03, 0.01), np.full(count, 2e-3))
-    variance = rng.uniform(1e-6, 9e-6, count)
-    edge = np.array([0, 0, 2, 3, 3, 5, 3, 7, 8])
-    agrees = rng.random(count) < 0.8
-    pitch, roll = 0.028, 0.012
-    turned = normal @ level_rotation(pitch, roll).T
-    slope = np.stack([turned[:, 1], -turned[:, 0]], axis=-1)
-    off, weight = turned[:, 2], 1.0 / (variance + (turned[:, 2] / SOFTENING) ** 2)
-
-    def solve(chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        h = slope[chosen]
-        information = (h.T * weight[chosen]) @ h + np.eye(2) / PRIOR_RAD**2
-        gradient = (h.T * weight[chosen]) @ off[chosen] + np.array([pitch, roll]) / PRIOR_RAD**2
-        covariance = np.linalg.inv(information)
-        return -covariance @ gradient, covariance
-
-    odds, deviations = [1.0], [solve(agrees)[1]]
-    for first in np.unique(edge[agrees]):
-        own = agrees & (edge == first)
-        change, covariance = solve(agrees & ~own)
-        mean = slope[own].mean(axis=0)
-        left = off[own].mean() + mean @ change
-        predicted = variance[own].sum() / own.sum() ** 2 + mean @ covariance @ mean
-        as_vertical = np.exp(-0.5 * left**2 / predicted) / np.sqrt(2.0 * np.pi * predicted)
-        as_stray = 1.0 / (np.pi * STRAY_RAD * (1.0 + (left / STRAY_RAD) ** 2))
-        odds.append(share / (1.0 - share) * as_stray / as_vertical)
-        deviations.append(covariance + np.outer(change, change))
-    expected = np.average(deviations, axis=0, weights=odds)
-    covered = cover_strays(
-        normal, variance, edge, agrees, pitch, roll, PRIOR_RAD, SOFTENING, share, STRAY_RAD
-    )
-    np.testing.assert_allclose(covered, expected, rtol=1e-6)
+def at(place: np.ndarray) -> LineFits:
+    """Lines at bearings in a camera of a thousand pixels per radian."""
+    count = len(place)
+    none, two, four = np.zeros(count), np.zeros((count, 2)), np.zeros((count, 2, 2))
+    return LineFits(place, np.full(count, 1e-3), two, four, none, none, none, none, none)
 
 
 def test_lines_of_one_edge_tell_as_much_as_one() -> None:
@@ -243,24 +165,13 @@ def test_lines_of_one_edge_tell_as_much_as_one() -> None:
     def told(place: np.ndarray, which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         count = len(place)
         variance, weight = np.full(count, 1e-6), np.full(count, 2.0)
-        edge = share_edges(
-            place,
-            np.full(count, 1e-3),
-            np.zeros((count, 2)),
-            np.ones(count),
-            rng.uniform(10.0, 20.0, count),
-            np.arange(count),
-            DEFAULT.same_edge_px,
-            variance,
-            weight,
-        )
+        evidence = rng.uniform(10.0, 20.0, count)
         normal = np.stack([np.cos(bearing), np.sin(bearing), -lean_], axis=-1)[which]
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-        tolerance = np.full(count, 0.015)
-        pitch, roll, covariance, _ = agree_on_tilt(
-            normal, variance, tolerance, weight, edge, 24, 0.1, PRIOR_RAD, SOFTENING, 6,
-            SETTINGS.stray_share, STRAY_RAD,
-        )  # fmt: skip
+        lines = Verticals(normal, variance, np.full(count, 0.015), weight)
+        fits, every = at(place), np.arange(count)
+        share_edges(fits, np.ones(count), evidence, every, DEFAULT.same_edge_px, lines)
+        pitch, roll, covariance, _ = agree_on_tilt(lines, ConsensusSettings(largest_rad=0.1))
         assert weight.sum() == pytest.approx(16.0)
         return np.array([pitch, roll]), covariance
 
@@ -273,16 +184,14 @@ def test_lines_of_one_edge_tell_as_much_as_one() -> None:
 
 def test_edges_of_other_polarity_or_farther_away_are_not_the_same() -> None:
     variance, weight = np.full(5, 1e-6), np.full(5, 3.0)
+    lines = Verticals(np.zeros((5, 3)), variance, np.ones(5), weight)
     edge = share_edges(
-        np.array([0.0, 1e-3, 1e-3, 4e-3, 4.5e-3]),
-        np.full(5, 1e-3),
-        np.zeros((5, 2)),
+        at(np.array([0.0, 1e-3, 1e-3, 4e-3, 4.5e-3])),
         np.array([1.0, 1.0, -1.0, 1.0, 1.0]),
         np.array([10.0, 12.0, 30.0, 9.0, 8.0]),
         np.arange(5),
         DEFAULT.same_edge_px,
-        variance,
-        weight,
+        lines,
     )
     np.testing.assert_array_equal(edge, [0, 0, 2, 3, 3])
     np.testing.assert_allclose(variance, [2e-6, 2e-6, 1e-6, 2e-6, 2e-6])
@@ -296,7 +205,8 @@ def test_blurred_edges_among_texture_do_not_overstate_the_tilt(narrow: bool) -> 
     Filters as wide as the blur even that out, and are not believed as far as these edges, which
     stand alone, would allow.
     """
-    chosen = replace(DEFAULT, blurred_widths=()) if narrow else DEFAULT
+    chosen = replace(DEFAULT, stray_share=0.0)
+    chosen = replace(chosen, blurred_widths=()) if narrow else chosen
     camera = pinhole(320, 160, 200.0, pitch_deg=10.0, row_aspect=2.0)
     table = build_vertical_table(camera)
     rng = np.random.default_rng(9)
@@ -321,4 +231,5 @@ def test_lean_is_what_a_tilted_camera_sees() -> None:
     level = np.array([np.cos(bearing), np.sin(bearing), 0.0])
     measured = level @ level_rotation(pitch, roll)
     # In the chart X = a + b Z the plane's normal is (left - a ahead, -b).
-    assert -measured[2] == pytest.approx(float(lean(bearing, pitch, roll)), abs=3e-4)
+    seen = largest_lean(np.array([bearing]), pitch, roll)
+    assert abs(measured[2]) == pytest.approx(seen, abs=3e-4)

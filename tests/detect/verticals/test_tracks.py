@@ -13,15 +13,18 @@ from hypothesis.extra import numpy as hnp
 from detect.line_settings import DEFAULT, PUBLISHED, LineSettings
 from detect.vector_code import LANES
 from detect.verticals.band_vector_kernels import RUN, TILE
-from detect.verticals.filter import FilteredColumns, gaussian_window, start_band
-from detect.verticals.start_kernels import find_starts
-from detect.verticals.tilt import TiltEstimate
-from detect.verticals.tracks import (
+from detect.verticals.response import (
+    gaussian_window,
+    line_filter,
     line_response,
-    line_starts,
-    line_tracks,
+    padded_pixels,
+    response_on_demand,
+    start_band,
     start_response,
+    strip_of,
 )
+from detect.verticals.tilt import TiltEstimate
+from detect.verticals.tracking import find_maxima, line_starts, line_tracks, ordered_starts
 from lut.verticals import build_vertical_table
 from tests.detect.line_scene import Edge, pinhole, render, tilted
 
@@ -105,7 +108,8 @@ def test_starts_have_company_on_a_neighbouring_row_of_the_band() -> None:
     image = render(CAMERA, [Edge(0.2, 40.0), Edge(-0.1, 90.0)], grey=60.0, noise=12.0, rng=rng)
     response, band = start_response(image, TABLE, DEFAULT)
     assert band.supported
-    row, column, sign, score = find_starts(response, band.row, DEFAULT.threshold, False)
+    maxima = find_maxima(response, band.row, DEFAULT.threshold, False)
+    row, column, sign, score = ordered_starts(response, band.row, maxima)
     level = {(int(band.row[k, c]), c): k for k in range(len(band.row)) for c in range(96)}
     k = np.array([level[v, c] for v, c in zip(row.tolist(), column.tolist())])
     beside = np.abs(k[:, None] - k) == 1
@@ -137,7 +141,7 @@ def test_tracks_bridge_gaps_up_to_a_length(gap: int) -> None:
     image[below : below + gap] = 110
     starts = line_starts(image, TABLE, replace(DEFAULT, start_band_rows=0))
     tracks = line_tracks(image, starts, TABLE, DEFAULT)
-    assert len(tracks) == 1
+    assert len(tracks.polarity) == 1
     assert tracks.top_row[0] == DEFAULT.border_rows
     if gap == 5:
         assert tracks.bottom_row[0] == 63 - DEFAULT.border_rows
@@ -175,7 +179,7 @@ def test_no_horizon_no_tracks() -> None:
     response = line_response(image, table, DEFAULT)
     assert not response.any()
     tracks = line_tracks(image, line_starts(image, table, DEFAULT), table, DEFAULT)
-    assert len(tracks) == 0
+    assert len(tracks.polarity) == 0
 
 
 # -- evaluated only where needed: against the filter evaluated everywhere -------------------------
@@ -195,7 +199,7 @@ def test_tracks_see_the_same_response_as_the_whole_strip(
     response = line_response(image, table, preset)
     tracks = line_tracks(image, line_starts(image, table, preset), table, preset)
     assert tracks.points.sum() > 100
-    for t in range(len(tracks)):
+    for t in range(len(tracks.polarity)):
         part = slice(tracks.bounds[t], tracks.bounds[t + 1])
         column = np.rint(tracks.column[part]).astype(int)
         signed = (
@@ -226,11 +230,12 @@ def test_tracks_see_the_same_response_at_the_borders() -> None:
 def test_what_was_filtered_before_gives_the_same_tracks() -> None:
     image = render(CAMERA, [Edge(0.1, 80.0), Edge(-0.15, -60.0)], grey=100.0)
     starts = line_starts(image, TABLE, DEFAULT)
-    filtered = FilteredColumns.none_yet(TABLE)
+    window = line_filter(DEFAULT)
+    lazy = response_on_demand(padded_pixels(image, window), strip_of(TABLE), window)
     tilt = TiltEstimate(0.01, -0.02, np.eye(2), 3)
     fresh = line_tracks(image, starts, TABLE, DEFAULT, tilt)
-    line_tracks(image, starts, TABLE, DEFAULT, filtered=filtered)
-    again = line_tracks(image, starts, TABLE, DEFAULT, tilt, filtered)
+    line_tracks(lazy, starts, TABLE, DEFAULT)
+    again = line_tracks(lazy, starts, TABLE, DEFAULT, tilt)
     for name in ("row", "column", "score", "bounds", "polarity"):
         np.testing.assert_array_equal(getattr(again, name), getattr(fresh, name))
 

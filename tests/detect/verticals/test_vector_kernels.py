@@ -14,8 +14,14 @@ from detect.verticals.filter_vector_kernels import (
     response_along,
     response_along_two,
 )
-from detect.verticals.refine_vector_kernels import ROWS, heights, move_crossings, newton_sums
-from detect.verticals.step_filters import SUBPIXELS, step_filters
+from detect.verticals.refine_vector_kernels import (
+    ROWS,
+    SUBPIXELS,
+    heights,
+    move_crossings,
+    newton_sums,
+)
+from detect.verticals.refinement import step_filters
 
 
 @njit(error_model="numpy")
@@ -45,7 +51,7 @@ def sums_of_rows(
 @pytest.mark.parametrize("sigma", [0.8, 1.2, 3.0])
 def test_sums_over_the_rows_of_a_line(sigma: float) -> None:
     rng = np.random.default_rng(2)
-    filters = step_filters((0.8, sigma) if sigma != 0.8 else (1.8, sigma))
+    filters = step_filters((0.8, sigma) if sigma != 0.8 else (1.8, sigma), ())
     rows, width = 3 * ROWS, 50
     grey = rng.integers(0, 256, (rows, width)).astype(np.uint8)
     margin = 16.0

@@ -1,28 +1,230 @@
-"""Compiled loops that fit lines to tracks: arrays in, arrays out.
+"""Refinement: straight lines through tracks, moved to where the grey values are steepest.
 
 Lines are described in the chart round a reference bearing phi: a direction at bearing phi + d whose
 elevation has tangent e is X = tan(d), Z = e / cos(d). There every line is straight, X = a + b Z; a
 is the tangent of its bearing at the horizon relative to phi, b its lean.
+
+A step of the grey value at u is seen by H(u) = sum of d G(d) I / sigma^2 over the pixels, d their
+distances from u and G a Gaussian: its height, if u is where the step is. H is largest there; its
+first and second derivatives, times sigma^2, have the weights (q - 1) G and (q - 3) d / sigma^2 G,
+q = d^2 / sigma^2. Newton's method moves a line to the maximum of the sum of H over its rows.
 """
 
 from __future__ import annotations
 
 import math
+from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from detect.vector_code import LANES
-from detect.verticals.group_kernels import MARGIN, STEP
-from detect.verticals.refine_vector_kernels import ROWS, heights, move_crossings, newton_sums
+from detect.line_settings import LineSettings
+from detect.vector_code import LANES, WORD
+from detect.verticals.refine_vector_kernels import (
+    ROWS,
+    SUBPIXELS,
+    heights,
+    move_crossings,
+    newton_sums,
+)
+from detect.verticals.response import Strip
+from detect.verticals.response_kernels import MARGIN, STEP
+from detect.verticals.tracking import LineTracks
 
-_Floats = NDArray[np.float64]
+FloatArray = NDArray[np.float64]
 
+#: Beyond so many standard deviations there is nothing left of the Gaussian.
+_REACH = 4.4
 #: Up to here series of tangents and arc tangents are as good as these.
 _SMALL = 0.1
 #: A step is not repeated where it moved no row farther than this, pixels.
 _STILL_PX = 0.02
+
+
+class Eigenlines(NamedTuple):
+    """Lines through tracks by the eigen-decomposition of their points' scatter.
+
+    Attributes
+    ----------
+    reference : (T,) float64
+        Bearing round which each line's chart lies (rad).
+    pixel : (T,) float64
+        Width of a column there (rad).
+    line : (T, 2) float64
+        a, b of X = a + b Z along the larger eigenvalue's eigenvector; NaN, as what follows, for
+        tracks that are left alone or of less than 3 points.
+    scatter_px : (T,) float64
+        Root of the smaller eigenvalue of the points' covariance, pixels.
+    middle, spread : (T,) float64
+        Mean of the points' Z, and its variance.
+    rise, off : (P,) float64
+        Tangent of the elevation of each point, and its bearing from the chart's origin (rad); of
+        tracks that are not left alone.
+    """
+
+    reference: FloatArray
+    pixel: FloatArray
+    line: FloatArray
+    scatter_px: FloatArray
+    middle: FloatArray
+    spread: FloatArray
+    rise: FloatArray
+    off: FloatArray
+
+
+class LineFits(NamedTuple):
+    """Straight lines through tracks, each in the chart round a reference bearing.
+
+    Attributes
+    ----------
+    reference_rad : (T,) float64
+        Bearing of the chart's origin.
+    pixel_rad : (T,) float64
+        Width of a pixel's column at the horizon there.
+    line : (T, 2) float64
+        a, b; NaN where there is no line.
+    covariance : (T, 2, 2) float64
+        Covariance of a, b, due to noise.
+    scatter_px : (T,) float64
+        Root-mean-square distance of the tracked points from their straight line, pixels.
+    shift_px : (T,) float64
+        How far the refinement took the line's middle, pixels.
+    spread : (T,) float64
+        Variance of the points' Z.
+    contrast : (T,) float64
+        Height of the step in grey values, as the fine filter sees it; NaN without refinement.
+    sharpness : (T,) float64
+        Contrast at the fine scale relative to the coarse one, at most 1; 1 without refinement.
+    """
+
+    reference_rad: FloatArray
+    pixel_rad: FloatArray
+    line: FloatArray
+    covariance: FloatArray
+    scatter_px: FloatArray
+    shift_px: FloatArray
+    spread: FloatArray
+    contrast: FloatArray
+    sharpness: FloatArray
+
+
+class StepFilters(NamedTuple):
+    """The steps of the refinement, and tables of their filters, one behind the other, each once.
+
+    Attributes
+    ----------
+    half : (K + 2,) int64
+        The filter at a position in pixels i to i + 1 covers ``2 half`` pixels, from i - half + 1.
+        The last two are those whose contrasts are compared, a fine and a coarse one.
+    begin : (K + 2,) int64
+        Where each filter's weights begin: `SUBPIXELS` rows of ``2 half``, and one of zeros.
+    height : (N,) float32
+        Weights of the step's height; each row has the sum 0.
+    derivatives : (2 N,) float32
+        Those of its derivatives times sigma^2: `WORD` (`detect.vector_code`) of the
+        first, then as many of the second, and so on.
+    farthest : (K,) float64
+        How far a step may take the middle of a line, pixels; one that would go farther is not made,
+        nor any after it. With no step the lines stay as tracked.
+    """
+
+    half: NDArray[np.int64]
+    begin: NDArray[np.int64]
+    height: NDArray[np.float32]
+    derivatives: NDArray[np.float32]
+    farthest: FloatArray
+
+
+@lru_cache(maxsize=16)
+def refinement_of(settings: LineSettings, steps: int | None = None) -> StepFilters:
+    """Filters of the settings' (first) steps and of the two contrasts; how far a step may go."""
+    some = settings.refine_steps_px[:steps]
+    scales = (*(scale for scale, _ in some), settings.fine_scale_px, settings.coarse_scale_px)
+    return step_filters(scales, tuple(distance for _, distance in some))
+
+
+def step_filters(sigmas_px: tuple[float, ...], farthest_px: tuple[float, ...]) -> StepFilters:
+    """Tables for Gaussians of some widths, pixels, in this order."""
+    halves, tables = [], []
+    # Equal ones share a table.
+    widths = list(dict.fromkeys(sigmas_px))
+    for sigma in widths:
+        half = 4 * math.ceil(_REACH * sigma / 4.0)
+        halves.append(half)
+        position = (np.arange(SUBPIXELS)[:, None] + 0.5) / SUBPIXELS
+        d = np.arange(-half + 1, half + 1) - position
+        q = (d / sigma) ** 2
+        gaussian = np.exp(-0.5 * q)
+        weights = np.stack(
+            [d / sigma**2 * gaussian, (q - 1.0) * gaussian, (q - 3.0) * d / sigma**2 * gaussian]
+        )
+        # What is cut off must not see the image's brightness.
+        weights -= weights.mean(axis=-1, keepdims=True)
+        weights = np.pad(weights, [(0, 0), (0, 1), (0, 0)])
+        tables.append(weights.reshape(3, -1))
+    height, first, second = np.concatenate(tables, axis=-1).astype(np.float32)
+    begins = np.concatenate([[0], np.cumsum([(SUBPIXELS + 1) * 2 * half for half in halves])])
+    which = [widths.index(sigma) for sigma in sigmas_px]
+    return StepFilters(
+        half=np.array(halves, np.int64)[which],
+        begin=begins.astype(np.int64)[which],
+        height=height,
+        derivatives=np.stack([first.reshape(-1, WORD), second.reshape(-1, WORD)], 1).reshape(-1),
+        farthest=np.array(farthest_px, np.float64),
+    )
+
+
+@njit(cache=True, error_model="numpy")
+def fit_lines(
+    image: NDArray[np.uint8], strip: Strip, tracks: LineTracks, filters: StepFilters,
+    least_points: int, least_score: float,
+) -> LineFits:  # fmt: skip
+    """Fit lines to tracks, and refine them.
+
+    Parameters
+    ----------
+    image : (H, W) uint8
+        Grey values.
+    strip, tracks, filters
+        The table, the tracks, the steps of the refinement; where there are none the covariance is
+        that of independent points with the scatter that the track shows.
+    least_points, least_score : int, float
+        Tracks of fewer points, or of a smaller sum of scores, are left alone.
+    """
+    of_track = fit_eigenlines(strip, tracks, least_points, least_score)
+    count = len(of_track.reference)
+    if len(filters.farthest) > 0:
+        line, covariance, shift_px, contrast, sharpness = refine_lines(
+            image, strip, tracks, of_track, filters
+        )
+    else:
+        line = of_track.line
+        covariance = regression_covariance(of_track, tracks.bounds)
+        shift_px = np.zeros(count)
+        contrast = np.full(count, np.nan)
+        sharpness = np.ones(count)
+    return LineFits(
+        of_track.reference, of_track.pixel, line, covariance, of_track.scatter_px, shift_px,
+        of_track.spread, contrast, sharpness,
+    )  # fmt: skip
+
+
+@njit(cache=True, error_model="numpy")
+def regression_covariance(lines: Eigenlines, bounds: NDArray[np.int64]) -> FloatArray:
+    """(T, 2, 2) covariance of a, b of regressions on points with independent errors."""
+    middle, count = lines.middle, len(lines.pixel)
+    covariance = np.empty((count, 2, 2))
+    for t in range(count):
+        points = bounds[t + 1] - bounds[t]
+        of_mean = (lines.scatter_px[t] * lines.pixel[t]) ** 2 / max(points - 2, 1)
+        of_lean = of_mean / lines.spread[t]
+        covariance[t, 0, 0] = of_mean + middle[t] * middle[t] * of_lean
+        covariance[t, 0, 1] = -middle[t] * of_lean
+        covariance[t, 1, 0] = covariance[t, 0, 1]
+        covariance[t, 1, 1] = of_lean
+    return covariance
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
@@ -43,45 +245,14 @@ def _arctan_series(x: float) -> float:
 
 @njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"})
 def fit_eigenlines(
-    bearing: NDArray[np.float64],
-    elevation: NDArray[np.float32],
-    bounds: NDArray[np.int64],
-    row: NDArray[np.int32],
-    column: NDArray[np.float64],
-    score: NDArray[np.float32],
-    least_points: int,
-    least_score: float,
-) -> tuple[_Floats, _Floats, _Floats, _Floats, _Floats, _Floats, _Floats, _Floats]:
+    strip: Strip, tracks: LineTracks, least_points: int, least_score: float
+) -> Eigenlines:
     """Straight lines through tracks, by the eigen-decomposition of their points' scatter.
 
-    Parameters
-    ----------
-    bearing
-        The table's.
-    elevation
-        See `detect.verticals.strip.Strip.rise`.
-    bounds, row, column, score
-        The tracks (see `follow_edges`).
-    least_points, least_score : int, float
-        Tracks of fewer points, or of a smaller sum of scores, are left alone.
-
-    Returns
-    -------
-    reference : (T,) float64
-        Bearing round which each line's chart lies (rad).
-    pixel : (T,) float64
-        Width of a column there (rad).
-    line : (T, 2) float64
-        a, b of X = a + b Z along the larger eigenvalue's eigenvector; NaN, as what follows, for
-        tracks that are left alone or of less than 3 points.
-    scatter_px : (T,) float64
-        Root of the smaller eigenvalue of the points' covariance, pixels.
-    middle, spread : (T,) float64
-        Mean of the points' Z, and its variance.
-    rise, off : (P,) float64
-        Tangent of the elevation of each point, and its bearing from the chart's origin (rad); of
-        tracks that are not left alone.
+    Tracks of fewer points, or of a smaller sum of scores, are left alone.
     """
+    bearing, elevation = strip.bearing, strip.rise
+    bounds, row, column, score = tracks.bounds, tracks.row, tracks.column, tracks.score
     count = len(bounds) - 1
     reference = np.empty(count)
     pixel = np.empty(count)
@@ -162,30 +333,14 @@ def fit_eigenlines(
         line[t, 0] = mean_x - b * mean_z
         line[t, 1] = b
         scatter_px[t] = math.sqrt(max(smaller, 0.0)) / pixel[t]
-    return reference, pixel, line, scatter_px, middle, spread, rise, off
+    return Eigenlines(reference, pixel, line, scatter_px, middle, spread, rise, off)
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"}, forceinline=True)
 def refine_lines(
-    image: NDArray[np.uint8],
-    strip: NDArray[np.float32],
-    bearing: NDArray[np.float64],
-    sign: NDArray[np.float64],
-    bounds: NDArray[np.int64],
-    row: NDArray[np.int32],
-    column: NDArray[np.float64],
-    reference: NDArray[np.float64],
-    pixel: NDArray[np.float64],
-    middle: NDArray[np.float64],
-    rise: NDArray[np.float64],
-    point_off: NDArray[np.float64],
-    half: NDArray[np.int64],
-    begin_of: NDArray[np.int64],
-    height_weights: NDArray[np.float32],
-    derivatives: NDArray[np.float32],
-    farthest: NDArray[np.float64],
-    tracked_line: NDArray[np.float64],
-) -> tuple[_Floats, _Floats, _Floats, _Floats, _Floats]:
+    image: NDArray[np.uint8], strip: Strip, tracks: LineTracks, lines: Eigenlines,
+    filters: StepFilters,
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:  # fmt: skip
     """Move lines to where the grey values are steepest along all of their rows together.
 
     Newton's method on the sum, over a track's rows, of the derivative-of-Gaussian response at the
@@ -201,36 +356,20 @@ def refine_lines(
     ----------
     image : (H, W) uint8
         Grey values.
-    strip
-        See `detect.verticals.strip.Strip.column`.
-    bearing
-        The table's.
-    sign, bounds, row, column
-        The tracks (see `follow_edges`).
-    reference, pixel, middle, rise, point_off
-        See `fit_eigenlines`.
-    half, begin_of, height_weights, derivatives
-        Filters (see `detect.verticals.step_filters.StepFilters`): of each step of Newton's method,
-        and two whose contrasts are compared, a fine and a coarse one.
-    farthest : (K,) float64
-        How far a step may take the middle of a line, pixels; one that would go farther is not made,
-        nor any after it.
-    tracked_line : (T, 2) float64
-        a, b of the lines to begin with; NaN for those that are left alone.
+    strip, tracks, lines, filters
+        The table, the tracks, lines through them, and the filters of each step.
 
     Returns
     -------
-    line : (T, 2) float64
-        a, b; NaN where no step was made.
-    covariance : (T, 2, 2) float64
-        Of a, b; NaN as above.
-    shift_px : (T,) float64
-        How far the steps took the middle of the line, pixels.
-    contrast : (T,) float64
-        Height of the step, grey values, as the fine filter sees it; NaN as above.
-    sharpness : (T,) float64
-        That contrast relative to the one that the coarse filter sees, at most 1; 1 as above.
+    line, covariance, shift_px, contrast, sharpness
+        See `LineFits`; NaN (sharpness 1) where no step was made.
     """
+    columns_of, bearing = strip.column, strip.bearing
+    sign, bounds, row, column = tracks.polarity, tracks.bounds, tracks.row, tracks.column
+    reference, pixel, middle, rise = lines.reference, lines.pixel, lines.middle, lines.rise
+    point_off, tracked_line = lines.off, lines.line
+    half, begin_of, farthest = filters.half, filters.begin, filters.farthest
+    height_weights, derivatives = filters.height, filters.derivatives
     count = len(sign)
     line = np.full((count, 2), np.nan)
     covariance = np.full((count, 2, 2), np.nan)
@@ -297,8 +436,8 @@ def refine_lines(
             group = j // STEP
             base = min(max(group * STEP - MARGIN, 0), width - LANES)
             place = (group * height + v) * LANES + j - base
-            columns[i] = strip[place]
-            next_columns[i] = strip[place + 1]
+            columns[i] = columns_of[place]
+            next_columns[i] = columns_of[place + 1]
         for i in range(n):
             columns_per_rad = 1.0 / (next_bearings[i] - bearings[i])
             at = (phi + turn[i] - bearings[i]) * columns_per_rad

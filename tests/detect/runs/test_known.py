@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from detect.runs.by_image import LinesByImage, TiltsByImage
+from detect.runs.known import FramesByImage, Known, TiltsByImage
 from landmarks import LandmarkFileError, read_frames, read_tilts
 
 LINES = """\
@@ -39,16 +39,16 @@ TILT k.0001 0.040000 0.001000 4e-06 0 5e-06 4
 def test_lines_are_those_of_the_frame(tmp_path: Path, line_end: str, mark: bytes) -> None:
     path = tmp_path / "k.lines"
     path.write_bytes(mark + LINES.replace("\n", line_end).encode())
-    found = LinesByImage(path)
+    found = Known(lines=FramesByImage(path))
     for frame in list(read_frames(path))[:3]:
-        assert tuple(found.get(frame.step.prefix) or ()) == frame.lines
-    (line,) = found.get("k.0001.png") or ()
+        assert found.of(frame.step.prefix).lines == frame.lines
+    (line,) = found.of("k.0001.png").lines
     assert (line.alpha, line.ids) == (0.25, (7,))
-    assert [line.ids for line in found.get("k.0002") or ()] == [(8, 9), (-1,)]
-    assert found.get("k.0000") == ()
-    (last,) = found.get("k.0003") or ()
+    assert [line.ids for line in found.of("k.0002").lines] == [(8, 9), (-1,)]
+    assert found.of("k.0000").lines == ()
+    (last,) = found.of("k.0003").lines
     assert last.ids == (4,)
-    assert found.get("k.0004") is None
+    assert found.of("k.0004").lines == ()
 
 
 def test_tilts_are_those_of_the_whole_file(tmp_path: Path) -> None:
@@ -67,6 +67,6 @@ def test_malformed_files_are_named(tmp_path: Path) -> None:
         TiltsByImage(path)
     path.write_text(LINES + "LANDMARK_L 0 0\n")
     with pytest.raises(LandmarkFileError, match="k:14: "):
-        LinesByImage(path)
+        FramesByImage(path)
     with pytest.raises(LandmarkFileError, match="no such"):
-        LinesByImage(tmp_path / "none")
+        FramesByImage(tmp_path / "none")

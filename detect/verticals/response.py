@@ -1,16 +1,34 @@
-"""The filter that finds edges along the verticals, and where it is evaluated."""
+"""Response: how much a step of the grey value along a vertical explains.
+
+A *strip* image has a pixel (v, c) for row v of the vertical that crosses the horizon at column c
+(see `lut.verticals`): the building's verticals are its columns, whatever the camera's pose and
+distortion. With Gaussian weights g round a pixel of the strip and h, the distance across the
+vertical in units of its weighted standard deviation, the response is the sign of the covariance
+times
+
+    Cov_g(h, I)^2 / (Var_g(I) + regulariser),
+
+the squared correlation of grey value and distance (DLR Spatial Cognition data set report, line
+detection). Affine changes of brightness change it only through the regulariser.
+
+It is evaluated on the rows round the horizon on which tracks start (`start_response`), and where
+tracks go (`ResponseOnDemand`); everywhere only for drawings (`line_response`).
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from functools import lru_cache
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from detect.line_settings import LineSettings
+from detect.vector_code import LANES, WORD
+from detect.verticals.band_vector_kernels import RUN, TILE
+from detect.verticals.response_kernels import MARGIN, STEP, band_response, strip_response
 from lut.verticals import VerticalTable
 
 FloatArray = NDArray[np.float64]
@@ -20,8 +38,7 @@ T = TypeVar("T", bound=np.generic)
 _CROSSED = 3
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class LineFilter:
+class LineFilter(NamedTuple):
     """Weights of the filter.
 
     Attributes
@@ -45,13 +62,12 @@ class LineFilter:
     regulariser: np.float32
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class StartBand:
+class StartBand(NamedTuple):
     """The rows parallel to the anchor on which tracks start, and what the filter needs there.
 
     The anchor is the horizon, or what stands for it (`lut.verticals`). Rows of the band are counted
-    from there: row i is `first_offset` + i rows below it. The filter is evaluated on its row s
-    (half the filter's length) and every `spacing` from there.
+    from there; the filter is evaluated on its row s (half the filter's length) and every `spacing`
+    from there.
 
     Attributes
     ----------
@@ -100,31 +116,89 @@ class StartBand:
     supported: bool
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class FilteredColumns:
-    """Where an image has been filtered so far, and the responses there; tracks extend it.
+class Strip(NamedTuple):
+    """A table of verticals as compiled code reads it: in groups of `LANES` neighbours.
+
+    Groups begin `STEP` columns apart, `MARGIN` columns before the first that is theirs.
 
     Attributes
     ----------
+    column : (G * H * L,) float32
+        Columns at which the L verticals of a group cross rows, row by row, for one group after the
+        other; NaN where they are not seen.
+    ends : (G, 4) int32
+        First and last row in which any of the group's verticals is seen; first and last row in
+        which all are, the first after the last where there are none.
+    first_row, last_row : (W,) int32
+        First and last row in which each vertical is seen.
+    rise : (W, H) float32
+        Tangents of elevations: the table's, column by column, as tracks read them.
+    lean_by_pitch, lean_by_roll : (W,) float64
+        By how many columns of the strip a vertical moves for a rise of 1 in a camera of unit pitch,
+        and of unit roll; NaN where there is no vertical, or none beside it.
+    bearing, anchor_row, robot_from_camera, row_aspect
+        See `lut.verticals.VerticalTable`.
+    """
+
+    column: NDArray[np.float32]
+    ends: NDArray[np.int32]
+    first_row: NDArray[np.int32]
+    last_row: NDArray[np.int32]
+    rise: NDArray[np.float32]
+    lean_by_pitch: FloatArray
+    lean_by_roll: FloatArray
+    bearing: FloatArray
+    anchor_row: FloatArray
+    robot_from_camera: FloatArray
+    row_aspect: float
+
+
+class ResponseOnDemand(NamedTuple):
+    """The response of one image, evaluated where it is asked for (`response_kernels.respond`).
+
+    Attributes
+    ----------
+    pixels : (N,) uint8
+        Grey values in scan order; where T > 2r + 2, behind the last of them as many as that more.
+    strip : Strip
+        At least `LANES` columns wide.
+    window : LineFilter
+        The filter.
     response : (G * H * L,) float32
         Responses at L neighbouring columns of the strip, a group, row by row, for one group after
         the other; only rows that are known mean anything.
     known : (G, 2) int32
         First of these rows, and the one after the last, of each group.
+    moments : (3 * H * L,) float32
+        Means, covariances and mean squares across the verticals of the group evaluated last.
+    moment_rows : (3,) int64
+        That group, the first of the rows for which there are moments, and the one after the last.
     """
 
+    pixels: NDArray[np.uint8]
+    strip: Strip
+    window: LineFilter
     response: NDArray[np.float32]
     known: NDArray[np.int32]
+    moments: NDArray[np.float32]
+    moment_rows: NDArray[np.int64]
 
-    @classmethod
-    def none_yet(cls, table: VerticalTable) -> FilteredColumns:
-        """Nothing has been filtered."""
-        from detect.vector_code import LANES
-        from detect.verticals.group_kernels import STEP
 
-        height, width = table.column.shape
-        groups = -(-width // STEP)
-        return cls(np.empty(groups * height * LANES, np.float32), np.zeros((groups, 2), np.int32))
+@njit(cache=True, error_model="numpy")
+def response_on_demand(
+    pixels: NDArray[np.uint8], strip: Strip, window: LineFilter
+) -> ResponseOnDemand:
+    """The response of an image, of which nothing is evaluated yet."""
+    height = strip.rise.shape[1]
+    return ResponseOnDemand(
+        pixels,
+        strip,
+        window,
+        np.empty(len(strip.column), np.float32),
+        np.zeros((len(strip.ends), 2), np.int32),
+        np.empty(3 * height * LANES, np.float32),
+        np.full(3, -1, np.int64),
+    )
 
 
 def gaussian_window(sigma: float) -> FloatArray:
@@ -146,7 +220,6 @@ def _weights_across(sigma_px: float, spacing_px: float) -> FloatArray:
 @lru_cache(maxsize=16)
 def line_filter(settings: LineSettings) -> LineFilter:
     """The filter that settings ask for."""
-    from detect.vector_code import WORD
 
     weights = _weights_across(settings.sigma_across_px, 1.0)
     # Moments between two pixels are those of both, interpolated; so are the weights.
@@ -178,7 +251,6 @@ def start_band(table: VerticalTable, settings: LineSettings) -> StartBand:
     StartBand
         Computed once for each table.
     """
-    from detect.verticals.band_vector_kernels import TILE
 
     window = line_filter(settings)
     r, s = window.weights.shape[1] // 2, len(window.along) // 2
@@ -231,7 +303,6 @@ def start_band(table: VerticalTable, settings: LineSettings) -> StartBand:
 
 def _in_tiles(rows: NDArray[T]) -> NDArray[T]:
     """(P // TILE, R, TILE) of (R, P)."""
-    from detect.verticals.band_vector_kernels import TILE
 
     tiles = rows.reshape(len(rows), -1, TILE).transpose(1, 0, 2)
     return np.ascontiguousarray(tiles)
@@ -242,7 +313,6 @@ def _runs_of_neighbours(
 ) -> tuple[NDArray[np.int32], NDArray[np.uint8], NDArray[np.int32], NDArray[np.int32]]:
     """See `StartBand`: runs, lengths, odd, odd_bounds."""
     from detect.vector_code import LANES
-    from detect.verticals.band_vector_kernels import RUN
 
     block = pixel.reshape(-1, RUN)
     breaks = np.diff(block, axis=1) != 1
@@ -267,3 +337,84 @@ def _typical_spacing(x: FloatArray, shown: NDArray[np.bool_]) -> float:
     """Median distance of neighbouring verticals in a row, pixels; 1 where there are none."""
     both = shown[1:] & shown[:-1]
     return float(np.median(np.abs(np.diff(x)[both]))) if both.any() else 1.0
+
+
+@lru_cache(maxsize=4)
+def strip_of(table: VerticalTable) -> Strip:
+    """The strip of a table; made once for each."""
+    height, width = table.column.shape
+    base = np.clip(np.arange(0, width, STEP) - MARGIN, 0, max(width - LANES, 0))
+    member = np.minimum(base[:, None] + np.arange(LANES), width - 1)
+    seen = table.usable[member]
+    first, last = table.first_row[member], table.last_row[member]
+    ends = np.stack(
+        [
+            np.where(seen, first, height).min(axis=1),
+            np.where(seen, last, -1).max(axis=1),
+            np.where(seen, first, height).max(axis=1),
+            np.where(seen, last, -1).min(axis=1),
+        ],
+        axis=1,
+    )
+    bearing = table.bearing_rad
+    per_rad = np.full(width, np.nan)
+    per_rad[1:-1] = 2.0 / (bearing[2:] - bearing[:-2])
+    return Strip(
+        column=np.ascontiguousarray(table.column.T[member].transpose(0, 2, 1)).reshape(-1),
+        ends=ends.astype(np.int32),
+        first_row=table.first_row,
+        last_row=table.last_row,
+        rise=np.ascontiguousarray(table.elevation_tan.T),
+        lean_by_pitch=np.sin(bearing) * per_rad,
+        lean_by_roll=-np.cos(bearing) * per_rad,
+        bearing=bearing,
+        anchor_row=table.anchor_row,
+        robot_from_camera=table.robot_from_camera,
+        row_aspect=table.row_aspect,
+    )
+
+
+def line_response(
+    image: NDArray[np.uint8], table: VerticalTable, settings: LineSettings
+) -> NDArray[np.float32]:
+    """The response at every pixel of the strip.
+
+    Parameters
+    ----------
+    image : (H, W) uint8
+        Grey values.
+    table : VerticalTable
+        Of the image's camera.
+    settings : LineSettings
+        Widths of the filter, regulariser.
+
+    Returns
+    -------
+    (H, W) float32
+        In [-1, 1], positive where the image is brighter on the right; 0 where it is not defined.
+    """
+    column = np.ascontiguousarray(table.column)
+    return strip_response(image, column, strip_of(table), line_filter(settings))
+
+
+def start_response(
+    image: NDArray[np.uint8], table: VerticalTable, settings: LineSettings
+) -> tuple[NDArray[np.float32], StartBand]:
+    """The response on the rows on which tracks start, as `line_response` up to a few percent.
+
+    Returns
+    -------
+    response : (K, W) float32
+        In the rows of the band.
+    band : StartBand
+        Which rows these are.
+    """
+    band = start_band(table, settings)
+    return band_response(np.ascontiguousarray(image), band, line_filter(settings)), band
+
+
+def padded_pixels(image: NDArray[np.uint8], window: LineFilter) -> NDArray[np.uint8]:
+    """The image in scan order, and behind it what the filter's weights of zero need."""
+    flat = image.reshape(-1)
+    missing = window.weights_between.shape[1] - window.weights.shape[1] - 1
+    return np.pad(flat, (0, missing)) if missing else flat

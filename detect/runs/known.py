@@ -1,14 +1,20 @@
-"""What a file says of each image, looked up while a run goes by: little of it is in memory."""
+"""What is known of each frame of a run beforehand: tilts, and landmarks with IDs.
+
+Files are looked into while the run goes by: little of them is in memory.
+"""
 
 from __future__ import annotations
 
 from array import array
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
 from detect.discs.identity import MappedDisc
+from detect.errors import DetectError
 from detect.runs.image_names import image_name
 from detect.runs.name_index import NameIndex
 from landmarks import (
@@ -23,9 +29,79 @@ from landmarks import (
     read_rows,
 )
 from landmarks.map_file import read_map, read_path
+from storage.bounds import NOT_NEGATIVE, demand
+
+T_co = TypeVar("T_co", covariant=True)
 
 #: Discs of a map that are farther from a frame than this are not looked for in it, metres.
 _REACH_M = 20.0
+
+
+class ByPrefix(Protocol[T_co]):
+    """Something of each frame, by its image's prefix: a dict, or a file that is looked into."""
+
+    def get(self, prefix: str, /) -> T_co | None: ...
+
+
+class KnownOfFrame(NamedTuple):
+    """What is known of a frame: see `Known`."""
+
+    tilt: FrameTilt | None = None
+    lines: tuple[LineLandmark, ...] = ()
+    discs: tuple[CircleLandmark, ...] = ()
+    discs_level: bool = False
+    mapped: tuple[MappedDisc, ...] = ()
+    slack_m: float = 0.1
+
+
+NOTHING = KnownOfFrame()
+
+
+@dataclass(frozen=True)
+class Known:
+    """What is known of the frames of a run.
+
+    Attributes
+    ----------
+    tilts : mapping, optional
+        Tilts by image prefix, for frames whose verticals are not looked for.
+    lines : mapping, optional
+        Frames by image prefix whose lines have IDs: carried over where the match is unambiguous.
+    discs : mapping, optional
+        Frames by image prefix whose discs have IDs: carried over to the rows of the same discs.
+    discs_level : bool
+        Whether these are corrected for the tilt.
+    mapped : mapping, optional
+        Discs of a map by image prefix: rows that `discs` knows nothing of get the ID of the one
+        that they fall on.
+    slack_m : float
+        Standard deviation of where these are, besides their covariances, metres.
+    """
+
+    tilts: ByPrefix[FrameTilt] | None = None
+    lines: ByPrefix[Frame] | None = None
+    discs: ByPrefix[Frame] | None = None
+    discs_level: bool = False
+    mapped: ByPrefix[Sequence[MappedDisc]] | None = None
+    slack_m: float = 0.1
+
+    def __post_init__(self) -> None:
+        demand(self, DetectError, slack_m=NOT_NEGATIVE)
+
+    def of(self, prefix: str) -> KnownOfFrame:
+        """What is known of a frame."""
+        if all(source is None for source in (self.tilts, self.lines, self.discs, self.mapped)):
+            return NOTHING
+        lines = None if self.lines is None else self.lines.get(prefix)
+        discs = None if self.discs is None else self.discs.get(prefix)
+        return KnownOfFrame(
+            None if self.tilts is None else self.tilts.get(prefix),
+            () if lines is None else lines.lines,
+            () if discs is None else discs.circles,
+            self.discs_level,
+            () if self.mapped is None else tuple(self.mapped.get(prefix) or ()),
+            self.slack_m,
+        )
 
 
 class TiltsByImage:
@@ -101,30 +177,6 @@ class FramesByImage:
         with self._path.open("rb") as stream:
             stream.seek(self._offsets[place])
             return next(frames_of_rows(parse_rows(stream, str(self._path))))
-
-
-class LinesByImage:
-    """The lines of a ``.lines`` file, by the name of their image; see `FramesByImage`."""
-
-    def __init__(self, path: Path) -> None:
-        self._frames = FramesByImage(path)
-
-    def get(self, prefix: str) -> Sequence[LineLandmark] | None:
-        """The lines of a frame; None if the file does not know it."""
-        frame = self._frames.get(prefix)
-        return None if frame is None else frame.lines
-
-
-class DiscsByImage:
-    """The discs of a ``.circles`` file, by the name of their image; see `FramesByImage`."""
-
-    def __init__(self, path: Path) -> None:
-        self._frames = FramesByImage(path)
-
-    def get(self, prefix: str) -> Sequence[CircleLandmark] | None:
-        """The discs of a frame; None if the file does not know it."""
-        frame = self._frames.get(prefix)
-        return None if frame is None else frame.circles
 
 
 class MapByImage:

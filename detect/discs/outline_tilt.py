@@ -1,0 +1,337 @@
+"""The tilt of the floor that the outlines of discs show.
+
+A disc of known radius r on a level floor looks like a circle there. On a robot that tilts, what the
+calibrated camera takes for the floor is another plane, on which the outline is an ellipse:
+
+    | A(c; t) (p - c) | = r,
+
+where p is a point of the outline as the calibrated floor has it, c the centre, t = (pitch, roll)
+the rotation that turns measured directions level, and A the derivative of levelling at c. Each disc
+whose rim is in view (`detect.discs.rim`) gives an estimate of t by least squares in pixels; the
+robust mean over the discs of a frame is its tilt. Neighbouring points of a rim err together, paper
+is not flat, and floors are uneven: both are stated, for a disc and for a frame.
+
+Distances to a plane from the outline of a circle on it: D. Forsyth et al., Invariant Descriptors
+for 3D Object Recognition and Pose, PAMI 13 (1991).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from camera import Camera
+from camera.kernels import camera_numbers
+from detect.discs.rim import DIRECTIONS, profiles, rim_points
+from detect.verticals.tilt import level_matrix
+
+#: Directions in which the rim must lie on the ellipse.
+LEAST_DIRECTIONS = 24
+#: The ellipse's shortest half axis must be as long, pixels.
+LEAST_AXIS_PX = 1.2
+#: Least contrast, grey levels.
+LEAST_CONTRAST = 8.0
+#: Standard deviation of a point of a rim, pixels, and how many points err together.
+POINT_SIGMA_PX, TOGETHER = 0.25, 4.0
+#: What tilts of single discs, and of the floor under all of a frame's, deviate from the robot's.
+DISC_SIGMA_RAD, FLOOR_SIGMA_RAD = math.radians(0.45), math.radians(0.3)
+
+_ANGLES = 2.0 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
+_COS, _SIN = np.cos(_ANGLES), np.sin(_ANGLES)
+_STEP_RAD = 1e-4
+_ITERATIONS = 7
+#: Degrees of freedom of Student's density of discs' tilts.
+_FREEDOM = 4.0
+
+
+class OutlineTilt(NamedTuple):
+    """Pitch and roll by discs' outlines (rad), their covariance (rad^2), and how many discs."""
+
+    pitch: float
+    roll: float
+    cpp: float
+    cpr: float
+    crr: float
+    discs: int
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _derivative_of_levelling(
+    rotation: NDArray[np.float64], centre: NDArray[np.float64], x: float, y: float
+) -> tuple[float, float, float, float]:
+    """d(levelled x, y) / d(x, y) of a point of the calibrated floor, row by row."""
+    dx, dy, dz = x - centre[0], y - centre[1], -centre[2]
+    down = rotation[2, 0] * dx + rotation[2, 1] * dy + rotation[2, 2] * dz
+    along = rotation[0, 0] * dx + rotation[0, 1] * dy + rotation[0, 2] * dz
+    aside = rotation[1, 0] * dx + rotation[1, 1] * dy + rotation[1, 2] * dz
+    height = rotation[2, 0] * centre[0] + rotation[2, 1] * centre[1] + rotation[2, 2] * centre[2]
+    scale = -height / down
+    return (
+        scale * (rotation[0, 0] - along / down * rotation[2, 0]),
+        scale * (rotation[0, 1] - along / down * rotation[2, 1]),
+        scale * (rotation[1, 0] - aside / down * rotation[2, 0]),
+        scale * (rotation[1, 1] - aside / down * rotation[2, 1]),
+    )
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _contrast(grey: NDArray[np.float64]) -> float:
+    """Grey levels within half a radius minus those beyond one and a third."""
+    inside = outside = 0.0
+    inside_count = outside_count = 0
+    for k in range(grey.shape[0]):
+        for m in range(4):
+            if not math.isnan(grey[k, m]):
+                inside += grey[k, m]
+                inside_count += 1
+        for m in range(grey.shape[1] - 8, grey.shape[1]):
+            if not math.isnan(grey[k, m]):
+                outside += grey[k, m]
+                outside_count += 1
+    return inside / inside_count - outside / outside_count
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def inverted(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Inverse of a small positive definite matrix, by Gauss and Jordan.
+
+    NumPy's would have Numba look LAPACK up at the first call, which an interrupt must not meet.
+    """
+    n = len(matrix)
+    left, right = matrix.copy(), np.eye(n)
+    for i in range(n):
+        pivot = left[i, i]
+        for j in range(n):
+            left[i, j] /= pivot
+            right[i, j] /= pivot
+        for k in range(n):
+            if k != i:
+                share = left[k, i]
+                for j in range(n):
+                    left[k, j] -= share * left[i, j]
+                    right[k, j] -= share * right[i, j]
+    return right
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def fit_outline(
+    point_xy: NDArray[np.float64],
+    px_per_m: NDArray[np.float64],
+    centre: NDArray[np.float64],
+    x: float,
+    y: float,
+    radius: float,
+) -> tuple[bool, NDArray[np.float64], NDArray[np.float64]]:
+    """The tilt of one disc by points of its outline.
+
+    Parameters
+    ----------
+    point_xy : (N, 2) float64
+        Points of the outline on the calibrated floor, relative to (x, y), metres; NaN where it
+        is not seen.
+    px_per_m : (N,) float64
+        Scale of the image along each point's direction.
+    centre : (3,) float64
+        Of the camera, robot frame, metres.
+    x, y, radius : float
+        About the middle of the disc, and its radius, metres.
+
+    Returns
+    -------
+    found : bool
+        Whether enough of the outline is on the ellipse.
+    tilt : (2,) float64
+        Pitch and roll (rad).
+    covariance : (2, 2) float64
+        From the points alone (rad^2).
+    """
+    count = len(point_xy)
+    unknowns = np.zeros(4)  # of the centre, metres; pitch, roll
+    weight, residual, row = np.zeros(count), np.zeros(count), np.zeros((count, 4))
+    for k in range(count):
+        weight[k] = 0.0 if math.isnan(point_xy[k, 0]) else 1.0
+    normal, inverse, sigma = np.zeros((4, 4)), np.zeros((4, 4)), 0.0
+    shapes = np.empty((5, 4))
+    for iteration in range(_ITERATIONS):
+        pitch, roll = unknowns[2], unknowns[3]
+        for i in range(5):
+            by_pitch = _STEP_RAD * ((i == 1) - (i == 2))
+            by_roll = _STEP_RAD * ((i == 3) - (i == 4))
+            rotation = level_matrix(pitch + by_pitch, roll + by_roll)
+            a, b, c, d = _derivative_of_levelling(rotation, centre, x, y)
+            shapes[i, 0], shapes[i, 1], shapes[i, 2], shapes[i, 3] = a, b, c, d
+        for k in range(count):
+            if math.isnan(point_xy[k, 0]):
+                continue
+            px, py = point_xy[k, 0] - unknowns[0], point_xy[k, 1] - unknowns[1]
+            lengths = np.empty(5)
+            for i in range(5):
+                a, b, c, d = shapes[i]
+                lengths[i] = math.sqrt((a * px + b * py) ** 2 + (c * px + d * py) ** 2)
+            a, b, c, d = shapes[0]
+            across, along = (a * px + b * py) / lengths[0], (c * px + d * py) / lengths[0]
+            residual[k] = (lengths[0] - radius) * px_per_m[k]
+            row[k, 0] = -(across * a + along * c) * px_per_m[k]
+            row[k, 1] = -(across * b + along * d) * px_per_m[k]
+            row[k, 2] = (lengths[1] - lengths[2]) / (2.0 * _STEP_RAD) * px_per_m[k]
+            row[k, 3] = (lengths[3] - lengths[4]) / (2.0 * _STEP_RAD) * px_per_m[k]
+        if iteration > 1:
+            # The first steps go from a level floor to the tilted one, with all points.
+            sigma = max(0.1, 1.48 * np.median(np.abs(residual[weight > 0.0])))
+            for k in range(count):
+                if weight[k] > 0.0:
+                    weight[k] = 1.0 / (1.0 + (residual[k] / (2.0 * sigma)) ** 2) ** 2
+        normal[:, :] = 0.0
+        right = np.zeros(4)
+        for k in range(count):
+            for i in range(4):
+                right[i] -= weight[k] * row[k, i] * residual[k]
+                for j in range(4):
+                    normal[i, j] += weight[k] * row[k, i] * row[k, j]
+        for i in range(4):
+            normal[i, i] *= 1.0 + 1e-9
+        inverse = inverted(normal)
+        for i in range(4):
+            for j in range(4):
+                unknowns[i] += inverse[i, j] * right[j]
+    on = 0
+    squares = weights = 0.0
+    for k in range(count):
+        on += weight[k] > 0.0 and abs(residual[k]) < 3.0 * sigma
+        squares += weight[k] * residual[k] ** 2
+        weights += weight[k]
+    variance = max(squares / weights, POINT_SIGMA_PX**2) * TOGETHER
+    found = bool(on >= LEAST_DIRECTIONS and np.abs(unknowns[2:]).max() < 0.3)
+    return found, unknowns[2:], variance * inverse[2:, 2:]
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def mean_of_tilts(
+    tilt: NDArray[np.float64], covariance: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Mean of discs' tilts by Student's density, and its covariance.
+
+    Parameters
+    ----------
+    tilt : (N, 2) float64
+        Pitch and roll (rad).
+    covariance : (N, 2, 2) float64
+        Of them (rad^2).
+
+    Returns
+    -------
+    mean : (2,) float64
+    covariance : (2, 2) float64
+    """
+    mean = np.array([np.median(tilt[:, 0]), np.median(tilt[:, 1])])
+    information = np.zeros((len(tilt), 2, 2))
+    for k in range(len(tilt)):
+        information[k] = inverted(covariance[k])
+    of_mean = np.zeros((2, 2))
+    for _ in range(_ITERATIONS):
+        total = np.zeros((2, 2))
+        right = np.zeros(2)
+        for k in range(len(tilt)):
+            off = tilt[k] - mean
+            squared = 0.0
+            for i in range(2):
+                for j in range(2):
+                    squared += off[i] * information[k, i, j] * off[j]
+            weight = (_FREEDOM + 2.0) / (_FREEDOM + squared)
+            total += weight * information[k]
+            for i in range(2):
+                for j in range(2):
+                    right[i] += weight * information[k, i, j] * tilt[k, j]
+        of_mean = inverted(total)
+        for i in range(2):
+            mean[i] = of_mean[i, 0] * right[0] + of_mean[i, 1] * right[1]
+    return mean, of_mean
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _tilt_of_outlines(
+    image: NDArray[np.uint8],
+    numbers: NDArray[np.float64],
+    centre: NDArray[np.float64],
+    floor_xy: NDArray[np.float64],
+    radius: float,
+    height_ratio: float,
+) -> tuple[int, NDArray[np.float64], NDArray[np.float64]]:
+    """How many discs, their mean tilt and its covariance."""
+    tilts, covariances = np.empty((len(floor_xy), 2)), np.empty((len(floor_xy), 2, 2))
+    used = 0
+    point_xy = np.empty((DIRECTIONS, 2))
+    for k in range(len(floor_xy)):
+        x, y = floor_xy[k, 0], floor_xy[k, 1]
+        grey, scale = profiles(image, numbers, x, y, radius)
+        if not scale.min() >= LEAST_AXIS_PX:
+            continue
+        contrast = _contrast(grey)
+        if not abs(contrast) >= LEAST_CONTRAST:
+            continue
+        distance, _ = rim_points(grey, scale, contrast)
+        if np.count_nonzero(~np.isnan(distance)) < LEAST_DIRECTIONS:
+            continue
+        point_xy[:, 0] = radius * distance * _COS
+        point_xy[:, 1] = radius * distance * _SIN
+        # What a higher camera sees is larger than the calibrated floor has it.
+        seen_radius = radius / height_ratio
+        found, tilt, covariance = fit_outline(point_xy, scale / radius, centre, x, y, seen_radius)
+        if found:
+            tilts[used] = tilt
+            covariances[used] = covariance
+            for i in range(2):
+                covariances[used, i, i] += DISC_SIGMA_RAD**2
+            used += 1
+    if used == 0:
+        return 0, np.zeros(2), np.zeros((2, 2))
+    mean, covariance = mean_of_tilts(tilts[:used], covariances[:used])
+    for i in range(2):
+        covariance[i, i] += FLOOR_SIGMA_RAD**2
+    return used, mean, covariance
+
+
+def tilt_of_outlines(
+    image: NDArray[np.uint8],
+    camera: Camera,
+    floor_xy: NDArray[np.float64],
+    radius_m: float,
+    raised_m: float = 0.0,
+) -> OutlineTilt | None:
+    """The tilt that the outlines of the discs in an image show.
+
+    Parameters
+    ----------
+    image : (H, W) uint8
+        The image.
+    camera : Camera
+        The camera as calibrated.
+    floor_xy : (N, 2) float64
+        Where discs were seen, nothing levelled, metres.
+    radius_m : float
+        Their radius.
+    raised_m : float
+        How much higher the camera is than calibrated.
+
+    Returns
+    -------
+    OutlineTilt or None
+        None where no disc's rim is in view.
+    """
+    discs, mean, covariance = _tilt_of_outlines(
+        image,
+        camera_numbers(camera),
+        np.array(camera.centre),
+        floor_xy,
+        radius_m,
+        1.0 + raised_m / float(camera.centre[2]),
+    )
+    if discs == 0:
+        return None
+    pitch, roll = mean.tolist()
+    (cpp, cpr), (_, crr) = covariance.tolist()
+    return OutlineTilt(pitch, roll, cpp, cpr, crr, discs)

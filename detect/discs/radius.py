@@ -1,0 +1,76 @@
+"""The radius of the discs in some images: that at which the evidence of all of them is largest.
+
+Discs are searched at radii that grow by a constant factor; a parabola through the logarithms of the
+best three radii gives the peak. Evidence is a log-odds (`detect.discs.evidence_kernels`), in which
+the radius of each fit has a part, so that its sum over the discs is a likelihood of the radius.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from camera import Camera
+from detect.circles import detect_circles, disc_shape
+from detect.settings import CircleSettings
+from lut import build_disc_table
+
+#: Radii that are tried, metres, and the factor from one to the next.
+SMALLEST_M, LARGEST_M = 0.02, 0.5
+FACTOR = 1.1
+#: So many discs must be found at the best of them.
+LEAST_DISCS = 3
+
+
+class RadiusEstimate(NamedTuple):
+    """A radius, its standard deviation (metres), and how many discs showed it."""
+
+    radius_m: float
+    sigma_m: float
+    discs: int
+
+
+def find_radius(
+    images: Sequence[NDArray[np.uint8]], camera: Camera, settings: CircleSettings
+) -> RadiusEstimate | None:
+    """Find the radius of the discs in some images.
+
+    Parameters
+    ----------
+    images : sequence of (H, W) uint8
+    camera : Camera
+        The calibrated camera.
+    settings : CircleSettings
+        What to look for; its radius does not matter.
+
+    Returns
+    -------
+    RadiusEstimate or None
+        None where fewer than `LEAST_DISCS` discs are found at any radius.
+    """
+    count = math.ceil(math.log(LARGEST_M / SMALLEST_M) / math.log(FACTOR))
+    radii = SMALLEST_M * FACTOR ** np.arange(count + 1)
+    evidence, discs = np.zeros(len(radii)), np.zeros(len(radii), np.int64)
+    for k, radius_m in enumerate(radii.tolist()):
+        tried = replace(settings, radius_m=radius_m)
+        table = build_disc_table(camera, disc_shape(tried))
+        for image in images:
+            found = detect_circles(image, camera, table, tried)
+            evidence[k] += found.evidence.sum()
+            discs[k] += len(found)
+    best = int(np.argmax(np.where(discs >= LEAST_DISCS, evidence, -np.inf)))
+    if discs[best] < LEAST_DISCS:
+        return None
+    shift = 0.0
+    if 0 < best < count:
+        before, here, after = evidence[best - 1 : best + 2]
+        shift = 0.5 * (after - before) / (2.0 * here - before - after)
+    radius_m = float(radii[best] * FACTOR**shift)
+    # A camera that leans otherwise than calibrated sees discs some percent larger or smaller.
+    sigma_m = 0.5 * radius_m * math.log(FACTOR)
+    return RadiusEstimate(radius_m, sigma_m, int(discs[best]))

@@ -1,0 +1,134 @@
+"""How a camera is mounted, by a drive with it: its constant lean, and its height over the floor.
+
+The lean is what the verticals of all frames show (`detect.run_tilt`). The height follows from the
+outlines of discs of known size: at a wrong height they agree with a circle at another pitch than
+that of the verticals (`detect.discs.outline_tilt`). Both assume that the lens is right.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from camera import Camera
+from detect.run_tilt import COMMON_RAD, LEAST_FRAMES, FrameTilts, tilt_of_run
+
+FloatArray = NDArray[np.float64]
+
+#: Outlines of discs are tried at heights that differ by these shares of the calibrated one.
+HEIGHT_STEPS = (-0.06, 0.0, 0.06)
+#: How well a radius is known, relative: where the edge of a blurred disc is, and of its print.
+_RADIUS_SIGMA = 0.01
+#: So many neighbouring frames see the same discs.
+_TOGETHER = 5.0
+
+
+@dataclass(frozen=True)
+class Mounting:
+    """How a camera is mounted, compared with its calibration.
+
+    Attributes
+    ----------
+    pitch_rad, roll_rad : float
+        Rotation vector (pitch, roll, 0) about the robot's X and Y that turns measured directions
+        level.
+    pitch_sigma_rad, roll_sigma_rad : float
+        Standard deviations, that of the lens included.
+    raised_m, raised_sigma_m : float
+        How much higher the camera is than calibrated; NaN where too few discs tell.
+    frames : int
+        Frames whose verticals have a tilt.
+    frames_with_discs : int
+        Those of them whose discs told the height.
+    """
+
+    pitch_rad: float
+    roll_rad: float
+    pitch_sigma_rad: float
+    roll_sigma_rad: float
+    raised_m: float
+    raised_sigma_m: float
+    frames: int
+    frames_with_discs: int
+
+    def sentences(self) -> list[str]:
+        """What was found, in words."""
+        pitch, roll = math.degrees(self.pitch_rad), math.degrees(self.roll_rad)
+        sigmas = math.degrees(self.pitch_sigma_rad), math.degrees(self.roll_sigma_rad)
+        lines = [
+            f"the camera leans {pitch:.2f} +- {sigmas[0]:.2f} degrees (pitch) and {roll:.2f} +- "
+            f"{sigmas[1]:.2f} (roll) from its calibration, by the verticals of {self.frames} frames"
+        ]
+        if math.isnan(self.raised_m):
+            lines.append("its height is left as calibrated: too few discs tell it")
+        else:
+            lines.append(
+                f"it hangs {100.0 * self.raised_m:+.1f} +- {100.0 * self.raised_sigma_m:.1f} cm "
+                f"from the calibrated height, by the discs of {self.frames_with_discs} frames"
+            )
+        return lines
+
+
+def mounting_of_run(
+    height_m: float, verticals: FrameTilts, outline_pitch_rad: FloatArray
+) -> Mounting | None:
+    """The mounting that a run shows.
+
+    Parameters
+    ----------
+    height_m : float
+        Calibrated height of the camera.
+    verticals : FrameTilts
+        Tilts of N frames by their verticals.
+    outline_pitch_rad : (N, 3) float64
+        Pitch by the outlines of the discs, the height changed by each of `HEIGHT_STEPS`; NaN where
+        no outlines are.
+
+    Returns
+    -------
+    Mounting or None
+        None where too few frames have a tilt by verticals (`detect.run_tilt.LEAST_FRAMES`).
+    """
+    run = tilt_of_run(verticals)
+    if run is None:
+        return None
+    pitch, roll = run.axes
+    known = np.isfinite(outline_pitch_rad).all(axis=1) & np.isfinite(verticals.tilt[:, 0])
+    raised_m = sigma_m = math.nan
+    count = int(np.count_nonzero(known))
+    if count >= LEAST_FRAMES:
+        # Pitch by outlines is nearly linear in the height; frames share the slope.
+        lower, same, higher = (outline_pitch_rad[known] - verticals.tilt[known, :1]).T
+        slope = float(np.median(higher - lower)) / (HEIGHT_STEPS[2] - HEIGHT_STEPS[0])
+        bend = float(np.median(higher + lower - 2.0 * same)) / HEIGHT_STEPS[2] ** 2
+        off = float(np.median(same))
+        share = -off / slope
+        for _ in range(5):
+            share = -(off + 0.5 * bend * share**2) / slope
+        spread = 1.4826 * float(np.median(np.abs(same - off)))
+        statistical = spread * math.sqrt(0.5 * math.pi * _TOGETHER / count) / abs(slope)
+        raised_m = share * height_m
+        sigma_m = height_m * math.hypot(statistical, COMMON_RAD / slope, _RADIUS_SIGMA)
+    return Mounting(
+        pitch_rad=pitch.lean,
+        roll_rad=roll.lean,
+        pitch_sigma_rad=pitch.lean_sigma,
+        roll_sigma_rad=roll.lean_sigma,
+        raised_m=raised_m,
+        raised_sigma_m=sigma_m,
+        frames=int(np.count_nonzero(np.isfinite(verticals.tilt[:, 0]))),
+        frames_with_discs=count,
+    )
+
+
+def remounted(camera: Camera, mounting: Mounting) -> Camera:
+    """The camera as it is mounted, turned about the robot's origin on the floor."""
+    turn = Rotation.from_rotvec([mounting.pitch_rad, mounting.roll_rad, 0.0]).as_matrix()
+    up = np.array([0.0, 0.0, 0.0 if math.isnan(mounting.raised_m) else mounting.raised_m])
+    pose = np.column_stack([turn @ camera.rotation, turn @ (camera.centre + up)])
+    a, b, c = ((float(x), float(y), float(z), float(t)) for x, y, z, t in pose)
+    return replace(camera, robot_from_camera=(a, b, c))

@@ -1,0 +1,325 @@
+"""The commands ``detect circles``, ``lines``, ``markers`` and ``all``: a run in, files out."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from detect import __version__
+from detect.drawing.head import read_head
+from detect.errors import EXIT_FRAMES_FAILED, DetectError, FrameError, WorkerError
+from detect.options import All, Circles, DetectorFlags, DiscIdOptions, Lines, Markers
+from detect.run import ImageRun, Run, read_image
+from detect.runs.conduct import Conduct
+from detect.runs.dispatch import Workers
+from detect.runs.frame import Drawing, FramePlan
+from detect.runs.known import FramesByImage, Known, MapByImage, TiltsByImage
+from detect.runs.outputs import frames_tilt_place
+from detect.runs.progress import print_failures, progress_bar
+from detect.runs.rows import RunSummary
+from detect.runs.run_log import log_place
+from detect.runs.stream import detect_run, make_folder
+from detect.runs.workers import cluster_workers, default_jobs, local_workers
+from detect.settings import CircleSettings
+from detect.sources.opening import open_calibrated, open_source
+from storage.kernel_loading import load_kernels_alone
+
+#: The radius of the discs is found in about so many images.
+_RADIUS_IMAGES = 12
+#: Of runs of at least so many frames it is said when there are hardly any discs in them, and that
+#: the radius is another where it differs by this (its logarithm).
+_FEWEST_FRAMES, _OTHER_RADIUS = 10, 0.15
+
+
+class _Job(NamedTuple):
+    """What a command asks for: see `detect.runs.stream.detect_run`."""
+
+    label: str
+    run: ImageRun
+    plan: FramePlan
+    places: Mapping[str, Path]
+    known: Known | None = None
+    pictures: Path | None = None
+    crlf: bool = False
+    named_after: Path | None = None  # whose name the log has, if it is not the output
+
+
+def perform(command: DetectorFlags) -> int:
+    """Carry a command out; returns the exit code."""
+    job = _job_of(command)
+    log = log_place(job.named_after or next(iter(job.places.values())))
+    name = type(command).__name__.lower()
+    conduct = Conduct(__version__, command.force, job.crlf, log, name, command.conduct)
+    with progress_bar(job.label, job.run.frames.expected) as advance:
+        summary = detect_run(
+            job.run,
+            job.plan,
+            job.places,
+            known=job.known,
+            pictures=job.pictures,
+            workers=_workers(command, job),
+            on_progress=advance,
+            conduct=conduct,
+        )
+    _tell_results(job, summary)
+    _tell_blind_to_verticals(job, summary)
+    _tell_folded_lens(job)
+    _advise(job, summary)
+    if summary.images_without_step:
+        print(f"{summary.images_without_step} {job.run.frames.why_left_out}")
+    print_failures(summary.failed, summary.failures)
+    return EXIT_FRAMES_FAILED if summary.failed else 0
+
+
+def _job_of(command: DetectorFlags) -> _Job:
+    if isinstance(command, Markers):
+        return _markers(command)
+    run = open_calibrated(command.run, command.camera, command.source)
+    if isinstance(command, Circles):
+        return _circles(command, run)
+    if isinstance(command, Lines):
+        return _lines(command, run)
+    assert isinstance(command, All)
+    return _all(command, run)
+
+
+def _circles(command: Circles, run: Run) -> _Job:
+    places = {"circles": _output(command, run, "circles")}
+    if command.json is not None:
+        places["json"] = command.json
+    drawing: Drawing | None = None if command.draw is None else "discs"
+    settings = _with_radius(command.settings, run) if command.find_radius else command.settings
+    return _Job(
+        "discs",
+        run,
+        FramePlan(run.camera, circles=settings, drawing=drawing),
+        places,
+        _known(command.ids, tilts=command.tilt),
+        command.draw,
+        command.line_ends == "crlf",
+    )
+
+
+def _lines(command: Lines, run: Run) -> _Job:
+    output = _output(command, run, "lines")
+    settings = command.settings
+    if command.join_threshold is not None:
+        # On the horizon straight ahead, a bearing of one radian is scale_x pixels wide.
+        settings = replace(settings, join_px=command.join_threshold * run.camera.scale_x)
+    plan = FramePlan(run.camera, lines=settings)
+    if command.draw is not None:
+        drawing: Drawing = "tracks" if command.rejected else "lines"
+        plan = replace(plan, drawing=drawing, draw_response=command.response)
+    return _Job(
+        "lines",
+        run,
+        plan,
+        {"lines": output, "tilt": command.tilt or output.with_suffix(".tilt")},
+        _known(lines=command.ids_from),
+        command.draw,
+        command.line_ends == "crlf",
+    )
+
+
+def _markers(command: Markers) -> _Job:
+    run = open_source(command.run, command.camera, command.source)
+    camera = run.camera if isinstance(run, Run) else None
+    drawing: Drawing | None = None if command.draw is None else "markers"
+    return _Job(
+        "markers",
+        run,
+        FramePlan(camera, markers=command.settings, drawing=drawing),
+        {"markers": _output(command, run, "markers")},
+        pictures=command.draw,
+    )
+
+
+def _all(command: All, run: Run) -> _Job:
+    if command.output is not None:
+        make_folder(command.output)
+    places = {
+        kind: run.output(kind) if command.output is None else command.output / f"detected.{kind}"
+        for kind in ("lines", "tilt", "circles")
+    }
+    circles = _with_radius(command.circles, run) if command.find_radius else command.circles
+    return _Job(
+        "lines, tilt and discs",
+        run,
+        FramePlan(run.camera, lines=command.lines, circles=circles, levelling=command.tilt),
+        places,
+        _known(command.ids, lines=command.line_ids_from),
+        crlf=command.line_ends == "crlf",
+        named_after=places["lines"].with_suffix(""),
+    )
+
+
+def _with_radius(settings: CircleSettings, run: Run) -> CircleSettings:
+    """The settings with the radius that the discs have in some of the images."""
+    from detect.discs.radius import find_radius
+
+    images = list(_some_images(run))
+    found = find_radius(images, run.camera, settings)
+    if found is None:
+        raise DetectError(
+            f"{len(images)} images: no radius of discs can be found in them: expected some discs "
+            "on the floor, or --radius-m"
+        )
+    print(
+        f"discs have a radius of {found.radius_m:.4f} +- {found.sigma_m:.4f} m, by {found.discs} "
+        f"of them in {len(images)} images",
+        file=sys.stderr,
+    )
+    return replace(settings, radius_m=round(found.radius_m, 4))
+
+
+def _some_images(run: Run) -> Iterator[NDArray[np.uint8]]:
+    """Images that are spread over a run, as far as its length is known beforehand."""
+    if run.frames.expected is None:
+        raise DetectError("--find-radius: expected recorded images, which can be read twice")
+    step = max(1, run.frames.expected // _RADIUS_IMAGES)
+    for frame in islice(run.frames, 0, step * _RADIUS_IMAGES, step):
+        with suppress(FrameError):
+            yield read_image(frame, run.camera)
+
+
+def _output(command: DetectorFlags, run: ImageRun, kind: str) -> Path:
+    """The file that a command's result is written to."""
+    output = command.output if command.output is not None else run.output(kind)
+    if not output.name:  # what an empty word becomes, too
+        raise DetectError(f"{output}: is a folder: expected the file to write")
+    return output
+
+
+def _known(
+    discs: DiscIdOptions | None = None, *, lines: Path | None = None, tilts: Path | None = None
+) -> Known:
+    """What files say of the frames beforehand."""
+    discs = DiscIdOptions() if discs is None else discs
+    if (discs.ids_from_map is None) != (discs.path is None):
+        raise DetectError("--ids-from-map and --path: expected both or neither")
+    mapped = None
+    if discs.ids_from_map is not None and discs.path is not None:
+        mapped = MapByImage(discs.ids_from_map, discs.path)
+    return Known(
+        tilts=None if tilts is None else TiltsByImage(tilts),
+        lines=None if lines is None else FramesByImage(lines),
+        discs=None if discs.ids_from is None else FramesByImage(discs.ids_from),
+        discs_level=discs.ids_from is not None and read_head(discs.ids_from).level,
+        mapped=mapped,
+        slack_m=discs.id_slack_m,
+    )
+
+
+def _workers(command: DetectorFlags, job: _Job) -> Workers:
+    """Who does the work of a command."""
+    frames = job.run.frames
+    large = job.pictures is not None or frames.ships_images
+    if command.cluster is not None:
+        if command.jobs is not None:
+            raise WorkerError("--jobs and --cluster: expected one of them")
+        workers = cluster_workers(command.cluster, large=large)
+    else:
+        expected = frames.expected
+        jobs = command.jobs if command.jobs is not None else default_jobs(expected or 0)
+        workers = local_workers(jobs, large=large, camera=job.plan.camera, frames=expected)
+    if not workers.tell_of_tables:  # this process makes the tables, at least
+        load_kernels_alone()
+    return workers
+
+
+def _tell_results(job: _Job, summary: RunSummary) -> None:
+    found, places = summary.found, job.places
+    if "lines" in places:
+        print(f"{places['lines']}: {found['lines']} lines in {summary.frames} frames")
+    if "tilt" in places and summary.tilt is not None:
+        frames_tilt = frames_tilt_place(places["tilt"])
+        print(f"{frames_tilt}: the tilt of {found['tilts']} frames, each by itself")
+        print(f"{places['tilt']}: {summary.tilt.sentence()}")
+    elif "tilt" in places:
+        others = _other_frames(job.plan, summary)
+        print(f"{places['tilt']}: the tilt of {found['tilts']} frames{others}")
+    if "circles" in places:
+        print(f"{places['circles']}: {found['discs']} discs in {summary.frames} frames")
+    if "markers" in places:
+        print(f"{places['markers']}: {found['markers']} markers in {summary.frames} frames")
+    if summary.rejected:
+        causes = ", ".join(f"{cause} {count}" for cause, count in sorted(summary.rejected.items()))
+        print(f"rejected: {causes}")
+
+
+def _tell_folded_lens(job: _Job) -> None:
+    """Say so where part of the image sees nothing."""
+    camera = job.plan.camera
+    if camera is not None and camera.seen_share < 1.0:
+        print(
+            f"as it is calibrated, the lens folds in the image: {100 * camera.seen_share:.0f} % of "
+            "the pixels see anything; nothing is detected in the others",
+            file=sys.stderr,
+        )
+
+
+def _other_frames(plan: FramePlan, summary: RunSummary) -> str:
+    """What is done with the discs of frames that have no tilt, if there are any."""
+    others = summary.frames - summary.failed - summary.found["tilts"]
+    if plan.circles is None or plan.levelling == "none" or others == 0:
+        return ""
+    if plan.circles.tilt_sigma_deg == 0.0:
+        return f"; the other {others} count as level beyond doubt (see --circles.tilt-sigma-deg)"
+    return f"; the other {others} count as level within {plan.circles.tilt_sigma_deg:g} degrees"
+
+
+def _advise(job: _Job, summary: RunSummary) -> None:
+    """Say what to try where hardly any discs were found."""
+    settings, run, found = job.plan.circles, job.run, summary.found["discs"]
+    hardly_any = summary.frames >= _FEWEST_FRAMES and 3 * found < summary.frames
+    if settings is None or not settings.verify or not isinstance(run, Run) or not hardly_any:
+        return
+    if run.frames.expected is None:
+        return
+    from detect.discs.radius import find_radius
+
+    images = list(_some_images(run))
+    likely = find_radius(images, run.camera, replace(settings, polarity="any"))
+    words = f"{found} discs of radius {settings.radius_m:g} m in {summary.frames} frames. "
+    if likely is None:
+        words += (
+            f"At no radius are more found in {len(images)} of the images: is the calibration that "
+            "of this camera (`detect draw` shows outlines), are the images much blurred "
+            "(--blur-px), are there discs in view?"
+        )
+    elif abs(math.log(likely.radius_m / settings.radius_m)) > _OTHER_RADIUS:
+        words += (
+            f"It looks as if their radius were {likely.radius_m:.3f} m: {likely.discs} of them are "
+            f"found in {len(images)} of the images. Try --radius-m {likely.radius_m:.3f}."
+        )
+    elif settings.polarity != "any":
+        words += (
+            f"Lighter and darker ones together are {likely.discs} in {len(images)} of the images: "
+            "try --polarity any."
+        )
+    else:
+        return
+    print(words, file=sys.stderr)
+
+
+def _tell_blind_to_verticals(job: _Job, summary: RunSummary) -> None:
+    """Say so where there are no lines for no line can be seen."""
+    if job.plan.lines is None or job.plan.camera is None or summary.found["lines"]:
+        return
+    from lut import cached_vertical_table
+
+    if not cached_vertical_table(job.plan.camera).usable.any():
+        print(
+            "no verticals: as it is calibrated, the camera looks too far past the horizon, or lies "
+            "on its side",
+            file=sys.stderr,
+        )

@@ -1,0 +1,343 @@
+"""What is written of one frame: rows, JSON and pictures, as bytes.
+
+This is all that a worker sends back, whichever process or machine it runs on: some kilobytes.
+"""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import islice
+from pathlib import Path
+from textwrap import indent
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from detect.discs.identity import ids_of_map, ids_of_rows
+from detect.errors import FrameError
+from detect.runs.frame import (
+    COSTS_THE_FRAME,
+    FrameDetections,
+    FramePlan,
+    FrameTask,
+    Tables,
+    detect_batch,
+    reason_of,
+)
+from detect.runs.known import KnownOfFrame
+from detect.sources.times import format_time
+from detect.verticals.identity import carry_ids
+from landmarks import (
+    format_levelling,
+    format_no_tilt,
+    format_outline_tilt,
+    format_record,
+    format_tilt,
+)
+
+if TYPE_CHECKING:
+    from detect.circles import CircleDetections
+    from detect.lines import LineDetections
+    from detect.run_tilt import RunTilt
+
+#: So many pixels are decoded before any of them is looked at.
+PIXELS_AT_ONCE = 1 << 25
+
+#: So many failures are kept word for word.
+KEPT_FAILURES = 100
+
+_NONE: Mapping[str, int] = {}
+
+
+class FrameRows(NamedTuple):
+    """What came of a frame.
+
+    Attributes
+    ----------
+    rows : mapping
+        Its rows in files of each kind: "circles", "lines", "tilt", "markers", "json", "times".
+    found : mapping
+        How many "discs", "lines", "tilts" and "markers" there are.
+    rejected : mapping
+        How many candidates for markers were rejected, by cause.
+    pictures : tuple of (name, PNG)
+        Drawings.
+    error : str or None
+        Why the frame could not be worked on: its STEP stays, without landmarks.
+    """
+
+    rows: Mapping[str, bytes]
+    found: Mapping[str, int] = _NONE
+    rejected: Mapping[str, int] = _NONE
+    pictures: tuple[tuple[str, bytes], ...] = ()
+    error: str | None = None
+
+
+@dataclass
+class RunSummary:
+    """What came of a run.
+
+    Attributes
+    ----------
+    frames : int
+        Frames looked at.
+    found : Counter
+        How many "discs", "lines" and "markers" were found in them, and "tilts".
+    rejected : Counter
+        How many candidates for markers were rejected, by cause.
+    failed : int
+        Frames that could not be worked on.
+    failures : list of str
+        A line for each of the first `KEPT_FAILURES` of them.
+    images_without_step : int
+        Images that are no part of the run: the odometry knows nothing of them.
+    tilt : RunTilt or None
+        What discs were levelled by, if it was the tilt of the run.
+    """
+
+    frames: int = 0
+    found: Counter[str] = field(default_factory=Counter)
+    rejected: Counter[str] = field(default_factory=Counter)
+    failed: int = 0
+    failures: list[str] = field(default_factory=list)
+    images_without_step: int = 0
+    tilt: RunTilt | None = None
+
+    def add(self, rows: FrameRows) -> None:
+        """Count a frame."""
+        self.frames += 1
+        self.found.update(rows.found)
+        self.rejected.update(rows.rejected)
+        if rows.error is not None:
+            self.failed += 1
+            if len(self.failures) < KEPT_FAILURES:
+                self.failures.append(rows.error)
+
+
+def rows_of_frames(tasks: Sequence[FrameTask], plan: FramePlan, tables: Tables) -> list[FrameRows]:
+    """Work on some frames; an image that cannot be worked on costs its frame only.
+
+    Parameters
+    ----------
+    tasks : sequence of FrameTask
+        The frames.
+    plan : FramePlan
+        What is done with each.
+    tables : Tables
+        See `detect.runs.frame.tables_of`.
+
+    Returns
+    -------
+    list of FrameRows
+        One for each.
+    """
+    camera = plan.camera
+    at_once = PIXELS_AT_ONCE // (camera.width * camera.height) if camera is not None else 1
+    if plan.drawing is not None or plan.draw_response:
+        at_once = 1
+    rows: list[FrameRows] = []
+    source = iter(tasks)
+    while batch := tuple(islice(source, max(1, at_once))):
+        found = detect_batch(batch, plan, tables)
+        rows += [_rows_of(task, each, plan, tables) for task, each in zip(batch, found)]
+    return rows
+
+
+def _rows_of(task: FrameTask, found: FrameDetections, plan: FramePlan, tables: Tables) -> FrameRows:
+    if found.error is not None:
+        return rows_of_failure(task, found.error)
+    try:
+        return FrameRows(
+            _rows_by_kind(task, found, plan),
+            {
+                "discs": 0 if found.discs is None else len(found.discs),
+                "lines": 0 if found.lines is None else len(found.lines),
+                "tilts": int(found.lines is not None and found.tilt is not None),
+                "markers": 0 if found.markers is None else len(found.markers),
+            },
+            _NONE if found.markers is None else dict(sorted(found.markers.rejected.items())),
+            tuple(_drawn(Path(task.frame.step.prefix).name, found, plan, tables)),
+        )
+    except COSTS_THE_FRAME as error:
+        return rows_of_failure(task, reason_of(error, task))
+
+
+def _rows_by_kind(task: FrameTask, found: FrameDetections, plan: FramePlan) -> dict[str, bytes]:
+    step = task.frame.step
+    head = encoded(format_record(step))
+    rows = {"times": _time_row(task)}
+    if found.lines is not None:
+        rows["lines"] = head + _line_rows(found.lines, task.known)
+        if found.tilt is None:
+            rows["tilt"] = encoded(format_no_tilt(step.prefix, len(found.lines)))
+        else:
+            rows["tilt"] = encoded(format_tilt(found.tilt))
+        if found.outline_tilt is not None:
+            rows["tilt"] += encoded(format_outline_tilt(found.outline_tilt))
+    if found.discs is not None and found.seen is not None:
+        level = found.discs.levelled_by
+        head_of_discs = head if level is None else head + encoded(format_levelling(level))
+        rows["circles"] = head_of_discs + _disc_rows(found.discs, found.seen, task.known)
+        if plan.json:
+            rows["json"] = _json({"frame": step.prefix, "discs": _disc_records(found.discs)})
+    if found.markers is not None:
+        markers = [encoded(format_record(marker)) for marker in found.markers.landmarks()]
+        rows["markers"] = b"".join([head, *markers])
+    return rows
+
+
+def rows_of_failure(task: FrameTask, reason: str) -> FrameRows:
+    """What is written of a frame that could not be worked on."""
+    step = task.frame.step
+    rows = dict.fromkeys(("circles", "lines", "markers"), encoded(format_record(step)))
+    rows["tilt"] = encoded(format_no_tilt(step.prefix, 0))
+    rows["json"] = _json({"frame": step.prefix, "error": reason})
+    rows["times"] = _time_row(task)
+    return FrameRows(rows, error=reason)
+
+
+def landmark_rows(
+    keyword: str, numbers: NDArray[np.float64], ids: Sequence[tuple[int, ...]]
+) -> bytes:
+    """Rows of landmarks, as `landmarks.format_record` lays them out.
+
+    Parameters
+    ----------
+    keyword : str
+    numbers : (N, K) float64
+        What stands behind it.
+    ids : sequence of N tuples of int
+        Stand at the end.
+
+    Raises
+    ------
+    FrameError
+        If a number is not finite.
+    """
+    if not np.isfinite(numbers).all():
+        raise FrameError(f"{keyword}: a number of it is not finite")
+    row = keyword + " %g" * numbers.shape[1]
+    rows = "".join([" ".join([row, *map(str, own)]) + "\n" for own in ids])
+    return (rows % tuple(numbers.ravel().tolist())).encode()
+
+
+def disc_numbers(
+    floor_xy: NDArray[np.float64], quality: NDArray[np.float64], covariance: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """The (N, 6) numbers of rows of discs: x, y, quality, cxx, cxy, cyy."""
+    numbers = np.empty((len(quality), 6))
+    numbers[:, :2], numbers[:, 2] = floor_xy, quality
+    numbers[:, 3:5], numbers[:, 5] = covariance[:, 0], covariance[:, 1, 1]
+    return numbers
+
+
+def _line_rows(found: LineDetections, known: KnownOfFrame) -> bytes:
+    ids: list[tuple[int, ...]] = [(-1,)] * len(found)
+    if known.lines:
+        ids = [row.ids for row in carry_ids(found.landmarks(), known.lines)]
+    ends_and_angles, sigma = found.line_numbers[:6], found.line_numbers[6:7]
+    numbers = np.concatenate([ends_and_angles, np.zeros_like(sigma), sigma]).T
+    return landmark_rows("LANDMARK_L", numbers, ids)
+
+
+def _disc_rows(discs: CircleDetections, seen: CircleDetections, known: KnownOfFrame) -> bytes:
+    numbers = disc_numbers(discs.floor_xy, discs.quality, discs.covariance)
+    ids: list[tuple[int, ...]] = [(-1,)] * len(discs)
+    if known.discs or known.mapped:
+        ids = _ids_of_discs(discs, seen, known)
+    return landmark_rows("LANDMARK_C", numbers, ids)
+
+
+def _ids_of_discs(
+    discs: CircleDetections, seen: CircleDetections, known: KnownOfFrame
+) -> list[tuple[int, ...]]:
+    """The IDs of each row: those of a known row of the same disc, or of a map's, or -1."""
+    ids: list[tuple[int, ...]] = [()] * len(discs)
+    if known.discs:
+        alike = discs if known.discs_level else seen
+        by_pixel = dict(
+            zip(map(tuple, alike.pixels.tolist()), ids_of_rows(alike.floor_xy, known.discs))
+        )
+        ids = [by_pixel[u, v] for u, v in discs.pixels.tolist()]
+    if known.mapped:
+        taken = {number for own in ids for number in own}
+        left = [disc for disc in known.mapped if disc.id not in taken]
+        open_rows = [k for k, own in enumerate(ids) if own in ((), (-1,))]
+        named = ids_of_map(
+            discs.floor_xy[open_rows], discs.covariance[open_rows], left, known.slack_m
+        )
+        for k, number in zip(open_rows, named.tolist()):
+            ids[k] = (number,)
+    return [own or (-1,) for own in ids]
+
+
+def _time_row(task: FrameTask) -> bytes:
+    frame = task.frame
+    return b"" if frame.time_s is None else encoded(format_time(frame.step.prefix, frame.time_s))
+
+
+def encoded(row: str) -> bytes:
+    """A row as it stands in a file, its end included."""
+    return f"{row}\n".encode("utf-8", "surrogateescape")
+
+
+def _json(record: dict[str, object]) -> bytes:
+    """A record as it stands in the list of frames of an indented document."""
+    return b"\n" + indent(json.dumps(record, indent=1), "  ").encode()
+
+
+def _disc_records(found: CircleDetections) -> list[dict[str, object]]:
+    return [
+        {
+            "pixel": [int(u), int(v)],
+            "x_m": float(x),
+            "y_m": float(y),
+            "quality": float(quality),
+            "evidence": float(evidence) if np.isfinite(evidence) else None,
+            "covariance_m2": [float(c[0, 0]), float(c[0, 1]), float(c[1, 1])],
+        }
+        for (u, v), (x, y), c, quality, evidence in zip(
+            found.pixels, found.floor_xy, found.covariance, found.quality, found.evidence
+        )
+    ]
+
+
+def _drawn(
+    name: str, found: FrameDetections, plan: FramePlan, tables: Tables
+) -> Iterator[tuple[str, bytes]]:
+    """The pictures that a plan asks for, by name."""
+    if plan.drawing is None and not plan.draw_response:
+        return
+    from detect.drawing.detections import draw_circles
+    from detect.drawing.lines import draw_lines, draw_response, draw_tracks
+    from detect.verticals.response import line_response
+
+    image, camera = found.pixels, plan.camera
+    picture: NDArray[np.uint8] | None = None
+    if plan.drawing == "markers" and found.markers is not None:
+        from detect.markers.drawing import draw_markers
+
+        picture = draw_markers(image, found.markers)
+    elif plan.drawing == "discs" and found.discs is not None and camera and plan.circles:
+        picture = draw_circles(image, camera, found.discs, plan.circles)
+    elif found.lines is not None and camera and tables.verticals:
+        if plan.drawing == "lines":
+            picture = draw_lines(image, camera, tables.verticals, found.lines)
+        elif plan.drawing == "tracks":
+            picture = draw_tracks(image, tables.verticals, found.lines, rejected=True, reasons=True)
+    if picture is not None:
+        yield f"{name}.png", _png(picture)
+    if plan.draw_response and found.lines is not None and plan.lines and tables.verticals:
+        response = line_response(image, tables.verticals, plan.lines)
+        yield f"{name}.response.png", _png(draw_response(response, tables.verticals))
+
+
+def _png(picture: NDArray[np.uint8]) -> bytes:
+    import cv2
+
+    _, encoded_picture = cv2.imencode(".png", picture)
+    return encoded_picture.tobytes()

@@ -1,0 +1,301 @@
+"""Joining: one line for each edge, close ones together, and their bearings.
+
+Of accepted tracks, from the strongest on, those of the same edge as a stronger one and those beside
+a much stronger one are left out; neighbours closer than `join_px` are one line. Its bearing is the
+mean of the mixture of its tracks' Gaussians, sum of w_k N(alpha_k, noise_k^2 + (sigma_px pixel)^2),
+and its standard deviation that of the mixture.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from detect.line_settings import LineSettings
+from detect.verticals.bearing import ends_of_lines, turned_bearings, wrapped
+from detect.verticals.judgement import (
+    ACCEPTED,
+    BESIDE_A_STRONGER_EDGE,
+    JOINED,
+    SAME_EDGE,
+    Judgement,
+)
+from detect.verticals.response import Strip
+from detect.verticals.tilt import level_matrix
+from detect.verticals.tilt_error import descending
+from detect.verticals.tracking import LineTracks
+
+FloatArray = NDArray[np.float64]
+
+
+class JoiningLimits(NamedTuple):
+    """What lines are gathered by; see `detect.line_settings.LineSettings`.
+
+    `equal` is whether joined lines count the same, `turn` 1 to undo the tilt and -1 to apply it
+    once more, `building_rad` see `detect.verticals.bearing.turned_bearings`.
+    """
+
+    same_edge_px: float
+    join_px: float
+    join_share: float
+    shoulder_px: float
+    shoulder_share: float
+    sigma_px: float
+    equal: bool
+    turn: float
+    building_rad: float
+
+
+class Lines(NamedTuple):
+    """The lines of an image, the leftmost first.
+
+    Attributes
+    ----------
+    ends : (N, 4) float64
+        xtop, ytop, xbottom, ybottom: undistorted normalised coordinates.
+    alpha_rad, beta_rad : (N,) float64
+        Bearings, and inclinations of the normals of their planes.
+    sigma_rad, noise_rad : (N,) float64
+        Standard deviations of the bearings, and the part of them due to noise.
+    members : (M,) int64
+        Tracks, line by line; the strongest of each line first.
+    bounds : (N + 1,) int64
+        Line n's members are ``bounds[n] : bounds[n + 1]``.
+    """
+
+    ends: FloatArray
+    alpha_rad: FloatArray
+    beta_rad: FloatArray
+    sigma_rad: FloatArray
+    noise_rad: FloatArray
+    members: NDArray[np.int64]
+    bounds: NDArray[np.int64]
+
+
+@lru_cache(maxsize=16)
+def joining_of(settings: LineSettings) -> JoiningLimits:
+    """What lines are gathered by."""
+    level = settings.alpha == "level"
+    return JoiningLimits(
+        same_edge_px=float(settings.same_edge_px),
+        join_px=float(settings.join_px),
+        join_share=float(settings.join_share),
+        shoulder_px=float(settings.shoulder_px),
+        shoulder_share=float(settings.shoulder_share),
+        sigma_px=float(settings.sigma_px),
+        equal=settings.joined == "equal",
+        turn=1.0 if level else -1.0,
+        building_rad=math.radians(settings.building_deg) if level else math.inf,
+    )
+
+
+@njit(cache=True, error_model="numpy")
+def lines_of_tracks(
+    strip: Strip, tracks: LineTracks, judged: Judgement, limits: JoiningLimits
+) -> Lines:
+    """Lines of accepted tracks.
+
+    The fate of tracks that are left out or joined is changed.
+    """
+    fits, evidence, tilt = judged.fits, judged.evidence, judged.tilt
+    count = len(evidence)
+    tilted = not np.isnan(tilt.pitch_rad)
+    pitch = tilt.pitch_rad if tilted else 0.0
+    roll = tilt.roll_rad if tilted else 0.0
+    rotation = level_matrix(limits.turn * pitch, limits.turn * roll)
+    building = limits.building_rad if tilted else np.inf
+    alpha, noise = turned_bearings(fits, rotation, pitch, roll, building)
+    members, bounds = group_tracks(alpha, tracks.polarity, judged, limits)
+    weight = np.ones(count) if limits.equal else evidence
+    joined, sigma = join_tracks(
+        alpha, noise, fits.pixel_rad, weight, members, bounds, limits.sigma_px
+    )
+    own_ends, own_beta = ends_of_lines(strip, tracks, fits, members)
+    ends = np.empty((len(joined), 4))
+    beta = np.empty(len(joined))
+    for n in range(len(joined)):
+        # The first member of a line is its strongest.
+        first = bounds[n]
+        last = bounds[n + 1] if limits.equal else first + 1
+        for k in range(4):
+            ends[n, k] = own_ends[first:last, k].mean()
+        beta[n] = own_beta[first:last].mean()
+    return Lines(ends, joined, beta, sigma, noise[members[bounds[:-1]]], members, bounds)
+
+
+@njit(cache=True, error_model="numpy")
+def group_tracks(
+    alpha: FloatArray, polarity: FloatArray, judged: Judgement, limits: JoiningLimits
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Gather accepted tracks to lines: one for each edge, close ones together.
+
+    Parameters
+    ----------
+    alpha, polarity : (T,) float64
+        Bearings (rad); 1 where the image is brighter on the right.
+    judged : Judgement
+        The fate of tracks that are left out or joined is changed.
+    limits
+        See there.
+
+    Returns
+    -------
+    members, bounds
+        See `Lines`.
+    """
+    pixel, contrast = judged.fits.pixel_rad, judged.fits.contrast
+    evidence, fate = judged.evidence, judged.fate
+    accepted = np.flatnonzero(fate == ACCEPTED)
+    kept = np.empty(len(accepted), np.int64)
+    near_px = np.empty(len(accepted))
+    places = np.empty(len(accepted))
+    n = 0
+    for k in descending(evidence[accepted]):
+        t = accepted[k]
+        reason = ACCEPTED
+        for s in kept[:n]:
+            near = abs(wrapped(alpha[s] - alpha[t])) / pixel[t]
+            if polarity[s] == polarity[t] and near < limits.same_edge_px:
+                reason = SAME_EDGE
+                break
+            if (near < limits.join_px and evidence[t] < limits.join_share * evidence[s]) or (
+                near < limits.shoulder_px and contrast[t] < limits.shoulder_share * contrast[s]
+            ):
+                reason = BESIDE_A_STRONGER_EDGE
+        fate[t] = reason
+        if reason == ACCEPTED:
+            kept[n] = t
+            places[n] = alpha[t]
+            near_px[n] = limits.join_px * pixel[t]
+            n += 1
+    group = chain_neighbours(places[:n], near_px[:n])
+    # Leftmost first; stable: the strongest of each line stays its first.
+    by_group = descending(-group.astype(np.float64))
+    members = np.empty(n, np.int64)
+    for k in range(n):
+        members[k] = kept[by_group[k]]
+    bounds = np.zeros(n + 1, np.int64)
+    count = 0
+    for k in range(n):
+        if k > 0 and group[by_group[k]] == group[by_group[k - 1]]:
+            fate[members[k]] = JOINED
+        else:
+            count += 1
+        bounds[count] = k + 1
+    return members, bounds[: count + 1]
+
+
+@njit(cache=True, error_model="numpy")
+def chain_neighbours(
+    alpha: NDArray[np.float64], distance: NDArray[np.float64]
+) -> NDArray[np.int64]:
+    """Number the groups of bearings whose neighbours are close.
+
+    Parameters
+    ----------
+    alpha : (N,) float64
+        Bearings (rad).
+    distance : (N,) float64
+        Two neighbours belong together if they are closer than the smaller of their two distances.
+
+    Returns
+    -------
+    (N,) int64
+        The group of each, counted from 0 at the largest bearing (leftmost in the image).
+    """
+    order = descending(alpha)
+    group = np.zeros(len(alpha), np.int64)
+    number = 0
+    for k in range(1, len(alpha)):
+        left = order[k - 1]
+        right = order[k]
+        if alpha[left] - alpha[right] >= min(distance[left], distance[right]):
+            number += 1
+        group[right] = number
+    return group
+
+
+@njit(cache=True, error_model="numpy")
+def join_tracks(
+    alpha: NDArray[np.float64],
+    noise: NDArray[np.float64],
+    pixel: NDArray[np.float64],
+    evidence: NDArray[np.float64],
+    members: NDArray[np.int64],
+    bounds: NDArray[np.int64],
+    sigma_px: float,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Bearings of lines, and their standard deviations: mixtures of those of their tracks.
+
+    Parameters
+    ----------
+    alpha, noise : (T,) float64
+        Bearings of tracks and their noise (rad).
+    pixel : (T,) float64
+        Width of a pixel (rad).
+    evidence : (T,) float64
+        Weights of the mixture.
+    members, bounds
+        See `group_tracks`.
+    sigma_px : float
+        Standard deviation of an edge about the line of the building that it stands for, pixels.
+
+    Returns
+    -------
+    alpha, sigma : (N,) float64
+        Means and standard deviations of the mixtures (rad).
+    """
+    count = len(bounds) - 1
+    joined = np.empty(count)
+    sigma = np.empty(count)
+    places = np.empty(len(members))
+    deviations = np.empty(len(members))
+    weights = np.empty(len(members))
+    for n in range(count):
+        begin, end = bounds[n], bounds[n + 1]
+        for k in range(begin, end):
+            t = members[k]
+            places[k] = alpha[t]
+            weights[k] = evidence[t]
+            systematic = sigma_px * pixel[t]
+            deviations[k] = math.sqrt(noise[t] * noise[t] + systematic * systematic)
+        joined[n], sigma[n] = join_mixture(
+            places[begin:end], deviations[begin:end], weights[begin:end]
+        )
+    return joined, sigma
+
+
+@njit(cache=True, error_model="numpy")
+def join_mixture(
+    alpha: NDArray[np.float64], sigma: NDArray[np.float64], weight: NDArray[np.float64]
+) -> tuple[float, float]:
+    """Mean and standard deviation of a mixture of Gaussians of bearings.
+
+    Parameters
+    ----------
+    alpha, sigma : (N,) float64
+        Means and standard deviations of the components (rad); all means within half a turn.
+    weight : (N,) float64
+        Their weights, not negative, of any sum.
+
+    Returns
+    -------
+    alpha, sigma : float
+        Of the mixture (rad).
+    """
+    total = 0.0
+    mean = 0.0
+    for k in range(len(alpha)):
+        total += weight[k]
+        mean += weight[k] * wrapped(alpha[k] - alpha[0])
+    mean /= total
+    variance = 0.0
+    for k in range(len(alpha)):
+        off = wrapped(alpha[k] - alpha[0]) - mean
+        variance += weight[k] * (sigma[k] * sigma[k] + off * off)
+    return wrapped(alpha[0] + mean), math.sqrt(variance / total)

@@ -1,0 +1,83 @@
+"""The command line of a program: its commands, each carried out by a module of its own.
+
+Only what `--help` needs is imported at once; everything heavy waits for the command that uses it.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib import import_module
+from importlib.metadata import version
+from typing import Annotated, Any, Union
+
+import tyro
+from tyro.conf import arg, subcommand
+
+from storage.exit_codes import exit_code_of
+from storage.kernel_loading import load_kernels_alone
+
+
+@dataclass(frozen=True)
+class Program:
+    """A program.
+
+    Attributes
+    ----------
+    name : str
+    description : str
+        What its `--help` says.
+    performed_by : mapping
+        Dataclasses of flags, one for each command, which has the class's name in small letters; and
+        the module whose `perform` carries it out.
+    compiled : tuple of type
+        Commands that run compiled kernels.
+    """
+
+    name: str
+    description: str
+    performed_by: Mapping[type, str]
+    compiled: tuple[type, ...] = field(default=())
+
+    def main(self, arguments: list[str] | None = None) -> int:
+        """Run the command line; returns the exit code."""
+        # Matrices are small or sparse here: threads of BLAS would cost more than they save.
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+        given = sys.argv[1:] if arguments is None else arguments
+        return exit_code_of(lambda: self.carry_out(self.parsed(given)))
+
+    def parsed(
+        self, arguments: Sequence[str], defaults: Mapping[type, object] | None = None
+    ) -> Any:
+        """What a command line says; exits, as `--help` does, where nothing can be done about it.
+
+        Parameters
+        ----------
+        arguments : sequence of str
+        defaults : mapping, optional
+            Commands that flags change, for some of the classes.
+        """
+        commands: list[Any] = []
+        for kind in self.performed_by:
+            name, known = kind.__name__.lower(), defaults or {}
+            named = subcommand(name, default=known[kind]) if kind in known else subcommand(name)
+            commands.append(Annotated[kind, named])
+        if list(arguments) == ["--version"]:
+            print(f"{self.name} {version('redetect')}")
+            raise SystemExit(0)
+        choice: Any = Union.__getitem__(tuple(commands))
+        return tyro.cli(
+            Annotated[choice, arg(name="")],
+            prog=self.name,
+            description=self.description,
+            args=arguments,
+        )
+
+    def carry_out(self, command: Any) -> int:
+        """Carry out a command; returns the exit code."""
+        if isinstance(command, self.compiled):
+            load_kernels_alone()
+        code: int = import_module(self.performed_by[type(command)]).perform(command)
+        return code

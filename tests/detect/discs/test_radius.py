@@ -1,0 +1,91 @@
+"""The radius of discs comes back from images, and is offered where hardly any were found."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from camera import Camera
+from detect.cli import main, parsed
+from detect.discs.radius import find_radius
+from detect.options import All, Circles
+from detect.settings import CircleSettings
+from tests.detect.painted_floor import PaintedFloor
+
+PLACES = [(0.4, -1.3), (-0.6, -1.6), (0.1, -2.1), (0.7, -2.4)]
+
+
+def image(camera: Camera, radius_m: float, seed: int) -> np.ndarray:
+    floor = PaintedFloor(camera)
+    for place in PLACES:
+        floor.disc(place, radius_m=radius_m)
+    return floor.image(seed=seed)
+
+
+@pytest.mark.parametrize("radius_m", [0.06, 0.1, 0.15])
+def test_radius_comes_back(published_camera: Camera, radius_m: float) -> None:
+    images = [image(published_camera, radius_m, seed) for seed in (0, 1)]
+
+    found = find_radius(images, published_camera, CircleSettings())
+
+    assert found is not None
+    assert found.discs == 2 * len(PLACES)
+    assert abs(found.radius_m - radius_m) < min(0.03 * radius_m, 1.5 * found.sigma_m)
+
+
+def test_an_empty_floor_has_no_radius(published_camera: Camera) -> None:
+    bare = PaintedFloor(published_camera).image()
+    assert find_radius([bare], published_camera, CircleSettings()) is None
+
+
+@pytest.mark.parametrize(
+    "words", [["--radius-m", "auto"], ["--radius-m=auto"], ["--circles.radius-m", "auto"]]
+)
+def test_auto_stands_for_finding_it(words: list[str]) -> None:
+    command = "all" if "circles" in words[0] else "circles"
+    flags = parsed([command, "run", *words, "--jobs", "1"])
+    assert isinstance(flags, Circles | All)
+    assert flags.find_radius
+    assert flags.jobs == 1
+    assert not parsed([command, "run"]).find_radius  # type: ignore[union-attr]
+
+
+@pytest.fixture
+def run(published_camera: Camera, published_cam_text: str, tmp_path: Path) -> Path:
+    """A dozen images of discs of radius 0.06 m."""
+    folder = tmp_path / "s"
+    (folder / "images").mkdir(parents=True)
+    (folder / "s.cam").write_text(published_cam_text)
+    for seed in range(12):
+        path = folder / "images" / f"s.{seed:04d}.png"
+        cv2.imwrite(str(path), image(published_camera, 0.06, seed))
+    return folder
+
+
+def test_a_run_is_detected_at_the_radius_found(
+    run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["circles", str(run), "--radius-m", "auto"]) == 0
+    said = capsys.readouterr()
+    assert "discs have a radius of 0.06" in said.err
+    assert "48 discs in 12 frames" in said.out
+    assert "radius_m=0.06" in (run / "detected.circles").read_text()
+
+
+def test_another_radius_is_offered(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["circles", str(run)]) == 0
+    assert "looks as if their radius were 0.06" in capsys.readouterr().err
+
+
+def test_where_there_are_no_discs_it_is_said_what_to_look_at(
+    run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for path in (run / "images").iterdir():
+        cv2.imwrite(str(path), np.full((288, 768), 100, np.uint8))
+    assert main(["circles", str(run)]) == 0
+    assert "0 discs of radius 0.1 m in 12 frames. At no radius" in capsys.readouterr().err
+    shutil.rmtree(run / "images")

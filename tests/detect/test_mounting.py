@@ -1,0 +1,113 @@
+"""How a camera is mounted: simulated tilts, and the demo run with a calibration that is wrong."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from camera import Camera, read_camera, write_camera
+from camera.cli import main
+from detect.mounting import HEIGHT_STEPS, Mounting, mounting_of_run, remounted
+from detect.run_tilt import LEAST_FRAMES, FrameTilts
+from detect.seen import image_positions, level_seen
+from storage import OutputExistsError
+
+HEIGHT_M = 1.5
+#: How pitch by outlines goes with the height: linear, and a little bent.
+SLOPE, BEND = -3.0, 4.0
+
+
+def drive(
+    lean: tuple[float, float], raised_m: float, frames: int = 200
+) -> tuple[FrameTilts, np.ndarray]:
+    """Tilts by verticals, and pitches by outlines at the tried heights."""
+    rng = np.random.default_rng(4)
+    true = lean + np.radians(0.3) * rng.standard_normal((frames, 2))
+    sigma = np.full(true.shape, np.radians(0.1))
+    verticals = FrameTilts(true + sigma * rng.standard_normal(true.shape), sigma**2)
+    off = np.array(HEIGHT_STEPS) - raised_m / HEIGHT_M
+    pitches = true[:, :1] + SLOPE * off + BEND * off**2
+    return verticals, pitches + np.radians(0.4) * rng.standard_normal((frames, 1))
+
+
+@pytest.mark.parametrize("raised_m", [0.0, -0.045, 0.06])
+def test_lean_and_height_come_back(raised_m: float) -> None:
+    lean = (-0.045, 0.013)
+    found = mounting_of_run(HEIGHT_M, *drive(lean, raised_m))
+
+    assert found is not None
+    assert abs(found.pitch_rad - lean[0]) < found.pitch_sigma_rad
+    assert abs(found.roll_rad - lean[1]) < found.roll_sigma_rad
+    assert abs(found.raised_m - raised_m) < 0.01
+    assert 0.01 < found.raised_sigma_m < 0.03
+    assert found.frames == found.frames_with_discs == 200
+    assert f"{100 * found.raised_m:+.1f}" in found.sentences()[1]
+
+
+def test_without_discs_the_height_stays() -> None:
+    verticals, pitches = drive((0.01, 0.0), 0.0)
+    pitches[LEAST_FRAMES - 1 :] = math.nan
+    found = mounting_of_run(HEIGHT_M, verticals, pitches)
+
+    assert found is not None
+    assert math.isnan(found.raised_m)
+    assert "left as calibrated" in found.sentences()[1]
+
+
+def test_without_verticals_there_is_no_mounting() -> None:
+    verticals, pitches = drive((0.01, 0.0), 0.0)
+    verticals.tilt[:] = math.nan
+    assert mounting_of_run(HEIGHT_M, verticals, pitches) is None
+
+
+def test_the_remounted_camera_sees_level(published_camera: Camera) -> None:
+    """What the mounting turns level is where the remounted camera puts it."""
+    tilt, raised_m = (-0.045, 0.013), -0.04
+    mounting = Mounting(*tilt, 0.0, 0.0, raised_m, 0.0, 30, 30)
+    rows_xy = np.array([(0.3, -1.4), (-0.7, -2.2), (0.1, -3.3)])
+    pixels = image_positions(published_camera, rows_xy)
+
+    seen = remounted(published_camera, mounting).floor_from_pixel(pixels)
+
+    np.testing.assert_allclose(seen, level_seen(published_camera, rows_xy, tilt, raised_m))
+
+
+@pytest.mark.long
+def test_the_demos_camera_comes_back(
+    project_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A calibration that is 5 cm too low and leans by 2 degrees is put right."""
+    run = project_root / "images" / "e"
+    true = read_camera(run / "e.cam")
+    wrong = remounted(true, Mounting(0.035, -0.01, 0.0, 0.0, -0.05, 0.0, 30, 30))
+    write_camera(wrong, tmp_path / "wrong.cam")
+    output = tmp_path / "level.cam"
+
+    command = ["level", str(run), "--camera", str(tmp_path / "wrong.cam"), "-o", str(output)]
+    assert main(command) == 0
+
+    said = capsys.readouterr().out
+    assert re.search(r"leans -2\.\d+ \+- 0\.1\d degrees", said)
+    found = read_camera(output)
+    assert abs(found.centre[2] - true.centre[2]) < 0.02
+    # The simulated robot itself leans by a tenth of a degree or two in the mean.
+    off = np.degrees(np.arccos((np.trace(found.rotation @ true.rotation.T) - 1.0) / 2.0))
+    assert off < 0.5
+    assert replace(found, robot_from_camera=true.robot_from_camera) == true
+    assert main(command) == 1  # nothing is overwritten unasked
+    assert main([*command, "--force"]) == 0
+
+
+def test_an_existing_file_is_found_first(tmp_path: Path) -> None:
+    from camera.options import Level
+    from detect.mounting_command import perform
+
+    output = tmp_path / "level.cam"
+    output.touch()
+    with pytest.raises(OutputExistsError):
+        perform(Level(tmp_path / "nothing", output))
