@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 import sys
-import tomllib
 from fnmatch import fnmatch
 from importlib import import_module
 from pathlib import Path
@@ -23,10 +22,10 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 DOCS = Path(__file__).resolve().parent
 ROOT = DOCS.parent
 sys.path.insert(0, str(ROOT))
-_PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+from storage.version import __version__  # noqa: E402
 
-project = _PROJECT["name"]
-release = version = _PROJECT["version"]
+project = "redetect"
+release = version = __version__
 copyright = "the authors of redetect, BSD-3-Clause"
 
 extensions = ["myst_parser", "sphinx.ext.autodoc"]

@@ -7,14 +7,4 @@ frame at the start of the run. A pose is (x, y, theta). Metres, radians.
 >>> recording = read_recording("images/e", circles=True, lines=True)    # doctest: +SKIP
 """
 
-
-def __getattr__(name: str) -> str:
-    """The version, looked up when it is asked for: that takes longer than all else here."""
-    if name != "__version__":
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from importlib.metadata import PackageNotFoundError, version
-
-    try:
-        return version("redetect")
-    except PackageNotFoundError:  # a checkout that was never installed
-        return "unknown"
+from storage.version import __version__ as __version__

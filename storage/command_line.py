@@ -10,7 +10,6 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
-from importlib.metadata import version
 from typing import Annotated, Any, Union
 
 import tyro
@@ -18,6 +17,7 @@ from tyro.conf import arg, subcommand
 
 from storage.exit_codes import exit_code_of
 from storage.kernel_loading import load_kernels_alone
+from storage.version import __version__
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class Program:
             named = subcommand(name, default=known[kind]) if kind in known else subcommand(name)
             commands.append(Annotated[kind, named])
         if list(arguments) == ["--version"]:
-            print(f"{self.name} {version('redetect')}")
+            print(f"{self.name} {__version__}")
             raise SystemExit(0)
         choice: Any = Union.__getitem__(tuple(commands))
         return tyro.cli(
