@@ -19,12 +19,12 @@ import tyro
 from detect.announcing import show_announcements
 from detect.errors import WorkerError
 from detect.exports.options import Export
+from detect.interrupts import interrupts_noted
 from detect.line_settings import PRESETS as LINE_PRESETS
 from detect.line_settings import LineSettings
 from detect.markers.settings import PRESETS as MARKER_PRESETS
 from detect.markers.settings import MarkerSettings
 from detect.options import All, Circles, Compare, Lines, Markers
-from detect.runs.interrupts import interrupts_noted
 from detect.settings import PRESETS as CIRCLE_PRESETS
 from detect.settings import CircleSettings
 from detect.viewing_options import Draw, Report, Tune, View

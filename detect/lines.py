@@ -20,6 +20,7 @@ filters as wide as the blur (`detect.verticals.blur`).
 from __future__ import annotations
 
 import math
+from contextlib import nullcontext
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -28,6 +29,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from detect.errors import FrameError
+from detect.interrupts import interrupts_deferred
 from detect.line_settings import DEFAULT, LineSettings
 from detect.verticals.blur import median_sharpness, widened, width_for
 from detect.verticals.detections import LineDetections
@@ -158,7 +160,11 @@ def detect_lines(
         )
     image = np.ascontiguousarray(image)
     search = _search(table, settings)
-    found = LineDetections(*find_lines(image, padded_pixels(image, search.window), search))
+    pixels = padded_pixels(image, search.window)
+    # Numba makes named tuples by Python code, and does not check whether an interrupt ended it.
+    # What is not compiled yet may take a minute, which nobody should have to wait for.
+    with interrupts_deferred() if find_lines.signatures else nullcontext():
+        found = LineDetections(*find_lines(image, pixels, search))
     if found.sharpness < search.least_sharpness:
         wider = widened(settings, width_for(found.sharpness, settings))
         return detect_lines(image, table, wider)

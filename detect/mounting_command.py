@@ -6,22 +6,21 @@ The command is one of the program `camera`; it is carried out here, for it detec
 from __future__ import annotations
 
 import math
+import sys
 
 import numpy as np
 
 from camera import write_camera
 from camera.options import Level
-from detect.circles import detect_circles, disc_shape
 from detect.discs.outline_tilt import tilt_of_outlines
-from detect.errors import DetectError, FrameError
-from detect.lines import detect_lines
+from detect.errors import DetectError
+from detect.line_settings import LineSettings
 from detect.mounting import HEIGHT_STEPS, mounting_of_run, remounted
-from detect.run import read_image
-from detect.run_tilt import LEAST_FRAMES, FrameTilts
+from detect.run_tilt import LEAST_FRAMES, frame_tilts
+from detect.runs.frame import FramePlan, FrameTask, detect_batch, tables_of
 from detect.runs.progress import progress_bar
 from detect.settings import CircleSettings
 from detect.sources.opening import open_calibrated
-from lut import cached_disc_table, cached_vertical_table
 from storage import OutputExistsError
 
 
@@ -31,35 +30,28 @@ def perform(options: Level) -> int:
         raise OutputExistsError(options.output)
     run = open_calibrated(options.run, options.camera)
     camera, height_m = run.camera, float(run.camera.centre[2])
-    settings = CircleSettings(radius_m=options.radius_m)
-    table, verticals = (
-        cached_disc_table(camera, disc_shape(settings)),
-        cached_vertical_table(camera),
+    plan = FramePlan(
+        camera, LineSettings(), CircleSettings(radius_m=options.radius_m), levelling="none"
     )
-    tilts, variances, pitches = [], [], []
+    tables = tables_of(plan)
+    tilts, pitches = [], []
     with progress_bar("verticals and outlines", run.frames.expected) as advance:
         for frame in run.frames:
             advance()
-            try:
-                image = read_image(frame, camera)
-            except FrameError:
+            (found,) = detect_batch([FrameTask(frame)], plan, tables)
+            if found.error is not None or found.seen is None:
+                print(f"left out: {found.error}", file=sys.stderr)
                 continue
-            tilt = detect_lines(image, verticals).tilt
-            found = (math.nan,) * 4
-            if tilt is not None:
-                found = (tilt.pitch_rad, tilt.roll_rad, *np.diag(tilt.covariance).tolist())
-            tilts.append(found[:2])
-            variances.append(found[2:])
-            discs = detect_circles(image, camera, table, settings).floor_xy
             outlines = [
-                tilt_of_outlines(image, camera, discs, options.radius_m, share * height_m)
+                tilt_of_outlines(
+                    found.pixels, camera, found.seen.floor_xy, options.radius_m, share * height_m
+                )
                 for share in HEIGHT_STEPS
             ]
+            tilts.append(found.tilt)
             pitches.append([math.nan if one is None else one.pitch for one in outlines])
     mounting = mounting_of_run(
-        height_m,
-        FrameTilts(np.reshape(tilts, (-1, 2)), np.reshape(variances, (-1, 2))),
-        np.reshape(pitches, (-1, len(HEIGHT_STEPS))),
+        height_m, frame_tilts(tilts), np.reshape(pitches, (-1, len(HEIGHT_STEPS)))
     )
     if mounting is None:
         raise DetectError(

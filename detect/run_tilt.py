@@ -12,11 +12,14 @@ likelihood.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+
+from landmarks import FrameTilt
 
 FloatArray = NDArray[np.float64]
 
@@ -42,6 +45,16 @@ class FrameTilts(NamedTuple):
     """(N, 2)"""
     variance: FloatArray
     """(N, 2)"""
+
+
+def frame_tilts(tilts: Sequence[FrameTilt | None]) -> FrameTilts:
+    """Pitch and roll of frames with their variances, NaN for frames without a tilt."""
+    unknown = FrameTilt("", math.nan, math.nan, math.nan, 0.0, math.nan, 0)
+    known = [tilt or unknown for tilt in tilts]
+    return FrameTilts(
+        np.array([(tilt.pitch, tilt.roll) for tilt in known]).reshape(-1, 2),
+        np.array([(tilt.cpp, tilt.crr) for tilt in known]).reshape(-1, 2),
+    )
 
 
 @dataclass(frozen=True, eq=False)

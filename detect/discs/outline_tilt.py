@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from camera import Camera
 from camera.kernels import camera_numbers
 from detect.discs.rim import DIRECTIONS, profiles, rim_points
+from detect.positive_definite import invert_positive
 from detect.verticals.tilt import level_matrix
 
 #: Directions in which the rim must lie on the ellipse.
@@ -93,28 +94,6 @@ def _contrast(grey: NDArray[np.float64]) -> float:
                 outside += grey[k, m]
                 outside_count += 1
     return inside / inside_count - outside / outside_count
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def inverted(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Inverse of a small positive definite matrix, by Gauss and Jordan.
-
-    NumPy's would have Numba look LAPACK up at the first call, which an interrupt must not meet.
-    """
-    n = len(matrix)
-    left, right = matrix.copy(), np.eye(n)
-    for i in range(n):
-        pivot = left[i, i]
-        for j in range(n):
-            left[i, j] /= pivot
-            right[i, j] /= pivot
-        for k in range(n):
-            if k != i:
-                share = left[k, i]
-                for j in range(n):
-                    left[k, j] -= share * left[i, j]
-                    right[k, j] -= share * right[i, j]
-    return right
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -194,7 +173,8 @@ def fit_outline(
                     normal[i, j] += weight[k] * row[k, i] * row[k, j]
         for i in range(4):
             normal[i, i] *= 1.0 + 1e-9
-        inverse = inverted(normal)
+        if not invert_positive(normal, inverse):
+            return False, unknowns[2:], inverse[2:, 2:]
         for i in range(4):
             for j in range(4):
                 unknowns[i] += inverse[i, j] * right[j]
@@ -230,7 +210,7 @@ def mean_of_tilts(
     mean = np.array([np.median(tilt[:, 0]), np.median(tilt[:, 1])])
     information = np.zeros((len(tilt), 2, 2))
     for k in range(len(tilt)):
-        information[k] = inverted(covariance[k])
+        invert_positive(covariance[k], information[k])
     of_mean = np.zeros((2, 2))
     for _ in range(_ITERATIONS):
         total = np.zeros((2, 2))
@@ -246,7 +226,7 @@ def mean_of_tilts(
             for i in range(2):
                 for j in range(2):
                     right[i] += weight * information[k, i, j] * tilt[k, j]
-        of_mean = inverted(total)
+        invert_positive(total, of_mean)
         for i in range(2):
             mean[i] = of_mean[i, 0] * right[0] + of_mean[i, 1] * right[1]
     return mean, of_mean

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from detect.markers.homography_kernels import square_homography
 from detect.markers.lens_kernels import bent, straightened
 from detect.markers.robust_kernels import LEAST_NOISE, OUTLIER, robust_sigma
-from detect.markers.solve_kernels import invert_positive, solve_positive
+from detect.positive_definite import invert_positive, solve_positive
 
 #: What an edge's row of results holds: offset from the given line outwards in its middle and its
 #: change to the end (px), their variances and covariance (px^2), dark and light grey level, blur

@@ -31,7 +31,7 @@ from detect.markers.pattern_model_kernels import (
 )
 from detect.markers.pattern_residual_kernels import cell_values, inflation_of
 from detect.markers.robust_kernels import LEAST_NOISE, OUTLIER, robust_sigma
-from detect.markers.solve_kernels import invert_positive, solve_positive
+from detect.positive_definite import invert_positive, solve_positive
 
 #: Standard deviations of the light's slope and bend over half a marker, in contrasts.
 _SLOPE_SIGMA = 0.3

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -20,7 +19,6 @@ from numpy.typing import NDArray
 from camera import Camera
 from detect.errors import FrameError
 from detect.run import RunFrame, read_image
-from detect.runs.interrupts import interrupts_deferred
 from detect.runs.known import NOTHING, KnownOfFrame
 from landmarks import FrameTilt, Step, tilt_as_written
 
@@ -185,13 +183,10 @@ def _decode(task: FrameTask, found: FrameDetections, plan: FramePlan, _: Tables)
 
 def _find_lines(_: FrameTask, found: FrameDetections, plan: FramePlan, tables: Tables) -> None:
     if plan.lines is not None:
-        from detect.lines import detect_lines, find_lines
+        from detect.lines import detect_lines
 
         assert tables.verticals is not None
-        # Numba makes named tuples by Python code, and does not look whether an interrupt ended it.
-        # What is not compiled yet may take a minute, which nobody should have to wait for.
-        with interrupts_deferred() if find_lines.signatures else nullcontext():
-            found.lines = detect_lines(found.pixels, tables.verticals, plan.lines)
+        found.lines = detect_lines(found.pixels, tables.verticals, plan.lines)
 
 
 def _tell_tilt(task: FrameTask, found: FrameDetections, _: FramePlan, __: Tables) -> None:

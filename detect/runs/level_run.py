@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Iterator, Mapping
 from typing import BinaryIO
 
@@ -10,7 +9,7 @@ import numpy as np
 
 from camera import Camera
 from detect.discs.levelling_kernels import level_discs
-from detect.run_tilt import FrameTilts, RunTilt, tilt_of_run
+from detect.run_tilt import RunTilt, frame_tilts, tilt_of_run
 from detect.runs.outputs import LEVEL_CIRCLES, LEVEL_TILT
 from detect.runs.rows import RunSummary, disc_numbers, encoded, landmark_rows
 from landmarks import FrameTilt, format_levelling, format_no_tilt, format_tilt, tilt_as_written
@@ -64,23 +63,13 @@ def _applied(
     frames: list[_Tilted], outlines: list[FrameTilt | None], sigma_rad: float
 ) -> tuple[RunTilt | None, Iterable[FrameTilt | None]]:
     """The tilt of the run, and what each frame's discs are levelled by."""
-    run = tilt_of_run(_measured([tilt for _, _, tilt in frames]), _measured(outlines))
+    run = tilt_of_run(frame_tilts([tilt for _, _, tilt in frames]), frame_tilts(outlines))
     if run is None:
         return None, (_by_itself(prefix, tilt, sigma_rad) for prefix, _, tilt in frames)
     numbers = zip(frames, run.tilt.tolist(), run.variance.tolist())
     return run, (
         tilt_as_written(FrameTilt(prefix, pitch, roll, cpp, 0.0, crr, lines))
         for (prefix, lines, _), (pitch, roll), (cpp, crr) in numbers
-    )
-
-
-def _measured(tilts: list[FrameTilt | None]) -> FrameTilts:
-    """Pitch and roll of frames, and their variances; NaN where there are none."""
-    unknown = FrameTilt("", math.nan, math.nan, math.nan, 0.0, math.nan, 0)
-    known = [tilt or unknown for tilt in tilts]
-    return FrameTilts(
-        np.array([(tilt.pitch, tilt.roll) for tilt in known]).reshape(-1, 2),
-        np.array([(tilt.cpp, tilt.crr) for tilt in known]).reshape(-1, 2),
     )
 
 

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
-from detect.runs.interrupts import raise_if_interrupted
+from detect.interrupts import raise_if_interrupted
 
 _SHOWN_FAILURES = 10
 
@@ -15,7 +15,7 @@ _SHOWN_FAILURES = 10
 def progress_bar(label: str, total: int | None) -> Iterator[Callable[[], None]]:
     """A progress bar with the rate, on a terminal; yields what to call after every frame.
 
-    Calling it raises an interrupt that got lost (see `detect.runs.interrupts`).
+    Calling it raises an interrupt that got lost (see `detect.interrupts`).
 
     Without a total, it shows how many there were.
 

@@ -21,9 +21,9 @@ from typing import TYPE_CHECKING, NamedTuple, ParamSpec, TypeVar, cast
 
 from detect.announcing import announce_compiling, announcements_are_shown, show_announcements
 from detect.errors import WorkerError
+from detect.interrupts import interrupts_deferred
 from detect.runs.dispatch import Workers
 from detect.runs.frame import FramePlan, import_detectors, rehearse, tables_of
-from detect.runs.interrupts import interrupts_deferred
 from detect.runs.rows import PIXELS_AT_ONCE
 from storage.kernel_loading import load_kernels_alone, waiting_before_compiling
 

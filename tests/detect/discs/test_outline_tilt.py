@@ -16,7 +16,6 @@ from detect.discs.outline_tilt import (
     FLOOR_SIGMA_RAD,
     OutlineTilt,
     fit_outline,
-    inverted,
     mean_of_tilts,
     tilt_of_outlines,
 )
@@ -125,9 +124,3 @@ def test_levelling_and_its_inverse_agree(published_camera: Camera) -> None:
     tilt = (-0.045, 0.012)
     rows = published_camera.floor_from_pixel(image_positions(published_camera, DISCS, tilt))
     np.testing.assert_allclose(level_seen(published_camera, rows, tilt), DISCS, atol=1e-9)
-
-
-def test_inverse_is_one() -> None:
-    half = np.random.default_rng(3).normal(size=(4, 4))
-    matrix = half @ half.T + 0.1 * np.eye(4)
-    np.testing.assert_allclose(inverted(matrix) @ matrix, np.eye(4), atol=1e-9)

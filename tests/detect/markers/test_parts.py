@@ -27,9 +27,9 @@ from detect.markers.quadrangle import rough_corners
 from detect.markers.quadrangle_kernels import largest_quadrangle
 from detect.markers.robust_kernels import robust_sigma
 from detect.markers.settings import MarkerSettings
-from detect.markers.solve_kernels import invert_positive, solve_positive
 from detect.markers.templates import templates_of
 from detect.noise import estimate_noise
+from detect.positive_definite import invert_positive, solve_positive
 
 FloatArray = NDArray[np.float64]
 

@@ -14,7 +14,7 @@ import pytest
 
 from detect import cli
 from detect.cli import main
-from detect.runs.interrupts import interrupts_deferred, interrupts_noted, raise_if_interrupted
+from detect.interrupts import interrupts_deferred, interrupts_noted, raise_if_interrupted
 from detect.runs.progress import progress_bar
 
 

@@ -1,4 +1,7 @@
-"""Compiled solution of small positive definite systems, which says when they are not."""
+"""Compiled solution of small positive definite systems, which says when they are not.
+
+NumPy's own would have Numba look LAPACK up at the first call, which an interrupt must not meet.
+"""
 
 from __future__ import annotations
 
