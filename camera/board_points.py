@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -68,8 +69,6 @@ def _not_found(board: Board) -> CalibrationError:
 
 
 def _checkerboard(image: GreyImage, board: Board, window: float) -> FloatArray:
-    import cv2
-
     size = (board.columns, board.rows)
     for reduced in _reductions(image):
         per_pixel = np.array([image.shape[1] / reduced.shape[1], image.shape[0] / reduced.shape[0]])
@@ -89,8 +88,6 @@ def _checkerboard(image: GreyImage, board: Board, window: float) -> FloatArray:
 
 def _reductions(image: GreyImage) -> Iterator[GreyImage]:
     """The image as small as it is searched, smallest first."""
-    import cv2
-
     height, width = image.shape
     for longest in _SEARCHED_PX:
         if longest >= max(height, width):
@@ -108,8 +105,6 @@ def _refined(image: GreyImage, grid: NDArray[np.float32], share: float) -> Float
     The window is small, and a corner's own: a larger one follows the lens's bending of the edges,
     and one that reaches the next corner is drawn to it. Corners that are NaN stay so.
     """
-    import cv2
-
     half = np.clip(
         np.rint(share * _spacing(grid)), _SMALLEST_HALF_WINDOW, _LARGEST_HALF_WINDOW
     ).astype(int)
@@ -189,8 +184,6 @@ def _least_spacing(grid: NDArray[np.float32]) -> float:
 
 
 def _circles(image: GreyImage, board: Board) -> FloatArray:
-    import cv2
-
     flag = (
         cv2.CALIB_CB_ASYMMETRIC_GRID
         if board.kind == "asymmetric-circles"
@@ -219,8 +212,6 @@ def _circles(image: GreyImage, board: Board) -> FloatArray:
 
 def _twice_as_high(image: GreyImage) -> GreyImage:
     """The image stretched: half-height ones flatten what is square or round."""
-    import cv2
-
     height, width = image.shape
     return np.asarray(
         cv2.resize(image, (width, 2 * height), interpolation=cv2.INTER_LINEAR), dtype=np.uint8
@@ -246,8 +237,6 @@ def circle_centroids(image: GreyImage, grid: FloatArray) -> FloatArray:
     (rows, columns, 2) array
         The area centroid of each; a place where there is no circle to measure stays as it is.
     """
-    import cv2
-
     spacing = _least_spacing(grid.astype(np.float32))
     result = grid.copy()
     for index in np.ndindex(grid.shape[:2]):

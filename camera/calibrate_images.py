@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -101,8 +102,6 @@ def grey_of_content(content: bytes, name: object) -> GreyImage:
     CalibrationError
         If it cannot be read.
     """
-    import cv2
-
     image = None
     with suppress(cv2.error):
         image = cv2.imdecode(
@@ -142,8 +141,6 @@ def _evenly(paths: list[Path], most: int) -> list[Path]:
 
 
 def _frames(path: Path, every: int, most: int) -> Iterator[tuple[str, GreyImage]]:
-    import cv2
-
     video = cv2.VideoCapture(str(path))
     try:
         if not video.isOpened():

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -81,8 +82,6 @@ def dictionary_of(board: Board) -> cv2.aruco.Dictionary:
     CalibrationError
         If OpenCV has none of that name, or its markers are fewer than the board's.
     """
-    import cv2
-
     number = getattr(cv2.aruco, board.dictionary, None)
     if not board.dictionary.startswith("DICT_") or number is None:
         raise CalibrationError(
@@ -104,8 +103,6 @@ def _interpolated(image: GreyImage, board: Board) -> tuple[IntArray, FloatArray]
 
     Half-height images flatten the markers, until their cells are less than a pixel high.
     """
-    import cv2
-
     pattern = cv2.aruco.CharucoBoard(
         (board.columns, board.rows), board.square_m, board.marker_m, dictionary_of(board)
     )
@@ -146,8 +143,6 @@ def measured_corners(image: GreyImage, grid: FloatArray, marker_share: float) ->
     (rows, columns, 2) array
         NaN where there is none to be seen.
     """
-    import cv2
-
     grey = image.astype(np.float64)
     gradient: FloatArray = np.empty((2, *grey.shape))
     cv2.Scharr(grey, cv2.CV_64F, 1, 0, dst=gradient[0])
@@ -189,8 +184,6 @@ def _bordering(present: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 def _homography(grid: FloatArray, present: NDArray[np.bool_]) -> FloatArray | None:
     """(3, 3) from (column, row) to pixels, by all corners; None if they are on a line."""
-    import cv2
-
     places = np.argwhere(present)[:, ::-1].astype(np.float64)
     found: FloatArray | None = cv2.findHomography(places, grid[present])[0]  # type: ignore[assignment]
     return found

@@ -9,6 +9,8 @@ from __future__ import annotations
 import struct
 from typing import TYPE_CHECKING
 
+import pycolmap
+
 from camera.conversion_models import COEFFICIENTS, ForeignCamera, Model
 from camera.convert_yaml import shortest
 from camera.errors import ConversionError
@@ -215,7 +217,5 @@ def pycolmap_from_camera(camera: ForeignCamera) -> pycolmap.Camera:
     ConversionError
         If COLMAP has no such model.
     """
-    import pycolmap
-
     name, parameters = colmap_parameters(camera)
     return pycolmap.Camera(model=name, width=camera.width, height=camera.height, params=parameters)

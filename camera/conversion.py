@@ -13,7 +13,7 @@ from camera.brown import NOT_TANGENTIAL, Tangential, brown_of, brown_shift
 from camera.calibration_model import free_span, is_possible, project_points
 from camera.calibration_projection import intrinsics_of
 from camera.conversion_fit import EXACT_PX, least_squares, smallest_largest
-from camera.conversion_models import COEFFICIENTS, P1, ForeignCamera, Model
+from camera.conversion_models import COEFFICIENTS, P1, ForeignCamera, Model, distorted
 from camera.distortion import NO_POLYNOMIAL
 from camera.errors import CameraError, ConversionError
 from camera.model import Camera
@@ -319,8 +319,6 @@ def _nearest(
 
 
 def _unchecked(model: Model, p: FloatArray) -> Callable[[FloatArray], FloatArray]:
-    from camera.conversion_models import distorted
-
     def project(rays: FloatArray) -> FloatArray:
         with np.errstate(all="ignore"):
             return np.asarray(distorted(model, p[4:], rays) * p[:2] + p[2:4])

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml  # type: ignore[import-untyped, unused-ignore]
 
 from camera.errors import ConversionError
 from storage.bounded import read_bounded
@@ -58,7 +59,6 @@ def parse_yaml(text: str, name: str) -> dict[str, Any]:
     ConversionError
         If it is no YAML, uses aliases, or is no mapping; the message names the line.
     """
-    import yaml  # type: ignore[import-untyped, unused-ignore]
 
     class Loader(yaml.SafeLoader):  # type: ignore[misc, unused-ignore]
         def compose_node(self, parent: Any, index: Any) -> Any:

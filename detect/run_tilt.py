@@ -18,7 +18,9 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import minimize
 
+from detect.run_tilt_kernels import smooth_axis
 from landmarks import FrameTilt
 
 FloatArray = NDArray[np.float64]
@@ -122,8 +124,6 @@ def tilt_of_run(verticals: FrameTilts, outlines: FrameTilts | None = None) -> Ru
     if np.count_nonzero(np.isfinite(verticals.tilt[:, 0])) < LEAST_FRAMES:
         return None
     measured, variance = verticals if outlines is None else _joined(verticals, outlines)
-    from detect.run_tilt_kernels import smooth_axis
-
     axes, tilts, variances = [], [], []
     for values, of_values in zip(measured.T, variance.T):
         sigma = np.sqrt(of_values)
@@ -175,10 +175,6 @@ def _part(values: FloatArray, sigma: FloatArray) -> tuple[FloatArray, FloatArray
 
 def _learned(values: FloatArray, sigma: FloatArray) -> AxisModel:
     """The constants of the largest likelihood, and how well the lean among them is known."""
-    from scipy.optimize import minimize
-
-    from detect.run_tilt_kernels import smooth_axis
-
     unit = math.radians(0.1)
 
     def cost(unknowns: FloatArray) -> float:

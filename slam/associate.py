@@ -23,6 +23,7 @@ from slam.local_map import tilt_jacobian
 from slam.loops import LoopSettings, Match, find_matches, stretches_of
 from slam.loops_closing import closed_path, in_order, merge_labels, pairs_by_votes, pairs_in_place
 from slam.loops_path import Solution, intersect_bearings, solve_path
+from slam.motion import chain_steps
 from slam.recording import Recording
 from storage.bounds import demand, whole
 
@@ -207,8 +208,6 @@ def _solved(
     """Path and map by discs, or by lines where there are no discs."""
     line_xy = None
     if not by_discs:
-        from slam.motion import chain_steps
-
         start = chain_steps(recording.steps) if path is None else path
         line_xy = intersect_bearings(recording, start, labels, camera_xy=camera_xy)
     none = np.zeros(len(recording.lines), dtype=np.int64)

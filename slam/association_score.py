@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+from scipy.sparse import csr_array
 
 IntArray = NDArray[np.int64]
 
@@ -62,9 +64,6 @@ def score_association(labels: IntArray, ids: Sequence[tuple[int, ...]]) -> Assoc
     -------
     AssociationScore
     """
-    from scipy.optimize import linear_sum_assignment
-    from scipy.sparse import csr_array
-
     known = [k for k, listed in enumerate(ids) if listed]
     names = {name: k for k, name in enumerate(sorted({i for k in known for i in ids[k]}))}
     _, label = np.unique(np.asarray(labels, dtype=np.int64)[known], return_inverse=True)
@@ -105,8 +104,6 @@ def _pairs(
 
     Rows with the same IDs are counted together: pairs of rows themselves are too many in long runs.
     """
-    from scipy.sparse import csr_array
-
     kinds: dict[frozenset[int], int] = {}
     kind = np.array(
         [kinds.setdefault(frozenset(ids[k]), len(kinds)) for k in known], dtype=np.int64

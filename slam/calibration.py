@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from camera import Camera
 from slam.calibration_model import rotation_exp, skew
@@ -156,8 +157,6 @@ def mounting_change(camera: Camera, mounting: FloatArray) -> FloatArray:
     -------
     (4,) float64
     """
-    from scipy.spatial.transform import Rotation
-
     turn = mounting[:, :3] @ np.linalg.inv(camera.rotation)
     return np.append(
         Rotation.from_matrix(turn).as_rotvec(), mounting[2, 3] - float(camera.centre[2])

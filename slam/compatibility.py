@@ -16,7 +16,9 @@ from functools import cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.special import chdtri
 
+from slam.compatibility_kernels import individual_distances, pair_nearest_first, search_jointly
 from slam.errors import SlamError
 
 FloatArray = NDArray[np.float64]
@@ -76,8 +78,6 @@ def nearest_compatible(
     SlamError
         If the shapes do not fit or the probability is not in (0, 1).
     """
-    from slam.compatibility_kernels import individual_distances, pair_nearest_first
-
     innovation, predicted, measured = _checked(innovations, predicted_covariance, noise)
     width = innovation.shape[2]
     squared = individual_distances(innovation, predicted, measured)
@@ -122,8 +122,6 @@ def joint_compatible(
     SlamError
         If the shapes do not fit or the probability is not in (0, 1).
     """
-    from slam.compatibility_kernels import individual_distances, search_jointly
-
     innovation, predicted, measured = _checked(innovations, predicted_covariance, noise)
     n, _, width = innovation.shape
     squared = individual_distances(innovation, predicted, measured)
@@ -163,8 +161,6 @@ def chi_squared_gates(probability: float, width: int, most_pairs: int) -> FloatA
 
 @cache
 def _gates(probability: float, width: int, most_pairs: int) -> FloatArray:
-    from scipy.special import chdtri
-
     gates = np.zeros(most_pairs + 1)
     gates[1:] = chdtri(width * np.arange(1, most_pairs + 1), 1.0 - probability)
     return gates

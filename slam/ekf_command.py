@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import slam
 from landmarks.map_file import read_map, write_map, write_path
 from slam.ekf import EkfSlam, run_ekf
 from slam.errors import SlamError
@@ -27,8 +28,6 @@ MAP_NAME, JSON_NAME = "map.csv", "ekf.json"
 
 def perform(command: Ekf) -> int:
     """Map a run and localise in it at once; returns the exit code."""
-    import slam
-
     output = command.output or default_output(command.run, "ekf")
     names = (
         *(PATH_NAME, MAP_NAME, covariance_file(Path(MAP_NAME)).name, JSON_NAME, MAP_PICTURE),

@@ -16,6 +16,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg.blas import dsyrk
+from scipy.linalg.lapack import dtrtrs
 
 from slam.ekf_kernels import set_symmetric_rows, symmetric_block, symmetric_columns
 from slam.errors import SlamError
@@ -44,9 +46,6 @@ class JointCovariance:
     """
 
     def __init__(self, pose_covariance: FloatArray) -> None:
-        from scipy.linalg.blas import dsyrk
-        from scipy.linalg.lapack import dtrtrs
-
         self._subtract: Callable[..., FloatArray] = dsyrk
         self._solve: Callable[..., tuple[FloatArray, int]] = dtrtrs
         self.size = POSE_SIZE

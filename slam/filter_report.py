@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+import slam
 from landmarks import squared_mahalanobis, wrap_angle
 from landmarks.map_file import LandmarkMap, Path2D
 from slam.errors import SlamError
@@ -104,8 +105,6 @@ def summary(run: FilterRun, settings: Any, distance: dict[str, float] | None) ->
     -------
     dict
     """
-    import slam
-
     count = run.count
     figures: dict[str, object] = {
         "steps": len(run.path.poses) - 1,

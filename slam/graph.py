@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -172,8 +172,6 @@ def with_lines(graph: Graph, rows: LineRows, line_ids: IntArray) -> Graph:
     -------
     Graph
     """
-    from dataclasses import replace
-
     place = {int(number): k for k, number in enumerate(line_ids)}
     usable = [k for k, ids in enumerate(rows.ids) if ids and all(i in place for i in ids)]
     members = [(r, place[i]) for r, k in enumerate(usable) for i in rows.ids[k]]

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from landmarks import wrap_angle
 from slam.errors import SlamError
+from slam.line_points_kernels import best_run, crossings, scores_of
 from slam.loops_path import intersect_bearings, solve_path
 from slam.measurement import disc_in_map
 from slam.recording import Recording
@@ -257,8 +258,6 @@ def find_points(rays: Rays, setting: PointSettings) -> tuple[IntArray, FloatArra
     points : (k, 2) float64
         In the map (m).
     """
-    from slam.line_points_kernels import best_run, crossings, scores_of
-
     window = setting.window_frames
     points, frames = crossings(
         rays.centre,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+import slam
 from landmarks.map_file import read_map, write_path
 from slam.errors import SlamError
 from slam.filter_association import Associator
@@ -27,8 +28,6 @@ JSON_NAME = "localize.json"
 
 def perform(command: Localize) -> int:
     """Localise in a run; returns the exit code."""
-    import slam
-
     output = command.output or default_output(command.run, "localize")
     names = (PATH_NAME, JSON_NAME, MAP_PICTURE, *([ERROR_PICTURE] if command.reference else []))
     associator = Associator(command.association, command.gate_probability)

@@ -16,8 +16,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.stats import binom
 
 from slam.errors import SlamError
+from slam.loops_kernels import best_motion
 from storage.bounds import ABOVE_0, LIMIT, NOT_NEGATIVE, demand, whole
 
 if TYPE_CHECKING:
@@ -183,8 +186,6 @@ def shared_landmarks(stretches: Sequence[Stretch]) -> csr_array:
     (S, S) sparse int64
         Of each two; rows and columns as in the sequence.
     """
-    from scipy.sparse import csr_array
-
     sizes = np.array([len(s.labels) for s in stretches], dtype=np.int64)
     labels = np.concatenate([np.zeros(0, dtype=np.int64), *(s.labels for s in stretches)])
     starts = np.concatenate([[0], np.cumsum(sizes)])
@@ -214,8 +215,6 @@ def find_matches(
     list of Match
         The surest first.
     """
-    from slam.loops_kernels import best_motion
-
     candidates: list[tuple[Stretch, Stretch, BoolArray, BoolArray, float, FloatArray]] = []
     tried = 0
     centres = np.array([s.xy.mean(axis=0) for s in stretches]).reshape(-1, 2)
@@ -335,8 +334,6 @@ def log10_false_alarms(agreeing: int, present: int, chance: float, tried: int) -
     -------
     float
     """
-    from scipy.stats import binom
-
     tail = float(binom.logsf(agreeing - 3, max(present - 2, 0), min(chance, 1.0)))
     return float(np.log10(max(tried, 1)) + tail / np.log(10.0))
 

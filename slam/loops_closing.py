@@ -6,6 +6,8 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csc_array
+from scipy.sparse.linalg import splu
 
 from slam.loops import SHARED_BY_ONE_PLACE, Match, Stretch, mutual_pairs, shared_landmarks
 from slam.motion import relative_pose, rotation
@@ -199,9 +201,6 @@ def _chained(
     before: IntArray, after: IntArray, differences: FloatArray, weight: FloatArray, count: int
 ) -> FloatArray:
     """Values at nodes 0 (where they are 0) to count from weighted differences between nodes."""
-    from scipy.sparse import csc_array
-    from scipy.sparse.linalg import splu
-
     edges = np.arange(len(before))
     row = np.concatenate([edges, edges])
     column = np.concatenate([after, before]) - 1

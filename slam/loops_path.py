@@ -11,6 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csc_array, eye_array
+from scipy.sparse.linalg import splu
 
 from landmarks import wrap_angle
 from slam.measurement import (
@@ -296,9 +298,6 @@ def _step(
     damping: float,
 ) -> FloatArray:
     """Change of all unknowns: poses but the first, discs, lines with a place."""
-    from scipy.sparse import csc_array, eye_array
-    from scipy.sparse.linalg import splu
-
     recording = system.recording
     count = len(recording)
     first_disc = 3 * count

@@ -19,6 +19,7 @@ from slam.graph_terms import Weighting
 from slam.map_covariance import covariance_file, joint_covariance, write_joint_covariance
 from slam.mapping import LeftOut, MappedRun, Mounting, landmark_map, map_run, path_of
 from slam.options import Map
+from slam.pictures import draw_map
 from slam.recording import Recording
 from slam.run_camera import camera_of_run
 from slam.run_rows import recording_of
@@ -157,8 +158,6 @@ def _draw(
     output: Path,
     command: Map,
 ) -> None:
-
-    from slam.pictures import draw_map
 
     first = landmark_map(mapped.graph, mapped.start, None)
     draw_map(

@@ -21,6 +21,7 @@ from slam.initial_lines import InitialLines, place_lines
 from slam.marginals import Marginals, marginals
 from slam.recording import Recording
 from slam.solve import Solution, solve
+from slam.solve_gtsam import solve_gtsam
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -207,8 +208,6 @@ def path_of(recording: Recording, estimate: Estimate, covariance: Marginals | No
 
 def _descent(solver: Solver) -> Callable[[Graph, Estimate, Weighting], Solution]:
     if solver == "gtsam":
-        from slam.solve_gtsam import solve_gtsam
-
         return solve_gtsam
     return solve
 

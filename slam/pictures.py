@@ -10,6 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from matplotlib.collections import PolyCollection
+from matplotlib.colors import to_rgb
+from matplotlib.ticker import MultipleLocator
 from numpy.typing import ArrayLike, NDArray
 
 from landmarks import is_positive_definite, squared_mahalanobis, wrap_angle
@@ -158,8 +161,6 @@ def draw_map(
     scale = min(largest[0] / span[0], largest[1] / span[1])
     size = (max(scale * span[0] * columns, 6.0) + 1.2, scale * span[1] * rows + 1.8)
     with picture(png, size, overwrite=overwrite, interactive=interactive) as figure:
-        from matplotlib.ticker import MultipleLocator
-
         all_axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).ravel()
         for axes, (name, some, poses) in zip(all_axes, panels):
             _draw_panel(axes, some, poses, reference, low, high)
@@ -348,8 +349,6 @@ def _draw_landmarks(
     low: FloatArray,
     high: FloatArray,
 ) -> None:
-    from matplotlib.collections import PolyCollection
-
     if len(some) == 0:
         return
     shown = _inside(some.xy, low, high)
@@ -378,6 +377,4 @@ def _draw_landmarks(
 
 
 def _rgb(colour: str) -> tuple[float, float, float]:
-    from matplotlib.colors import to_rgb
-
     return to_rgb(colour)

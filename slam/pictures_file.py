@@ -8,6 +8,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import matplotlib as mpl
+from matplotlib import pyplot
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
 from slam.errors import SlamError
 from storage import OutputExistsError, write_whole
 
@@ -46,22 +51,15 @@ def picture(
     SlamError
         If a window is asked for where none can be opened.
     """
-    import matplotlib as mpl
-
     if not overwrite and png.exists():  # before the work instead of after it
         raise OutputExistsError(png)
     with mpl.rc_context():
         mpl.rcdefaults()
         if interactive:
-            from matplotlib import pyplot
-
             if mpl.get_backend().lower() in _WITHOUT_WINDOWS:
                 raise SlamError("no window can be opened here: expected a display for interactive")
             figure = pyplot.figure(figsize=size, dpi=DPI, layout="constrained")
         else:
-            from matplotlib.backends.backend_agg import FigureCanvasAgg
-            from matplotlib.figure import Figure
-
             figure = Figure(figsize=size, dpi=DPI, layout="constrained")
             FigureCanvasAgg(figure)
         try:

@@ -8,6 +8,7 @@ import warnings
 from typing import Any, BinaryIO
 
 import numpy as np
+from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from storage.messages import one_line
@@ -37,8 +38,6 @@ def read_plain_array(
     ValueError
         If there is no such array; the message says what stands there, on one line.
     """
-    from numpy.lib import format as npy
-
     expected = f"expected {dimensions}-dimensional {dtype}, row by row"
     try:
         version = npy.read_magic(stream)

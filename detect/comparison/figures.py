@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import chdtri
 
 from detect.comparison.result import NormalisedError
 
@@ -41,10 +42,8 @@ def normalised_error(
     NormalisedError
         With the central 95 % of the chi-square distribution as band.
     """
-    from scipy.stats import chi2
-
     dof = dof_per_row * len(squared)
     if dof == 0:
         return NormalisedError(per_dof=None, dof=0, band=None, left_out=left_out)
-    low, high = (float(chi2.ppf(p, dof)) / dof for p in _BAND)
+    low, high = (float(chdtri(dof, 1.0 - p)) / dof for p in _BAND)
     return NormalisedError(float(squared.sum()) / dof, dof, (low, high), left_out)

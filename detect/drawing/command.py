@@ -9,6 +9,7 @@ from contextlib import ExitStack, contextmanager
 from math import isfinite
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -87,8 +88,6 @@ def perform(options: Draw) -> int:
 
 def png(picture: NDArray[np.uint8]) -> bytes:
     """A picture in OpenCV's order of colours as a PNG file."""
-    import cv2
-
     _, encoded = cv2.imencode(".png", picture)
     return encoded.tobytes()
 
@@ -115,8 +114,6 @@ def mp4(
     storage.OutputExistsError
         If the file exists and must not be replaced.
     """
-    import cv2
-
     writer: cv2.VideoWriter | None = None
     size: tuple[int, int] | None = None
 

@@ -23,6 +23,7 @@ from detect.comparison.result import CompareOptions
 from detect.drawing.detections import EDGE_COLOUR, outline_disc
 from detect.drawing.inputs import SeenRows
 from detect.drawing.strokes import Colour, canvas_of, draw_curve, draw_text, enlargement
+from detect.markers.drawing import mark_marker
 from detect.seen import FrameView, circle_on_floor, image_positions
 from detect.settings import CircleSettings
 from landmarks import (
@@ -226,8 +227,6 @@ def _draw_lines(
 
 
 def _draw_markers(canvas: NDArray[np.uint8], found: Sequence[MarkerLandmark]) -> str:
-    from detect.markers.drawing import mark_marker
-
     for row in found:
         corners = np.array([(c.u, c.v) for c in row.corners])
         covariance = np.array([[(c.cuu, c.cuv), (c.cuv, c.cvv)] for c in row.corners])

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import lru_cache
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -58,8 +59,6 @@ def draw_curve(
     canvas: NDArray[np.uint8], points: FloatArray, colour: Colour, *, closed: bool = False
 ) -> None:
     """Draw a curve through (N, 2) points u, v; nothing is drawn if one is not finite."""
-    import cv2
-
     if np.all(np.abs(points) < _FARTHEST_PX):
         fixed = np.rint(points * (1 << _SUBPIXEL_BITS)).astype(np.int32)
         width = enlargement(canvas)
@@ -70,8 +69,6 @@ def draw_text(
     canvas: NDArray[np.uint8], text: str, at: tuple[int, int], colour: Colour, size: float = 0.35
 ) -> None:
     """Write at the left end of the base line; what is no ASCII is a question mark."""
-    import cv2
-
     plain = text.encode("ascii", "replace").decode()
     times = enlargement(canvas)
     font = cv2.FONT_HERSHEY_SIMPLEX

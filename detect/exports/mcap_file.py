@@ -13,6 +13,8 @@ from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
+import numpy as np
+
 from detect.errors import DetectError
 from detect.exports.rows import TableRow
 from landmarks.columns import FRAME_COLUMNS, TABLES, Column, TableName
@@ -135,8 +137,6 @@ def _messages(
 
 
 def _ros_values(row: TableRow) -> Iterator[Any]:
-    import numpy as np
-
     for value in row.values:
         if isinstance(value, tuple):
             yield np.array(value, dtype=np.int64)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -78,8 +79,6 @@ def closing(grey: GreyImage, radius: int) -> GreyImage:
     -------
     (H, W) uint8
     """
-    import cv2
-
     half = round(_SQUARE_SHARE * radius)
     square = np.ones((2 * half + 1, 2 * half + 1), np.uint8)
     cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
@@ -144,8 +143,6 @@ def dark_masks(layer: Layer, noise: float, settings: MarkerSettings) -> tuple[Ma
     -------
     tuple of Mask
     """
-    import cv2
-
     gate = settings.dark_noise * noise / layer.scale
     masks = []
     smooth: Layer | None = None
@@ -165,8 +162,6 @@ def dark_masks(layer: Layer, noise: float, settings: MarkerSettings) -> tuple[Ma
 
 def dark_pixels(layer: Layer, threshold: float, gate: float, darkness: Darkness) -> GreyImage:
     """1 where a layer is darker than its closing by the threshold and by `gate` grey levels."""
-    import cv2
-
     limit = np.arange(256.0)
     by_threshold = limit * (1.0 - threshold) if darkness == "ratio" else limit - 255.0 * threshold
     # I1 < limit(I2), for whole grey levels; the limit itself is not dark.
@@ -177,8 +172,6 @@ def dark_pixels(layer: Layer, threshold: float, gate: float, darkness: Darkness)
 
 def _reduced(image: GreyImage, scale: int) -> GreyImage:
     """Means over `scale` x `scale` pixels; rows and columns left over are dropped."""
-    import cv2
-
     if scale == 1:
         return image
     height, width = image.shape[0] // scale, image.shape[1] // scale

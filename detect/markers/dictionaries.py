@@ -17,6 +17,7 @@ import functools
 from dataclasses import dataclass
 
 import numpy as np
+from cv2 import aruco
 from numpy.typing import NDArray
 
 from detect.errors import DetectError
@@ -155,16 +156,12 @@ def _framed(patterns: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 @functools.cache
 def _opencv_constants() -> dict[str, int]:
-    from cv2 import aruco
-
     names = (name for name in dir(aruco) if name.startswith(_OPENCV_PREFIX))
     return {name.removeprefix(_OPENCV_PREFIX).lower(): getattr(aruco, name) for name in names}
 
 
 def _opencv_patterns(constant: int) -> NDArray[np.bool_]:
     """Patterns of an OpenCV dictionary, with the border of one cell."""
-    from cv2 import aruco
-
     dictionary = aruco.getPredefinedDictionary(constant)
     side = dictionary.markerSize + 2
     return np.stack(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -77,8 +78,6 @@ def mark_marker(
     covariance : (4, 2, 2) float64
         Of the corners, pixels squared; ellipses show 20 standard deviations.
     """
-    import cv2
-
     times = enlargement(canvas)
     draw_curve(canvas, corners, _EDGE_COLOUR, closed=True)
     for place, spread in zip(corners, covariance):

@@ -10,6 +10,7 @@ import math
 from collections import Counter
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -89,8 +90,6 @@ def marker_regions(
     rejected : Counter
         How many were not taken, by cause; the smallest specks are not counted.
     """
-    import cv2
-
     rejected: Counter[str] = Counter()
     scale = mask.layer.scale
     count, labels, stats, _ = cv2.connectedComponentsWithStatsWithAlgorithm(

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from detect import __version__
 from detect.drawing.frame import draw_rows
 from detect.errors import DetectError, FrameError
+from detect.report.gallery import gallery
 from detect.report.inputs import ReportInputs, gather
 from detect.report.page import Picture, report_page
 from detect.run import Run, RunFrame, read_image
@@ -20,8 +23,6 @@ _JPEG_QUALITY = 88
 
 def perform(options: Report) -> int:
     """Carry the command out; returns the exit code."""
-    from detect import __version__
-
     if options.worst < 0:
         raise DetectError(f"worst is {options.worst}: expected 0 or more")
     demand_recording(options.run)
@@ -54,10 +55,6 @@ def perform(options: Report) -> int:
 
 def _gallery(inputs: ReportInputs, fate: str) -> tuple[bytes, int, int, int, int] | None:
     """Cut-outs of missed or extra discs as JPEG: content, width, height, how many, of how many."""
-    import cv2
-
-    from detect.report.gallery import gallery
-
     frames = {frame.step.prefix: frame for frame in inputs.run.frames}
     camera = inputs.run.camera if isinstance(inputs.run, Run) else None
 
@@ -77,8 +74,6 @@ def _gallery(inputs: ReportInputs, fate: str) -> tuple[bytes, int, int, int, int
 
 def _picture(inputs: ReportInputs, prefix: str) -> Picture:
     """The picture of a frame as JPEG; or why there is none."""
-    import cv2
-
     run = inputs.run
     camera = run.camera if isinstance(run, Run) else None
     frame: RunFrame | None = next((f for f in run.frames if f.step.prefix == prefix), None)

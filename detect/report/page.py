@@ -7,11 +7,14 @@ from dataclasses import fields
 from typing import Any
 
 import numpy as np
+from jinja2 import Environment, StrictUndefined
+from markupsafe import Markup
 
 from detect.comparison.circles import FLOOR_GATE_M
 from detect.comparison.tables import number
 from detect.drawing.inputs import picture_name
 from detect.line_settings import LineSettings
+from detect.markers.settings import MarkerSettings
 from detect.report.accuracy import disc_parts, line_parts
 from detect.report.figures import counts_figure, tilt_figure
 from detect.report.inputs import ReportInputs
@@ -49,9 +52,6 @@ def report_page(
         Of cut-outs: "missed" or "extra", a JPEG, its width and height, how many discs are shown,
         and how many there are.
     """
-    from jinja2 import Environment, StrictUndefined
-    from markupsafe import Markup
-
     sections = [Section("summary", "What was found", _summary(inputs))]
     if "circles" in inputs.files.detected:
         sections.append(Section("discs", "Discs against the reference", disc_parts(inputs)))
@@ -286,8 +286,6 @@ def _settings(inputs: ReportInputs, version: str) -> list[Part]:
 
 def _defaults(kind: str) -> dict[str, str]:
     """The default settings, written as heads write them."""
-    from detect.markers.settings import MarkerSettings
-
     kinds: dict[str, Any] = {
         "circles": CircleSettings, "lines": LineSettings, "markers": MarkerSettings,
     }  # fmt: skip

@@ -6,6 +6,10 @@ import io
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Literal
 
+import matplotlib as mpl
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
@@ -34,16 +38,11 @@ def plotted(
     -------
     bytes
     """
-    import matplotlib as mpl
-
     with mpl.rc_context():
         mpl.rcdefaults()
         # Names of parts are made of a hash; text stays text, and is set in a font of the reader's.
         mpl.rcParams.update({"svg.hashsalt": "redetect", "svg.fonttype": "none"})
         mpl.rcParams.update({"axes.spines.top": False, "axes.spines.right": False})
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-
         figure = Figure(figsize=size, dpi=_DPI, layout="constrained")
         FigureCanvasAgg(figure)
         draw(figure)

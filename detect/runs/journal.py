@@ -17,6 +17,9 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import cv2
+import numpy as np
+
 from detect.run import RunFrame
 from detect.runs.conduct import Conduct
 from detect.runs.frame import FramePlan, FrameTask
@@ -157,9 +160,6 @@ def left_journal(place: Path) -> Journal | None:
 
 def made_by(outputs: Sequence[Output], plan: FramePlan, conduct: Conduct) -> str:
     """A digest of whatever decides the rows, besides the frames themselves."""
-    import cv2
-    import numpy as np
-
     settings = [
         None if values is None else asdict(values)
         for values in (plan.circles, plan.lines, plan.markers)

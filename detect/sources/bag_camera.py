@@ -16,7 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera
+from camera.calibration_floor import with_pose
+from camera.conversion import convert_to_camera
+from camera.ros_camera_info import camera_from_message
 from detect.errors import DetectError
+from detect.sources.bag_messages import LONGEST_NAME, messages, opened_bag, understood
 from detect.sources.interface import Calibration
 from detect.sources.steps import DATASET_FROM_ROBOTICS
 from storage.messages import one_line
@@ -70,10 +74,6 @@ def calibration_of_info(message: Any, name: str, pose: Matrix | None, why_not: s
     camera.CameraError
         If there can be no such camera.
     """
-    from camera.calibration_floor import with_pose
-    from camera.conversion import convert_to_camera
-    from camera.ros_camera_info import camera_from_message
-
     part = message.roi.width or message.roi.height
     if part or max(message.binning_x, message.binning_y) > 1:
         raise DetectError(f"{name}: binning or roi is set: name a calibration by --camera")
@@ -107,8 +107,6 @@ def static_transforms(reader: AnyReader, path: Path) -> dict[str, tuple[str, Mat
     DetectError
         If one is none.
     """
-    from detect.sources.bag import messages, understood
-
     kinds = {c.topic: c.msgtype for c in reader.connections}
     if kinds.get(_STATIC) != _TRANSFORMS:
         return {}
@@ -194,8 +192,6 @@ def recorded_calibration(path: Path, image_topic: str, base: str) -> Calibration
     DetectError, camera.CameraError
         As `calibration_of_info`, or if the bag cannot be read.
     """
-    from detect.sources.bag import LONGEST_NAME, messages, opened_bag, understood
-
     with opened_bag(path) as reader:
         topic = info_topic(reader, image_topic)
         if topic is None:

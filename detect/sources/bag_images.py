@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any, Protocol
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -52,8 +53,6 @@ def pixels_of_message(message: ImageMessage, name: object) -> NDArray[Any]:
     FrameError
         If the encoding is another, or there is less data than the message speaks of.
     """
-    import cv2
-
     encoding = message.encoding
     bayer = encoding.rstrip("0123456789").rstrip("_") if encoding.startswith("bayer_") else None
     if encoding in _LUMA:
@@ -92,3 +91,16 @@ def _rows(message: ImageMessage, name: object, dtype: np.dtype[Any], channels: i
         )
     rows = data[: height * message.step].reshape(height, message.step)[:, :wide]
     return np.ascontiguousarray(rows).view(dtype)
+
+
+def compressed_content(message: Any, name: object) -> bytes:
+    """The image file in a `sensor_msgs/CompressedImage`.
+
+    Raises
+    ------
+    FrameError
+        If it is none that can be decoded: compressed depth.
+    """
+    if "compressedDepth" in message.format:
+        raise FrameError(f"{name}: format {excerpt(message.format)}: expected jpeg, png or tiff")
+    return bytes(message.data)

@@ -10,6 +10,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -92,8 +93,6 @@ def gray_of_pixels(pixels: NDArray[Any], name: object, bits: int = 16) -> NDArra
     if pixels.dtype not in (np.uint8, np.uint16):
         raise FrameError(f"{name}: holds {pixels.dtype}: expected images of 8 or 16 bits")
     if pixels.ndim == 3:
-        import cv2
-
         code = cv2.COLOR_BGR2GRAY if pixels.shape[2] == 3 else cv2.COLOR_BGRA2GRAY
         pixels = cv2.cvtColor(pixels, code)
     if pixels.dtype == np.uint8:
@@ -129,8 +128,6 @@ def significant_bits_of_file(path: Path) -> int | None:
 
 
 def _decoded(content: bytes, *, deep: bool) -> NDArray[Any] | None:
-    import cv2
-
     if not content:
         return None
     # A calibration is of the sensor's pixels, whichever way up a telephone would show them (Exif).

@@ -17,6 +17,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, Protocol
 
+import cv2
 from numpy.typing import NDArray
 
 from detect.errors import DetectError
@@ -160,8 +161,6 @@ def _stoppable() -> Iterator[threading.Event]:
 
 
 def _open_camera(index: int) -> Capture:
-    import cv2
-
     with quiet_opencv():
         capture = cv2.VideoCapture(index)
     if not capture.isOpened():

@@ -10,6 +10,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import cv2
+
 from detect.errors import DetectError
 from detect.sources.gray import gray_of_pixels
 from detect.sources.interface import (
@@ -45,8 +47,6 @@ class VideoFile:
     ships_images = True
 
     def __init__(self, path: Path) -> None:
-        import cv2
-
         self.path = path
         self.name = str(path)
         self.output_base = path.with_name(f"{path.stem}.detected")
@@ -65,8 +65,6 @@ class VideoFile:
 
     def images(self) -> Generator[SourceImage, None, None]:
         """The frames as grey values, with their presentation times."""
-        import cv2
-
         with _opened(self.path) as capture:
             per_second = capture.get(cv2.CAP_PROP_FPS)
             number, last_s = 0, -math.inf
@@ -97,8 +95,6 @@ class VideoFile:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[cv2.VideoCapture]:
-    import cv2
-
     with quiet_opencv():
         capture = cv2.VideoCapture(str(path))
     try:
@@ -117,8 +113,6 @@ def _opened(path: Path) -> Iterator[cv2.VideoCapture]:
 @contextmanager
 def quiet_opencv() -> Iterator[None]:
     """Keep OpenCV, and FFmpeg in it, from telling in their own words what is told in ours."""
-    import cv2
-
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     levels: Any = getattr(cv2.utils, "logging", cv2)  # where OpenCV 4 has them
     before = levels.getLogLevel()

@@ -6,12 +6,14 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
+from detect import __version__
 from detect.comparison.lines_result import LineCompareOptions
 from detect.drawing.selection import select_frames
 from detect.errors import EXIT_FRAMES_FAILED, DetectError
 from detect.line_settings import PRESETS, LineSettings
 from detect.runs.known import FramesByImage, TiltsByImage
 from detect.runs.progress import print_failures, progress_bar
+from detect.runs.workers import default_jobs, local_workers
 from detect.settings import PUBLISHED, CircleSettings
 from detect.sources.opening import demand_recording, open_calibrated
 from detect.tune.grid import combinations, settings_with
@@ -24,9 +26,6 @@ from storage import OutputExistsError, write_whole
 
 def perform(options: Tune) -> int:
     """Carry the command out; returns the exit code."""
-    from detect import __version__
-    from detect.runs.workers import default_jobs, local_workers
-
     base: Settings
     if options.verticals:
         base = PRESETS[options.preset]

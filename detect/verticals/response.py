@@ -312,8 +312,6 @@ def _runs_of_neighbours(
     pixel: NDArray[np.int32], pixels: int
 ) -> tuple[NDArray[np.int32], NDArray[np.uint8], NDArray[np.int32], NDArray[np.int32]]:
     """See `StartBand`: runs, lengths, odd, odd_bounds."""
-    from detect.vector_code import LANES
-
     block = pixel.reshape(-1, RUN)
     breaks = np.diff(block, axis=1) != 1
     number = np.concatenate([np.zeros((len(block), 1), np.intp), np.cumsum(breaks, axis=1)], axis=1)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from groundtruth.clocks.clock import ClockSegment
 
@@ -49,7 +49,7 @@ def on_one_line(segments: Sequence[ClockSegment]) -> list[ClockSegment]:
     line = covariance @ design.T @ target
     squared = float(np.sum((target - design @ line) ** 2))
     freedom = len(values) - 2
-    if squared > chi2.ppf(_AGREEMENT, freedom):
+    if squared > chdtri(freedom, 1.0 - _AGREEMENT):
         return list(segments)
     note = f"one line through {len(told)} segments: chi2 {squared:.1f} of {freedom}"
     result = []

@@ -11,6 +11,15 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeRemainingColumn,
+)
+
 from groundtruth import __version__
 from groundtruth.errors import GroundTruthError
 from storage import OutputExistsError, write_whole
@@ -57,15 +66,6 @@ def progress(label: str) -> Iterator[tuple[Callable[[int], None], Callable[[], N
     if not sys.stderr.isatty():
         yield lambda total: None, lambda: None
         return
-    from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeRemainingColumn,
-    )
-
     bar = Progress(
         TextColumn("{task.description}"),
         BarColumn(),

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from groundtruth.fusion.motion_kernels import POSE
 from groundtruth.fusion.movement import MovementProblem
@@ -104,7 +104,7 @@ def looser_over_seconds(problem: MovementProblem, noise: FloatArray) -> float:
             float(np.sum(np.minimum(account.squared[1:], problem.gate())))
             for account in (part.account(math.sqrt(looser) * noise) for part in some)
         )
-        if looser == 1.0 and squared < chi2.ppf(1.0 - _DOUBT, numbers):
+        if looser == 1.0 and squared < chdtri(numbers, _DOUBT):
             return 1.0
         looser *= max(squared / numbers, 1.0)
     return looser

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from groundtruth.fusion.controls import movements, variances_of
 from groundtruth.fusion.gaps import (
@@ -256,7 +256,7 @@ class MovementProblem:
 
     def gate(self) -> float:
         """Largest squared normalised innovation."""
-        return float(chi2.ppf(self.settings.gate_probability, POSE))
+        return float(chdtri(POSE, 1.0 - self.settings.gate_probability))
 
     def _variances(self, noise: FloatArray) -> FloatArray:
         """(N, 3) what odometry's random errors sum up to."""

@@ -8,6 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from groundtruth.geometry.plane import compose
 from groundtruth.lasers.outline import outline_faces, outline_radius_m, outline_symmetries
@@ -163,10 +166,6 @@ def acquire(
 
 def _places(points: FloatArray, body: Body, settings: LaserSettings) -> list[FloatArray]:
     """Where the robot's middle might be: the middles of heaps, those of parts of large ones."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-    from scipy.spatial import cKDTree
-
     pairs = cKDTree(points).query_pairs(settings.link_m, output_type="ndarray")
     # SciPy before 1.12 knows no graphs with indices of 64 bits.
     ends = (pairs[:, 0].astype(np.int32), pairs[:, 1].astype(np.int32))

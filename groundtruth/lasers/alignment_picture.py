@@ -5,6 +5,8 @@ from __future__ import annotations
 import io
 
 import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from groundtruth.geometry.plane import apply
@@ -26,9 +28,6 @@ def draw_alignment(
 
     The same input gives the same bytes.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     figure = Figure(figsize=(13.5, 6.2), dpi=110, layout="constrained")
     FigureCanvasAgg(figure)
     after = [scanner.pose for scanner in alignment.scanners]

@@ -13,6 +13,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from ezdxf import units
+from ezdxf.enums import InsertUnits
+from ezdxf.filemanagement import readfile
 from numpy.typing import NDArray
 
 from groundtruth.errors import GroundTruthError, StreamError
@@ -177,10 +180,6 @@ def _read_rows(path: str | os.PathLike[str], file: bytes) -> FloatArray:
 def _read_drawing(
     path: str | os.PathLike[str], layers: Sequence[str] | None, unit_m: float | None
 ) -> FloatArray:
-    from ezdxf import units
-    from ezdxf.enums import InsertUnits
-    from ezdxf.filemanagement import readfile
-
     wanted = None if layers is None else {layer.casefold() for layer in layers}
     pieces: list[tuple[float, float, float, float]] = []
     try:

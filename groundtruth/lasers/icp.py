@@ -19,6 +19,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
+from scipy.special import ndtri
 
 from groundtruth.errors import GeometryError, GroundTruthError
 from groundtruth.lasers.icp_kernels import moved, nearest_on_segments, rigid_fit
@@ -142,8 +144,6 @@ def icp_to_points(
     GroundTruthError
         If a shape is wrong or a number not finite.
     """
-    from scipy.spatial import cKDTree
-
     cloud = _checked(target, 2, "target")
     tree = cKDTree(cloud) if tree is None else tree
 
@@ -228,10 +228,8 @@ def trimmed_variance(kept: float) -> tuple[float, float]:
     """
     if kept >= 1.0:
         return 1.0, 1.0
-    from scipy.stats import norm
-
-    cut = float(norm.ppf(0.5 * (1.0 + kept)))
-    inside = kept - 2.0 * cut * float(norm.pdf(cut))
+    cut = float(ndtri(0.5 * (1.0 + kept)))
+    inside = kept - 2.0 * cut * math.exp(-0.5 * cut * cut) / math.sqrt(2.0 * math.pi)
     return inside / kept, kept / inside
 
 

@@ -8,10 +8,12 @@
 
 from __future__ import annotations
 
+import gzip
 import os
 import re
 import struct
 import zipfile
+import zlib
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -180,8 +182,6 @@ def _member(
     dtype: np.dtype[Any],
     dimensions: int,
 ) -> NDArray[Any]:
-    import zlib
-
     place = f"{path}: {name}"
     try:
         info = archive.getinfo(f"{name}.npy")
@@ -237,9 +237,6 @@ def _row(path: str | os.PathLike[str], number: int, line: str, words: list[str])
 
 def _lines(path: str | os.PathLike[str]) -> Iterator[tuple[int, str]]:
     """Yield numbers and lines, without comments and blank lines; bounded, however well packed."""
-    import gzip
-    import zlib
-
     packed = Path(path).suffix == ".gz"
     try:
         with Path(path).open("rb") as file, ExitStack() as stack:

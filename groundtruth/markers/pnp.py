@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import numpy as np
+import pycolmap
 from numpy.typing import NDArray
 
 from camera import Camera
@@ -174,8 +176,6 @@ def _root_mean_square(residuals: FloatArray) -> float:
 
 
 def _opencv(points: FloatArray, normalised: FloatArray, solver: Solver) -> list[FloatArray]:
-    import cv2
-
     flags = {
         "sqpnp": cv2.SOLVEPNP_SQPNP,
         "epnp": cv2.SOLVEPNP_EPNP,
@@ -200,8 +200,6 @@ def _opencv(points: FloatArray, normalised: FloatArray, solver: Solver) -> list[
 
 
 def _pycolmap(camera: Camera, points: FloatArray, normalised: FloatArray) -> list[FloatArray]:
-    import pycolmap
-
     found = pycolmap.estimate_and_refine_absolute_pose(
         normalised * camera.scale_x,
         points,
@@ -212,8 +210,6 @@ def _pycolmap(camera: Camera, points: FloatArray, normalised: FloatArray) -> lis
 
 
 def _pycolmap_cameras(problem: PoseProblem) -> list[FloatArray]:
-    import pycolmap
-
     points = apply(problem.robot_from_marker[problem.seen.part], problem.seen.points)
     used, index = np.unique(problem.seen.camera, return_inverse=True)
     pixels = np.empty_like(problem.seen.pixels)
@@ -235,8 +231,6 @@ def _pycolmap_cameras(problem: PoseProblem) -> list[FloatArray]:
 
 
 def _ransac() -> Any:
-    import pycolmap
-
     # One thread and a seed: the same corners give the same pose.
     return pycolmap.RANSACOptions(
         max_error=_RANSAC_PX, min_num_trials=100, random_seed=0, num_threads=1
@@ -245,8 +239,6 @@ def _ransac() -> Any:
 
 def _pinhole(camera: Camera) -> Any:
     """A camera without distortion whose pixels are about those of `camera`."""
-    import pycolmap
-
     return pycolmap.Camera(
         model="SIMPLE_PINHOLE",
         width=camera.width,

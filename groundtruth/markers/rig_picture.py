@@ -6,6 +6,8 @@ import io
 from typing import TYPE_CHECKING
 
 import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from groundtruth.geometry.transforms import apply, inverse
@@ -35,9 +37,6 @@ def draw_rig(estimate: RigEstimate) -> bytes:
     bytes
         A PNG of three views along the axes; the same input gives the same bytes.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     rig = estimate.rig
     agreeing, differing = _clouds(estimate, rig)
     figure = Figure(figsize=(13.5, 5.0), dpi=110, layout="constrained")

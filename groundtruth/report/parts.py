@@ -7,6 +7,9 @@ from dataclasses import dataclass
 from typing import Any, Literal
 from xml.etree.ElementTree import Element, tostring
 
+from jinja2 import Environment, StrictUndefined
+from markupsafe import Markup
+
 from groundtruth.report.template import PAGE, STYLE
 
 Kind = Literal["paragraph", "note", "problem", "table", "figure", "picture"]
@@ -65,8 +68,6 @@ def table(
 
 def figure(caption: str, *drawings: Element) -> Part:
     """Drawings over their caption."""
-    from markupsafe import Markup
-
     # The serialiser has escaped all text and attributes in them.
     texts = (_printable(tostring(d, encoding="unicode", method="html")) for d in drawings)
     return Part("figure", caption, drawings=tuple(Markup(text) for text in texts))
@@ -79,9 +80,6 @@ def picture(caption: str, address: str, instead: str) -> Part:
 
 def page(title: str, sections: Sequence[Section]) -> bytes:
     """A whole page, UTF-8; all text is escaped."""
-    from jinja2 import Environment, StrictUndefined
-    from markupsafe import Markup
-
     environment = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, finalize=_clean
     )

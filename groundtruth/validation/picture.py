@@ -7,6 +7,8 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from groundtruth.validation.validate import PUBLISHED, Figures, PoseError, ReferencePose
@@ -36,9 +38,6 @@ def draw_errors(
     building : (S, 4) array, optional
         Walls to draw on the map (m).
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     figure = Figure(figsize=(13.5, 6.4), dpi=110, layout="constrained")
     FigureCanvasAgg(figure)
     grid = figure.add_gridspec(2, 2, width_ratios=[1.25, 1.0])

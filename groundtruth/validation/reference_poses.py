@@ -14,6 +14,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import chdtrc
 
 from groundtruth.errors import GroundTruthError
 from groundtruth.validation.fiducials import Distance, Survey
@@ -296,9 +297,7 @@ def _without_gross(
 
 
 def _improbable(cost: float, freedom: int, s: DistanceSettings) -> bool:
-    from scipy.stats import chi2
-
-    return freedom > 0 and float(chi2.sf(cost, freedom)) < s.gross_probability
+    return freedom > 0 and float(chdtrc(freedom, cost)) < s.gross_probability
 
 
 def _covariance(jacobian: FloatArray, sigma_m: float) -> FloatArray:

@@ -14,6 +14,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import chdtrc
 
 from groundtruth.errors import GeometryError, GroundTruthError
 from groundtruth.geometry.plane import apply
@@ -242,10 +243,8 @@ def refine_pose(
     own = found.covariance + _mount_covariance(points, segments, found, s)
     apart = found.pose - prior
     apart[2] = wrap_angle(apart[2])
-    from scipy.stats import chi2
-
     misfit = float(apart @ np.linalg.solve(own + covariance, apart))
-    if chi2.sf(misfit, 3) < s.disagreement_probability:
+    if chdtrc(3, misfit) < s.disagreement_probability:
         return unrefined(
             "disagrees",
             f"{1e3 * math.hypot(apart[0], apart[1]):.0f} mm and {math.degrees(apart[2]):.2f} deg "

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import chdtri
 
 from groundtruth.errors import GeometryError, GroundTruthError
 from groundtruth.trajectories.streams import PlanarPoses, is_positive_definite
@@ -320,8 +321,6 @@ def figures_of(errors: Sequence[PoseError]) -> Figures:
     """
     if not errors:
         raise GroundTruthError("no reference pose with ground truth at its time")
-    from scipy.stats import chi2
-
     linear = np.array([e.linear_m for e in errors])
     angular = np.array([e.angular_rad for e in errors])
     nees = np.array([e.nees for e in errors])
@@ -329,8 +328,8 @@ def figures_of(errors: Sequence[PoseError]) -> Figures:
     low, high = (math.nan, math.nan)
     if len(nees):
         freedom = 3 * len(nees)
-        tails = [0.5 * (1.0 - _BAND), 0.5 * (1.0 + _BAND)]
-        low, high = (float(v) / freedom for v in chi2.ppf(tails, freedom))
+        tails = [0.5 * (1.0 + _BAND), 0.5 * (1.0 - _BAND)]
+        low, high = (float(v) / freedom for v in chdtri(freedom, tails))
 
     def sigma(values: FloatArray) -> float:
         return float(values.std(ddof=1)) if len(values) > 1 else 0.0

@@ -12,7 +12,7 @@ import numpy as np
 
 from camera import CameraError
 from detect.errors import DetectError
-from detect.sources import bag as bag_source
+from detect.sources import bag_messages
 from detect.sources.bag import Bag
 from detect.sources.bag_camera import pose_in_dataset, static_transforms
 from detect.sources.steps import movement_between, step_of
@@ -50,7 +50,7 @@ def _asked_of(path: Path) -> object:
     odometry = bag.poses(None)
     poses = [] if odometry is None else list(odometry)
     steps = [step_of("e", movement_between(*pair)) for pair in pairwise(poses)]
-    with bag_source.opened_bag(path) as reader:
+    with bag_messages.opened_bag(path) as reader:
         transforms = static_transforms(reader, path)
     return images, steps, pose_in_dataset(transforms, "b", "o")
 
