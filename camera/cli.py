@@ -16,11 +16,11 @@ PROGRAM = Program(
     "Calibrate a camera, place it on the floor, convert its calibration.\n\n"
     "Example: camera calibrate photographs --columns 9 --rows 6 --square-m 0.025 -o my.cam",
     {
-        Calibrate: "camera.calibrate_command",
-        Floor: "camera.calibrate_floor_command",
+        Calibrate: "camera.commands.calibrate",
+        Floor: "camera.commands.floor",
         # It detects: the room above carries it out.
         Level: "detect.mounting_command",
-        Convert: "camera.convert_command",
+        Convert: "camera.commands.convert",
     },
 )
 

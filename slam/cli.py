@@ -16,13 +16,13 @@ PROGRAM = Program(
     "What landmarks are for: map, localisation, SLAM, association, noise.\n\n"
     "Example: slam map images/e --circles --lines -o /tmp/e-map",
     {
-        Map: "slam.map_command",
-        Localize: "slam.localize_command",
-        Ekf: "slam.ekf_command",
-        Associate: "slam.associate_command",
-        Noise: "slam.noise_command",
-        Export: "slam.export_command",
-        Import: "slam.export_command",
+        Map: "slam.commands.map",
+        Localize: "slam.commands.localize",
+        Ekf: "slam.commands.ekf",
+        Associate: "slam.commands.associate",
+        Noise: "slam.commands.noise",
+        Export: "slam.commands.export",
+        Import: "slam.commands.export",
     },
     compiled=(Map, Localize, Ekf, Associate),
 )

@@ -8,7 +8,7 @@ from typing import Annotated, Literal, Optional
 
 from tyro.conf import Positional, arg
 
-from slam.odometry_noise import OdometryNoise
+from slam.models.odometry_noise import OdometryNoise
 
 # For `X | None` tyro imports another library that takes a tenth of a second.
 MaybePath = Optional[Path]  # noqa: UP045

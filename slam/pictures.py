@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from landmarks import is_positive_definite, squared_mahalanobis, wrap_angle
 from landmarks.map_file import LandmarkMap, Landmarks, Path2D
 from slam.errors import SlamError
-from slam.pictures_file import picture
+from slam.figure_file import picture
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

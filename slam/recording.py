@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from landmarks import CircleLandmark, Frame, LineLandmark, read_frames
 from slam.errors import SlamError
-from slam.odometry_noise import OdometryNoise
+from slam.models.odometry_noise import OdometryNoise
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera
-from camera.calibration_floor import with_pose
-from camera.conversion import convert_to_camera
-from camera.ros_camera_info import camera_from_message
+from camera.calibration.floor import with_pose
+from camera.formats.conversion import convert_to_camera
+from camera.formats.ros import camera_from_message
 from detect.errors import DetectError
 from detect.sources.bag_messages import LONGEST_NAME, messages, opened_bag, understood
 from detect.sources.interface import Calibration

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera, read_camera
-from camera.calibrate_images import grey_of_content
+from camera.calibration.images import grey_of_content
 from camera.errors import CalibrationError
 from groundtruth.errors import GeometryError, GroundTruthError
 from groundtruth.json_file import read_json

@@ -1,8 +1,8 @@
 """Checkerboards of which only one way to hold them is right; they are found by the camera room.
 
-A board's frame is that of `camera.board`: origin at the middle of its inner corners, x right, y up,
-z out of the print, held so that the square in its top left corner is black. With one even and one
-odd number of corners only one way to hold it is like that.
+A board's frame is that of `camera.boards.board`: origin at the middle of its inner corners, x
+right, y up, z out of the print, held so that the square in its top left corner is black. With one
+even and one odd number of corners only one way to hold it is like that.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from camera.board import Board
-from camera.board_points import find_board
+from camera.boards.board import Board
+from camera.boards.points import find_board
 from camera.errors import CalibrationError
 from groundtruth.errors import GeometryError, GroundTruthError
 

@@ -13,11 +13,11 @@ import pytest
 from numpy.typing import NDArray
 
 from camera import Camera, read_camera, write_camera
-from camera.board import Board
-from camera.board_points import find_board
-from camera.calibration_floor import on_floor, place_on_floor, read_floor_points
-from camera.calibration_model import rotation_of
-from camera.calibration_projection import projection_difference
+from camera.boards.board import Board
+from camera.boards.points import find_board
+from camera.calibration.floor import on_floor, place_on_floor, read_floor_points
+from camera.calibration.model import rotation_of
+from camera.calibration.projection import projection_difference
 from camera.cli import main
 from camera.errors import CalibrationError
 from tools.camera_evaluation.rendered import BOARDS, calibrate_rendered

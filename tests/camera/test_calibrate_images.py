@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from camera import Camera
-from camera.calibrate_images import calibration_images, read_grey
+from camera.calibration.images import calibration_images, read_grey
 from detect.sources.gray import decode_gray
 from detect.sources.video import VideoFile
 from groundtruth.errors import GroundTruthError

@@ -9,29 +9,29 @@ import pytest
 from numpy.typing import NDArray
 
 from camera import Camera
-from camera.board import Board
-from camera.calibration import (
+from camera.boards.board import Board
+from camera.calibration.adjustment import Estimate, Points, adjust, project_estimate
+from camera.calibration.calibrate import (
     BoardView,
     calibrate,
     points_of,
 )
-from camera.calibration_adjustment import Estimate, Points, adjust, project_estimate
-from camera.calibration_checks import coverage_warnings, warnings_of
-from camera.calibration_fit import circle_shifts
-from camera.calibration_model import (
+from camera.calibration.checks import coverage_warnings, warnings_of
+from camera.calibration.fit import circle_shifts
+from camera.calibration.model import (
     COUNT,
     free_span,
     is_possible,
     project_points,
     rotation_of,
 )
-from camera.calibration_projection import (
+from camera.calibration.projection import (
     intrinsics_of,
     projection_difference,
     projection_sigma,
     with_intrinsics,
 )
-from camera.calibration_settings import CalibrationSettings, FreeLens
+from camera.calibration.settings import CalibrationSettings, FreeLens
 from camera.errors import CalibrationError
 from tools.camera_evaluation.covariance import monte_carlo
 from tools.camera_evaluation.rendering import board_poses

@@ -7,11 +7,11 @@ from collections.abc import Iterable
 import numpy as np
 import pytest
 
-from camera import calibration_choice
-from camera.calibration_adjustment import Adjusted, Estimate, Points
-from camera.calibration_choice import Candidate, Candidates, choose_lens
-from camera.calibration_model import COUNT, INTRINSICS
-from camera.calibration_settings import CalibrationSettings, FreeLens
+from camera.calibration import choice as calibration_choice
+from camera.calibration.adjustment import Adjusted, Estimate, Points
+from camera.calibration.choice import Candidate, Candidates, choose_lens
+from camera.calibration.model import COUNT, INTRINSICS
+from camera.calibration.settings import CalibrationSettings, FreeLens
 
 COUNTED = 756
 START = Estimate(np.zeros(COUNT), np.zeros((0, 3, 3)), np.zeros((0, 3)))

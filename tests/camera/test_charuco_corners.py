@@ -7,9 +7,9 @@ import pytest
 from numpy.typing import NDArray
 
 from camera import Camera
-from camera.board import Board
-from camera.calibration_model import rotation_of
-from camera.charuco_corners import find_charuco
+from camera.boards.board import Board
+from camera.boards.charuco import find_charuco
+from camera.calibration.model import rotation_of
 from camera.errors import CalibrationError
 from tools.camera_evaluation.rendering import rays_of, render_board
 

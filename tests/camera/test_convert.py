@@ -12,21 +12,21 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from camera import Camera, read_camera, write_camera
-from camera.calibration_projection import projection_difference
+from camera.calibration.projection import projection_difference
 from camera.cli import main
-from camera.colmap_cameras import (
+from camera.errors import ConversionError
+from camera.formats.colmap import (
     camera_from_pycolmap,
     format_colmap,
     parse_colmap,
     pycolmap_from_camera,
 )
-from camera.conversion import convert_to_camera, convert_to_foreign
-from camera.conversion_models import ForeignCamera
-from camera.convert_yaml import parse_yaml
-from camera.errors import ConversionError
-from camera.kalibr_camchain import format_kalibr, parse_kalibr
-from camera.opencv_yaml import format_opencv, parse_opencv
-from camera.ros_camera_info import camera_from_message, format_ros, parse_ros
+from camera.formats.conversion import convert_to_camera, convert_to_foreign
+from camera.formats.kalibr import format_kalibr, parse_kalibr
+from camera.formats.models import ForeignCamera
+from camera.formats.opencv import format_opencv, parse_opencv
+from camera.formats.plain_yaml import parse_yaml
+from camera.formats.ros import camera_from_message, format_ros, parse_ros
 
 FloatArray = NDArray[np.float64]
 

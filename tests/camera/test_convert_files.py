@@ -13,15 +13,15 @@ from hypothesis import strategies as st
 
 from camera import Camera
 from camera.cli import main
-from camera.colmap_cameras import text_of_binary
-from camera.conversion import convert_to_camera
-from camera.conversion_models import ForeignCamera, Model
-from camera.convert_command import convert, format_of, format_of_text, parse, read_text
-from camera.convert_yaml import parse_yaml
+from camera.commands.convert import convert, format_of, format_of_text, parse, read_text
 from camera.errors import ConversionError
-from camera.kalibr_camchain import format_kalibr, parse_kalibr
+from camera.formats.colmap import text_of_binary
+from camera.formats.conversion import convert_to_camera
+from camera.formats.kalibr import format_kalibr, parse_kalibr
+from camera.formats.models import ForeignCamera, Model
+from camera.formats.plain_yaml import parse_yaml
+from camera.formats.ros import format_ros, parse_ros
 from camera.options import Convert, Format
-from camera.ros_camera_info import format_ros, parse_ros
 
 RADTAN = ForeignCamera(
     "radtan", 640, 480, 500.0, 505.0, 318.5, 241.0, (-0.3, 0.1, 1e-3, -5e-4, 0.0)

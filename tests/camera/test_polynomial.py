@@ -14,8 +14,6 @@ from hypothesis import strategies as st
 from camera import Camera, CameraError, format_camera, parse_camera
 from camera.brown import brown_jacobian, brown_of, brown_shift, one_to_one_radius
 from camera.brown_kernels import brown_shift_point
-from camera.conversion import convert_to_camera, convert_to_foreign
-from camera.conversion_models import ForeignCamera
 from camera.distortion import (
     RADIUS_LIMIT,
     Coef,
@@ -24,6 +22,8 @@ from camera.distortion import (
     radial_factor_derivative,
     undistorted_radius,
 )
+from camera.formats.conversion import convert_to_camera, convert_to_foreign
+from camera.formats.models import ForeignCamera
 from camera.kernels import camera_numbers, has_brown, lens_numbers, project_floor_point
 from tests.camera.strategies import cameras, coefficients, pixel_grid
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.filter_frames import FrameRows
+from slam.filters.frames import FrameRows
 from slam.recording import CircleRows, LineRows
 
 FloatArray = NDArray[np.float64]

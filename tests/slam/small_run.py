@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.measurement import bearing_of_vertical, disc_in_robot
-from slam.motion import chain_steps, relative_pose
+from slam.models.measurement import bearing_of_vertical, disc_in_robot
+from slam.models.motion import chain_steps, relative_pose
 from slam.recording import CircleRows, LineRows, Recording
 
 FloatArray = NDArray[np.float64]

@@ -8,7 +8,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from slam.loops import (
+from slam.association.loop_closing import (
+    closed_path,
+    in_order,
+    merge_labels,
+    pairs_by_votes,
+    pairs_in_place,
+    seen_together,
+)
+from slam.association.loop_path import first_sight, intersect_bearings, solve_path
+from slam.association.loops import (
     LoopSettings,
     Match,
     Stretch,
@@ -18,18 +27,9 @@ from slam.loops import (
     mutual_pairs,
     stretches_of,
 )
-from slam.loops_closing import (
-    closed_path,
-    in_order,
-    merge_labels,
-    pairs_by_votes,
-    pairs_in_place,
-    seen_together,
-)
-from slam.loops_kernels import best_motion
-from slam.loops_path import first_sight, intersect_bearings, solve_path
-from slam.measurement import bearing_of_vertical, disc_in_robot
-from slam.motion import chain_steps, relative_pose, rotation
+from slam.association.loops_kernels import best_motion
+from slam.models.measurement import bearing_of_vertical, disc_in_robot
+from slam.models.motion import chain_steps, relative_pose, rotation
 from slam.recording import CircleRows, LineRows, Recording
 
 FloatArray = NDArray[np.float64]

@@ -11,12 +11,12 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from landmarks import wrap_angle
-from slam.associate import AssociateSettings, associate_run
-from slam.associate_local import LocalSettings, Method, associate_locally
-from slam.association_score import score_association
-from slam.local_map import LocalMap, moved, tilt_jacobian
-from slam.measurement import bearing_of_vertical, disc_in_robot
-from slam.motion import chain_steps, relative_pose
+from slam.association.frame_to_frame import LocalSettings, Method, associate_locally
+from slam.association.local_map import LocalMap, moved, tilt_jacobian
+from slam.association.run import AssociateSettings, associate_run
+from slam.association.score import score_association
+from slam.models.measurement import bearing_of_vertical, disc_in_robot
+from slam.models.motion import chain_steps, relative_pose
 from slam.recording import CircleRows, LineRows, Recording
 
 FloatArray = NDArray[np.float64]

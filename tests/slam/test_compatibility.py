@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from slam.compatibility import chi_squared_gates, joint_compatible, nearest_compatible
+from slam.association.compatibility import chi_squared_gates, joint_compatible, nearest_compatible
 from slam.errors import SlamError
 
 FloatArray = NDArray[np.float64]

@@ -9,18 +9,18 @@ import pytest
 from numpy.typing import NDArray
 
 from landmarks import wrap_angle
-from slam.ekf import EkfSlam, JacobiansAt, run_ekf
-from slam.ekf_covariance import JointCovariance
 from slam.errors import SlamError
-from slam.filter_association import Associator
-from slam.filter_kernels import frame_innovation
-from slam.measurement import (
+from slam.filters.association import Associator
+from slam.filters.ekf_slam import EkfSlam, JacobiansAt, run_ekf
+from slam.filters.innovation_kernels import frame_innovation
+from slam.filters.joint_covariance import JointCovariance
+from slam.models.measurement import (
     disc_in_map,
     disc_in_map_jacobians,
     disc_in_robot,
     disc_jacobians,
 )
-from slam.motion import move, move_jacobians
+from slam.models.motion import move, move_jacobians
 from slam.recording import CircleRows, Recording
 from tests.slam.ekf_rows import CAMERA_XY, NOTHING, rows_of, spd
 
@@ -120,7 +120,7 @@ def test_the_filter_is_the_plain_dense_one(seed: int) -> None:
 def batch_solution(recording: Recording, size: int) -> tuple[FloatArray, FloatArray]:
     """Last pose and discs by Gauss-Newton on all poses and discs, and their covariance."""
     steps, circles = len(recording), recording.circles
-    from slam.motion import chain_steps, relative_pose, relative_pose_jacobians
+    from slam.models.motion import chain_steps, relative_pose, relative_pose_jacobians
 
     poses = chain_steps(recording.steps)
     discs = np.zeros((size, 2))

@@ -6,19 +6,19 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from slam.ekf import EkfSlam, JacobiansAt, run_ekf
-from slam.ekf_lines import start_line, triangulate
-from slam.ekf_views import MOST_KEPT_POSES
 from slam.errors import SlamError
-from slam.filter_association import Associator
-from slam.filter_kernels import frame_innovation
-from slam.measurement import (
+from slam.filters.association import Associator
+from slam.filters.delayed_lines import start_line, triangulate
+from slam.filters.ekf_slam import EkfSlam, JacobiansAt, run_ekf
+from slam.filters.innovation_kernels import frame_innovation
+from slam.filters.views import MOST_KEPT_POSES
+from slam.models.measurement import (
     bearing_jacobians,
     bearing_of_vertical,
     disc_in_map,
     disc_jacobians,
 )
-from slam.motion import move
+from slam.models.motion import move
 from slam.recording import LineRows, Recording
 from tests.slam.ekf_rows import CAMERA_XY, NO_DISCS, bearings_of, spd
 
@@ -143,7 +143,7 @@ def test_lines_by_all_their_bearings_are_batch_least_squares(jacobians: Jacobian
     assert run.count.lines == len(rows)
     # Pose and two lines come before the last, and several kept poses.
     assert max(ekf.line_slots.values()) >= 3 + 4 + 9
-    from slam.motion import chain_steps, relative_pose, relative_pose_jacobians
+    from slam.models.motion import chain_steps, relative_pose, relative_pose_jacobians
 
     poses, places = chain_steps(recording.steps), lines.copy()
     unknowns = 3 * steps + 6

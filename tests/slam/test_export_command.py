@@ -18,10 +18,10 @@ from landmarks.map_file import (
     write_map,
     write_path,
 )
-from slam.axes import covariance_from_dataset, from_dataset
 from slam.cli import main
-from slam.g2o_reading import read_g2o
-from slam.motion import chain_steps
+from slam.formats.axes import covariance_from_dataset, from_dataset
+from slam.formats.g2o_reading import read_g2o
+from slam.models.motion import chain_steps
 from slam.recording import read_recording
 
 DEMO = Path(__file__).parents[2] / "images" / "e"

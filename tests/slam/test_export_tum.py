@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 
 from landmarks import wrap_angle
 from landmarks.map_file import Path2D
-from slam.axes import Axes
 from slam.errors import SlamError
-from slam.tum import read_tum, write_tum
+from slam.formats.axes import Axes
+from slam.formats.tum import read_tum, write_tum
 from storage import OutputExistsError
 
 numbers = st.floats(-1e6, 1e6)

@@ -13,13 +13,19 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from landmarks import CircleLandmark, Frame, Step, format_frame, read_frames, wrap_angle
-from slam.axes import Axes
 from slam.errors import SlamError
-from slam.g2o import RunGraph, end_covariance, first_disc_vertex, start_covariance, write_g2o
-from slam.g2o_frames import frames_of_graph, graph_of_frames
-from slam.g2o_reading import read_g2o
-from slam.measurement import disc_in_robot
-from slam.motion import relative_pose, rotation
+from slam.formats.axes import Axes
+from slam.formats.g2o import (
+    RunGraph,
+    end_covariance,
+    first_disc_vertex,
+    start_covariance,
+    write_g2o,
+)
+from slam.formats.g2o_frames import frames_of_graph, graph_of_frames
+from slam.formats.g2o_reading import read_g2o
+from slam.models.measurement import disc_in_robot
+from slam.models.motion import relative_pose, rotation
 
 FloatArray = NDArray[np.float64]
 DEMO = Path(__file__).parents[2] / "images" / "e" / "map.circles"

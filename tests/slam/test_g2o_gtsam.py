@@ -10,13 +10,13 @@ import pytest
 from numpy.typing import NDArray
 
 from landmarks import read_frames, wrap_angle
-from slam.axes import from_dataset
-from slam.g2o import RunGraph, write_g2o
-from slam.g2o_frames import graph_of_frames
-from slam.measurement import disc_in_robot
-from slam.motion import relative_pose
+from slam.formats.axes import from_dataset
+from slam.formats.g2o import RunGraph, write_g2o
+from slam.formats.g2o_frames import graph_of_frames
+from slam.formats.tables import write_odometry
+from slam.models.measurement import disc_in_robot
+from slam.models.motion import relative_pose
 from slam.recording import read_recording
-from slam.tables import write_odometry
 
 gtsam: Any = pytest.importorskip("gtsam", reason="needs gtsam: pip install 'redetect[slam]'")
 

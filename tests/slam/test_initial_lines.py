@@ -7,8 +7,8 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from slam.initial_lines import place_lines, triangulate
-from slam.measurement import bearing_of_vertical
+from slam.mapping.initial_lines import place_lines, triangulate
+from slam.models.measurement import bearing_of_vertical
 from slam.recording import LineRows
 
 FloatArray = NDArray[np.float64]

@@ -9,11 +9,11 @@ import pytest
 from numpy.typing import NDArray
 
 from landmarks import wrap_angle
-from slam.association_score import score_association
+from slam.association.line_points import PointSettings, Rays, find_points, lines_by_points, rays_of
+from slam.association.score import score_association
 from slam.errors import SlamError
-from slam.line_points import PointSettings, Rays, find_points, lines_by_points, rays_of
-from slam.measurement import bearing_of_vertical
-from slam.motion import chain_steps
+from slam.models.measurement import bearing_of_vertical
+from slam.models.motion import chain_steps
 from slam.recording import CircleRows, LineRows, Recording
 
 FloatArray = NDArray[np.float64]

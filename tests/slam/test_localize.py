@@ -11,16 +11,16 @@ from numpy.typing import NDArray
 from landmarks import wrap_angle
 from landmarks.map_file import LandmarkMap, Landmarks, no_landmarks
 from slam.errors import SlamError
-from slam.filter_association import Associator
-from slam.filter_frames import frames_of
-from slam.localize import Localizer, MapErrors, run_localizer
-from slam.measurement import (
+from slam.filters.association import Associator
+from slam.filters.frames import frames_of
+from slam.filters.localizer import Localizer, MapErrors, run_localizer
+from slam.models.measurement import (
     bearing_jacobians,
     bearing_of_vertical,
     disc_in_robot,
     disc_jacobians,
 )
-from slam.motion import move, move_jacobians
+from slam.models.motion import move, move_jacobians
 from slam.recording import CircleRows, LineRows, Recording, read_recording
 
 FloatArray = NDArray[np.float64]
@@ -309,9 +309,9 @@ def test_the_demo_run_is_near_its_truth(project_root: Path) -> None:
     """The filters on the demo run: its rows are exact, so that only odometry is wrong."""
     import json
 
-    from slam.ekf import EkfSlam, run_ekf
-    from slam.filter_input import camera_xy_of
-    from slam.motion import relative_pose
+    from slam.commands.filter_input import camera_xy_of
+    from slam.filters.ekf_slam import EkfSlam, run_ekf
+    from slam.models.motion import relative_pose
 
     run_folder = project_root / "images" / "e"
     recording = read_recording(run_folder, circles=True, lines=True)

@@ -12,8 +12,8 @@ import pytest
 
 from landmarks.map_file import read_map, read_path
 from slam.cli import main
-from slam.measurement import disc_in_robot
-from slam.motion import relative_pose
+from slam.models.measurement import disc_in_robot
+from slam.models.motion import relative_pose
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +59,7 @@ def test_the_joint_covariance_of_too_many_landmarks_is_not_written(
     output = demo_run.parent / "many"
     assert main(["map", str(demo_run), "-o", str(output)]) == 0
     assert (output / "map_covariance.npy").is_file()
-    monkeypatch.setattr("slam.map_command.MOST_LANDMARKS_TOGETHER", 30)
+    monkeypatch.setattr("slam.commands.map.MOST_LANDMARKS_TOGETHER", 30)
     assert main(["map", str(demo_run), "-o", str(output), "--force"]) == 0
     assert "more than 30 landmarks: no map_covariance.npy" in capsys.readouterr().out
     assert not (output / "map_covariance.npy").exists()

@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 
 from landmarks.map_file import LandmarkMap, Landmarks, no_landmarks
+from slam.commands.run_camera import camera_of_run
 from slam.errors import SlamError
-from slam.graph_terms import Weighting, linearise
-from slam.map_covariance import (
+from slam.mapping.covariance_file import (
     covariance_file,
     joint_covariance,
     read_joint_covariance,
     write_joint_covariance,
 )
-from slam.mapping import map_run
+from slam.mapping.graph_terms import Weighting, linearise
+from slam.mapping.run_map import map_run
+from slam.mapping.solve import normal_equations
 from slam.recording import read_recording
-from slam.run_camera import camera_of_run
-from slam.solve import normal_equations
 from storage import OutputExistsError
 
 

@@ -11,16 +11,16 @@ from numpy.typing import NDArray
 
 from camera import Camera
 from landmarks import read_frames
-from slam.calibration import directions_of_rows, rows_through_mounting
-from slam.calibration_model import rotation_exp
 from slam.errors import SlamError
-from slam.graph import first_sight, graph_of_recording
-from slam.graph_terms import Weighting
-from slam.initial_lines import place_lines
-from slam.mapping import MappedRun, map_run
+from slam.mapping.graph import first_sight, graph_of_recording
+from slam.mapping.graph_terms import Weighting
+from slam.mapping.initial_lines import place_lines
+from slam.mapping.run_map import MappedRun, map_run
+from slam.mapping.solve import solve
+from slam.mapping.solve_gtsam import solve_gtsam
+from slam.models.mounted_discs import rotation_exp
+from slam.models.mounting import directions_of_rows, rows_through_mounting
 from slam.recording import LineRows, Recording, read_recording, recording_of_frames
-from slam.solve import solve
-from slam.solve_gtsam import solve_gtsam
 from tests.slam.small_run import CAMERA_XY, SmallRun, small_run
 
 

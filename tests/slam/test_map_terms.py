@@ -9,15 +9,23 @@ import pytest
 from scipy import sparse
 
 from camera import Camera
-from slam.calibration import mounting_change, rows_as_recorded
-from slam.calibration_model import Geometry, predict_pixels, rotation_exp
-from slam.graph import Estimate, Graph, first_sight, graph_of_recording, with_lines
-from slam.graph_terms import Loss, RowErrors, Weighting, errors, layout_of, linearise, robust
-from slam.marginal_kernels import filled_pattern
-from slam.marginals import inverse_blocks, marginals
-from slam.measurement import bearing_of_vertical
+from slam.mapping.graph import Estimate, Graph, first_sight, graph_of_recording, with_lines
+from slam.mapping.graph_terms import (
+    Loss,
+    RowErrors,
+    Weighting,
+    errors,
+    layout_of,
+    linearise,
+    robust,
+)
+from slam.mapping.marginal_kernels import filled_pattern
+from slam.mapping.marginals import inverse_blocks, marginals
+from slam.mapping.solve import moved, solve
+from slam.models.measurement import bearing_of_vertical
+from slam.models.mounted_discs import Geometry, predict_pixels, rotation_exp
+from slam.models.mounting import mounting_change, rows_as_recorded
 from slam.recording import LineRows
-from slam.solve import moved, solve
 from tests.slam.small_run import CAMERA_XY, small_run
 
 

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from landmarks import wrap_angle
-from slam.measurement import (
+from slam.models.measurement import (
     bearing_jacobians,
     bearing_of_vertical,
     disc_in_map,
@@ -17,7 +17,7 @@ from slam.measurement import (
     disc_in_robot,
     disc_jacobians,
 )
-from slam.motion import (
+from slam.models.motion import (
     chain_steps,
     move,
     move_jacobians,

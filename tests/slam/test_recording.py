@@ -9,7 +9,7 @@ import pytest
 
 from landmarks import LandmarkFileError
 from slam.errors import SlamError
-from slam.odometry_noise import OdometryNoise
+from slam.models.odometry_noise import OdometryNoise
 from slam.recording import read_recording
 
 STEP = "STEP a.{k} 0.1 -0.2 0.05 1e-4 0 1e-4 0 0 1e-5\n"

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from camera import Camera, CameraError
-from camera.calibrate_images import read_grey
+from camera.calibration.images import read_grey
 from detect.errors import FrameError
 from detect.sources.gray import decode_gray
 from groundtruth.errors import GroundTruthError

@@ -13,10 +13,10 @@ import tyro
 from tyro.conf import Positional
 
 from camera import read_camera
-from camera.calibration_projection import pixel_grid, projection_difference
-from camera.conversion import Rows, convert_to_camera, convert_to_foreign
-from camera.conversion_models import ForeignCamera, Model
-from camera.convert_command import MODELS
+from camera.calibration.projection import pixel_grid, projection_difference
+from camera.commands.convert import MODELS
+from camera.formats.conversion import Rows, convert_to_camera, convert_to_foreign
+from camera.formats.models import ForeignCamera, Model
 from camera.model import Camera
 
 

@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from tyro.conf import Positional
 
 from camera import Camera, read_camera
-from camera.board import Board
-from camera.calibration_adjustment import Estimate, Points
-from camera.calibration_fit import circle_shifts, fit_points
-from camera.calibration_model import INTRINSICS
-from camera.calibration_projection import intrinsics_of
-from camera.calibration_settings import CalibrationSettings, FreeLens
+from camera.boards.board import Board
+from camera.calibration.adjustment import Estimate, Points
+from camera.calibration.fit import circle_shifts, fit_points
+from camera.calibration.model import INTRINSICS
+from camera.calibration.projection import intrinsics_of
+from camera.calibration.settings import CalibrationSettings, FreeLens
 from tools.camera_evaluation.rendered import BOARDS
 from tools.camera_evaluation.rendering import board_poses
 

@@ -18,13 +18,13 @@ import tyro
 from numpy.typing import NDArray
 from tyro.conf import Positional
 
-from camera.board import Board
-from camera.board_points import circle_centroids
-from camera.calibrate_images import read_grey
-from camera.calibration import BoardView, calibrate
-from camera.calibration_adjustment import Points
-from camera.calibration_choice import holdout_error
-from camera.calibration_settings import CalibrationSettings, FreeLens
+from camera.boards.board import Board
+from camera.boards.points import circle_centroids
+from camera.calibration.adjustment import Points
+from camera.calibration.calibrate import BoardView, calibrate
+from camera.calibration.choice import holdout_error
+from camera.calibration.images import read_grey
+from camera.calibration.settings import CalibrationSettings, FreeLens
 from camera.errors import CalibrationError
 
 FloatArray = NDArray[np.float64]

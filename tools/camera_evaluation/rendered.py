@@ -13,23 +13,23 @@ import tyro
 from tyro.conf import Positional
 
 from camera import Camera, read_camera
-from camera.board import Board
-from camera.board_points import find_board
-from camera.calibration import (
+from camera.boards.board import Board
+from camera.boards.points import find_board
+from camera.calibration.adjustment import Estimate
+from camera.calibration.calibrate import (
     BoardView,
     Calibration,
     calibrate,
     points_of,
 )
-from camera.calibration_adjustment import Estimate
-from camera.calibration_fit import circle_shifts
-from camera.calibration_projection import (
+from camera.calibration.fit import circle_shifts
+from camera.calibration.projection import (
     intrinsics_of,
     projection_difference,
     projection_sigma,
     with_intrinsics,
 )
-from camera.calibration_settings import CalibrationSettings
+from camera.calibration.settings import CalibrationSettings
 from camera.errors import CalibrationError
 from tools.camera_evaluation.rendering import board_poses, rays_of, render_board
 

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera
-from camera.board import Board
-from camera.calibration_model import rotation_of
+from camera.boards.board import Board
+from camera.calibration.model import rotation_of
 
 FloatArray = NDArray[np.float64]
 

@@ -16,7 +16,7 @@ import tyro
 from tyro.conf import Positional
 
 from camera import read_camera
-from camera.board import Board
+from camera.boards.board import Board
 from storage import OutputExistsError
 from tools.camera_evaluation.rendering import board_poses, rays_of, render_board
 

@@ -7,13 +7,13 @@ from functools import partial
 from pathlib import Path
 
 from camera import CameraError, format_camera, parse_camera, read_camera
-from camera.calibration_floor import read_floor_points
-from camera.colmap_cameras import format_colmap, parse_colmap
-from camera.conversion_models import ForeignCamera
-from camera.convert_command import format_of_text, read_text
-from camera.kalibr_camchain import format_kalibr, parse_kalibr
-from camera.opencv_yaml import format_opencv, parse_opencv
-from camera.ros_camera_info import format_ros, parse_ros
+from camera.calibration.floor import read_floor_points
+from camera.commands.convert import format_of_text, read_text
+from camera.formats.colmap import format_colmap, parse_colmap
+from camera.formats.kalibr import format_kalibr, parse_kalibr
+from camera.formats.models import ForeignCamera
+from camera.formats.opencv import format_opencv, parse_opencv
+from camera.formats.ros import format_ros, parse_ros
 from tools.fuzz.reader import Reader
 from tools.fuzz.words import CAMERA_TEXT, NUMBERS
 

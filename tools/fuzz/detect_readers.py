@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera import CameraError, parse_camera
-from camera.calibrate_images import read_grey
+from camera.calibration.images import read_grey
 from detect.drawing.head import read_head
 from detect.errors import DetectError, FrameError
 from detect.runs.image_bounds import bounded_content

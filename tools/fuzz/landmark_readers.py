@@ -11,9 +11,9 @@ from landmarks import LandmarkError, frames_of_rows, read_rows
 from landmarks.map_file import read_map, read_path
 from landmarks.tilts import read_tilts
 from slam.errors import SlamError
-from slam.g2o_reading import read_g2o
-from slam.map_covariance import covariance_file, read_joint_covariance
-from slam.tum import read_tum
+from slam.formats.g2o_reading import read_g2o
+from slam.formats.tum import read_tum
+from slam.mapping.covariance_file import covariance_file, read_joint_covariance
 from tools.fuzz.reader import Reader
 from tools.fuzz.words import NUMBERS
 

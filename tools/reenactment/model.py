@@ -1,6 +1,6 @@
 """Odometry's part of what a run's rows and steps are explained by.
 
-What a tilted, differently mounted camera makes of discs is `slam.calibration_model`.
+What a tilted, differently mounted camera makes of discs is `slam.models.mounted_discs`.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.calibration_model import (
+from slam.models.mounted_discs import (
     Geometry,
     PixelJacobians,
     nominal_geometry,

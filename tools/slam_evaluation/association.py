@@ -17,10 +17,10 @@ from typing import Annotated, Any, Literal, Optional
 import tyro
 from tyro.conf import Positional, arg
 
-from slam.associate import AssociateSettings, associate_run
-from slam.associate_command import score_run
-from slam.associate_local import LocalSettings
-from slam.filter_input import camera_xy_of
+from slam.association.frame_to_frame import LocalSettings
+from slam.association.run import AssociateSettings, associate_run
+from slam.commands.associate import score_run
+from slam.commands.filter_input import camera_xy_of
 from slam.noise import with_relative_noise
 from slam.recording import read_recording
 from storage import write_whole

@@ -14,9 +14,9 @@ import tyro
 from numpy.typing import NDArray
 
 from landmarks import wrap_angle
-from slam.ekf import EkfSlam, JacobiansAt, run_ekf
-from slam.filter_frames import FilterRun
-from slam.localize import Localizer, MapErrors, run_localizer
+from slam.filters.ekf_slam import EkfSlam, JacobiansAt, run_ekf
+from slam.filters.frames import FilterRun
+from slam.filters.localizer import Localizer, MapErrors, run_localizer
 from tools.slam_evaluation.simulated_runs import (
     CAMERA_XY,
     Scenario,

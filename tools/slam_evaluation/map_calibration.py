@@ -15,13 +15,13 @@ import tyro
 from numpy.typing import NDArray
 
 from camera import Camera
-from slam.calibration import rows_through_mounting
-from slam.calibration_model import rotation_exp
-from slam.graph_terms import RowErrors, Weighting
-from slam.mapping import map_run
-from slam.measurement import disc_in_robot
+from slam.commands.run_camera import camera_of_run
+from slam.mapping.graph_terms import RowErrors, Weighting
+from slam.mapping.run_map import map_run
+from slam.models.measurement import disc_in_robot
+from slam.models.mounted_discs import rotation_exp
+from slam.models.mounting import rows_through_mounting
 from slam.recording import Recording, read_recording
-from slam.run_camera import camera_of_run
 from tools.slam_evaluation.map_study import with_right_odometry
 from tools.slam_evaluation.map_truth import Truth, path_distance, read_truth
 

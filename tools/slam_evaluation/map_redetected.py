@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from landmarks import squared_mahalanobis
 from slam.errors import SlamError
-from slam.mapping import MappedRun, map_run
-from slam.measurement import disc_in_robot
+from slam.mapping.run_map import MappedRun, map_run
+from slam.models.measurement import disc_in_robot
 from slam.recording import UNKNOWN_ID, CircleRows, Recording, read_recording
 from tools.slam_evaluation.map_truth import Truth, path_distance, read_truth
 

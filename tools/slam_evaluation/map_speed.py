@@ -11,11 +11,11 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
-from slam.graph import Estimate, Graph, first_sight, graph_of_recording
-from slam.graph_terms import Weighting, cost
+from slam.mapping.graph import Estimate, Graph, first_sight, graph_of_recording
+from slam.mapping.graph_terms import Weighting, cost
+from slam.mapping.solve import solve
+from slam.mapping.solve_gtsam import estimate_of_values, gtsam_problem, load_gtsam
 from slam.recording import read_recording
-from slam.solve import solve
-from slam.solve_gtsam import estimate_of_values, gtsam_problem, load_gtsam
 
 #: A run that GTSAM takes from odometry: what it is, and how many of its steps lead how far.
 Outcome = tuple[float, int]

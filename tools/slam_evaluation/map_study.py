@@ -15,9 +15,9 @@ from typing import Annotated
 import numpy as np
 import tyro
 
-from slam.chi_squared import ChiSquared
-from slam.mapping import MappedRun, map_run
-from slam.motion import relative_pose
+from slam.mapping.chi_squared import ChiSquared
+from slam.mapping.run_map import MappedRun, map_run
+from slam.models.motion import relative_pose
 from slam.recording import Recording, read_recording
 from tools.simulator.odometry import step_covariance
 from tools.slam_evaluation.map_truth import Distance, Truth, distance, path_distance, read_truth

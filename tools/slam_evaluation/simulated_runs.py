@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from landmarks.map_file import LandmarkMap, Landmarks, no_landmarks
-from slam.measurement import bearing_of_vertical, disc_in_robot
-from slam.motion import chain_steps
+from slam.models.measurement import bearing_of_vertical, disc_in_robot
+from slam.models.motion import chain_steps
 from slam.recording import CircleRows, LineRows, Recording
 
 FloatArray = NDArray[np.float64]

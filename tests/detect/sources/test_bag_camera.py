@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 pytest.importorskip("rosbags", reason="the extra [bags] is not installed")
 
 from camera import Camera
-from camera.conversion import convert_to_foreign
-from camera.conversion_models import ForeignCamera
-from camera.ros_camera_info import ROS_NAMES
+from camera.formats.conversion import convert_to_foreign
+from camera.formats.models import ForeignCamera
+from camera.formats.ros import ROS_NAMES
 from detect.cli import main
 from detect.errors import DetectError
 from detect.run import Run

@@ -1,0 +1,1 @@
+"""Boards for calibration (`board`), and their points in an image (`points`, `charuco`)."""

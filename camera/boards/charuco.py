@@ -1,0 +1,308 @@
+"""Corners of a ChArUco board: OpenCV reads the markers, and each corner is measured on its edges.
+
+The markers fill most of the white squares, so that a window round a corner holds their edges, too,
+which draw it away. What is measured here are two strips along the corner's own two edges, as wide
+as the white between edge and marker. Corners whose markers were not read, for they are small,
+oblique or cut off by the image's border, are looked for where their neighbours say.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from camera.boards.board import Board
+from camera.errors import CalibrationError
+
+if TYPE_CHECKING:
+    import cv2
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+GreyImage = NDArray[np.uint8]
+
+# How far the strips follow the edges, in squares: farther, the lens bends them.
+_ALONG = 0.4
+# An edge is no wider than this to either side (px), nor can it be measured in less.
+_WIDEST_PX = 3.0
+_NARROWEST_PX = 1.2
+# Blur and the gradient's own width carry the marker's edge so far towards the corner's.
+_REACH_PX = 1.5
+# Away from where it is expected, in squares; and agreement with black and white as printed.
+_FARTHEST = 0.25
+_LEAST_AGREEMENT = 0.85
+_ITERATIONS = 40
+_STILL_PX = 1e-4
+# Corners that tell where their neighbour is.
+_NEIGHBOURS = 12
+# Fewer tell no plane.
+_FEWEST_FOUND = 4
+
+
+def find_charuco(image: GreyImage, board: Board) -> tuple[IntArray, FloatArray]:
+    """Find the corners of a ChArUco board in an image.
+
+    Parameters
+    ----------
+    image : (H, W) uint8 array
+    board : Board
+        Of kind `charuco`.
+
+    Returns
+    -------
+    indices : (K,) int64 array
+        Which of `Board.points`; ascending. K may be 0.
+    pixels : (K, 2) array
+        Where they are (the top left pixel's centre is 0, 0).
+
+    Raises
+    ------
+    CalibrationError
+        If the board's dictionary is unknown, or too small for it.
+    """
+    rows, columns = board.rows - 1, board.columns - 1
+    grid = np.full((rows, columns, 2), np.nan)
+    indices, pixels = _interpolated(image, board)
+    if len(indices) < _FEWEST_FOUND:
+        return np.empty(0, dtype=np.int64), np.empty((0, 2))
+    grid[indices // columns, indices % columns] = pixels
+    grid = measured_corners(image, grid, board.marker_m / board.square_m)
+    found = np.flatnonzero(np.isfinite(grid[..., 0]).ravel())
+    return found, grid.reshape(-1, 2)[found]
+
+
+def dictionary_of(board: Board) -> cv2.aruco.Dictionary:
+    """The dictionary that a ChArUco board's markers are of.
+
+    Raises
+    ------
+    CalibrationError
+        If OpenCV has none of that name, or its markers are fewer than the board's.
+    """
+    number = getattr(cv2.aruco, board.dictionary, None)
+    if not board.dictionary.startswith("DICT_") or number is None:
+        raise CalibrationError(
+            f"dictionary {board.dictionary!r} is unknown: expected a name of OpenCV's, such as "
+            "DICT_5X5_100"
+        )
+    dictionary = cv2.aruco.getPredefinedDictionary(number)
+    markers, most = board.columns * board.rows // 2, len(dictionary.bytesList)
+    if markers > most:
+        raise CalibrationError(
+            f"dictionary {board.dictionary} has {most} markers, and a {board} {markers}: expected "
+            "the dictionary that the board was printed with"
+        )
+    return dictionary
+
+
+def _interpolated(image: GreyImage, board: Board) -> tuple[IntArray, FloatArray]:
+    """Corners between the markers that OpenCV reads, in the image or in one of twice the height.
+
+    Half-height images flatten the markers, until their cells are less than a pixel high.
+    """
+    pattern = cv2.aruco.CharucoBoard(
+        (board.columns, board.rows), board.square_m, board.marker_m, dictionary_of(board)
+    )
+    detector = cv2.aruco.CharucoDetector(pattern)
+    best = np.empty(0, dtype=np.int64), np.empty((0, 2))
+    height, width = image.shape
+    for taller in (False, True):
+        picture = cv2.resize(image, (width, 2 * height)) if taller else image
+        try:
+            corners, identities, _, _ = detector.detectBoard(picture)
+        except cv2.error as error:
+            raise CalibrationError(f"no {board} in the image: OpenCV says {error.err}") from None
+        if identities is None or len(identities) <= len(best[0]):
+            continue
+        found = np.asarray(corners, dtype=np.float64).reshape(-1, 2)
+        if taller:
+            # Row v of the image is at 2 v + 0.5 of the taller one.
+            found = np.column_stack([found[:, 0], 0.5 * (found[:, 1] - 0.5)])
+        best = np.asarray(identities, dtype=np.int64).ravel(), found
+        if len(best[0]) == (board.columns - 1) * (board.rows - 1):
+            break
+    return best
+
+
+def measured_corners(image: GreyImage, grid: FloatArray, marker_share: float) -> FloatArray:
+    """Measure a grid of corners on their edges, and look for those that are missing.
+
+    Parameters
+    ----------
+    image : (H, W) uint8 array
+    grid : (rows, columns, 2) array
+        About where the corners are; NaN where that is not known. At least four.
+    marker_share : float
+        Side of the markers in squares.
+
+    Returns
+    -------
+    (rows, columns, 2) array
+        NaN where there is none to be seen.
+    """
+    grey = image.astype(np.float64)
+    gradient: FloatArray = np.empty((2, *grey.shape))
+    cv2.Scharr(grey, cv2.CV_64F, 1, 0, dst=gradient[0])
+    cv2.Scharr(grey, cv2.CV_64F, 0, 1, dst=gradient[1])
+    white = 0.5 * (1.0 - marker_share)
+    rough, result = grid, np.full(grid.shape, np.nan)
+    tried = np.zeros(grid.shape[:2], dtype=bool)
+    while True:
+        # First those that were given, then, ring by ring, what borders on what was found.
+        known = rough if not tried.any() else result
+        present = np.isfinite(known[..., 0])
+        wanted = (present if not tried.any() else _bordering(present)) & ~tried
+        if not wanted.any() or present.sum() < _FEWEST_FOUND:
+            return result
+        homography = _homography(known, present)
+        if homography is None:
+            return result
+        found = result.copy()
+        for row, column in np.argwhere(wanted):
+            tried[row, column] = True
+            at, axes = _expected(homography, known, present, row, column)
+            if np.isfinite(known[row, column, 0]):
+                at = known[row, column]
+            parity = int(row + column) % 2
+            found[row, column] = _measured(grey, gradient, at, axes, white, parity)
+        result = found
+
+
+def _bordering(present: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Places that touch a present one, also across a corner."""
+    padded = np.pad(present, 1)
+    rows, columns = present.shape
+    near = np.zeros_like(present)
+    for down in range(3):
+        for right in range(3):
+            near |= padded[down : down + rows, right : right + columns]
+    return near & ~present
+
+
+def _homography(grid: FloatArray, present: NDArray[np.bool_]) -> FloatArray | None:
+    """(3, 3) from (column, row) to pixels, by all corners; None if they are on a line."""
+    places = np.argwhere(present)[:, ::-1].astype(np.float64)
+    found: FloatArray | None = cv2.findHomography(places, grid[present])[0]  # type: ignore[assignment]
+    return found
+
+
+def _expected(
+    homography: FloatArray, grid: FloatArray, present: NDArray[np.bool_], row: int, column: int
+) -> tuple[FloatArray, FloatArray]:
+    """Where a corner is expected, (2,), and the pixels of a square to the right and down, (2, 2).
+
+    The homography of all, plus what the nearest corners differ from it: that is the lens.
+    """
+    places = np.argwhere(present)[:, ::-1].astype(np.float64)
+    here = np.array([column, row], dtype=np.float64)
+    near = np.argsort(np.sum((places - here) ** 2, axis=1), kind="stable")[:_NEIGHBOURS]
+    relative = places[near] - here
+    differs = grid[present][near] - _mapped(homography, places[near])
+    system = np.hstack([np.ones((len(near), 1)), relative])
+    bend = np.linalg.lstsq(system, differs, rcond=None)[0]
+    step = 0.5 * np.eye(2)
+    slope = _mapped(homography, here + step) - _mapped(homography, here - step)
+    at = _mapped(homography, here[None])[0] + bend[0]
+    return np.asarray(at), np.asarray((slope + bend[1:]).T)
+
+
+def _mapped(homography: FloatArray, places: FloatArray) -> FloatArray:
+    mapped = np.column_stack([places, np.ones(len(places))]) @ homography.T
+    return np.asarray(mapped[:, :2] / mapped[:, 2:])
+
+
+def _measured(
+    grey: FloatArray,
+    gradient: FloatArray,
+    start: FloatArray,
+    axes: FloatArray,
+    white: float,
+    parity: int,
+) -> FloatArray:
+    """A corner as the point that its edges' gradients are at right angles to (Foerstner 1987).
+
+    Parameters
+    ----------
+    grey : (H, W) array
+    gradient : (2, H, W) array
+    start : (2,) array
+        Where it is about.
+    axes : (2, 2) array
+        Columns: pixels of one square to the right and one down, on the board.
+    white : float
+        Width of the white between edge and marker, in squares.
+    parity : int
+        0 where the square right below the corner is black, as the one beyond it.
+
+    Returns
+    -------
+    (2,) array
+        NaN if there is no such corner.
+    """
+    nothing = np.full(2, np.nan)
+    area = abs(float(np.linalg.det(axes)))
+    if not np.isfinite(area) or area < 9.0 or not np.all(np.isfinite(start)):
+        return nothing
+    # Width of a square across the edge to the right (rows) and across the one down (columns).
+    across = area / np.linalg.norm(axes, axis=0)
+    half_px = np.clip(white * across - _REACH_PX, _NARROWEST_PX, _WIDEST_PX)
+    to_squares = np.linalg.inv(axes)
+    # Room for the whole window wherever it may go.
+    extent = (_ALONG + _FARTHEST) * np.abs(axes).sum(axis=1) + 1.0
+    low = np.maximum(np.floor(start - extent), 1.0).astype(int)
+    high = np.minimum(np.ceil(start + extent), np.array(grey.shape[::-1]) - 2.0).astype(int)
+    if np.any(high - low < 4):
+        return nothing
+    u, v = np.meshgrid(np.arange(low[0], high[0] + 1), np.arange(low[1], high[1] + 1))
+    pixels = np.stack([u.ravel(), v.ravel()], axis=-1).astype(np.float64)
+    gu, gv = gradient[:, low[1] : high[1] + 1, low[0] : high[0] + 1].reshape(2, -1)
+    at = start
+    for _ in range(_ITERATIONS):
+        square = (pixels - at) @ to_squares.T
+        weight = _strips(square, across, half_px)
+        uu, uv, vv = np.sum(weight * gu * gu), np.sum(weight * gu * gv), np.sum(weight * gv * gv)
+        determinant = uu * vv - uv * uv
+        if determinant <= 1e-3 * uu * vv:
+            return nothing
+        along = weight * (gu * (pixels[:, 0] - at[0]) + gv * (pixels[:, 1] - at[1]))
+        right_u, right_v = np.sum(along * gu), np.sum(along * gv)
+        step = np.array([vv * right_u - uv * right_v, uu * right_v - uv * right_u]) / determinant
+        at = at + step
+        if np.any(np.abs(to_squares @ (at - start)) > _FARTHEST):
+            return nothing
+        if np.abs(step).max() < _STILL_PX:
+            break
+    inside = (at >= low) & (at <= high)
+    if not inside.all():
+        return nothing
+    square = (pixels - at) @ to_squares.T
+    window = grey[low[1] : high[1] + 1, low[0] : high[0] + 1].ravel()
+    weight = _strips(square, across, half_px)
+    agreement = _agreement(window, square * across[::-1], weight, parity)
+    return at if agreement >= _LEAST_AGREEMENT else nothing
+
+
+def _strips(square: FloatArray, across: FloatArray, half_px: FloatArray) -> FloatArray:
+    """Weights of pixels at places in squares from the corner: the strips, with soft ends."""
+    away = np.abs(square)
+    # Pixels to the edge that goes right (along which x grows), and to the one that goes down.
+    right = np.clip(half_px[0] + 0.5 - away[:, 1] * across[0], 0.0, 1.0)
+    down = np.clip(half_px[1] + 0.5 - away[:, 0] * across[1], 0.0, 1.0)
+    near = np.clip(1.0 - away / _ALONG, 0.0, 1.0)
+    return np.asarray(np.maximum(right * near[:, 0], down * near[:, 1]))
+
+
+def _agreement(window: FloatArray, away_px: FloatArray, weight: FloatArray, parity: int) -> float:
+    """Weighted correlation of grey values with the print: +1 as printed, -1 its negative."""
+    soft = np.clip(away_px / _REACH_PX, -1.0, 1.0)
+    light = soft[:, 0] * soft[:, 1] * (-1.0 if parity == 0 else 1.0)
+    total = weight.sum()
+    if total <= 0.0:
+        return 0.0
+    grey = window - np.sum(weight * window) / total
+    light = light - np.sum(weight * light) / total
+    both = np.sum(weight * grey * grey) * np.sum(weight * light * light)
+    return float(np.sum(weight * grey * light) / np.sqrt(both)) if both > 0.0 else 0.0

@@ -1,0 +1,284 @@
+"""Points of a board in an image (OpenCV)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from camera.boards.board import Board
+from camera.boards.charuco import find_charuco
+from camera.errors import CalibrationError
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+GreyImage = NDArray[np.uint8]
+
+# Half the side of the window round a corner, as a share of its squares in the image.
+_WINDOW = 0.3
+_SMALLEST_HALF_WINDOW = 2
+_LARGEST_HALF_WINDOW = 9
+_FEWEST_POINTS = 8
+# A checkerboard is looked for in pictures reduced to so many pixels along their longer side, one
+# after the other: what OpenCV's search takes grows faster than the picture, most where there is no
+# board, and squares of a few pixels are enough for it.
+_SEARCHED_PX = (1280, 2048)
+
+
+def find_board(
+    image: GreyImage, board: Board, *, window: float = _WINDOW
+) -> tuple[IntArray, FloatArray]:
+    """Find a board's points in an image.
+
+    Parameters
+    ----------
+    image : (H, W) uint8 array
+    board : Board
+    window : float
+        Half the side of the window in which a checkerboard's corner is refined, as a share of its
+        squares in the image: a larger one averages more, and follows the lens's bending more.
+
+    Returns
+    -------
+    indices : (K,) int64 array
+        Which of `Board.points`; ascending.
+    pixels : (K, 2) array
+        Where they are (the top left pixel's centre is 0, 0).
+
+    Raises
+    ------
+    CalibrationError
+        If the board is not there, or too little of a ChArUco board is.
+    """
+    if board.kind == "charuco":
+        return _charuco(image, board)
+    if board.kind == "checkerboard":
+        grid = _checkerboard(image, board, window)
+    else:
+        grid = _circles(image, board)
+    return np.arange(board.columns * board.rows), grid.reshape(-1, 2)
+
+
+def _not_found(board: Board) -> CalibrationError:
+    return CalibrationError(
+        f"no {board} in the image: is all of it visible, with a white border, sharp and evenly "
+        "lit, and are --columns and --rows right?"
+    )
+
+
+def _checkerboard(image: GreyImage, board: Board, window: float) -> FloatArray:
+    size = (board.columns, board.rows)
+    for reduced in _reductions(image):
+        per_pixel = np.array([image.shape[1] / reduced.shape[1], image.shape[0] / reduced.shape[0]])
+        # Half-height images flatten the squares.
+        for taller in (False, True):
+            searched = _twice_as_high(reduced) if taller else reduced
+            found, corners = cv2.findChessboardCorners(searched, size)
+            if not found:
+                continue
+            flat = np.asarray(corners, dtype=np.float64).reshape(-1, 2)
+            flat = _of_half_height(flat) if taller else flat
+            flat = (flat + 0.5) * per_pixel - 0.5
+            grid = flat.astype(np.float32).reshape(board.rows, board.columns, 2)
+            return _in_order(image, _refined(image, grid, window))
+    raise _not_found(board)
+
+
+def _reductions(image: GreyImage) -> Iterator[GreyImage]:
+    """The image as small as it is searched, smallest first."""
+    height, width = image.shape
+    for longest in _SEARCHED_PX:
+        if longest >= max(height, width):
+            break
+        scale = longest / max(height, width)
+        reduced = (max(round(scale * width), 1), max(round(scale * height), 1))
+        yield np.asarray(cv2.resize(image, reduced, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    if max(height, width) <= _SEARCHED_PX[-1]:
+        yield image
+
+
+def _refined(image: GreyImage, grid: NDArray[np.float32], share: float) -> FloatArray:
+    """Saddle points, from as much round each as holds nothing else.
+
+    The window is small, and a corner's own: a larger one follows the lens's bending of the edges,
+    and one that reaches the next corner is drawn to it. Corners that are NaN stay so.
+    """
+    half = np.clip(
+        np.rint(share * _spacing(grid)), _SMALLEST_HALF_WINDOW, _LARGEST_HALF_WINDOW
+    ).astype(int)
+    stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 100, 1e-4)
+    refined = np.full(grid.shape, np.nan)
+    present = np.isfinite(grid[..., 0])
+    for size in np.unique(half[present], axis=0):
+        chosen = np.all(half == size, axis=-1) & present
+        corners = np.ascontiguousarray(grid[chosen].reshape(-1, 1, 2))
+        window = (int(size[0]), int(size[1]))
+        found = cv2.cornerSubPix(image, corners, window, (-1, -1), stop)
+        refined[chosen] = np.asarray(found, dtype=np.float64).reshape(-1, 2)
+    return refined
+
+
+def _spacing(grid: NDArray[np.float32]) -> FloatArray:
+    """(rows, columns, 2) extent of a square at each corner along u and v, pixels."""
+    extent = np.full((*grid.shape, 2), np.inf)
+    for axis in (0, 1):
+        step = np.abs(np.diff(grid, axis=axis))
+        step = np.where(np.isfinite(step), step, np.inf)
+        ahead: list[slice] = [slice(None), slice(None)]
+        behind: list[slice] = [slice(None), slice(None)]
+        ahead[axis], behind[axis] = slice(None, -1), slice(1, None)
+        for where in (tuple(ahead), tuple(behind)):
+            extent[(*where, slice(None), axis)] = np.minimum(
+                extent[(*where, slice(None), axis)], step
+            )
+    # A corner without neighbours gets the smallest windows.
+    extent = np.where(np.isfinite(extent), extent, 0.0)
+    return np.asarray(extent.max(axis=-1))
+
+
+def _in_order(image: GreyImage, grid: FloatArray) -> FloatArray:
+    """Bring a (rows, columns, 2) grid of corners into the board's own order.
+
+    The board is seen from its printed side, so right x down points into the image; and the square
+    right below the first corner is black, as the one beyond it is. A board that looks the same
+    turned begins in the image's upper left.
+    """
+    grid = _from_the_front(grid)
+    centres = 0.25 * (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:])
+    columns = np.clip(np.rint(centres[..., 0]).astype(int), 0, image.shape[1] - 1)
+    rows = np.clip(np.rint(centres[..., 1]).astype(int), 0, image.shape[0] - 1)
+    grey = image[rows, columns].astype(np.float64)
+    even = np.add.outer(np.arange(grey.shape[0]), np.arange(grey.shape[1])) % 2 == 0
+    if grey[even].mean() > grey[~even].mean():
+        grid = grid[::-1, ::-1]
+    return np.ascontiguousarray(grid)
+
+
+def _from_the_front(grid: FloatArray) -> FloatArray:
+    right = grid[:, -1] - grid[:, 0]
+    down = grid[-1] - grid[0]
+    if np.sum(right[:, 0]) * np.sum(down[:, 1]) < np.sum(right[:, 1]) * np.sum(down[:, 0]):
+        return grid[:, ::-1]
+    return grid
+
+
+def _charuco(image: GreyImage, board: Board) -> tuple[IntArray, FloatArray]:
+    indices, pixels = find_charuco(image, board)
+    if len(indices) < _FEWEST_POINTS:
+        raise CalibrationError(
+            f"{len(indices)} corners of a {board} in the image: expected at least "
+            f"{_FEWEST_POINTS}; is --dictionary {board.dictionary} right?"
+        )
+    return indices, pixels
+
+
+def _least_spacing(grid: NDArray[np.float32]) -> float:
+    """Least distance of neighbours that were both seen, pixels."""
+    steps = np.concatenate(
+        [np.linalg.norm(np.diff(grid, axis=axis), axis=-1).ravel() for axis in (0, 1)]
+    )
+    steps = steps[np.isfinite(steps)]
+    return float(steps.min()) if len(steps) else 10.0
+
+
+def _circles(image: GreyImage, board: Board) -> FloatArray:
+    flag = (
+        cv2.CALIB_CB_ASYMMETRIC_GRID
+        if board.kind == "asymmetric-circles"
+        else cv2.CALIB_CB_SYMMETRIC_GRID
+    )
+    size = (board.columns, board.rows)
+    # Clustering bears more perspective, the plain search more clutter; light circles on a dark
+    # ground are dark ones in the negative; and half-height images flatten circle and grid.
+    for taller in (False, True):
+        for negative in (False, True):
+            picture = 255 - image if negative else image
+            searched = _twice_as_high(picture) if taller else picture
+            for extra in (0, cv2.CALIB_CB_CLUSTERING):
+                found, centres = cv2.findCirclesGrid(searched, size, flags=flag | extra)
+                if not found:
+                    continue
+                flat = np.asarray(centres, dtype=np.float64).reshape(-1, 2)
+                grid = (_of_half_height(flat) if taller else flat).reshape(
+                    board.rows, board.columns, 2
+                )
+                if board.kind == "circles":
+                    grid = _from_the_front(grid)
+                return circle_centroids(picture, grid)
+    raise _not_found(board)
+
+
+def _twice_as_high(image: GreyImage) -> GreyImage:
+    """The image stretched: half-height ones flatten what is square or round."""
+    height, width = image.shape
+    return np.asarray(
+        cv2.resize(image, (width, 2 * height), interpolation=cv2.INTER_LINEAR), dtype=np.uint8
+    )
+
+
+def _of_half_height(pixels: FloatArray) -> FloatArray:
+    """(N, 2) pixels of `_twice_as_high` in the image itself: row v is at 2 v + 0.5 there."""
+    return np.column_stack([pixels[:, 0], 0.5 * (pixels[:, 1] - 0.5)])
+
+
+def circle_centroids(image: GreyImage, grid: FloatArray) -> FloatArray:
+    """Centroids of dark circles near given places, weighted by how dark each pixel is.
+
+    Parameters
+    ----------
+    image : (H, W) uint8 array
+    grid : (rows, columns, 2) array
+        Where the circles are, to within their radii.
+
+    Returns
+    -------
+    (rows, columns, 2) array
+        The area centroid of each; a place where there is no circle to measure stays as it is.
+    """
+    spacing = _least_spacing(grid.astype(np.float32))
+    result = grid.copy()
+    for index in np.ndindex(grid.shape[:2]):
+        # Twice, because the first window is round the finder's centre.
+        for _ in range(2):
+            moved = _centroid(image, result[index], 0.5 * spacing, cv2)
+            if moved is None:
+                break
+            result[index] = moved
+    return result
+
+
+def _centroid(image: GreyImage, at: FloatArray, reach: float, cv2: object) -> FloatArray | None:
+    """Centroid of the dark blob in the square window round `at`; None where there is none."""
+    half = max(int(reach), 3)
+    u, v = int(np.rint(at[0])), int(np.rint(at[1]))
+    top, left = max(v - half, 0), max(u - half, 0)
+    window = image[top : v + half + 1, left : u + half + 1].astype(np.float64)
+    if min(window.shape) < 5:
+        return None
+    light = np.percentile(window, 90.0)
+    dark = float(image[min(max(v, 0), image.shape[0] - 1), min(max(u, 0), image.shape[1] - 1)])
+    if light - dark < 20.0:
+        return None
+    # Paper and ink are flat; only the circle's edge, where a pixel holds both, counts in part.
+    weight = np.clip((light - window) / (light - dark), 0.0, 1.0)
+    weight[weight < 0.15] = 0.0
+    connected = _blob(weight, v - top, u - left, cv2)
+    if connected is None:
+        return None
+    weight = np.where(connected, weight, 0.0)
+    total = weight.sum()
+    rows, columns = np.mgrid[top : top + window.shape[0], left : left + window.shape[1]]
+    return np.array([np.sum(weight * columns) / total, np.sum(weight * rows) / total])
+
+
+def _blob(weight: FloatArray, row: int, column: int, cv2: object) -> NDArray[np.bool_] | None:
+    """The blob at a place of the window, if it does not touch the window's edge."""
+    mask = (weight > 0.0).astype(np.uint8)
+    if not (0 <= row < mask.shape[0] and 0 <= column < mask.shape[1]) or not mask[row, column]:
+        return None
+    _, labels = cv2.connectedComponents(mask, connectivity=4)  # type: ignore[attr-defined]
+    blob = np.asarray(labels == labels[row, column])
+    edge = blob[0].any() or blob[-1].any() or blob[:, 0].any() or blob[:, -1].any()
+    return None if edge else blob

@@ -1,0 +1,220 @@
+"""Calibration of a camera by views of a board: from points to intrinsics and how good they are."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from camera.boards.board import Board
+from camera.calibration.adjustment import Adjusted, Estimate, Points, StartError, project_estimate
+from camera.calibration.checks import demand_different_views, demand_enough, warnings_of
+from camera.calibration.choice import choose_lens, of_views
+from camera.calibration.fit import circle_shifts, fit_points
+from camera.calibration.settings import CalibrationSettings, FreeLens
+from camera.calibration.start import best_poses, first_estimate, normals_spread_deg
+from camera.errors import CalibrationError
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+_OUTLIER_FACTOR = 3.0
+# A point is wrong when it is so many standard deviations off.
+_WRONG_POINT = 8.0
+_FEWEST_POINTS = 8
+
+
+@dataclass(frozen=True, eq=False)
+class BoardView:
+    """A board in a picture.
+
+    Attributes
+    ----------
+    name : str
+        The picture's.
+    indices : (K,) int64
+        Which of the board's points were seen.
+    pixels : (K, 2) float64
+        Where.
+    """
+
+    name: str
+    indices: IntArray
+    pixels: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """A calibrated camera.
+
+    Attributes
+    ----------
+    adjusted : Adjusted
+    points : Points
+        What it was fitted to; circles' shifts are taken off.
+    names : tuple of str
+        The views' names.
+    outliers : tuple of (str, float)
+        Views left out, with the RMS of their residuals (px).
+    lens : FreeLens
+        Which coefficients of the distortion are free.
+    holdout_px : dict of FreeLens to float
+        RMS reprojection error (u and v together) in views that the intrinsics were not fitted to,
+        by what was free; all that was tried.
+    spread_deg : float
+        Largest angle between two boards' normals.
+    warnings : tuple of str
+    """
+
+    adjusted: Adjusted
+    points: Points
+    names: tuple[str, ...]
+    outliers: tuple[tuple[str, float], ...]
+    lens: FreeLens
+    holdout_px: dict[FreeLens, float]
+    spread_deg: float
+    warnings: tuple[str, ...] = field(default=())
+
+    @property
+    def intrinsics(self) -> FloatArray:
+        """(14,) `calibration_model.INTRINSICS`."""
+        return self.adjusted.estimate.intrinsics
+
+    @property
+    def view_rms_px(self) -> FloatArray:
+        """(V,) RMS residual of each view."""
+        squares = np.sum(self.adjusted.residuals**2, axis=1)
+        mean = np.add.reduceat(squares, self.points.starts) / self.points.counts
+        return np.asarray(np.sqrt(mean))
+
+
+def calibrate(
+    views: Sequence[BoardView],
+    board: Board,
+    size: tuple[int, int],
+    settings: CalibrationSettings | None = None,
+) -> Calibration:
+    """Calibrate a camera by views of a board, by the reprojection error.
+
+    Parameters
+    ----------
+    views : sequence of BoardView
+    board : Board
+    size : (int, int)
+        Width and height of the pictures, pixels.
+    settings : CalibrationSettings, optional
+
+    Returns
+    -------
+    Calibration
+
+    Raises
+    ------
+    CalibrationError
+        If the views are too few or too much alike, or nothing explains them.
+    """
+    settings = settings if settings is not None else CalibrationSettings()
+    demand_enough(len(views))
+    measured = points_of(views, board, size)
+    names = tuple(view.name for view in views)
+    try:
+        start = first_estimate(measured, settings.aspect)
+    except StartError:
+        raise CalibrationError(
+            "no camera explains the points found: are --columns, --rows and the kind of --board "
+            "right, and do all pictures show the same board by the same camera at the same zoom?"
+        ) from None
+    radius = 0.5 * board.circle_m
+    start = _staged(start, measured, settings, radius)
+
+    outliers: tuple[tuple[str, float], ...] = ()
+    # What a model lacks is no picture's fault, so outliers are told by the fullest one.
+    most = settings.most
+    for count in range(min(2, most), most + 1):
+        first = fit_points(start, measured, settings, settings.lens(count), radius)
+        start = first[0].estimate
+    # Before more is asked of views that can't tell.
+    demand_different_views(first[0], normals_spread_deg(start.rotations))
+    if settings.tangential is not False:
+        full = settings.lens(most, tangential=True)
+        first = fit_points(start, measured, settings, full, radius)
+        start = first[0].estimate
+    rms = _view_rms(*first)
+    far = rms > _OUTLIER_FACTOR * np.median(rms)
+    if far.any() and not settings.keep_outliers:
+        kept = np.flatnonzero(~far)
+        outliers = tuple((names[v], float(rms[v])) for v in np.flatnonzero(far))
+        demand_enough(len(kept), f" without {', '.join(name for name, _ in outliers)}")
+        names = tuple(names[v] for v in kept)
+        measured = measured.of(kept)
+        start = of_views(start, kept)
+    measured, wrong = _without_wrong_points(start, measured, first[0].sigma_px, settings, radius)
+
+    lens, tried = choose_lens(start, measured, settings, radius)
+    adjusted, points = tried[lens].adjusted, tried[lens].points
+    spread = normals_spread_deg(adjusted.estimate.rotations)
+    demand_different_views(adjusted, spread)
+    warnings = warnings_of(adjusted, points, spread)
+    if wrong:
+        warnings.insert(0, f"{wrong} points left out: they lie far from where the others say")
+    holdout = {free: candidate.holdout_px for free, candidate in tried.items()}
+    return Calibration(adjusted, points, names, outliers, lens, holdout, spread, tuple(warnings))
+
+
+def points_of(views: Sequence[BoardView], board: Board, size: tuple[int, int]) -> Points:
+    """The points of all views, one after the other."""
+    counts = [len(view.indices) for view in views]
+    return Points(
+        board=np.concatenate([board.points[view.indices] for view in views]),
+        pixels=np.concatenate([view.pixels for view in views]).astype(np.float64),
+        starts=np.cumsum([0, *counts[:-1]]).astype(np.int64),
+        width=size[0],
+        height=size[1],
+    )
+
+
+def _staged(
+    start: Estimate, points: Points, settings: CalibrationSettings, radius_m: float
+) -> Estimate:
+    """One and then two coefficients, with the poses' second solutions tried in between."""
+    for count in (1, min(2, settings.most)):
+        lens = settings.lens(count)
+        estimate = fit_points(start, points, settings, lens, radius_m)[0].estimate
+        start = best_poses(estimate, points)
+    return start
+
+
+def _without_wrong_points(
+    estimate: Estimate,
+    points: Points,
+    sigma_px: float,
+    settings: CalibrationSettings,
+    radius_m: float,
+) -> tuple[Points, int]:
+    """Leave out points that were found wrongly; the second result says how many."""
+    if not settings.robust:
+        return points, 0
+    seen = points.pixels
+    if radius_m > 0.0:
+        shifts = circle_shifts(estimate, points, radius_m)
+        seen = seen - np.where(np.isfinite(shifts), shifts, 0.0)
+    residuals = seen - project_estimate(estimate, points)[0]
+    right = np.all(np.abs(residuals) < _WRONG_POINT * sigma_px, axis=1)
+    counts = np.add.reduceat(right.astype(np.int64), points.starts)
+    # A picture of which too little is left stays as it is: the robust loss deals with it.
+    right |= np.repeat(counts < _FEWEST_POINTS, points.counts)
+    counts = np.add.reduceat(right.astype(np.int64), points.starts)
+    trimmed = replace(
+        points,
+        board=points.board[right],
+        pixels=points.pixels[right],
+        starts=np.cumsum([0, *counts[:-1]]).astype(np.int64),
+    )
+    return trimmed, int(np.sum(~right))
+
+
+def _view_rms(fit: Adjusted, points: Points) -> FloatArray:
+    squares = np.sum(fit.residuals**2, axis=1)
+    return np.asarray(np.sqrt(np.add.reduceat(squares, points.starts) / points.counts))

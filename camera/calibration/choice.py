@@ -1,0 +1,215 @@
+"""Which coefficients of a lens are free: those that explain pictures that were held out."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from camera.calibration.adjustment import Adjusted, Estimate, Points, StartError, adjust
+from camera.calibration.fit import fit_points
+from camera.calibration.model import COUNT, INTRINSICS, TANGENTIAL
+from camera.calibration.settings import CalibrationSettings, FreeLens
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+_FOLDS = 8
+# A coefficient more has to lower the sum of the squared hold-out errors by so many variances.
+_WORTH = 4.0
+# The two tangential terms by so many, and they have to differ from 0 by so many variances: where a
+# board's points are found a little wrong, always in the same way, that can look like decentering.
+_TANGENTIAL_WORTH = 20.0
+_TANGENTIAL_SIGNIFICANCE = 50.0
+# The polynomial instead of a rational function of as few coefficients, by so many.
+_POLYNOMIAL_WORTH = 20.0
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A fit with some coefficients free.
+
+    Attributes
+    ----------
+    adjusted : Adjusted
+    points : Points
+        What it was fitted to; circles' shifts are taken off.
+    holdout_px : float
+        `holdout_error`.
+    """
+
+    adjusted: Adjusted
+    points: Points
+    holdout_px: float
+
+
+Candidates = dict[FreeLens, Candidate]
+
+
+def choose_lens(
+    start: Estimate, points: Points, settings: CalibrationSettings, radius_m: float
+) -> tuple[FreeLens, Candidates]:
+    """Fit with more and more coefficients free, and choose.
+
+    The fewest radial coefficients whose hold-out error is not worse than the best. Tangential terms
+    if they lower it, beside those, by more than they would by chance, and are significant; then the
+    radial ones are chosen anew. The polynomial instead of the rational function if, beside the same
+    tangential terms, it needs fewer coefficients for an error that is not worse, or lowers the
+    error by more than it would by chance; what it has then not been asked yet is whether it needs
+    tangential terms.
+
+    Parameters
+    ----------
+    start : Estimate
+    points : Points
+    settings : CalibrationSettings
+        `coefficients`, `tangential` and `polynomial` may leave no choice.
+    radius_m : float
+        Radius of the circles; 0 for points.
+
+    Returns
+    -------
+    FreeLens, Candidates
+        The chosen one, and all that were tried.
+    """
+    chosen, tried = _chosen_of_a_kind(start, points, settings, radius_m)
+    if settings.polynomial is not None or settings.coefficients is not None:
+        return chosen, tried
+    counts = (2, 3)  # one coefficient, a3, is k1
+    others = [FreeLens(0, chosen.tangential, count) for count in counts]
+    polynomials = _tried(start, points, settings, radius_m, others)
+    other = _fewest_needed(polynomials)
+    # Coefficients that the pictures do not need make the projection unsure where nothing was seen.
+    worth = -_WORTH if other.polynomial < chosen.coefficients else _POLYNOMIAL_WORTH
+    if _is_lower(polynomials[other], tried[chosen], worth):
+        chosen = other
+        if not chosen.tangential:
+            chosen, polynomials = _with_tangential(start, points, settings, radius_m, polynomials)
+    return chosen, tried | polynomials
+
+
+def _chosen_of_a_kind(
+    start: Estimate, points: Points, settings: CalibrationSettings, radius_m: float
+) -> tuple[FreeLens, Candidates]:
+    """`choose_lens` among rational functions, or polynomials."""
+    counts = range(settings.most + 1) if settings.coefficients is None else [settings.most]
+    if settings.tangential is True:
+        decentred = [settings.lens(count, tangential=True) for count in counts]
+        tried = _tried(start, points, settings, radius_m, decentred)
+        return _fewest_needed(tried), tried
+    tried = _tried(start, points, settings, radius_m, [settings.lens(count) for count in counts])
+    return _with_tangential(start, points, settings, radius_m, tried)
+
+
+def _with_tangential(
+    start: Estimate,
+    points: Points,
+    settings: CalibrationSettings,
+    radius_m: float,
+    radial: Candidates,
+) -> tuple[FreeLens, Candidates]:
+    """Choose among radial lenses, and tangential terms where they are worth it."""
+    chosen = _fewest_needed(radial)
+    if settings.tangential is False:
+        return chosen, radial
+    beside = chosen._replace(tangential=True)
+    estimate = radial[chosen].adjusted.estimate
+    tried = radial | _tried(estimate, points, settings, radius_m, [beside])
+    if not _is_worth_it(tried[chosen], tried[beside]):
+        return chosen, tried
+    others = [lens._replace(tangential=True) for lens in radial if lens != chosen]
+    more = {beside: tried[beside]} | _tried(start, points, settings, radius_m, others)
+    return _fewest_needed(more), tried | more
+
+
+def _tried(
+    start: Estimate,
+    points: Points,
+    settings: CalibrationSettings,
+    radius_m: float,
+    lenses: Iterable[FreeLens],
+) -> Candidates:
+    """Each fitted from where the last ended."""
+    tried: Candidates = {}
+    estimate = start
+    for lens in lenses:
+        adjusted, seen = fit_points(estimate, points, settings, lens, radius_m)
+        estimate = adjusted.estimate
+        tried[lens] = Candidate(adjusted, seen, holdout_error(estimate, seen, settings, lens))
+    return tried
+
+
+def _fewest_needed(tried: Candidates) -> FreeLens:
+    best = min(tried.values(), key=lambda candidate: candidate.holdout_px)
+    slack = _WORTH * best.adjusted.sigma_px**2 / len(best.points.board)
+    limit = best.holdout_px**2 + slack
+    return min(lens for lens, candidate in tried.items() if candidate.holdout_px**2 <= limit)
+
+
+def _is_worth_it(radial: Candidate, decentred: Candidate) -> bool:
+    """Whether tangential terms explain what was held out, and are more than noise."""
+    lower = _is_lower(decentred, radial, _TANGENTIAL_WORTH)
+    return lower and tangential_significance(decentred.adjusted) >= _TANGENTIAL_SIGNIFICANCE
+
+
+def _is_lower(candidate: Candidate, other: Candidate, variances: float) -> bool:
+    """Whether a candidate's sum of squared hold-out errors is lower by so many variances."""
+    slack = variances * candidate.adjusted.sigma_px**2 / len(candidate.points.board)
+    return candidate.holdout_px**2 + slack <= other.holdout_px**2
+
+
+def tangential_significance(adjusted: Adjusted) -> float:
+    """Squared distance of (p1, p2) from 0 in standard deviations; 2 on average where they are 0."""
+    places = [INTRINSICS.index(name) for name in TANGENTIAL]
+    found = adjusted.estimate.intrinsics[places]
+    covariance = adjusted.covariance[np.ix_(places, places)]
+    return float(found @ np.linalg.pinv(covariance) @ found)
+
+
+def of_views(estimate: Estimate, views: IntArray) -> Estimate:
+    """An estimate with the poses of some views only."""
+    return Estimate(estimate.intrinsics, estimate.rotations[views], estimate.translations[views])
+
+
+def holdout_error(
+    estimate: Estimate,
+    points: Points,
+    settings: CalibrationSettings,
+    lens: FreeLens,
+    folds: Sequence[IntArray] | None = None,
+) -> float:
+    """RMS reprojection error in views that the intrinsics were not fitted to, pixels.
+
+    Of what is held out only the poses are fitted.
+
+    Parameters
+    ----------
+    estimate : Estimate
+        Where each fit begins.
+    points : Points
+    settings : CalibrationSettings
+    lens : FreeLens
+        Which coefficients are free.
+    folds : sequence of int64 arrays, optional
+        The views that are held out together; each view in one of them. Else every `_FOLDS`-th
+        (each on its own where there are few).
+    """
+    every = np.arange(len(points.starts))
+    if folds is None:
+        number = min(_FOLDS, len(every))
+        folds = [every[every % number == fold] for fold in range(number)]
+    squares = 0.0
+    span, nothing = lens.span(settings.aspect), np.zeros((COUNT, 0))
+    for out in folds:
+        used = np.setdiff1d(every, out)
+        fit = adjust(of_views(estimate, used), points.of(used), span, robust=settings.robust)
+        held = points.of(out)
+        there = replace(of_views(estimate, out), intrinsics=fit.estimate.intrinsics)
+        try:
+            test = adjust(there, held, nothing, robust=settings.robust, sigma_px=fit.sigma_px)
+        except StartError:  # a held-out point lies past this fit's fold
+            return float("inf")
+        squares += float(np.sum(test.residuals**2))
+    return float(np.sqrt(squares / len(points.board)))

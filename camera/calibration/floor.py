@@ -1,0 +1,231 @@
+"""Where a calibrated camera is with respect to the floor, from known places on it.
+
+The robot's axes are given by where the board lies: its middle at (X, Y) of the robot frame (X left,
+Y backward, Z up), its x axis turned from the robot's X axis.
+"""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from camera.calibration.adjustment import Adjusted, Estimate, Points, adjust, project_estimate
+from camera.calibration.fit import fit_to_centres
+from camera.calibration.model import COUNT, cross_matrices
+from camera.calibration.projection import intrinsics_of
+from camera.calibration.start import best_poses, board_poses
+from camera.errors import CalibrationError
+from camera.model import Camera, Pose
+from storage.bounded import read_bounded
+from storage.messages import excerpt
+
+FloatArray = NDArray[np.float64]
+
+#: Columns of a file of floor points: pixel, and place in the robot frame (m).
+FLOOR_COLUMNS = ("u", "v", "x", "y")
+
+_FEWEST_POINTS = 4
+_LARGEST_FILE_BYTES = 1 << 24
+
+
+@dataclass(frozen=True, eq=False)
+class FloorPose:
+    """The camera's pose in the robot frame.
+
+    Attributes
+    ----------
+    robot_from_camera : (3, 4) float64
+    covariance : (6, 6) float64
+        Of the position (m, robot frame) and of a small rotation from the left (rad, about the
+        robot's axes), in this order; errors of the points and of the intrinsics.
+    residuals : (N, 2) float64
+        Seen less projected, pixels.
+    sigma_px : float
+        Noise of a coordinate that the residuals show.
+    """
+
+    robot_from_camera: FloatArray
+    covariance: FloatArray
+    residuals: FloatArray
+    sigma_px: float
+
+    @property
+    def rms_px(self) -> float:
+        """Root of the mean squared distance between seen and projected."""
+        return float(np.sqrt(np.mean(np.sum(self.residuals**2, axis=1))))
+
+
+def on_floor(board_points: FloatArray, origin_xy: tuple[float, float], yaw: float) -> FloatArray:
+    """(N, 3) places in the robot frame of a board's (N, 3) points.
+
+    Parameters
+    ----------
+    board_points : (N, 3) array
+        In the board's frame (x right, y up, z out of the print), metres.
+    origin_xy : (float, float)
+        Where the board's middle lies, robot X and Y in metres.
+    yaw : float
+        Angle from the robot's X axis to the board's x axis, counterclockwise seen from above (rad).
+    """
+    c, s = np.cos(yaw), np.sin(yaw)
+    turned = board_points @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]).T
+    return np.asarray(turned + np.array([*origin_xy, 0.0]))
+
+
+def place_on_floor(
+    camera: Camera,
+    pixels: FloatArray,
+    floor_xy: FloatArray,
+    intrinsics_covariance: FloatArray | None = None,
+    radius_m: float = 0.0,
+) -> FloorPose:
+    """The camera's pose from points on the floor.
+
+    Parameters
+    ----------
+    camera : Camera
+        Its intrinsics; its pose does not matter.
+    pixels : (N, 2) array
+        Where the points are seen.
+    floor_xy : (N, 2) array
+        Where they are, robot X and Y in metres.
+    intrinsics_covariance : (14, 14) array, optional
+        Of `calibration_model.INTRINSICS`; zero if not given.
+    radius_m : float
+        Where the points are the centroids of circles' images, the circles' radius: it takes off
+        what perspective and lens move them.
+
+    Returns
+    -------
+    FloorPose
+
+    Raises
+    ------
+    CalibrationError
+        If there are too few points, they lie in a line, or no pose above the floor sees them.
+    """
+    floor = np.column_stack([floor_xy, np.zeros(len(floor_xy))])
+    _check(pixels, floor)
+    points = Points(floor, pixels, np.zeros(1, dtype=np.int64), camera.width, camera.height)
+    intrinsics = intrinsics_of(camera)
+    start = Estimate(intrinsics, *board_poses(intrinsics, points))
+
+    def adjusted(start: Estimate, points: Points) -> Adjusted:
+        # Not robust with few: four points have no residuals to tell outliers by.
+        return adjust(start, points, np.zeros((COUNT, 0)), robust=len(floor) > 8)
+
+    try:
+        fit, _ = fit_to_centres(adjusted, best_poses(start, points), points, radius_m)
+    except ValueError:
+        raise CalibrationError(
+            "no pose of the camera sees the floor's points where they are: are they in the order "
+            "u, v, x, y, with X to the left and Y backward, and is it this camera's calibration?"
+        ) from None
+    estimate = fit.estimate
+    R, t = estimate.rotations[0].T, -estimate.rotations[0].T @ estimate.translations[0]
+    if t[2] <= 0.0:
+        raise CalibrationError(
+            "the points are seen from below the floor: X and Y are mirrored (X is to the left, Y "
+            "backward, Z up), or the board lies with its print down"
+        )
+    covariance = fit.pose_covariances[0]
+    if intrinsics_covariance is not None:
+        _, by_intrinsics, by_pose = project_estimate(estimate, points)
+        gain = np.linalg.pinv(by_pose.reshape(-1, 6)) @ by_intrinsics.reshape(-1, COUNT)
+        covariance = covariance + gain @ intrinsics_covariance @ gain.T
+    # From (rotation from the left in the camera frame, translation) of camera_from_robot.
+    # R' = R exp(-w), t' = -R exp(-w) (T + dT): dt = -R dT + R (w x T).
+    to_pose = np.zeros((6, 6))
+    to_pose[:3, 3:] = -R
+    to_pose[:3, :3] = -R @ cross_matrices(estimate.translations[0])
+    to_pose[3:, :3] = -R
+    return FloorPose(
+        robot_from_camera=np.column_stack([R, t]),
+        covariance=to_pose @ covariance @ to_pose.T,
+        residuals=fit.residuals,
+        sigma_px=fit.sigma_px,
+    )
+
+
+def with_pose(camera: Camera, pose: FloatArray) -> Camera:
+    """The camera at a (3, 4) pose `robot_from_camera`.
+
+    A ``sensor2Tcp`` that it has stays: it belongs to its mount. One that has none gets the
+    identity, which says that the sensor is its own tool.
+    """
+    rows: Pose = tuple((float(a), float(b), float(c), float(d)) for a, b, c, d in pose)
+    identity: Pose = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
+    tcp = camera.sensor_to_tcp if camera.sensor_to_tcp is not None else identity
+    return replace(camera, robot_from_camera=rows, sensor_to_tcp=tcp)
+
+
+def read_floor_points(path: Path) -> tuple[FloatArray, FloatArray]:
+    """Read a CSV file of floor points with the header ``u,v,x,y``.
+
+    Returns
+    -------
+    pixels, floor_xy : (N, 2) arrays
+        Pixels, and metres in the robot frame.
+
+    Raises
+    ------
+    CalibrationError
+        If it cannot be read; the message names the line.
+    """
+    try:
+        lines = read_bounded(path, _LARGEST_FILE_BYTES).decode("utf-8-sig").splitlines()
+        rows = list(csv.reader(lines))
+    except (UnicodeDecodeError, csv.Error):
+        raise CalibrationError(f"{path}: is no text: expected floor points") from None
+    except OSError as error:
+        raise CalibrationError(
+            f"{path}: cannot be read as floor points: {error.strerror}"
+        ) from None
+    header = tuple(name.strip().lower() for name in rows[0]) if rows else ()
+    if header != FLOOR_COLUMNS:
+        raise CalibrationError(
+            f"{path}:1: the header is {excerpt(','.join(header))}: expected u,v,x,y (pixels; "
+            "metres, X left and Y backward of the robot)"
+        )
+    numbers = []
+    for line, row in enumerate(rows[1:], start=2):
+        if not row:
+            continue
+        try:
+            values = [float(cell) for cell in row]
+        except ValueError:
+            values = []
+        if len(values) != 4 or not np.all(np.isfinite(values)):
+            raise CalibrationError(f"{path}:{line}: expected four numbers u,v,x,y")
+        numbers.append(values)
+    table = np.array(numbers, dtype=np.float64).reshape(-1, 4)
+    return table[:, :2], table[:, 2:]
+
+
+def _check(pixels: FloatArray, floor: FloatArray) -> None:
+    if len(pixels) < _FEWEST_POINTS:
+        raise CalibrationError(
+            f"{len(pixels)} points on the floor: at least {_FEWEST_POINTS} are needed, better 10 "
+            "and more over all of the floor that is seen"
+        )
+    for what, values in (("on the floor", floor[:, :2]), ("in the image", pixels)):
+        spread = np.linalg.svd(values - values.mean(axis=0), compute_uv=False)
+        if spread[1] < 1e-3 * spread[0]:
+            raise CalibrationError(
+                f"the points lie in a line {what}: add some beside it, or the camera's tilt about "
+                "the line stays open"
+            )
+        away = values - values.mean(axis=0)
+        spreads = np.linalg.eigvalsh(
+            # Of all but one, each in turn.
+            away.T @ away - len(away) / (len(away) - 1) * away[:, :, None] * away[:, None, :]
+        )
+        if np.any(spreads[:, 0] < 1e-6 * spreads[:, 1]):
+            raise CalibrationError(
+                f"all but one of the points lie in a line {what}: add another beside it, or poses "
+                "can't be told apart"
+            )

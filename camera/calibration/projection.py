@@ -1,0 +1,101 @@
+"""How sure a calibration is of where it projects, and how far two cameras' projections differ.
+
+A small rotation of the camera looks the same as a shift of the principal point, and the pose takes
+it up; so what is common with a rotation is taken off, as mrcal does.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from camera.calibration.model import COUNT, cross_matrices, project_points, rotation_of
+from camera.model import Camera
+
+FloatArray = NDArray[np.float64]
+
+
+def pixel_grid(width: int, height: int, columns: int = 49, rows: int = 37) -> FloatArray:
+    """(rows * columns, 2) pixels from corner to corner of an image."""
+    u, v = np.meshgrid(np.linspace(0.0, width - 1.0, columns), np.linspace(0.0, height - 1.0, rows))
+    return np.stack([u, v], axis=-1).reshape(-1, 2)
+
+
+def intrinsics_of(camera: Camera) -> FloatArray:
+    """(14,) numbers of a camera (`calibration_model.INTRINSICS`)."""
+    pinhole = (camera.scale_x, camera.scale_y, camera.offset_x, camera.offset_y)
+    return np.array([*pinhole, *camera.coef, *camera.tangential, *camera.polynomial])
+
+
+def with_intrinsics(camera: Camera, intrinsics: FloatArray) -> Camera:
+    """The camera with other intrinsics, an array as of `intrinsics_of`."""
+    sx, sy, ox, oy, a2, a3, b1, b2, b3, p1, p2, *k = (float(x) for x in intrinsics)
+    return replace(
+        camera, scale_x=sx, scale_y=sy, offset_x=ox, offset_y=oy, coef=(a2, a3, b1, b2, b3),
+        tangential=(p1, p2), polynomial=(k[0], k[1], k[2]),
+    )  # fmt: skip
+
+
+def projection_sigma(
+    camera: Camera, covariance: FloatArray, columns: int = 49, rows: int = 37
+) -> FloatArray:
+    """Standard deviation of where directions are projected, whatever the camera's rotation.
+
+    Parameters
+    ----------
+    camera : Camera
+    covariance : (14, 14) array
+        Of its intrinsics.
+    columns, rows : int
+        Of the grid of pixels.
+
+    Returns
+    -------
+    (rows, columns) array
+        Root of the trace of each pixel's covariance (u and v together), pixels.
+    """
+    rays = camera.unproject(pixel_grid(camera.width, camera.height, columns, rows))
+    _, by_intrinsics, by_point = project_points(intrinsics_of(camera), rays)
+    J = by_intrinsics.reshape(-1, COUNT)
+    turn = (-by_point @ cross_matrices(rays)).reshape(-1, 3)
+    J = J - turn @ np.linalg.lstsq(turn, J, rcond=None)[0]
+    variance = np.einsum("ni,ij,nj->n", J, covariance, J).reshape(-1, 2).sum(axis=1)
+    return np.asarray(np.sqrt(np.maximum(variance, 0.0)).reshape(rows, columns))
+
+
+def projection_difference(
+    camera: Camera, other: Camera, *, rotate: bool = True, columns: int = 49, rows: int = 37
+) -> FloatArray:
+    """How far apart two cameras project the same directions.
+
+    Parameters
+    ----------
+    camera, other : Camera
+    rotate : bool
+        Turn the other camera so that it fits best.
+    columns, rows : int
+        Of the grid of pixels of `camera`.
+
+    Returns
+    -------
+    (rows, columns) array
+        Pixels; NaN where the other camera does not see the direction.
+    """
+    pixels = pixel_grid(camera.width, camera.height, columns, rows)
+    rays = camera.unproject(pixels)
+    rotation = np.eye(3)
+    intrinsics = intrinsics_of(other)
+    for _ in range(10 if rotate else 0):
+        turned = rays @ rotation.T
+        found, _, by_point = project_points(intrinsics, turned)
+        turn = -by_point @ cross_matrices(turned)
+        good = np.all(np.isfinite(found), axis=1)
+        error = (pixels - found)[good].ravel()
+        step = np.linalg.lstsq(turn[good].reshape(-1, 3), error, rcond=None)[0]
+        rotation = rotation_of(np.asarray(step, dtype=np.float64)) @ rotation
+        if np.abs(step).max() < 1e-12:
+            break
+    found = other.distort((rays @ rotation.T)[:, :2] / (rays @ rotation.T)[:, 2:])
+    return np.asarray(np.linalg.norm(found - pixels, axis=1).reshape(rows, columns))

@@ -1,0 +1,316 @@
+"""``camera calibrate``: pictures in; a .cam file, its report and its pictures out."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterable
+from errno import ENOENT
+from math import degrees, radians
+from os import strerror
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from camera.boards.board import Board
+from camera.boards.charuco import dictionary_of
+from camera.boards.points import find_board
+from camera.calibration.calibrate import (
+    BoardView,
+    Calibration,
+    calibrate,
+)
+from camera.calibration.checks import coverage
+from camera.calibration.floor import (
+    FloorPose,
+    on_floor,
+    place_on_floor,
+    read_floor_points,
+    with_pose,
+)
+from camera.calibration.images import GreyImage, calibration_images, read_grey
+from camera.calibration.model import INTRINSICS
+from camera.calibration.pictures import pictures
+from camera.calibration.projection import projection_sigma
+from camera.calibration.settings import CalibrationSettings
+from camera.camfile import format_camera
+from camera.errors import CalibrationError, CameraError
+from camera.model import Camera
+from camera.options import Calibrate
+from storage import OutputExistsError, write_whole
+
+FloatArray = NDArray[np.float64]
+
+_WHETHER = {"auto": None, "on": True, "off": False}
+_IDENTITY = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
+
+
+def perform(options: Calibrate) -> int:
+    """Carry the command out; returns the exit code."""
+    names = {name: _beside(options.output, name) for name in ("residuals", "views", "coverage")}
+    report = options.output.with_suffix(".json")
+    for path in (options.output, report, *names.values()):
+        if path.exists() and not options.force:
+            raise OutputExistsError(path)
+    # What would be told only after minutes of work.
+    if report == options.output:
+        raise CalibrationError(f"{report}: the report is written there: expected a name in .cam")
+    if not options.output.parent.exists():
+        raise FileNotFoundError(ENOENT, strerror(ENOENT), str(options.output))
+    if options.floor is not None and not options.floor.exists():
+        raise CalibrationError(f"{options.floor}: no such picture or .csv of the floor")
+    board = Board(
+        kind=options.board,
+        columns=options.columns,
+        rows=options.rows,
+        square_m=options.square_m,
+        marker_m=options.marker_m,
+        dictionary=options.dictionary,
+        circle_m=options.circle_m,
+    )
+    settings = CalibrationSettings(
+        aspect=None if options.free_aspect else 0.5 if options.half else 1.0,
+        coefficients=None if options.coefficients == "auto" else int(options.coefficients),
+        tangential=_WHETHER[options.tangential],
+        polynomial=_WHETHER[options.polynomial],
+        keep_outliers=options.keep_outliers,
+    )
+    images = calibration_images(options.images, options.every, options.max_images)
+    views, size = find_views(images, board)
+    on_the_floor: tuple[FloatArray, FloatArray, float] | None = None
+    if options.floor is not None:
+        on_the_floor = (
+            *floor_points(options.floor, board, options.floor_origin, options.floor_yaw, size),
+            radius_on_floor(options.floor, board),
+        )
+    calibration = calibrate(views, board, size, settings)
+    camera = camera_of(calibration)
+    print(describe(calibration, camera))
+
+    placed: FloorPose | None = None
+    if on_the_floor is not None:
+        pixels, floor_xy, radius_m = on_the_floor
+        placed = place_on_floor(camera, pixels, floor_xy, calibration.adjusted.covariance, radius_m)
+        camera = with_pose(camera, placed.robot_from_camera)
+        print(describe_pose(placed))
+    else:
+        print(
+            "no pose: sensor2World is the identity; `camera floor` finds it from a picture of the "
+            "board on the floor"
+        )
+    drawn = pictures(calibration, camera)
+    for name, path in names.items():
+        with write_whole(path, overwrite=options.force) as stream:
+            stream.write(drawn[name])
+    with write_whole(report, overwrite=options.force) as stream:
+        stream.write(report_text(options, calibration, camera, placed).encode())
+    with write_whole(options.output, overwrite=options.force) as stream:
+        stream.write(format_camera(camera).encode())
+    print(f"written: {options.output}, {report.name}, {', '.join(p.name for p in names.values())}")
+    return 0
+
+
+def _beside(output: Path, name: str) -> Path:
+    return output.with_name(f"{output.stem}.{name}.png")
+
+
+def find_views(
+    images: Iterable[tuple[str, GreyImage]], board: Board
+) -> tuple[list[BoardView], tuple[int, int]]:
+    """Find the board in pictures; those without it are told on standard error.
+
+    Raises
+    ------
+    CalibrationError
+        If the pictures are not of one size, or none shows the board, or its markers are unknown.
+    """
+    if board.kind == "charuco":
+        dictionary_of(board)
+    views: list[BoardView] = []
+    size: tuple[int, int] | None = None
+    count = 0
+    for name, image in images:
+        count += 1
+        found_size = (image.shape[1], image.shape[0])
+        if size is not None and found_size != size:
+            raise CalibrationError(
+                f"{name}: {found_size[0]} x {found_size[1]} pixels, the pictures before "
+                f"{size[0]} x {size[1]}: use pictures of one camera, all upright or none"
+            )
+        size = found_size
+        try:
+            indices, pixels = find_board(image, board)
+        except CalibrationError as error:
+            print(f"{name}: {error}", file=sys.stderr)
+            continue
+        views.append(BoardView(name, indices, pixels))
+    if size is None or not views:
+        raise CalibrationError(
+            f"no {board} in any of {count} pictures: are --board, --columns and --rows right? "
+            "Inner corners of a checkerboard are counted, so a board of 10 x 7 squares has 9 x 6"
+        )
+    print(f"{board}: found in {len(views)} of {count} pictures of {size[0]} x {size[1]}")
+    return views, size
+
+
+def camera_of(calibration: Calibration) -> Camera:
+    """The calibrated camera, without a pose."""
+    sx, sy, ox, oy, a2, a3, b1, b2, b3, p1, p2, *k = (float(x) for x in calibration.intrinsics)
+    points = calibration.points
+    try:
+        return Camera(
+            width=points.width, height=points.height,
+            scale_x=sx, scale_y=sy, offset_x=ox, offset_y=oy, coef=(a2, a3, b1, b2, b3),
+            robot_from_camera=_IDENTITY, sensor_to_tcp=_IDENTITY, tangential=(p1, p2),
+            polynomial=(k[0], k[1], k[2]),
+        )  # fmt: skip
+    except CameraError as error:
+        raise CalibrationError(
+            f"the calibration is no possible camera: {error}; take pictures out to the image's "
+            "corners, or fewer --coefficients"
+        ) from None
+
+
+def floor_points(
+    path: Path, board: Board, origin: tuple[float, float], yaw_deg: float, size: tuple[int, int]
+) -> tuple[FloatArray, FloatArray]:
+    """Pixels and floor places (robot X, Y) of a .csv file or of a picture of the board.
+
+    Raises
+    ------
+    CalibrationError
+        If the board is not found, shows no direction, or the picture has another size.
+    """
+    if path.suffix.lower() == ".csv":
+        return read_floor_points(path)
+    if board.looks_turned:
+        raise CalibrationError(
+            f"a {board} looks the same turned by 180 degrees, so it can't say where the robot's "
+            "axes point: use one with one even and one odd number, or a .csv of places u,v,x,y"
+        )
+    image = read_grey(path)
+    if image.shape != size[::-1]:
+        raise CalibrationError(
+            f"{path}: {image.shape[1]} x {image.shape[0]} pixels: expected the calibrated camera's "
+            f"{size[0]} x {size[1]}"
+        )
+    try:
+        indices, pixels = find_board(image, board)
+    except CalibrationError as error:
+        raise CalibrationError(f"{path}: {error}") from None
+    return pixels, on_floor(board.points[indices], origin, radians(yaw_deg))[:, :2]
+
+
+def radius_on_floor(path: Path, board: Board) -> float:
+    """Radius of the circles whose centroids `floor_points` gives (m); 0 for points."""
+    return 0.0 if path.suffix.lower() == ".csv" else 0.5 * board.circle_m
+
+
+def describe(calibration: Calibration, camera: Camera) -> str:
+    """What was found, for people."""
+    sigma = np.sqrt(np.diag(calibration.adjusted.covariance))
+    lines = [
+        f"  {name:8s} {value:12.6g}" + (f" +- {s:.2g}" if s > 0.0 else "  (fixed)")
+        for name, value, s in zip(INTRINSICS, calibration.intrinsics, sigma)
+    ]
+    views = len(calibration.names)
+    lines.insert(0, f"intrinsics from {len(calibration.points.board)} points in {views} pictures:")
+    lines.append(
+        f"RMS residual {calibration.adjusted.rms_px:.3f} px (u and v together), noise "
+        f"{calibration.adjusted.sigma_px:.3f} px per coordinate"
+    )
+    for lens, error in calibration.holdout_px.items():
+        mark = " <- chosen" if lens == calibration.lens else ""
+        lines.append(f"RMS in pictures held out, coefficients {lens}: {error:.3f} px{mark}")
+    spread = projection_sigma(camera, calibration.adjusted.covariance)
+    lines.append(
+        f"standard deviation of the projection: {np.median(spread):.3f} px (median over the "
+        f"image), {spread.max():.3f} px at most"
+    )
+    for name, rms in calibration.outliers:
+        lines.append(f"left out: {name}, residuals of {rms:.2f} px (--keep-outliers keeps it)")
+    lines += [f"warning: {text}" for text in calibration.warnings]
+    return "\n".join(lines)
+
+
+def describe_pose(pose: FloorPose) -> str:
+    """The pose with its standard deviations, for people."""
+    sigma = np.sqrt(np.diag(pose.covariance))
+    R, t = pose.robot_from_camera[:, :3], pose.robot_from_camera[:, 3]
+    down = degrees(np.arcsin(np.clip(-R[2, 2], -1.0, 1.0)))
+    bearing = degrees(np.arctan2(R[0, 2], -R[1, 2]))
+    return "\n".join(
+        [
+            f"pose from {len(pose.residuals)} points on the floor, RMS {pose.rms_px:.3f} px:",
+            *(
+                f"  {axis} {value:9.5f} m +- {s:.5f}"
+                for axis, value, s in zip(
+                    ("X (left)    ", "Y (backward)", "Z (up)      "), t, sigma
+                )
+            ),
+            f"  looking {down:.3f} deg down, {bearing:.3f} deg to the left; rotations about X, "
+            f"Y, Z +- {', '.join(f'{degrees(s):.4f}' for s in sigma[3:])} deg",
+            "  covariance (X Y Z in m, rotations about X Y Z in rad):",
+            *(f"    {' '.join(f'{value: .3e}' for value in row)}" for row in pose.covariance),
+        ]
+    )
+
+
+def report_text(
+    options: Calibrate, calibration: Calibration, camera: Camera, placed: FloorPose | None
+) -> str:
+    """The report as JSON."""
+    adjusted = calibration.adjusted
+    view_rms = calibration.view_rms_px
+    content: dict[str, Any] = {
+        "options": {name: _plain(value) for name, value in vars(options).items()},
+        "image_size": [camera.width, camera.height],
+        "intrinsics": dict(zip(INTRINSICS, calibration.intrinsics.tolist())),
+        "sigma": dict(zip(INTRINSICS, np.sqrt(np.diag(adjusted.covariance)).tolist())),
+        "covariance": adjusted.covariance.tolist(),
+        "coefficients": calibration.lens.coefficients,
+        "tangential": calibration.lens.tangential,
+        "polynomial": calibration.lens.polynomial,
+        "points": len(calibration.points.board),
+        "rms_px": adjusted.rms_px,
+        "sigma_px": adjusted.sigma_px,
+        "holdout_rms_px": {
+            lens.label: error if np.isfinite(error) else None
+            for lens, error in calibration.holdout_px.items()
+        },
+        "views": [
+            {
+                "name": name,
+                "points": int(count),
+                "rms_px": float(rms),
+                "camera_from_board": np.column_stack([R, t]).tolist(),
+            }
+            for name, count, rms, R, t in zip(
+                calibration.names,
+                calibration.points.counts,
+                view_rms,
+                adjusted.estimate.rotations,
+                adjusted.estimate.translations,
+            )
+        ],
+        "left_out": [{"name": name, "rms_px": rms} for name, rms in calibration.outliers],
+        "points_per_cell": coverage(calibration.points).tolist(),
+        "normals_spread_deg": calibration.spread_deg,
+        "projection_sigma_px": projection_sigma(camera, adjusted.covariance).round(6).tolist(),
+        "warnings": list(calibration.warnings),
+    }
+    if placed is not None:
+        content["pose"] = {
+            "robot_from_camera": placed.robot_from_camera.tolist(),
+            "covariance": placed.covariance.tolist(),
+            "rms_px": placed.rms_px,
+        }
+    return json.dumps(content, indent=1, allow_nan=False) + "\n"
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, tuple):
+        return [_plain(item) for item in value]
+    return str(value) if isinstance(value, Path) else value

@@ -1,0 +1,227 @@
+"""``camera convert``: calibrations from and to other programs' formats."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from camera.camfile import format_camera, parse_camera, read_camera
+from camera.errors import ConversionError
+from camera.formats.colmap import format_colmap, parse_colmap, text_of_binary
+from camera.formats.conversion import (
+    AnyCamera,
+    Converted,
+    contains,
+    convert_to_camera,
+    convert_to_foreign,
+)
+from camera.formats.kalibr import format_kalibr, parse_kalibr
+from camera.formats.models import ForeignCamera, Model
+from camera.formats.opencv import format_opencv, parse_opencv
+from camera.formats.plain_yaml import parse_yaml, read_content, text_of
+from camera.formats.ros import format_ros, parse_ros
+from camera.model import Camera
+from camera.options import Convert, Format
+from storage import OutputExistsError, write_whole
+
+#: The models that each format has, the simplest first.
+MODELS: dict[str, tuple[Model, ...]] = {
+    "opencv": ("radtan", "rational", "fisheye"),
+    "ros": ("radtan", "rational", "fisheye"),
+    "kalibr": ("radtan", "fisheye"),
+    "colmap": ("radtan", "rational", "fisheye"),
+}
+# k1 k2 p1 p2, without k3; and the rational model without the thin prism.
+_FREE = {("kalibr", "radtan"): 4, ("colmap", "radtan"): 4, ("colmap", "rational"): 8}
+
+
+def perform(options: Convert) -> int:
+    """Carry the command out; returns the exit code."""
+    if options.target.exists() and not options.force:
+        raise OutputExistsError(options.target)
+    text = read_text(options.source)
+    from_format = options.from_format
+    if from_format == "auto":
+        from_format = format_of_text(options.source, text)
+    to_format = options.to_format
+    if to_format == "auto":
+        to_format = format_of_name(options.target)
+    source = parse(text, from_format, str(options.source), options.camera_name)
+    try:
+        converted = convert(source, to_format, options)
+    except ConversionError as error:
+        raise ConversionError(f"{options.source}: {error}") from None
+    camera = converted.camera
+    label = camera.model if isinstance(camera, ForeignCamera) else _label(camera)
+    u, v = converted.at
+    print(
+        f"{options.source} ({from_format}, {source.width} x {source.height}) to {to_format} "
+        f"({label}, {camera.width} x {camera.height}): largest deviation over the image "
+        f"{converted.deviation_px:.3g} px, at ({u:.0f}, {v:.0f})"
+    )
+    if not converted.deviation_px <= options.limit_px:
+        raise ConversionError(
+            f"{options.target}: not written, for {converted.deviation_px:.3g} px is above "
+            f"--limit-px {options.limit_px:g}: choose another --model or format, or raise the limit"
+        )
+    if isinstance(camera, Camera) and not isinstance(source, Camera) and options.pose_from is None:
+        print(
+            "no pose: sensor2World is the identity; give --pose-from, or let `camera floor` find it"
+        )
+    if isinstance(source, Camera) and not isinstance(camera, Camera):
+        print("the pose stays behind: the format has none (--pose-from brings it back)")
+    written = format_of(camera, to_format, options.camera_name)
+    with write_whole(options.target, overwrite=options.force) as stream:
+        stream.write(written.encode())
+    print(f"written: {options.target}")
+    return 0
+
+
+def read_text(path: Path) -> str:
+    """The text of a calibration file; of COLMAP's cameras.bin, that of its cameras.txt.
+
+    Raises
+    ------
+    ConversionError
+        If it cannot be read, is larger than any calibration, or no text.
+    """
+    content = read_content(path)
+    if path.suffix.lower() == ".bin":
+        return text_of_binary(content, str(path))
+    return text_of(content, str(path))
+
+
+def _label(camera: Camera) -> str:
+    """What a camera's distortion is made of."""
+    if not any(camera.brown):
+        return "rational radial"
+    parts = {
+        "rational radial": any(camera.coef[:2]),
+        "polynomial": any(camera.polynomial),
+        "tangential": camera.decentred,
+    }
+    return ", ".join(name for name, there in parts.items() if there)
+
+
+def format_of_name(path: Path) -> Format:
+    """The format that a file's name asks for.
+
+    Raises
+    ------
+    ConversionError
+        If it does not say.
+    """
+    name = path.name.lower()
+    if name.endswith(".cam"):
+        return "cam"
+    if name.endswith(".txt") and "cameras" in name:
+        return "colmap"
+    if name.endswith((".yaml", ".yml")):
+        for part, found in _YAML_NAMES.items():
+            if part in name:
+                return found
+    raise ConversionError(
+        f"{path}: the name does not say which format: give --to-format opencv, ros, kalibr or "
+        "colmap, or end it in .cam, .opencv.yaml, .ros.yaml, .kalibr.yaml or cameras.txt"
+    )
+
+
+_YAML_NAMES: dict[str, Format] = {
+    "opencv": "opencv",
+    ".ros.": "ros",
+    "camera_info": "ros",
+    "kalibr": "kalibr",
+    "camchain": "kalibr",
+}
+
+
+def format_of_text(path: Path, text: str) -> Format:
+    """The format of a file, by its content.
+
+    Raises
+    ------
+    ConversionError
+        If it is none that is known.
+    """
+    if text.lstrip().startswith("{ SmRadial") or path.suffix.lower() == ".cam":
+        return "cam"
+    if path.suffix.lower() in (".txt", ".bin"):
+        return "colmap"
+    if text.lstrip().startswith("<"):
+        raise ConversionError(
+            f"{path}: is XML: expected YAML; OpenCV writes it where the file's name ends in .yml"
+        )
+    if text.startswith("%YAML:") or "!!opencv-matrix" in text:
+        return "opencv"
+    content = parse_yaml(text, str(path))
+    if any(isinstance(value, dict) and "intrinsics" in value for value in content.values()):
+        return "kalibr"
+    if "distortion_model" in content:
+        return "ros"
+    if "fisheye_model" in content or "image_width" in content:
+        return "opencv"
+    raise ConversionError(
+        f"{path}: neither a .cam file nor a camera in OpenCV's, ROS's, Kalibr's or COLMAP's format "
+        "that is recognised (they have image_width, distortion_model, cam0 with intrinsics, or are "
+        "a cameras.txt): give --from-format"
+    )
+
+
+def parse(text: str, from_format: Format, name: str, camera_name: str = "") -> AnyCamera:
+    """A camera of the text of a file."""
+    if from_format == "cam":
+        return parse_camera(text, name)
+    if from_format == "opencv":
+        return parse_opencv(text, name)
+    if from_format == "ros":
+        return parse_ros(text, name)
+    if from_format == "kalibr":
+        return parse_kalibr(text, name, camera_name)
+    return parse_colmap(text, name, camera_name)
+
+
+def format_of(camera: AnyCamera, to_format: Format, camera_name: str = "") -> str:
+    """The text of a file of a camera."""
+    if isinstance(camera, Camera):
+        return format_camera(camera)
+    if to_format == "opencv":
+        return format_opencv(camera)
+    if to_format == "ros":
+        return format_ros(camera, camera_name or "camera")
+    if to_format == "kalibr":
+        return format_kalibr(camera, camera_name)
+    return format_colmap(camera, camera_name)
+
+
+def convert(source: AnyCamera, to_format: Format, options: Convert) -> Converted:
+    """Convert to a model of a format that holds the camera as it is, if there is one.
+
+    Else to the first one that is within the limit, or the nearest one.
+    """
+    if to_format == "cam":
+        pose = read_camera(options.pose_from) if options.pose_from is not None else None
+        return convert_to_camera(source, options.rows, pose)
+    models = MODELS[to_format]
+    if options.model != "auto":
+        if options.model not in models:
+            raise ConversionError(
+                f"{to_format} has no {options.model} model: expected {' or '.join(models)}"
+            )
+        models = (options.model,)
+
+    def free(model: Model) -> int:
+        return _FREE.get((to_format, model), -1)
+
+    own = source.model if isinstance(source, ForeignCamera) else None
+    order = sorted(
+        models, key=lambda model: (not contains(model, source, free=free(model)), model != own)
+    )
+    best: Converted | None = None
+    for model in order:
+        converted = convert_to_foreign(source, model, options.rows, free=free(model))
+        if best is None or converted.deviation_px < best.deviation_px:
+            best = converted
+        if best.deviation_px <= options.limit_px:
+            break
+    if best is None:
+        raise ConversionError(f"{to_format} has no model")
+    return best

@@ -1,0 +1,221 @@
+"""COLMAP's cameras.txt and cameras.bin, and ``pycolmap.Camera``.
+
+COLMAP counts pixels from the image's corner: the top left pixel's centre is (0.5, 0.5). So the
+principal point is moved by half a pixel on the way in and out.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import TYPE_CHECKING
+
+import pycolmap
+
+from camera.errors import ConversionError
+from camera.formats.models import COEFFICIENTS, ForeignCamera, Model
+from camera.formats.opencv import foreign
+from camera.formats.plain_yaml import shortest
+from storage.messages import excerpt, one_line
+
+if TYPE_CHECKING:
+    import pycolmap
+
+_HALF_PIXEL = 0.5
+_LONGEST_LIST = 100
+_DIGITS = frozenset("0123456789")
+
+#: COLMAP's models: ours, number of focal lengths, and where its distortion goes in our order.
+_MODELS: dict[str, tuple[Model, int, tuple[int, ...]]] = {
+    "SIMPLE_PINHOLE": ("radtan", 1, ()),
+    "PINHOLE": ("radtan", 2, ()),
+    "SIMPLE_RADIAL": ("radtan", 1, (0,)),
+    "RADIAL": ("radtan", 1, (0, 1)),
+    "OPENCV": ("radtan", 2, (0, 1, 2, 3)),
+    "FULL_OPENCV": ("rational", 2, (0, 1, 2, 3, 4, 5, 6, 7)),
+    "SIMPLE_RADIAL_FISHEYE": ("fisheye", 1, (0,)),
+    "RADIAL_FISHEYE": ("fisheye", 1, (0, 1)),
+    "OPENCV_FISHEYE": ("fisheye", 2, (0, 1, 2, 3)),
+}
+#: COLMAP's numbers of them, in cameras.bin.
+_NUMBERED = {
+    0: "SIMPLE_PINHOLE",
+    1: "PINHOLE",
+    2: "SIMPLE_RADIAL",
+    3: "RADIAL",
+    4: "OPENCV",
+    5: "OPENCV_FISHEYE",
+    6: "FULL_OPENCV",
+    8: "SIMPLE_RADIAL_FISHEYE",
+    9: "RADIAL_FISHEYE",
+}
+#: Those that can't be converted have to be passed over: names and numbers of parameters.
+_PASSED_OVER = {
+    7: ("FOV", 5),
+    10: ("THIN_PRISM_FISHEYE", 12),
+    11: ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
+}
+_WRITTEN: dict[Model, str] = {
+    "radtan": "OPENCV",
+    "rational": "FULL_OPENCV",
+    "fisheye": "OPENCV_FISHEYE",
+}
+
+
+def parse_colmap(text: str, name: str = "<text>", camera_name: str = "") -> ForeignCamera:
+    """A camera of the text of a cameras.txt; `camera_name` is its number.
+
+    Raises
+    ------
+    ConversionError
+        If it lacks something, holds several cameras and none is chosen, or has another model.
+    """
+    rows: dict[str, tuple[int, list[str]]] = {}
+    for number, line in enumerate(text.splitlines(), start=1):
+        fields = line.split()
+        if fields and not line.lstrip().startswith("#"):
+            if len(fields) < 5:
+                raise ConversionError(
+                    f"{name}:{number}: expected CAMERA_ID MODEL WIDTH HEIGHT PARAMS..."
+                )
+            if fields[0] in rows:
+                raise ConversionError(
+                    f"{name}:{number}: camera {one_line(fields[0], _LONGEST_LIST)} a second time, "
+                    f"after line {rows[fields[0]][0]}: expected different numbers"
+                )
+            rows[fields[0]] = (number, fields)
+    held = one_line(", ".join(rows), _LONGEST_LIST)
+    if camera_name and camera_name not in rows:
+        raise ConversionError(f"{name}: no camera {camera_name}: it holds {held}")
+    if not camera_name and len(rows) != 1:
+        there = f"it holds {held}: give --camera-name" if rows else "it holds none"
+        raise ConversionError(f"{name}: expected one camera, {there}")
+    number, fields = rows[camera_name or next(iter(rows))]
+    where = f"{name}:{number}"
+    try:
+        width, height = int(fields[2]), int(fields[3])
+        parameters = [float(field) for field in fields[4:]]
+    except ValueError:
+        raise ConversionError(f"{where}: a size or parameter that is no number") from None
+    return _from_parameters(where, fields[1], width, height, parameters)
+
+
+def text_of_binary(content: bytes, name: str = "<bytes>") -> str:
+    """The lines of a cameras.txt of the content of a cameras.bin.
+
+    Raises
+    ------
+    ConversionError
+        If it ends early, goes on behind its last camera, or has a model of unknown length.
+
+    References
+    ----------
+    COLMAP, src/colmap/scene/reconstruction_io_binary.cc.
+    """
+    lines = []
+    try:
+        (count,) = struct.unpack_from("<Q", content)
+        place = 8
+        for camera in range(1, count + 1):
+            number, model, width, height = struct.unpack_from("<IiQQ", content, place)
+            if model in _NUMBERED:
+                label = _NUMBERED[model]
+                _, focals, order = _MODELS[label]
+                length = focals + 2 + len(order)
+            elif model in _PASSED_OVER:
+                label, length = _PASSED_OVER[model]
+            else:
+                raise ConversionError(
+                    f"{name}: camera {camera} has COLMAP's model {model}, which is unknown here: "
+                    "expected one of 0 to 11; write it as text (colmap model_converter "
+                    "--output_type TXT)"
+                )
+            parameters = struct.unpack_from(f"<{length}d", content, place + 24)
+            place += 24 + 8 * length
+            values = " ".join(repr(value) for value in parameters)
+            lines.append(f"{number} {label} {width} {height} {values}")
+    except struct.error:
+        raise ConversionError(f"{name}: ends early: expected COLMAP's cameras.bin") from None
+    if place != len(content):
+        raise ConversionError(
+            f"{name}: {len(content) - place} bytes behind its {count} cameras: expected COLMAP's "
+            "cameras.bin"
+        )
+    return "\n".join([*lines, ""])
+
+
+def camera_from_pycolmap(camera: pycolmap.Camera) -> ForeignCamera:
+    """A camera of a ``pycolmap.Camera``.
+
+    Raises
+    ------
+    ConversionError
+        If it has a model that can't be converted.
+    """
+    parameters = [float(value) for value in camera.params]
+    model = camera.model.name
+    return _from_parameters("pycolmap.Camera", model, camera.width, camera.height, parameters)
+
+
+def _from_parameters(
+    where: str, model_name: str, width: int, height: int, parameters: list[float]
+) -> ForeignCamera:
+    if model_name not in _MODELS:
+        raise ConversionError(
+            f"{where}: model {excerpt(model_name)}: expected {', '.join(_MODELS)}"
+        )
+    model, focals, order = _MODELS[model_name]
+    if len(parameters) != focals + 2 + len(order):
+        raise ConversionError(
+            f"{where}: {len(parameters)} parameters of {model_name}: expected "
+            f"{focals + 2 + len(order)}"
+        )
+    fx, fy = parameters[0], parameters[focals - 1]
+    cx, cy = (value - _HALF_PIXEL for value in parameters[focals : focals + 2])
+    coefficients = [0.0] * COEFFICIENTS[model]
+    for place, value in zip(order, parameters[focals + 2 :]):
+        coefficients[place] = value
+    return foreign(where, model, width, height, (fx, fy, cx, cy), coefficients)
+
+
+def colmap_parameters(camera: ForeignCamera) -> tuple[str, list[float]]:
+    """COLMAP's name of the model, and its parameters.
+
+    Raises
+    ------
+    ConversionError
+        If COLMAP has no such model (k3 without the rational terms is written as FULL_OPENCV).
+    """
+    model, d = camera.model, camera.distortion
+    if model == "radtan" and d[4] != 0.0:
+        model, d = "rational", (*d, *(0.0,) * 7)
+    if model == "rational" and any(d[8:]):
+        raise ConversionError("COLMAP has no thin prism with the rational model")
+    name = _WRITTEN[model]
+    order = _MODELS[name][2]
+    pinhole = [camera.fx, camera.fy, camera.cx + _HALF_PIXEL, camera.cy + _HALF_PIXEL]
+    return name, [*pinhole, *(d[place] for place in order)]
+
+
+def format_colmap(camera: ForeignCamera, camera_name: str = "1") -> str:
+    """The text of a cameras.txt of one camera; its number is 1 unless `camera_name` is one."""
+    name, parameters = colmap_parameters(camera)
+    number = camera_name if camera_name and _DIGITS.issuperset(camera_name) else "1"
+    values = " ".join(shortest(value) for value in parameters)
+    return (
+        "# Camera list with one line of data per camera:\n"
+        "#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n"
+        "# Number of cameras: 1\n"
+        f"{number} {name} {camera.width} {camera.height} {values}\n"
+    )
+
+
+def pycolmap_from_camera(camera: ForeignCamera) -> pycolmap.Camera:
+    """A ``pycolmap.Camera`` of a camera.
+
+    Raises
+    ------
+    ConversionError
+        If COLMAP has no such model.
+    """
+    name, parameters = colmap_parameters(camera)
+    return pycolmap.Camera(model=name, width=camera.width, height=camera.height, params=parameters)

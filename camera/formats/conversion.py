@@ -1,0 +1,396 @@
+"""Converting a camera to another model: taken over where that contains it, else fitted."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from camera.brown import NOT_TANGENTIAL, Tangential, brown_of, brown_shift
+from camera.calibration.model import free_span, is_possible, project_points
+from camera.calibration.projection import intrinsics_of
+from camera.distortion import NO_POLYNOMIAL
+from camera.errors import CameraError, ConversionError
+from camera.formats.conversion_fit import EXACT_PX, least_squares, smallest_largest
+from camera.formats.models import COEFFICIENTS, P1, ForeignCamera, Model, distorted
+from camera.model import Camera
+
+FloatArray = NDArray[np.float64]
+AnyCamera = Camera | ForeignCamera
+Rows = Literal["same", "halve", "double"]
+
+_IDENTITY = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
+
+# Grids of pixels: to fit on, and to look for the largest deviation on.
+_FIT_GRID = (41, 31)
+_CHECK_GRID = (129, 97)
+_MANY_STEPS = 200
+# The rational model's coefficients before those of the thin prism.
+_WITHOUT_PRISM = 8
+# A largest deviation after least squares from which on another start is tried.
+_NEAR_PX = 0.02
+# b1, b2, b3 of a denominator that dips towards the image's corner, at radius 1.
+_DIP = (-2.5, 2.5, -0.85)
+
+
+@dataclass(frozen=True)
+class Converted:
+    """A converted camera.
+
+    Attributes
+    ----------
+    camera : Camera or ForeignCamera
+    deviation_px : float
+        Largest distance, over the image, between where a pixel's ray is seen by the source and by
+        the target (target's pixels).
+    at : (float, float)
+        The target's pixel where it is largest.
+    """
+
+    camera: AnyCamera
+    deviation_px: float
+    at: tuple[float, float]
+
+
+def target_size(source: AnyCamera, rows: Rows) -> tuple[int, int]:
+    """Width and height of the target's image."""
+    if rows == "halve":
+        return source.width, (source.height + 1) // 2
+    return source.width, source.height * (2 if rows == "double" else 1)
+
+
+def source_pixels(pixels: FloatArray, rows: Rows) -> FloatArray:
+    """The source's pixels of the target's: line v of the even lines is line 2 v of all."""
+    factor = {"same": 1.0, "halve": 2.0, "double": 0.5}[rows]
+    return np.asarray(pixels * np.array([1.0, factor]))
+
+
+def convert_to_foreign(
+    source: AnyCamera, model: Model, rows: Rows = "same", *, free: int = -1
+) -> Converted:
+    """Fit one of the other programs' models.
+
+    Parameters
+    ----------
+    source : Camera or ForeignCamera
+    model : str
+        `radtan`, `rational` or `fisheye`.
+    rows : str
+        `same`, `halve` or `double`.
+    free : int
+        Number of the model's first coefficients that may differ from 0; -1: all. A thin prism's are
+        taken over, but never fitted.
+
+    Returns
+    -------
+    Converted
+
+    Raises
+    ------
+    ConversionError
+        If the source does not see all of its image, or the fit fails.
+    """
+    number = COEFFICIENTS[model] if free < 0 else free
+    contained = _contained(source, model, number)
+    if model == "rational":
+        number = min(number, _WITHOUT_PRISM)
+    width, height = target_size(source, rows)
+    factor = {"same": 1.0, "halve": 0.5, "double": 2.0}[rows]
+    if contained is not None:
+        exact = replace(
+            contained,
+            width=width,
+            height=height,
+            fy=contained.fy * factor,
+            cy=contained.cy * factor,
+        )
+        return _measured(exact, _check(source, rows))
+    check = _check(source, rows)
+    pixels = _grid(width, height, _FIT_GRID)
+    rays = _rays(source, source_pixels(pixels, rows))
+    fx, fy, cx, cy = _pinhole(source)
+    start = np.concatenate([[fx, fy * factor, cx, cy * factor], np.zeros(COEFFICIENTS[model])])
+    if model != "fisheye":
+        start[4 + P1 : 4 + P1 + 2] = _tangential(source)
+
+    def camera_of(parameters: FloatArray) -> ForeignCamera:
+        fx, fy, cx, cy, *distortion = (float(value) for value in parameters)
+        return ForeignCamera(model, width, height, fx, fy, cx, cy, tuple(distortion))
+
+    def project(parameters: FloatArray) -> tuple[FloatArray, FloatArray]:
+        camera = _unchecked(model, parameters)
+        found = camera(rays)
+        jacobian = np.empty((*found.shape, len(parameters)))
+        for k in range(len(parameters)):
+            step = 1e-6 * max(abs(parameters[k]), 1.0)
+            moved = parameters.copy()
+            moved[k] += step
+            ahead = _unchecked(model, moved)(rays)
+            moved[k] -= 2.0 * step
+            jacobian[..., k] = (ahead - _unchecked(model, moved)(rays)) / (2.0 * step)
+        return found, jacobian
+
+    def possible(parameters: FloatArray) -> bool:
+        return bool(min(parameters[:2]) > 0.0)
+
+    every = np.eye(len(start))
+    spans = [every[:, : 4 + count] for count in _stages(model, number)]
+    best = _nearest(project, camera_of, start, spans, pixels, possible, check)
+    if best is None:
+        raise ConversionError(f"no {model} camera sees what the source sees")
+    return best
+
+
+def contains(model: Model, source: AnyCamera, *, free: int = -1) -> bool:
+    """Whether a model holds a camera as it is; parameters as of `convert_to_foreign`."""
+    return _contained(source, model, COEFFICIENTS[model] if free < 0 else free) is not None
+
+
+def convert_to_camera(
+    source: AnyCamera, rows: Rows = "same", pose: Camera | None = None
+) -> Converted:
+    """Take over, or fit, the project's model.
+
+    A polynomial and tangential terms without a denominator are taken over as they are. Else the
+    rational part is fitted beside the source's tangential terms and, where it comes not near, all
+    of them and a polynomial together.
+
+    Parameters
+    ----------
+    source : Camera or ForeignCamera
+    rows : str
+        `same`, `halve` or `double`.
+    pose : Camera, optional
+        Whose ``sensor2World``, ``sensor2Tcp`` and ``mountIndex`` the result gets; by default those
+        of the source if it has them, else the identity.
+
+    Returns
+    -------
+    Converted
+
+    Raises
+    ------
+    ConversionError
+        If the source does not see all of its image, or the fit fails.
+    """
+    width, height = target_size(source, rows)
+    if pose is None and isinstance(source, Camera):
+        pose = source
+    placed = pose.robot_from_camera if pose is not None else _IDENTITY
+    tcp = pose.sensor_to_tcp if pose is not None else _IDENTITY
+    mount = pose.mount_index if pose is not None else 0
+    unknown = source.unknown if isinstance(source, Camera) else ()
+    factor = {"same": 1.0, "halve": 0.5, "double": 2.0}[rows]
+
+    def camera_of(p: FloatArray) -> Camera:
+        sx, sy, ox, oy, a2, a3, b1, b2, b3, p1, p2, k1, k2, k3 = (float(x) for x in p)
+        return Camera(
+            width, height, sx, sy, ox, oy, (a2, a3, b1, b2, b3), placed, tcp, mount, unknown,
+            tangential=(p1, p2), polynomial=(k1, k2, k3),
+        )  # fmt: skip
+
+    fx, fy, cx, cy = _pinhole(source)
+    start = np.array(
+        [fx, fy * factor, cx, cy * factor, *[0.0] * 5, *_tangential(source), *[0.0] * 3]
+    )
+    check = _check(source, rows)
+    if isinstance(source, Camera):
+        start[4:9], start[11:14] = source.coef, source.polynomial
+        return _measured(camera_of(start), check)
+    plumb_bob = _contained(source, "radtan", COEFFICIENTS["radtan"])
+    if plumb_bob is not None:
+        k1, k2, _, _, k3 = plumb_bob.distortion
+        try:
+            return _measured(camera_of(np.array([*start[:11], k1, k2, k3])), check)
+        except CameraError:
+            # One-to-one over its image, but not over a circle around it, as cameras here are.
+            pass
+    pixels = _grid(width, height, _FIT_GRID)
+    rays = _rays(source, source_pixels(pixels, rows))
+    points = np.column_stack([rays, np.ones(len(rays))])
+
+    def project(parameters: FloatArray) -> tuple[FloatArray, FloatArray]:
+        found, by_intrinsics, _ = project_points(parameters, points)
+        return found, by_intrinsics
+
+    def possible(p: FloatArray) -> bool:
+        return is_possible(p, width, height)
+
+    if not possible(start):
+        raise ConversionError("the source's focal lengths or principal point are not possible here")
+    spans = [free_span(count, None) for count in range(6)]
+    if any(_tangential(source)):
+        # Last, the terms taken over may make up for what the radial part can't follow.
+        spans.append(free_span(5, None, tangential=True))
+    together = free_span(5, None, tangential=any(_tangential(source)), polynomial=3)
+    radius = np.hypot(rays[:, 0], rays[:, 1])
+    away = (pixels - start[2:4]) / start[:2] - brown_shift(
+        rays, brown_of(NO_POLYNOMIAL, _tangential(source))
+    )
+    moved = np.sum((away - rays) * rays, axis=1) / np.maximum(radius, 1e-9)
+    wavy = _wavy_start(start, radius, moved)
+    best = _nearest(project, camera_of, start, spans, pixels, possible, check, wavy)
+    if best is None or best.deviation_px > _NEAR_PX:
+        nearest = start if best is None else _intrinsics(best)
+        fuller = _nearest(project, camera_of, nearest, [together], pixels, possible, check)
+        if best is None or (fuller is not None and fuller.deviation_px < best.deviation_px):
+            best = fuller
+    if best is None:
+        raise ConversionError("no camera of the project's model sees what the source sees")
+    return best
+
+
+def _intrinsics(found: Converted) -> FloatArray:
+    assert isinstance(found.camera, Camera)
+    return intrinsics_of(found.camera)
+
+
+def _wavy_start(start: FloatArray, radius: FloatArray, moved: FloatArray) -> FloatArray:
+    """Where a fit begins to a lens whose radial distortion changes its sign within the image.
+
+    Least squares does not get there from a lens without distortion: the denominator has to dip
+    towards the border. With the dip given, a2 and a3 are linear.
+
+    Parameters
+    ----------
+    start : (14,) array
+        Intrinsics without radial distortion.
+    radius, moved : (N,) arrays
+        Undistorted radii, and how far the distortion moves rays outward there.
+    """
+    reach = float(radius.max())
+    b = np.array(_DIP) / reach ** np.array([1.0, 2.0, 3.0])
+    denominator = 1.0 + radius * (b[0] + radius * (b[1] + radius * b[2]))
+    powers = np.stack([radius**2, radius**3], axis=-1) / denominator[:, None]
+    a = np.linalg.lstsq(powers, moved, rcond=None)[0]
+    return np.concatenate([start[:4], a, b, start[9:]])
+
+
+def _nearest(
+    project: Callable[[FloatArray], tuple[FloatArray, FloatArray]],
+    camera_of: Callable[[FloatArray], AnyCamera],
+    start: FloatArray,
+    spans: list[FloatArray],
+    pixels: FloatArray,
+    possible: Callable[[FloatArray], bool],
+    check: tuple[FloatArray, FloatArray],
+    other_start: FloatArray | None = None,
+) -> Converted | None:
+    """The fit with the smallest largest deviation, each span fitted from where the last ended.
+
+    Where none is near, the last span is fitted from another start, too.
+    """
+    best: Converted | None = None
+    nearest = parameters = start
+
+    def keep(candidate: FloatArray) -> bool:
+        nonlocal best
+        try:
+            converted = _measured(camera_of(candidate), check)
+        except CameraError:
+            return False
+        if best is None or converted.deviation_px < best.deviation_px:
+            best = converted
+            return True
+        return False
+
+    span = spans[0]
+    for wider in spans:
+        parameters = least_squares(project, parameters, wider, pixels, possible)
+        if keep(parameters):
+            nearest, span = parameters, wider
+        if best is not None and best.deviation_px < EXACT_PX:
+            return best
+    if (
+        other_start is not None
+        and possible(other_start)
+        and (best is None or best.deviation_px > _NEAR_PX)
+    ):
+        parameters = least_squares(
+            project, other_start, spans[-1], pixels, possible, steps=_MANY_STEPS
+        )
+        if keep(parameters):
+            nearest, span = parameters, spans[-1]
+    keep(smallest_largest(project, nearest, span, pixels, possible))
+    return best
+
+
+def _unchecked(model: Model, p: FloatArray) -> Callable[[FloatArray], FloatArray]:
+    def project(rays: FloatArray) -> FloatArray:
+        with np.errstate(all="ignore"):
+            return np.asarray(distorted(model, p[4:], rays) * p[:2] + p[2:4])
+
+    return project
+
+
+def _stages(model: Model, number: int) -> list[int]:
+    """Numbers of free coefficients, from few to all: so a fit does not start in a wrong valley."""
+    return sorted({min(n, number) for n in (1, 2, 4, 5, 6, 7, 8, number)}) if number else [0]
+
+
+def _contained(source: AnyCamera, model: Model, number: int) -> ForeignCamera | None:
+    """The source itself in the target's model, where that holds it."""
+    if isinstance(source, Camera):
+        if any(source.coef[:2]) or model == "fisheye" or any(source.brown[number:]):
+            return None
+        fx, fy, cx, cy = _pinhole(source)
+        distortion = np.zeros(COEFFICIENTS[model])
+        distortion[: len(source.brown)] = source.brown
+        found = tuple(distortion.tolist())
+        return ForeignCamera(model, source.width, source.height, fx, fy, cx, cy, found)
+    if (source.model == "fisheye") != (model == "fisheye"):
+        return None
+    room = COEFFICIENTS[model]
+    padded = (*source.distortion, *(0.0,) * room)[:room]
+    if any(source.distortion[room:]) or any(padded[number:]):
+        return None
+    return replace(source, model=model, distortion=padded)
+
+
+def _tangential(source: AnyCamera) -> Tangential:
+    """p1 and p2, which mean the same in all models that have them."""
+    if isinstance(source, Camera):
+        return source.tangential
+    if source.model == "fisheye":
+        return NOT_TANGENTIAL
+    return source.distortion[P1], source.distortion[P1 + 1]
+
+
+def _pinhole(source: AnyCamera) -> tuple[float, float, float, float]:
+    if isinstance(source, Camera):
+        return source.scale_x, source.scale_y, source.offset_x, source.offset_y
+    return source.fx, source.fy, source.cx, source.cy
+
+
+def _grid(width: int, height: int, size: tuple[int, int]) -> FloatArray:
+    """(N, 2) pixels from corner to corner, denser towards the border, where models part."""
+    bend = [0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, n)) for n in size]
+    axes = [0.5 * b + 0.5 * np.linspace(0.0, 1.0, len(b)) for b in bend]
+    u, v = np.meshgrid(axes[0] * (width - 1), axes[1] * (height - 1))
+    return np.asarray(np.stack([u, v], axis=-1).reshape(-1, 2))
+
+
+def _rays(source: AnyCamera, pixels: FloatArray) -> FloatArray:
+    """(N, 2) undistorted normalised coordinates of the source's pixels."""
+    rays = source.undistort(pixels)
+    if not np.all(np.isfinite(rays)):
+        u, v = pixels[int(np.argmax(~np.isfinite(rays[:, 0])))]
+        raise ConversionError(f"the source sees nothing at pixel ({u:.6g}, {v:.6g})")
+    return rays
+
+
+def _check(source: AnyCamera, rows: Rows) -> tuple[FloatArray, FloatArray]:
+    """The target's pixels that the deviation is looked for at, and their rays."""
+    pixels = _grid(*target_size(source, rows), _CHECK_GRID)
+    return pixels, _rays(source, source_pixels(pixels, rows))
+
+
+def _measured(camera: AnyCamera, check: tuple[FloatArray, FloatArray]) -> Converted:
+    pixels, rays = check
+    away = np.linalg.norm(camera.distort(rays) - pixels, axis=1)
+    away = np.where(np.isfinite(away), away, np.inf)
+    worst = int(np.argmax(away))
+    return Converted(camera, float(away[worst]), (float(pixels[worst, 0]), float(pixels[worst, 1])))

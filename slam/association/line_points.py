@@ -1,0 +1,390 @@
+"""Which rows show the same vertical, where the path is known: points in which rays meet.
+
+A row of a vertical is a ray in the map. Frame to frame it does not say much: neighbouring edges
+stand closer than a bearing is certain, and a new edge may be at any distance. Over many frames it
+does: rays of one vertical meet in one point, and with each frame it is less likely that they do by
+chance. So wherever rays of frames a few steps apart cross, the frames round about are asked how
+much likelier they are with a vertical there; the best point takes its rows, one of a frame, then
+the next best of those that are left (the greedy way to solve what multiple hypothesis tracking
+solves by trees: D. B. Reid, "An algorithm for tracking multiple targets", IEEE Transactions on
+Automatic Control 24(6), 1979).
+
+The path comes from the discs; the heading of a single frame is less certain by it than a bearing
+is. So the verticals as they were found frame to frame are put into the least squares of the path
+first, robustly; then the search begins with wide gates, what it finds takes their place there, and
+it begins anew with narrower ones.
+"""
+
+from __future__ import annotations
+
+import heapq
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from landmarks import wrap_angle
+from slam.association.line_points_kernels import best_run, crossings, scores_of
+from slam.association.loop_path import intersect_bearings, solve_path
+from slam.errors import SlamError
+from slam.models.measurement import disc_in_map
+from slam.recording import Recording
+from storage.bounds import ABOVE_0, PROBABILITY, demand, whole
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+# The most of a field of view that a bearing at its end may lie beyond it.
+_WIDER_RAD = 0.005
+_FEWEST_ROWS = 3
+# What was found frame to frame corrects the path so many times.
+_FIRST_ROUNDS = 2
+
+
+@dataclass(frozen=True)
+class PointSettings:
+    """How points are looked for.
+
+    Attributes
+    ----------
+    heading_sigma_deg : tuple of float
+        What the path's heading in a single frame is trusted to, round by round (degrees).
+    sigma_scale : float
+        Factor on the rows' standard deviations, which leave out what a detector does with edges
+        that stand close together.
+    path_sigma_scale : float
+        The same where rows correct the path.
+    detected : float
+        Probability that a vertical in view gives a row.
+    gate_sigmas : float
+        A ray that passes farther from a point does not speak for it.
+    least_score : float
+        Logarithm of how much likelier the rows must be with a point than without.
+    gaps : tuple of int
+        Rays of frames so many steps apart are crossed.
+    least_parallax_sigmas : float
+        Least angle between two rays that are crossed.
+    farthest_m : float
+        Crossings farther away do not count.
+    window_frames : int
+        So far before and after a crossing frames are asked.
+    path_rows : int
+        Points of fewer rows do not correct the path.
+    """
+
+    heading_sigma_deg: tuple[float, ...] = (0.2, 0.15, 0.1, 0.1)
+    sigma_scale: float = 1.5
+    path_sigma_scale: float = 2.0
+    detected: float = 0.7
+    gate_sigmas: float = 3.0
+    least_score: float = 4.0
+    gaps: tuple[int, ...] = (2, 4, 7, 11)
+    least_parallax_sigmas: float = 4.0
+    farthest_m: float = 14.0
+    window_frames: int = 40
+    path_rows: int = 6
+
+    def __post_init__(self) -> None:
+        demand(
+            self,
+            SlamError,
+            heading_sigma_deg=ABOVE_0,
+            sigma_scale=ABOVE_0,
+            path_sigma_scale=ABOVE_0,
+            detected=PROBABILITY,
+            gate_sigmas=ABOVE_0,
+            least_score=ABOVE_0,
+            gaps=whole(1),
+            least_parallax_sigmas=ABOVE_0,
+            farthest_m=ABOVE_0,
+            window_frames=whole(1),
+            path_rows=whole(1),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Rays:
+    """Rows of verticals in the map.
+
+    Attributes
+    ----------
+    centre : (n, 2) float64
+        The camera's place (m).
+    angle : (n,) float64
+        Bearing in the map (rad).
+    sigma : (n,) float64
+        Of it (rad).
+    frame : (n,) int64
+        Ascending from 0.
+    start : (F + 1,) int64
+        Rays start[f] to start[f + 1] are those of frame f.
+    heading : (F,) float64
+        Of the robot (rad).
+    widest_rad : float
+        Half the field of view.
+    """
+
+    centre: FloatArray
+    angle: FloatArray
+    sigma: FloatArray
+    frame: IntArray
+    start: IntArray
+    heading: FloatArray
+    widest_rad: float
+
+    @property
+    def clutter(self) -> float:
+        """Rays per frame and radian."""
+        return len(self.angle) / len(self.heading) / (2.0 * self.widest_rad)
+
+
+def lines_by_points(
+    recording: Recording,
+    path: FloatArray,
+    circle_labels: IntArray,
+    line_labels: IntArray,
+    settings: PointSettings | None = None,
+    *,
+    camera_xy: tuple[float, float] = (0.0, 0.0),
+    disc_sigma_scale: float = 1.0,
+) -> tuple[IntArray, FloatArray]:
+    """Labels of the rows of verticals, by the points in which they meet.
+
+    Parameters
+    ----------
+    recording : Recording
+        The run.
+    path : (N + 1, 3) float64
+        Its poses, as the discs give them.
+    circle_labels : (n,) int64
+        Disc of each row.
+    line_labels : (m,) int64
+        Label of each row of a vertical as it was found frame to frame: that of rows for which no
+        point is found.
+    settings : PointSettings, optional
+    camera_xy : (2,)
+        The camera's centre in the robot frame (m).
+    disc_sigma_scale : float
+        Factor on the discs' standard deviations.
+
+    Returns
+    -------
+    labels : (m,) int64
+        From 0.
+    path : (N + 1, 3) float64
+        The path that the points helped to find.
+    """
+    setting = settings or PointSettings()
+    for _ in range(_FIRST_ROUNDS):
+        places = intersect_bearings(recording, path, line_labels, camera_xy=camera_xy)
+        known = np.isfinite(places[:, 0])
+        if not np.any(known):
+            break
+        label_of = np.where(known, np.cumsum(known) - 1, -1)
+        path = _path_with_points(
+            recording,
+            path,
+            circle_labels,
+            label_of[line_labels],
+            places[known],
+            setting,
+            camera_xy,
+            disc_sigma_scale,
+        )
+    labels = np.full(len(line_labels), -1, dtype=np.int64)
+    last = len(setting.heading_sigma_deg) - 1
+    for number, sigma_deg in enumerate(setting.heading_sigma_deg):
+        rays = rays_of(recording, path, camera_xy, setting.sigma_scale, np.radians(sigma_deg))
+        labels, points = find_points(rays, setting)
+        if number < last and len(points):
+            path = _path_with_points(
+                recording, path, circle_labels, labels, points, setting, camera_xy, disc_sigma_scale
+            )
+    rest = labels < 0
+    _, own = np.unique(line_labels[rest], return_inverse=True)
+    labels[rest] = labels.max(initial=-1) + 1 + own
+    return labels, path
+
+
+def rays_of(
+    recording: Recording,
+    path: FloatArray,
+    camera_xy: tuple[float, float],
+    sigma_scale: float,
+    heading_sigma_rad: float,
+) -> Rays:
+    """The rows of verticals as rays in the map.
+
+    Parameters
+    ----------
+    recording : Recording
+    path : (N + 1, 3) float64
+    camera_xy : (2,)
+        The camera's centre in the robot frame (m).
+    sigma_scale : float
+        Factor on the rows' standard deviations.
+    heading_sigma_rad : float
+        Of the path's heading in a single frame.
+
+    Returns
+    -------
+    Rays
+    """
+    lines = recording.lines
+    poses = path[lines.frame + 1]
+    return Rays(
+        centre=disc_in_map(poses, np.broadcast_to(np.asarray(camera_xy), (len(poses), 2))),
+        angle=lines.bearing_rad + poses[:, 2],
+        sigma=np.hypot(sigma_scale * lines.sigma_rad, heading_sigma_rad),
+        frame=lines.frame,
+        start=np.searchsorted(lines.frame, np.arange(len(recording) + 1)),
+        heading=path[1:, 2].copy(),
+        widest_rad=float(np.max(np.abs(lines.bearing_rad), initial=0.0)) + _WIDER_RAD,
+    )
+
+
+def find_points(rays: Rays, setting: PointSettings) -> tuple[IntArray, FloatArray]:
+    """The points in which rays meet, the best first.
+
+    Parameters
+    ----------
+    rays : Rays
+    setting : PointSettings
+
+    Returns
+    -------
+    labels : (n,) int64
+        The point of each ray, -1 without one.
+    points : (k, 2) float64
+        In the map (m).
+    """
+    window = setting.window_frames
+    points, frames = crossings(
+        rays.centre,
+        rays.angle,
+        rays.sigma,
+        rays.frame,
+        rays.start,
+        np.array(setting.gaps, dtype=np.int64),
+        setting.least_parallax_sigmas,
+        setting.farthest_m,
+    )
+    scores = scores_of(
+        points,
+        frames,
+        rays.centre,
+        rays.angle,
+        rays.sigma,
+        rays.start,
+        window,
+        rays.heading,
+        rays.widest_rad,
+        rays.clutter,
+        setting.detected,
+        setting.gate_sigmas,
+    )
+    free = np.ones(len(rays.angle), dtype=np.bool_)
+    rows = np.empty(len(rays.heading), dtype=np.int64)
+    labels = np.full(len(free), -1, dtype=np.int64)
+    found: list[FloatArray] = []
+    # Scores only fall as rows are taken: whoever is first still, with what is left, is the best.
+    waiting = [(-scores[k], int(k)) for k in np.flatnonzero(scores >= setting.least_score)]
+    heapq.heapify(waiting)
+
+    def run(place: FloatArray, first: int, last: int) -> float:
+        """The score of a place by what is left; its rows are in `rows` then."""
+        return float(
+            best_run(
+                place,
+                rays.centre,
+                rays.angle,
+                rays.sigma,
+                rays.start,
+                free,
+                first,
+                last,
+                rays.heading,
+                rays.widest_rad,
+                rays.clutter,
+                setting.detected,
+                setting.gate_sigmas,
+                rows,
+            )
+        )
+
+    while waiting:
+        _, k = heapq.heappop(waiting)
+        first, last = max(0, int(frames[k]) - window), min(len(rows), int(frames[k]) + window)
+        point = points[k]
+        score = run(point, first, last)
+        if score < setting.least_score:
+            continue
+        if waiting and score < -waiting[0][0]:
+            heapq.heappush(waiting, (-score, k))
+            continue
+        for _ in range(3):
+            used = rows[first:last]
+            better = _meeting_point(rays, used[used >= 0], point)
+            improved = run(better, first, last)
+            if improved <= score:
+                break
+            point, score = better, improved
+        run(point, first, last)
+        used = rows[first:last][rows[first:last] >= 0]
+        if len(used) >= _FEWEST_ROWS:
+            labels[used] = len(found)
+            free[used] = False
+            found.append(point)
+    return labels, np.array(found, dtype=np.float64).reshape(-1, 2)
+
+
+def _meeting_point(rays: Rays, used: IntArray, point: FloatArray) -> FloatArray:
+    """The point that some rays pass closest to: robust least squares, from a point near it."""
+    for _ in range(4):
+        offset = point - rays.centre[used]
+        off = wrap_angle(np.arctan2(offset[:, 0], -offset[:, 1]) - rays.angle[used])
+        squared = np.sum(offset**2, axis=1)
+        jacobian = np.stack([-offset[:, 1], offset[:, 0]], axis=1) / squared[:, None]
+        whitened = off / rays.sigma[used]
+        weight = 1.0 / (rays.sigma[used] ** 2 * (1.0 + 0.25 * whitened**2))
+        weighted = jacobian * weight[:, None]
+        change = np.linalg.solve(weighted.T @ jacobian + 1e-6 * np.eye(2), weighted.T @ off)
+        if np.hypot(*change) > 1.0:  # rays nearly parallel: nothing to be had
+            break
+        point = point - change
+    return point
+
+
+def _path_with_points(
+    recording: Recording,
+    path: FloatArray,
+    circle_labels: IntArray,
+    labels: IntArray,
+    points: FloatArray,
+    setting: PointSettings,
+    camera_xy: tuple[float, float],
+    disc_sigma_scale: float,
+) -> FloatArray:
+    """Least squares over poses, discs and points, done again without the rows that are far off."""
+    sigma = setting.path_sigma_scale * recording.lines.sigma_rad
+    scaled = replace(recording, lines=replace(recording.lines, sigma_rad=sigma))
+    count = len(points)
+    used = (labels >= 0) & (
+        np.bincount(labels + 1, minlength=count + 1)[labels + 1] >= setting.path_rows
+    )
+    for _ in range(3):
+        solution = solve_path(
+            scaled,
+            circle_labels,
+            np.where(used, labels, count),
+            path,
+            np.concatenate([points, [[np.nan, np.nan]]]),
+            camera_xy=camera_xy,
+            sigma_scale=disc_sigma_scale,
+        )
+        path = solution.path
+        rays = rays_of(recording, path, camera_xy, 1.0, 0.0)
+        offset = solution.line_xy[np.where(used, labels, 0)] - rays.centre
+        off = wrap_angle(np.arctan2(offset[:, 0], -offset[:, 1]) - rays.angle)
+        used &= np.abs(off) < 4.0 * sigma
+    return path

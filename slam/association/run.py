@@ -1,0 +1,266 @@
+"""Which rows of a run show the same landmark: frame to frame, then from place to place.
+
+First every row is associated with landmarks seen a moment before
+(`slam.association.frame_to_frame`). What comes out is right nearly always, but a landmark that is
+met again later has several labels. Then loops are looked for (`slam.association.loops`) and closed
+(`slam.association.loop_closing`, `slam.association.loop_path`) in rounds: the first looks where
+odometry's drift may have led, the next ones everywhere, since a closed loop straightens the map for
+the next. Verticals, which the local association often mistakes, are then associated anew on the
+path that the discs give (`slam.association.line_points`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.association.frame_to_frame import LocalSettings, associate_locally
+from slam.association.line_points import PointSettings, lines_by_points
+from slam.association.local_map import tilt_jacobian
+from slam.association.loop_closing import (
+    closed_path,
+    in_order,
+    merge_labels,
+    pairs_by_votes,
+    pairs_in_place,
+)
+from slam.association.loop_path import Solution, intersect_bearings, solve_path
+from slam.association.loops import LoopSettings, Match, find_matches, stretches_of
+from slam.errors import SlamError
+from slam.models.motion import chain_steps
+from slam.recording import Recording
+from storage.bounds import demand, whole
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+Progress = Callable[[str], None]
+
+# Edges of one door frame may stand 0.1 m apart.
+_LINE_REACH_M = 0.05
+# Longer than a landmark is in view or waited for by the local map.
+_ATTACHED_FRAMES = 200
+
+
+@dataclass(frozen=True)
+class AssociateSettings:
+    """How a run is associated.
+
+    Attributes
+    ----------
+    local : LocalSettings
+        From frame to frame.
+    map_level : bool
+        Whether loops are looked for.
+    loops : LoopSettings
+        How, in the first round.
+    points : PointSettings
+        How verticals are then told apart on the path that the discs give.
+    most_rounds : int
+        Bound of the rounds.
+    """
+
+    local: LocalSettings = field(default_factory=LocalSettings)
+    map_level: bool = True
+    loops: LoopSettings = field(default_factory=LoopSettings)
+    points: PointSettings = field(default_factory=PointSettings)
+    most_rounds: int = 6
+
+    def __post_init__(self) -> None:
+        demand(self, SlamError, most_rounds=whole(1))
+
+
+@dataclass(frozen=True, eq=False)
+class RunAssociation:
+    """Labels of a run's rows, numbered from 0 in the order of first sight.
+
+    Attributes
+    ----------
+    circle_labels, line_labels : (n,) int64
+        Of each row at the end.
+    local_circle_labels, local_line_labels : (n,) int64
+        From frame to frame only.
+    matches : tuple of Match
+        The loops that were closed.
+    path : (N + 1, 3) float64 or None
+        The path that goes with them; None without map level.
+    incomplete_frames : int
+        Frames whose joint search was cut short.
+    """
+
+    circle_labels: IntArray
+    line_labels: IntArray
+    local_circle_labels: IntArray
+    local_line_labels: IntArray
+    matches: tuple[Match, ...]
+    path: FloatArray | None
+    incomplete_frames: int
+
+
+def associate_run(
+    recording: Recording,
+    settings: AssociateSettings | None = None,
+    *,
+    camera_xy: tuple[float, float] = (0.0, 0.0),
+    progress: Progress | None = None,
+) -> RunAssociation:
+    """Find out which rows show the same landmark; IDs in the file are not looked at.
+
+    Parameters
+    ----------
+    recording : Recording
+        The run.
+    settings : AssociateSettings, optional
+    camera_xy : (2,)
+        The camera's centre in the robot frame (m); only bearings of lines need it.
+    progress : callable, optional
+        Told what is being done.
+
+    Returns
+    -------
+    RunAssociation
+    """
+    setting = settings or AssociateSettings()
+    tell = progress or (lambda _: None)
+    local = associate_locally(
+        recording,
+        setting.local,
+        camera_xy=camera_xy,
+        progress=lambda done: tell(f"frame {done} of {len(recording)}"),
+    )
+    incomplete = local.incomplete
+    if len(recording.circles) and len(recording.lines):
+        # Discs help to tell lines apart; lines, often mistaken, would only harm the discs.
+        discs_alone = associate_locally(_without_lines(recording), setting.local)
+        local = replace(local, circle_labels=discs_alone.circle_labels)
+    circle_labels, line_labels = local.circle_labels, local.line_labels
+    matches: list[Match] = []
+    path = None
+    if setting.map_level:
+        # The map is made of discs where there are any: their rows say where they are.
+        by_discs = len(recording.circles) > 0
+        rows = recording.circles if by_discs else recording.lines
+        labels = circle_labels if by_discs else line_labels
+        solution = _solved(recording, by_discs, labels, None, setting, camera_xy)
+        loops = setting.loops
+        for number in range(setting.most_rounds):
+            xy = solution.circle_xy if by_discs else solution.line_xy
+            stretches = stretches_of(rows.frame, labels, xy, len(recording), loops)
+            found = find_matches(
+                stretches,
+                loops,
+                lambda text, n=number: tell(f"round {n + 1}: {text}"),  # type: ignore[misc]
+            )
+            labels, matched = merge_labels(rows.frame, labels, pairs_by_votes(found))
+            path = closed_path(solution.path, found) if found else solution.path
+            solution = _solved(recording, by_discs, labels, path, setting, camera_xy)
+            xy = solution.circle_xy if by_discs else solution.line_xy
+            stretches = stretches_of(rows.frame, labels, xy, len(recording), loops)
+            pairs = pairs_in_place(stretches, loops.reach_m)
+            labels, in_place = merge_labels(rows.frame, labels, pairs)
+            if in_place:
+                solution = _solved(recording, by_discs, labels, solution.path, setting, camera_xy)
+            matches += found
+            everywhere = replace(
+                loops,
+                most_turn_rad=np.pi,
+                most_shift_m=np.inf,
+                later_step=2,
+                earlier_step=3,
+                attached_frames=_ATTACHED_FRAMES,
+            )
+            if matched + in_place == 0 and loops == everywhere:
+                break
+            loops = everywhere
+        path = solution.path
+        if by_discs:
+            circle_labels = labels
+            if len(line_labels):
+                tell("verticals on the path of the discs")
+                line_labels, path_of_both = lines_by_points(
+                    _swayed(recording, setting.local),
+                    path,
+                    labels,
+                    line_labels,
+                    setting.points,
+                    camera_xy=camera_xy,
+                    disc_sigma_scale=setting.local.sigma_scale,
+                )
+                line_labels = _merged_lines(
+                    recording, path_of_both, line_labels, setting, camera_xy
+                )
+        else:
+            line_labels = labels
+    return RunAssociation(
+        in_order(circle_labels),
+        in_order(line_labels),
+        in_order(local.circle_labels),
+        in_order(local.line_labels),
+        tuple(matches),
+        path,
+        incomplete,
+    )
+
+
+def _solved(
+    recording: Recording,
+    by_discs: bool,
+    labels: IntArray,
+    path: FloatArray | None,
+    setting: AssociateSettings,
+    camera_xy: tuple[float, float],
+) -> Solution:
+    """Path and map by discs, or by lines where there are no discs."""
+    line_xy = None
+    if not by_discs:
+        start = chain_steps(recording.steps) if path is None else path
+        line_xy = intersect_bearings(recording, start, labels, camera_xy=camera_xy)
+    none = np.zeros(len(recording.lines), dtype=np.int64)
+    return solve_path(
+        _swayed(recording, setting.local),
+        labels if by_discs else none[:0],
+        none if by_discs else labels,
+        path,
+        line_xy,
+        camera_xy=camera_xy,
+        sigma_scale=setting.local.sigma_scale,
+    )
+
+
+def _without_lines(recording: Recording) -> Recording:
+    none = recording.lines
+    empty = replace(
+        none, frame=none.frame[:0], bearing_rad=none.bearing_rad[:0], sigma_rad=none.sigma_rad[:0]
+    )
+    return replace(recording, lines=replace(empty, ids=()))
+
+
+def _swayed(recording: Recording, setting: LocalSettings) -> Recording:
+    """The run with the robot's sway in its discs' covariances."""
+    if setting.tilt_sigma_rad == 0.0:
+        return recording
+    moving = setting.tilt_sigma_rad * tilt_jacobian(recording.circles.xy, setting.camera_height_m)
+    covariance = recording.circles.covariance + moving @ moving.swapaxes(1, 2)
+    return replace(recording, circles=replace(recording.circles, covariance=covariance))
+
+
+def _merged_lines(
+    recording: Recording,
+    path: FloatArray,
+    labels: IntArray,
+    setting: AssociateSettings,
+    camera_xy: tuple[float, float],
+) -> IntArray:
+    """Labels of lines where those that stand at one spot of the map are one."""
+    if len(labels) == 0:
+        return labels
+    for _ in range(setting.most_rounds):
+        xy = intersect_bearings(recording, path, labels, camera_xy=camera_xy)
+        stretches = stretches_of(recording.lines.frame, labels, xy, len(recording), setting.loops)
+        pairs = pairs_in_place(stretches, _LINE_REACH_M)
+        labels, merged = merge_labels(recording.lines.frame, labels, pairs)
+        if merged == 0:
+            break
+    return labels

@@ -1,0 +1,7 @@
+"""Motion and measurement of a robot on the floor, with Jacobians, and the noise of its odometry.
+
+- `motion`: composition of poses.
+- `measurement`: discs and lines as a pose sees them.
+- `mounting`, `mounted_discs`: rows as a differently mounted camera would have written them.
+- `odometry_noise`: what is assumed where a source states no covariance.
+"""
