@@ -13,9 +13,9 @@ from __future__ import annotations
 import signal
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from types import FrameType
-from typing import NoReturn
+from typing import Any, NoReturn
 
 _received = threading.Event()
 
@@ -70,6 +70,16 @@ def interrupts_deferred() -> Iterator[None]:
     if waiting.is_set():
         _received.set()
         raise KeyboardInterrupt
+
+
+def interrupts_deferred_in(kernel: Any) -> AbstractContextManager[None]:
+    """Defer interrupts while a compiled kernel runs that returns named tuples.
+
+    Numba makes these by Python code and does not check whether an interrupt ended it. A kernel that
+    is not compiled yet may take a minute, which nobody should have to wait for: then an interrupt
+    ends the compiling.
+    """
+    return interrupts_deferred() if kernel.signatures else nullcontext()
 
 
 @contextmanager

@@ -20,7 +20,6 @@ filters as wide as the blur (`detect.verticals.blur`).
 from __future__ import annotations
 
 import math
-from contextlib import nullcontext
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -29,7 +28,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from detect.errors import FrameError
-from detect.interrupts import interrupts_deferred
+from detect.interrupts import interrupts_deferred_in
 from detect.line_settings import DEFAULT, LineSettings
 from detect.verticals.blur import median_sharpness, widened, width_for
 from detect.verticals.detections import LineDetections
@@ -161,9 +160,7 @@ def detect_lines(
     image = np.ascontiguousarray(image)
     search = _search(table, settings)
     pixels = padded_pixels(image, search.window)
-    # Numba makes named tuples by Python code, and does not check whether an interrupt ended it.
-    # What is not compiled yet may take a minute, which nobody should have to wait for.
-    with interrupts_deferred() if find_lines.signatures else nullcontext():
+    with interrupts_deferred_in(find_lines):
         found = LineDetections(*find_lines(image, pixels, search))
     if found.sharpness < search.least_sharpness:
         wider = widened(settings, width_for(found.sharpness, settings))

@@ -8,13 +8,13 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from detect.markers.edge_kernels import COVAR, OFFSET, TURN, VAR_OFFSET, VAR_TURN
+from detect.markers.edge_kernels import EdgeFits
 
 
 @njit(cache=True, error_model="numpy")
 def corners_of_edges(
     corners: NDArray[np.float64],
-    edges: NDArray[np.float64],
+    edges: EdgeFits,
     refined: NDArray[np.float64],
     covariance: NDArray[np.float64],
 ) -> bool:
@@ -24,7 +24,7 @@ def corners_of_edges(
     ----------
     corners : (4, 2) float64
         The corners that the edges' offsets are relative to.
-    edges : (4, EDGE_NUMBERS) float64
+    edges : EdgeFits
         From `detect.markers.edge_kernels.fit_edges`.
     refined : (4, 2) float64
         Result.
@@ -44,8 +44,8 @@ def corners_of_edges(
         length = math.hypot(p1[0] - p0[0], p1[1] - p0[1])
         tx, ty = (p1[0] - p0[0]) / length, (p1[1] - p0[1]) / length
         # Outward normal (ty, -tx); the fitted line runs through the shifted ends.
-        b0 = edges[k, OFFSET] - edges[k, TURN]
-        b1 = edges[k, OFFSET] + edges[k, TURN]
+        b0 = edges.offset[k] - edges.turn[k]
+        b1 = edges.offset[k] + edges.turn[k]
         ax, ay = p0[0] + b0 * ty, p0[1] - b0 * tx
         bx, by = p1[0] + b1 * ty, p1[1] - b1 * tx
         span = math.hypot(bx - ax, by - ay)
@@ -72,7 +72,7 @@ def corners_of_edges(
             s = ((x - q0[0]) * (q1[0] - q0[0]) + (y - q0[1]) * (q1[1] - q0[1])) / length / (
                 0.5 * length
             ) - 1.0
-            variance = edges[e, VAR_OFFSET] + 2.0 * s * edges[e, COVAR] + s * s * edges[e, VAR_TURN]
+            variance = edges.var_offset[e] + 2.0 * s * edges.covar[e] + s * s * edges.var_turn[e]
             mx = normal[o, 1] / determinant
             my = -normal[o, 0] / determinant
             covariance[k, 0, 0] += variance * mx * mx

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -12,13 +13,6 @@ from detect.markers.homography_kernels import square_homography
 from detect.markers.lens_kernels import bent, straightened
 from detect.markers.robust_kernels import LEAST_NOISE, OUTLIER, robust_sigma
 from detect.positive_definite import invert_positive, solve_positive
-
-#: What an edge's row of results holds: offset from the given line outwards in its middle and its
-#: change to the end (px), their variances and covariance (px^2), dark and light grey level, blur
-#: (px), standard deviation of what is left over, number of pixels, share of the length where the
-#: step is there.
-OFFSET, TURN, VAR_OFFSET, COVAR, VAR_TURN, DARK, LIGHT, BLUR, REST, PIXELS, SUPPORT = range(11)
-EDGE_NUMBERS = 11
 
 _PARAMETERS = 8
 _LEAST_PIXELS = 12
@@ -38,30 +32,105 @@ _LIGHT_SLOPE = 0.004
 _SAMPLED_RESIDUALS = 400
 
 
+class EdgeFits(NamedTuple):
+    """The fitted steps of a quadrangle's four edges; each attribute is (4,) float64.
+
+    Attributes
+    ----------
+    offset, turn
+        From the given line outwards, in its middle, and the change from there to its end, pixels.
+    var_offset, covar, var_turn
+        Their variances and covariance, pixels squared.
+    dark, light
+        Grey levels.
+    blur
+        Standard deviation, pixels.
+    rest
+        Standard deviation of the residuals, grey levels.
+    pixels
+        Number of pixels.
+    support
+        Share of the length where the step is there.
+    """
+
+    offset: NDArray[np.float64]
+    turn: NDArray[np.float64]
+    var_offset: NDArray[np.float64]
+    covar: NDArray[np.float64]
+    var_turn: NDArray[np.float64]
+    dark: NDArray[np.float64]
+    light: NDArray[np.float64]
+    blur: NDArray[np.float64]
+    rest: NDArray[np.float64]
+    pixels: NDArray[np.float64]
+    support: NDArray[np.float64]
+
+
+class EdgeSearch(NamedTuple):
+    """How edges are searched for.
+
+    Attributes
+    ----------
+    capture : float
+        How far the edges may be from the rough ones, pixels.
+    border : float
+        Thickness of the black border, in widths of the marker.
+    blur_guess : float
+        Standard deviation of the blur, pixels.
+    noise : float
+        Standard deviation of the noise at least, grey levels.
+    most_pixels : int
+        About how many pixels are used per edge; of more, whole columns (rows) are left out.
+    close_enough : float
+        Steps smaller than this end the iteration, pixels.
+    """
+
+    capture: float
+    border: float
+    blur_guess: float
+    noise: float
+    most_pixels: int
+    close_enough: float
+
+
+class _Band(NamedTuple):
+    """The surroundings of a line from p0 to p1, of which pixels within margin of an end are out."""
+
+    p0: NDArray[np.float64]
+    p1: NDArray[np.float64]
+    inwards: float
+    outwards: float
+    margin: float
+    stride: int
+
+
+class _EdgePixels(NamedTuple):
+    """Pixels near a line: where along (-1 to 1), how far out (px), grey value."""
+
+    along: NDArray[np.float64]
+    across: NDArray[np.float64]
+    grey: NDArray[np.float64]
+
+
 @njit(cache=True, error_model="numpy")
 def _pixels_along(
     image: NDArray[np.uint8],
     grid: NDArray[np.float64],
     step: float,
-    p0: NDArray[np.float64],
-    p1: NDArray[np.float64],
     guess: NDArray[np.float64],
-    inwards: float,
-    outwards: float,
-    margin: float,
-    stride: int,
-    along: NDArray[np.float64],
-    across: NDArray[np.float64],
-    grey: NDArray[np.float64],
-) -> int:
-    """Pixels near a line from p0 to p1: where along (-1 to 1), how far out (px), grey value."""
+    band: _Band,
+) -> _EdgePixels:
+    """The pixels of a band, but every `stride`-th of the image's columns or rows only."""
+    p0, p1, inwards, outwards = band.p0, band.p1, band.inwards, band.outwards
     height, width = image.shape
     length = math.hypot(p1[0] - p0[0], p1[1] - p0[1])
+    most = int((length + 4.0) * (inwards + outwards + 2.0)) + 64
+    along, across, grey = np.empty(most), np.empty(most), np.empty(most)
     tx, ty = (p1[0] - p0[0]) / length, (p1[1] - p0[1]) / length
     u0, v0 = bent(grid, step, p0[0], p0[1], guess[0], guess[1])
     u1, v1 = bent(grid, step, p1[0], p1[1], guess[0], guess[1])
     if not (math.isfinite(u0 + v0) and math.isfinite(u1 + v1)):
-        return 0
+        return _EdgePixels(along[:0], across[:0], grey[:0])
     flat = abs(u1 - u0) >= abs(v1 - v0)
     # A rough width of the band along the other axis; the test below is exact.
     pad = 1.5 * max(inwards, outwards) + 2.0
@@ -75,7 +144,7 @@ def _pixels_along(
         limit_a, limit_b = height, width
     count = 0
     half = 0.5 * length
-    for a in range(max(0, int(begin - pad)), min(limit_a, int(end + pad) + 2), stride):
+    for a in range(max(0, int(begin - pad)), min(limit_a, int(end + pad) + 2), band.stride):
         middle = v0 + slope * (a - u0) if flat else u0 + slope * (a - v0)
         for b in range(max(0, int(middle - pad)), min(limit_b, int(middle + pad) + 2)):
             u, v = (a, b) if flat else (b, a)
@@ -83,20 +152,20 @@ def _pixels_along(
             dx, dy = x - p0[0], y - p0[1]
             s = dx * tx + dy * ty
             d = dx * ty - dy * tx
-            if s < margin or s > length - margin or d < -inwards or d > outwards:
+            if s < band.margin or s > length - band.margin or d < -inwards or d > outwards:
                 continue
-            if count == len(along):
-                return count
+            if count == most:
+                return _EdgePixels(along, across, grey)
             along[count] = (s - half) / half
             across[count] = d
             grey[count] = image[v, u]
             count += 1
-    return count
+    return _EdgePixels(along[:count], across[:count], grey[:count])
 
 
 @njit(cache=True, error_model="numpy")
 def _best_split(
-    across: NDArray[np.float64], grey: NDArray[np.float64], count: int, reach: float
+    across: NDArray[np.float64], grey: NDArray[np.float64], reach: float
 ) -> tuple[float, float, float]:
     """How far out the grey values are best split in two, and the means on both sides.
 
@@ -104,7 +173,7 @@ def _best_split(
     """
     n = np.zeros(_SPLITS)
     total = np.zeros(_SPLITS)
-    for k in range(count):
+    for k in range(len(grey)):
         b = min(max(int((across[k] / reach + 1.0) * 0.5 * _SPLITS), 0), _SPLITS - 1)
         n[b] += 1.0
         total[b] += grey[k]
@@ -130,23 +199,16 @@ def _best_split(
 
 
 @njit(cache=True, error_model="numpy")
-def _fit_step(
-    along: NDArray[np.float64],
-    across: NDArray[np.float64],
-    grey: NDArray[np.float64],
-    count: int,
-    reach: float,
-    wide: float,
-    blur_guess: float,
-    noise: float,
-    close_enough: float,
-    out: NDArray[np.float64],
-) -> bool:
-    """Robust least squares of a blurred step; fills an edge's row of results."""
+def _fit_step(pixels: _EdgePixels, reach: float, search: EdgeSearch, out: EdgeFits, k: int) -> bool:
+    """Robust least squares of a blurred step, which becomes edge k of the results."""
+    along, across, grey = pixels.along, pixels.across, pixels.grey
+    noise, blur_guess = search.noise, search.blur_guess
+    wide = max(0.6 * reach, blur_guess)
+    count = len(grey)
     if count < _LEAST_PIXELS:
         return False
     # Inside is darker, beyond what noise does.
-    split, low, high = _best_split(across, grey, count, reach)
+    split, low, high = _best_split(across, grey, reach)
     if not high > low + 0.3 * noise:
         return False
     p = np.zeros(_PARAMETERS)
@@ -173,28 +235,28 @@ def _fit_step(
         blur = math.exp(p[5])
         weight_sum = 0.0
         rest = 0.0
-        for k in range(count):
-            z = (across[k] - p[0] - p[1] * along[k]) / blur
+        for n in range(count):
+            z = (across[n] - p[0] - p[1] * along[n]) / blur
             share = 0.5 * (1.0 + math.erf(z * _ROOT_HALF))
             density = math.exp(-0.5 * z * z) / _ROOT_2PI
             out_px = z * blur
-            top = p[3] + p[4] * along[k] + p[6] * out_px
-            bottom = p[2] + p[7] * along[k]
+            top = p[3] + p[4] * along[n] + p[6] * out_px
+            bottom = p[2] + p[7] * along[n]
             step = top - bottom
-            r = grey[k] - (bottom + step * share)
-            residual[k] = r
+            r = grey[n] - (bottom + step * share)
+            residual[n] = r
             weight = 1.0
             if free_steps > 2 and abs(r) > OUTLIER * scale:
                 weight = (OUTLIER * scale / r) ** 2
             slope = -step * density / blur - p[6] * share
             jacobian[0] = slope
-            jacobian[1] = slope * along[k]
+            jacobian[1] = slope * along[n]
             jacobian[2] = 1.0 - share
             jacobian[3] = share
-            jacobian[4] = share * along[k]
+            jacobian[4] = share * along[n]
             jacobian[5] = -step * density * z
             jacobian[6] = share * out_px
-            jacobian[7] = (1.0 - share) * along[k]
+            jacobian[7] = (1.0 - share) * along[n]
             for i in range(_PARAMETERS):
                 right[i] += weight * jacobian[i] * r
                 for j in range(i, _PARAMETERS):
@@ -246,7 +308,7 @@ def _fit_step(
                 # Close: go on with the blur free.
                 wide = blur_guess
                 p[5] = math.log(blur_guess)
-        elif largest < close_enough and free_steps > 2:
+        elif largest < search.close_enough and free_steps > 2:
             converged = True
             break
     if not converged and iteration + 1 < _WIDE_STEPS + _STEPS:
@@ -254,32 +316,28 @@ def _fit_step(
     if not invert_positive(normal, inverse):
         return False
     variance = max(rest / max(weight_sum - _PARAMETERS, 1.0), least * least)
-    out[OFFSET], out[TURN] = p[0], p[1]
-    out[VAR_OFFSET] = variance * inverse[0, 0]
-    out[COVAR] = variance * inverse[0, 1]
-    out[VAR_TURN] = variance * inverse[1, 1]
-    out[DARK], out[LIGHT] = p[2], p[3]
-    out[BLUR] = math.exp(p[5])
-    out[REST] = scale
-    out[PIXELS] = count
-    out[SUPPORT] = _support(along, across, grey, count, p)
-    return bool(np.all(np.isfinite(out)))
+    out.offset[k], out.turn[k] = p[0], p[1]
+    out.var_offset[k] = variance * inverse[0, 0]
+    out.covar[k] = variance * inverse[0, 1]
+    out.var_turn[k] = variance * inverse[1, 1]
+    out.dark[k], out.light[k] = p[2], p[3]
+    out.blur[k] = math.exp(p[5])
+    out.rest[k] = scale
+    out.pixels[k] = count
+    out.support[k] = _support(pixels, p)
+    numbers = p.sum() + inverse[:2, :2].sum() + variance + scale
+    return bool(np.isfinite(numbers))
 
 
 @njit(cache=True, error_model="numpy")
-def _support(
-    along: NDArray[np.float64],
-    across: NDArray[np.float64],
-    grey: NDArray[np.float64],
-    count: int,
-    p: NDArray[np.float64],
-) -> float:
+def _support(pixels: _EdgePixels, p: NDArray[np.float64]) -> float:
     """Share of the segments of an edge whose own step is at least half the fitted one."""
+    along, across, grey = pixels.along, pixels.across, pixels.grey
     inside = np.zeros(_SEGMENTS)
     outside = np.zeros(_SEGMENTS)
     n_inside = np.zeros(_SEGMENTS)
     n_outside = np.zeros(_SEGMENTS)
-    for k in range(count):
+    for k in range(len(grey)):
         d = across[k] - p[0] - p[1] * along[k]
         segment = min(int((along[k] + 1.0) * 0.5 * _SEGMENTS), _SEGMENTS - 1)
         if d < -0.5:
@@ -322,14 +380,8 @@ def fit_edges(
     step: float,
     corners: NDArray[np.float64],
     guess: NDArray[np.float64],
-    capture: float,
-    border: float,
-    blur_guess: float,
-    noise: float,
-    most_pixels: int,
-    close_enough: float,
-    edges: NDArray[np.float64],
-) -> bool:
+    search: EdgeSearch,
+) -> tuple[bool, EdgeFits]:
     """Fit a blurred step to each of four edges.
 
     Parameters
@@ -342,47 +394,30 @@ def fit_edges(
         Rough corners, clockwise as seen in the image, straight pixels.
     guess : (2,) float64
         A pixel near the marker.
-    capture : float
-        How far the edges may be from the rough ones, pixels.
-    border : float
-        Thickness of the black border, in widths of the marker.
-    blur_guess : float
-        Standard deviation of the blur, pixels.
-    noise : float
-        Standard deviation of the noise at least, grey levels.
-    most_pixels : int
-        About how many pixels are used per edge; of more, whole columns (rows) are left out.
-    close_enough : float
-        Steps smaller than this end the iteration, pixels.
-    edges : (4, EDGE_NUMBERS) float64
-        Result: see the module's indices.
+    search : EdgeSearch
 
     Returns
     -------
-    bool
+    found : bool
         Whether all four were fitted.
+    edges : EdgeFits
     """
-    thickness = border_thickness(corners, border)
+    edges = EdgeFits(
+        np.empty(4), np.empty(4), np.empty(4), np.empty(4), np.empty(4), np.empty(4),
+        np.empty(4), np.empty(4), np.empty(4), np.empty(4), np.empty(4),
+    )  # fmt: skip
+    thickness = border_thickness(corners, search.border)
     for k in range(4):
         p0 = corners[k]
         p1 = corners[(k + 1) % 4]
         length = math.hypot(p1[0] - p0[0], p1[1] - p0[1])
-        reach = min(capture, max(1.2, thickness[k]))
+        reach = min(search.capture, max(1.2, thickness[k]))
         inwards = min(reach, max(1.0, 0.85 * thickness[k]))
         margin = min(max(1.0, 0.7 * reach), 0.2 * length)
-        stride = max(1, int(length * (inwards + reach) / most_pixels))
-        room = int((length + 4.0) * (inwards + reach + 2.0)) + 64
-        along = np.empty(room)
-        across = np.empty(room)
-        grey = np.empty(room)
-        count = _pixels_along(
-            image, grid, step, p0, p1, guess, inwards, reach, margin, stride, along, across, grey
-        )
-        wide = max(0.6 * reach, blur_guess)
-        if not _fit_step(
-            along, across, grey, count, reach, wide, blur_guess, noise, close_enough, edges[k]
-        ):
-            return False
-        if not edges[k, REST] < _LARGEST_REST * (edges[k, LIGHT] - edges[k, DARK]):
-            return False
-    return True
+        stride = max(1, int(length * (inwards + reach) / search.most_pixels))
+        band = _Band(p0, p1, inwards, reach, margin, stride)
+        if not _fit_step(_pixels_along(image, grid, step, guess, band), reach, search, edges, k):
+            return False, edges
+        if not edges.rest[k] < _LARGEST_REST * (edges.light[k] - edges.dark[k]):
+            return False, edges
+    return True, edges

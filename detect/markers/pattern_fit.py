@@ -7,15 +7,18 @@ light, blur. What each cell then shows on its own says whether it is that marker
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.markers import pattern_fit_kernels as kernels
+from detect.interrupts import interrupts_deferred_in
 from detect.markers.homography_kernels import square_homography
 from detect.markers.lens import Lens
-from detect.markers.pattern_pixel_kernels import select_pixels
+from detect.markers.pattern_fit_kernels import PatternStart, fit_pattern
+from detect.markers.pattern_model_kernels import Pattern, corner_signs
+from detect.markers.pattern_pixel_kernels import Seam, select_pixels
 from detect.markers.robust_kernels import LEAST_NOISE
 from detect.markers.templates import Templates
 
@@ -128,55 +131,49 @@ def fit_marker(
     box = _pixel_box(image, lens, corners, seam)
     if box is None:
         return None
-    room = int((box[1] - box[0] + 1) * (box[3] - box[2] + 1))
-    pixels = np.empty((room, 2), np.int32)
-    straight = np.empty((room, 2))
-    grey = np.empty(room)
-    most_pixels = _FIRST_LOOK_PIXELS if first_look else _MOST_PIXELS
-    count = select_pixels(
-        image, lens.grid, lens.step, corners, box, templates.lines, seam,
-        _SEAM_BLURS * blur_px + _SEAM_PX, most_pixels, pixels, straight, grey,
-    )  # fmt: skip
+    near = _SEAM_BLURS * blur_px + _SEAM_PX
+    seam_pixels = Seam(seam, near, _FIRST_LOOK_PIXELS if first_look else _MOST_PIXELS)
     black = templates.blackness(template)
-    fitted, covariance = np.empty((4, 2)), np.empty((8, 8))
-    cells, cell_sigma = np.empty_like(black), np.empty_like(black)
-    numbers = np.empty(kernels.FIT_NUMBERS)
-    if not kernels.fit_pattern(
-        pixels, straight, grey, count, corners, templates.lines, black,
-        np.array([dark, light, blur_px]), noise, _FIRST_LOOK_STEPS if first_look else _MOST_STEPS,
-        max(_REACH_PX, _REACH_CELLS * cell_px), fitted, covariance, cells, cell_sigma, numbers,
-    ):  # fmt: skip
+    pattern = Pattern(templates.lines, black, corner_signs(black))
+    steps = _FIRST_LOOK_STEPS if first_look else _MOST_STEPS
+    reach_px = max(_REACH_PX, _REACH_CELLS * cell_px)
+    start = PatternStart(corners, dark, light, blur_px, noise, steps, reach_px)
+    with interrupts_deferred_in(fit_pattern):
+        samples = select_pixels(
+            image, lens.grid, lens.step, corners, box, templates.lines, seam_pixels
+        )
+        found = fit_pattern(samples, pattern, start)
+    if not found.found:
         return None
-    rest = float(numbers[kernels.REST])
-    contrast = max(float(numbers[kernels.CONTRAST]), 1e-3)
+    contrast = max(found.contrast, 1e-3)
     outside = np.ones(black.shape, dtype=bool)
     side = templates.dictionary.patterns.shape[-1]
     outside[templates.first : templates.first + side, templates.first : templates.first + side] = 0
     return PatternFit(
-        corners=fitted,
-        covariance=covariance,
-        cells=templates.grid_of(cells),
-        cell_sigma=templates.grid_of(cell_sigma),
-        border=cells[outside],
-        rest=rest,
-        misfit=float(np.sqrt(max(0.0, rest**2 - max(noise, LEAST_NOISE) ** 2)) / contrast),
-        explained=float(numbers[kernels.EXPLAINED]),
-        agree=float(numbers[kernels.AGREE]),
-        contrast=float(numbers[kernels.CONTRAST]),
-        blur_px=float(np.sqrt(0.5 * (numbers[kernels.BLUR_UU] + numbers[kernels.BLUR_VV]))),
-        blur_cells=_blur_along_axes(fitted, numbers) / templates.dictionary.cell,
-        inflation=float(numbers[kernels.INFLATION]),
+        corners=found.corners,
+        covariance=found.covariance,
+        cells=templates.grid_of(found.cells),
+        cell_sigma=templates.grid_of(found.cell_sigma),
+        border=found.cells[outside],
+        rest=found.rest,
+        misfit=math.sqrt(max(0.0, found.rest**2 - max(noise, LEAST_NOISE) ** 2)) / contrast,
+        explained=found.explained,
+        agree=found.agree,
+        contrast=found.contrast,
+        blur_px=math.sqrt(0.5 * (found.blur[0] + found.blur[2])),
+        blur_cells=_blur_along_axes(found.corners, found.blur) / templates.dictionary.cell,
+        inflation=found.inflation,
     )
 
 
-def _blur_along_axes(corners: FloatArray, numbers: FloatArray) -> float:
+def _blur_along_axes(corners: FloatArray, covariance: FloatArray) -> float:
     """Standard deviation of the blur in the marker's middle, along its axes, in its widths."""
     h = square_homography(corners)
     w = 0.5 * (h[2, 0] + h[2, 1]) + 1.0
     middle = (0.5 * (h[:2, 0] + h[:2, 1]) + h[:2, 2]) / w
     px_per_width = (h[:2, :2] - np.outer(middle, h[2, :2])) / w
     widths_per_px = np.linalg.inv(px_per_width)
-    uu, uv, vv = numbers[[kernels.BLUR_UU, kernels.BLUR_UV, kernels.BLUR_VV]]
+    uu, uv, vv = covariance
     blur = widths_per_px @ np.array([[uu, uv], [uv, vv]]) @ widths_per_px.T
     return float(np.sqrt(np.diag(blur).max()))
 

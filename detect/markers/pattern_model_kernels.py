@@ -10,6 +10,7 @@ them the cells' corners contribute what the bivariate normal distribution has mo
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -34,6 +35,48 @@ _LARGEST_CORRELATION = 0.96
 #: Nodes and weights of Gauss and Legendre's quadrature over (0, 1).
 NODES = np.array([0.1127016653792583, 0.5, 0.8872983346207417])
 _WEIGHTS = np.array([0.2777777777777778, 0.4444444444444444, 0.2777777777777778])
+
+
+class Pattern(NamedTuple):
+    """A pattern of black and white cells on the marker's unit square.
+
+    Attributes
+    ----------
+    lines : (L,) float64
+        Where cells end, in widths of the marker, from 0 to 1; along both axes.
+    black : (L - 1, L - 1) float64
+        1 where the pattern is black.
+    corner : (L, L) float64
+        Mixed differences of the pattern: the weights of the cells' corners.
+    """
+
+    lines: NDArray[np.float64]
+    black: NDArray[np.float64]
+    corner: NDArray[np.float64]
+
+
+class MarkerPlace(NamedTuple):
+    """Where a pixel is on the marker, and how the blur lies there.
+
+    Attributes
+    ----------
+    x, y : float
+        In widths of the marker.
+    x_u, x_v, y_u, y_v : float
+        Their derivatives with respect to the pixel's straight position.
+    sigma_x, sigma_y, correlation : float
+        Of the blur, along the marker's axes.
+    """
+
+    x: float
+    y: float
+    x_u: float
+    x_v: float
+    y_u: float
+    y_v: float
+    sigma_x: float
+    sigma_y: float
+    correlation: float
 
 
 @njit(cache=True, error_model="numpy")
@@ -96,21 +139,28 @@ def corner_excess(h: float, k: float, sines: NDArray[np.float64], angle: float) 
 
 @njit(cache=True, error_model="numpy")
 def blurred_blackness(
-    mx: float,
-    my: float,
-    sx: float,
-    sy: float,
-    rho: float,
-    lines: NDArray[np.float64],
-    black: NDArray[np.float64],
-    vertex: NDArray[np.float64],
-    work: NDArray[np.float64],
+    at: MarkerPlace, pattern: Pattern, profiles: NDArray[np.float64]
 ) -> tuple[float, float, float, float, float, float]:
-    """Blurred pattern (1 black, 0 white) at a place; its derivatives by mx, my, sx, sy, rho."""
-    zx, cx, px = work[0], work[1], work[2]
-    zy, cy, py = work[3], work[4], work[5]
-    x0, x1 = cell_profile(mx, sx, lines, zx, cx, px)
-    y0, y1 = cell_profile(my, sy, lines, zy, cy, py)
+    """Blurred pattern at a place, and its derivatives.
+
+    Parameters
+    ----------
+    at, pattern
+        The place and the pattern.
+    profiles : (7, L) float64
+        Working memory.
+
+    Returns
+    -------
+    blackness, by_x, by_y, by_sigma_x, by_sigma_y, by_correlation : float
+        1 is black, 0 white.
+    """
+    black = pattern.black
+    sx, sy, rho = at.sigma_x, at.sigma_y, at.correlation
+    zx, cx, px = profiles[0], profiles[1], profiles[2]
+    zy, cy, py = profiles[3], profiles[4], profiles[5]
+    x0, x1 = cell_profile(at.x, sx, pattern.lines, zx, cx, px)
+    y0, y1 = cell_profile(at.y, sy, pattern.lines, zy, cy, py)
     value, by_x, by_y, by_sx, by_sy = 0.0, 0.0, 0.0, 0.0, 0.0
     for j in range(y0, y1):
         wy = cy[j + 1] - cy[j]
@@ -133,14 +183,14 @@ def blurred_blackness(
         root = math.sqrt(1.0 - r * r)
         far = _FAR_FROM_CORNER * (1.0 + abs(r))
         angle = math.asin(r)
-        sines = work[6]
+        sines = profiles[6]
         for i in range(3):
             sines[i] = math.sin(angle * NODES[i])
         for j in range(y0, y1 + 1):
             if py[j] == 0.0:
                 continue
             for i in range(x0, x1 + 1):
-                sign = vertex[j, i]
+                sign = pattern.corner[j, i]
                 if px[i] == 0.0 or sign == 0.0:
                     continue
                 h, k = zx[i], zy[j]
@@ -166,12 +216,9 @@ def blurred_blackness(
 
 @njit(cache=True, error_model="numpy", inline="always")
 def place_on_marker(
-    inverse: NDArray[np.float64],
-    x: float,
-    y: float,
-    p: NDArray[np.float64],
-) -> tuple[float, float, float, float, float, float, float, float, float]:
-    """Place on the marker, gradients there, blur along its axes: mx my ax ay bx by sx sy rho."""
+    inverse: NDArray[np.float64], x: float, y: float, p: NDArray[np.float64]
+) -> MarkerPlace:
+    """Where a straight position (x, y) is on the marker, by the inverse of its homography."""
     q = inverse[2, 0] * x + inverse[2, 1] * y + inverse[2, 2]
     mx = (inverse[0, 0] * x + inverse[0, 1] * y + inverse[0, 2]) / q
     my = (inverse[1, 0] * x + inverse[1, 1] * y + inverse[1, 2]) / q
@@ -183,7 +230,7 @@ def place_on_marker(
     sx = math.sqrt(ax * ax * uu + 2.0 * ax * ay * uv + ay * ay * vv)
     sy = math.sqrt(bx * bx * uu + 2.0 * bx * by * uv + by * by * vv)
     rho = (ax * bx * uu + (ax * by + ay * bx) * uv + ay * by * vv) / (sx * sy)
-    return mx, my, ax, ay, bx, by, sx, sy, rho
+    return MarkerPlace(mx, my, ax, ay, bx, by, sx, sy, rho)
 
 
 @njit(cache=True, error_model="numpy", inline="always")

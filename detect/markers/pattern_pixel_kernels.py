@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -10,6 +11,25 @@ from numpy.typing import NDArray
 
 from detect.markers.homography_kernels import inverse_3x3, square_homography
 from detect.markers.lens_kernels import straightened
+from detect.markers.pattern_residual_kernels import Samples
+
+
+class Seam(NamedTuple):
+    """Which pixels round a marker are used.
+
+    Attributes
+    ----------
+    reach : float
+        Width of the seam, pixels.
+    near : float
+        If there are too many pixels, those farther than this from all cells' ends are thinned.
+    most_pixels : int
+        About how many are used at most.
+    """
+
+    reach: float
+    near: float
+    most_pixels: int
 
 
 @njit(cache=True, error_model="numpy")
@@ -20,13 +40,8 @@ def select_pixels(
     corners: NDArray[np.float64],
     box: NDArray[np.int64],
     lines: NDArray[np.float64],
-    reach: float,
-    near: float,
-    limit: int,
-    pixels: NDArray[np.int32],
-    straight: NDArray[np.float64],
-    grey: NDArray[np.float64],
-) -> int:
+    seam: Seam,
+) -> Samples:
     """Pixels of a marker and of a seam round it.
 
     Parameters
@@ -39,24 +54,18 @@ def select_pixels(
         First and last column, first and last row to look at (within the image).
     lines : (L,) float64
         Where cells end, in widths of the marker.
-    reach : float
-        Width of the seam, pixels.
-    near : float
-        If there are too many pixels, those farther than this from all cells' ends are thinned.
-    limit : int
-        About how many pixels are wanted at most.
-    pixels : (N, 2) int32
-        Result: u, v; row by row.
-    straight : (N, 2) float64
-        Result: straight positions.
-    grey : (N,) float64
-        Result: grey values.
+    seam : Seam
+        How far from the marker, and how many pixels.
 
     Returns
     -------
-    int
-        How many.
+    Samples
     """
+    reach, near, limit = seam.reach, seam.near, seam.most_pixels
+    most = (box[1] - box[0] + 1) * (box[3] - box[2] + 1)
+    pixels = np.empty((most, 2), np.int32)
+    straight = np.empty((most, 2))
+    grey = np.empty(most)
     inverse = inverse_3x3(square_homography(corners))
     area = 0.0
     for k in range(4):
@@ -101,12 +110,10 @@ def select_pixels(
                         break
                 if hashed % (every if close else 10 * every) != 0:
                     continue
-            if count == len(grey):
-                return count
             pixels[count, 0] = u
             pixels[count, 1] = v
             straight[count, 0] = x
             straight[count, 1] = y
             grey[count] = image[v, u]
             count += 1
-    return count
+    return Samples(pixels[:count], straight[:count], grey[:count])

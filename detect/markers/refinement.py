@@ -13,17 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from detect.interrupts import interrupts_deferred_in
 from detect.markers.edge_corner_kernels import corners_of_edges
-from detect.markers.edge_kernels import (
-    BLUR,
-    DARK,
-    EDGE_NUMBERS,
-    LIGHT,
-    PIXELS,
-    REST,
-    SUPPORT,
-    fit_edges,
-)
+from detect.markers.edge_kernels import EdgeSearch, fit_edges
 from detect.markers.lens import Lens
 from detect.markers.polygon_kernels import is_convex
 
@@ -124,16 +116,18 @@ def refine_quadrangle(
     """
     corners = np.ascontiguousarray(rough, dtype=np.float64)
     guess = lens.bend(corners.mean(axis=0)[None], corners.mean(axis=0))[0]
-    edges = np.empty((4, EDGE_NUMBERS))
     covariance = np.empty((4, 2, 2))
     capture, blur = capture_px, _FIRST_BLUR_PX
     pixels = _QUICK_PIXELS if quick else _MOST_PIXELS
     for attempt in range(_QUICK_PASSES if quick else _PASSES):
-        if not fit_edges(
-            image, lens.grid, lens.step, corners, guess, capture, border, blur, noise,
+        search = EdgeSearch(
+            capture, border, blur, noise,
             _FIRST_PIXELS if attempt == 0 else pixels,
-            _ROUGHLY_PX if quick or attempt == 0 else _EXACTLY_PX, edges,
-        ):  # fmt: skip
+            _ROUGHLY_PX if quick or attempt == 0 else _EXACTLY_PX,
+        )  # fmt: skip
+        with interrupts_deferred_in(fit_edges):
+            found, edges = fit_edges(image, lens.grid, lens.step, corners, guess, search)
+        if not found:
             return None
         refined = np.empty((4, 2))
         if not corners_of_edges(corners, edges, refined, covariance):
@@ -142,18 +136,18 @@ def refine_quadrangle(
             return None
         moved = float(np.abs(refined - corners).max())
         corners = refined
-        blur = float(np.clip(np.median(edges[:, BLUR]), 0.3, 6.0))
+        blur = float(np.clip(np.median(edges.blur), 0.3, 6.0))
         capture = max(_REACH_BLURS * blur + _REACH_PX, _LEAST_REACH_PX)
         if attempt > 0 and moved < _CLOSE_ENOUGH_PX:
             break
     return RefinedQuadrangle(
         corners=corners,
         covariance=covariance,
-        contrast=edges[:, LIGHT] - edges[:, DARK],
-        dark=edges[:, DARK].copy(),
-        light=edges[:, LIGHT].copy(),
-        blur_px=edges[:, BLUR].copy(),
-        rest=edges[:, REST].copy(),
-        pixels=edges[:, PIXELS].copy(),
-        support=edges[:, SUPPORT].copy(),
+        contrast=edges.light - edges.dark,
+        dark=edges.dark,
+        light=edges.light,
+        blur_px=edges.blur,
+        rest=edges.rest,
+        pixels=edges.pixels,
+        support=edges.support,
     )

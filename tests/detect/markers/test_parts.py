@@ -206,14 +206,13 @@ def test_a_blurred_corner_is_the_bivariate_normal_distribution(
 def test_the_blurred_patterns_derivatives(rho: float) -> None:
     templates = templates_of("6x6_250", (7,))
     black = templates.blackness(0)
-    vertex = model.corner_signs(black)
+    pattern = model.Pattern(templates.lines, black, model.corner_signs(black))
     work = np.empty((7, len(templates.lines)))
 
     def value(at: FloatArray) -> FloatArray:
-        mx, my, sx, sy, correlation = at
-        numbers = model.blurred_blackness(
-            mx, my, sx, sy, correlation, templates.lines, black, vertex, work
-        )
+        x, y, sigma_x, sigma_y, correlation = at.tolist()
+        place = model.MarkerPlace(x, y, 0.0, 0.0, 0.0, 0.0, sigma_x, sigma_y, correlation)
+        numbers = model.blurred_blackness(place, pattern, work)
         return np.array(list(numbers))
 
     rng = np.random.default_rng(4)
