@@ -21,6 +21,10 @@ from groundtruth.fusion.motion_kernels import POSE, STATE
 from groundtruth.fusion.smoother_kernels import (
     AFTER_REJECTIONS,
     WHERE_LOST,
+    Gating,
+    MeasuredPoses,
+    Odometry,
+    empty_history,
     filter_forward,
     smooth_backward,
 )
@@ -187,35 +191,24 @@ def _step(
 ) -> tuple[float, float, FloatArray]:
     """Filter and smooth over a gap with what is measured at its end (nothing, or one pose)."""
     count = len(controls)
-    states = [np.empty((count, STATE)) for _ in range(3)]
-    spreads = [np.empty((count, STATE, STATE)) for _ in range(4)]
-    squared = np.zeros(len(measured))
-    surprise = filter_forward(
-        controls,
-        variances,
+    history = empty_history(count)
+    end = np.full(len(measured), count - 1, dtype=np.int64)
+    squared, _, _, surprise = filter_forward(
+        Odometry(controls, variances),
         begin,
         spread,
-        np.full(len(measured), count - 1, dtype=np.int64),
-        measured,
-        measured_covariances,
-        math.inf,
-        1,
-        np.ones(POSE),
-        math.inf,
-        np.zeros(count, dtype=np.bool_),
+        MeasuredPoses(end, measured, measured_covariances),
+        _no_gate(count),
         points,
-        True,
-        states[0],
-        spreads[0],
-        states[1],
-        spreads[1],
-        spreads[2],
-        squared,
-        np.empty(len(measured), dtype=np.bool_),
-        np.empty(count, dtype=np.int8),
+        history,
     )
-    smooth_backward(states[0], spreads[0], states[1], spreads[1], spreads[2], states[2], spreads[3])
-    return float(surprise), float(squared[0]), states[2]
+    states, _ = smooth_backward(history)
+    return float(surprise), float(squared[0]), states
+
+
+def _no_gate(nodes: int) -> Gating:
+    """Accept everything."""
+    return Gating(math.inf, 1, np.ones(POSE), math.inf, np.zeros(nodes, dtype=np.bool_))
 
 
 def back_from(
@@ -240,29 +233,15 @@ def back_from(
     mirror = np.ones(STATE)
     mirror[_TURN_PER_METRE] = -1.0
     reverse = np.concatenate([np.zeros((1, 4)), -controls[:0:-1]])
-    states, spreads = np.empty((count, STATE)), np.empty((count, STATE, STATE))
+    history = empty_history(count)
     filter_forward(
-        reverse,
-        np.concatenate([np.zeros((1, 3)), variances[:0:-1]]),
+        Odometry(reverse, np.concatenate([np.zeros((1, 3)), variances[:0:-1]])),
         mirror * end,
         end_spread * mirror * mirror[:, None],
-        np.empty(0, dtype=np.int64),
-        np.empty((0, POSE)),
-        np.empty((0, POSE, POSE)),
-        math.inf,
-        1,
-        np.ones(POSE),
-        math.inf,
-        np.zeros(count, dtype=np.bool_),
+        MeasuredPoses(np.empty(0, dtype=np.int64), np.empty((0, POSE)), np.empty((0, POSE, POSE))),
+        _no_gate(count),
         np.empty((1, STATE)),
-        True,
-        np.empty((count, STATE)),
-        np.empty((count, STATE, STATE)),
-        states,
-        spreads,
-        np.empty((count, STATE, STATE)),
-        np.empty(0),
-        np.empty(0, dtype=np.bool_),
-        np.empty(count, dtype=np.int8),
+        history,
     )
-    return (states * mirror)[::-1], (spreads * mirror * mirror[:, None])[::-1]
+    states, spreads = history.filtered * mirror, history.filtered_covariance
+    return states[::-1], (spreads * mirror * mirror[:, None])[::-1]

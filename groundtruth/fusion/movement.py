@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +23,15 @@ from groundtruth.fusion.gaps import (
 from groundtruth.fusion.measurements import gather
 from groundtruth.fusion.motion_kernels import POSE, STATE
 from groundtruth.fusion.settings import FuseSettings
-from groundtruth.fusion.smoother_kernels import filter_forward, smooth_backward
+from groundtruth.fusion.smoother_kernels import (
+    FilterHistory,
+    Gating,
+    MeasuredPoses,
+    Odometry,
+    empty_history,
+    filter_forward,
+    smooth_backward,
+)
 from groundtruth.trajectories.streams import PlanarPoses, last_of_each_time
 
 FloatArray = NDArray[np.float64]
@@ -54,6 +63,13 @@ class MeasurementAccount:
     accepted: NDArray[np.bool_]
     restarted: NDArray[np.int8]
     surprise: float
+
+
+class Smoothed(NamedTuple):
+    """Smoothed states (N, 6) and covariances (N, 6, 6) at the nodes."""
+
+    states: FloatArray
+    covariances: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,38 +201,38 @@ class MovementProblem:
         after = np.flatnonzero(np.diff(self.times_s[self.nodes]) > UNMEASURED_S)
         for begin, end in zip(self.nodes[after], self.nodes[after + 1]):
             variances[begin + 1 : end + 1] *= looser_in_gaps
-        work = _Work(len(self.times_s))
+        history = empty_history(len(self.times_s))
         points = np.empty((1, STATE))
         cuts = np.zeros(len(self.times_s), dtype=np.bool_)
         while True:
-            account = self._forward(variances, points, cuts, work)
+            account = self._forward(variances, points, cuts, history)
             unfit = ends_that_did_not_fit(
                 self.times_s, self.nodes, account.accepted, account.restarted
             )
             if not unfit:
                 break
             cuts[unfit] = True
-        work.smooth_backward()
+        smoothed = Smoothed(*smooth_backward(history))
         gaps = gaps_where_lost(self.nodes, account.accepted, account.restarted)
-        points = work.smoothed.copy()
+        points = smoothed.states.copy()
         cuts[:] = False
         for begin, end in gaps:
-            found = self._bridge(begin, end, as_sampled, points, work)
+            found = self._bridge(begin, end, as_sampled, points, smoothed)
             cuts[end] = found.path is None
             variances[begin + 1 : end + 1] *= max(1.0, found.looser / looser_in_gaps)
         # Again, linearised along the smoothed path: where a gap was bridged, the filter alone was
         # too far off on its way for its derivatives to hold.
         for _ in range(_RELINEARISATIONS + (_RELINEARISATIONS_WHERE_LOST if gaps else 0)):
-            account = self._forward(variances, points, cuts, work)
-            work.smooth_backward()
-            points = work.smoothed.copy()
+            account = self._forward(variances, points, cuts, history)
+            smoothed = Smoothed(*smooth_backward(history))
+            points = smoothed.states.copy()
         for begin, end in gaps:
             if cuts[end]:
-                self._anchor(begin, end, variances, work)
-        return work.smoothed, work.smoothed_covariance, account
+                self._anchor(begin, end, variances, smoothed)
+        return smoothed.states, smoothed.covariances, account
 
     def _bridge(
-        self, begin: int, end: int, variances: FloatArray, points: FloatArray, work: _Work
+        self, begin: int, end: int, variances: FloatArray, points: FloatArray, smoothed: Smoothed
     ) -> Bridge:
         """Lay points over a gap that was cut, if it can be bridged.
 
@@ -227,9 +243,9 @@ class MovementProblem:
             self.controls[gap],
             variances[gap],
             points[begin:end],
-            work.smoothed_covariance[begin],
+            smoothed.covariances[begin],
             points[end, :POSE],
-            work.smoothed_covariance[end, :POSE, :POSE],
+            smoothed.covariances[end, :POSE, :POSE],
             self.gate(),
         )
         if found.path is None:
@@ -240,19 +256,19 @@ class MovementProblem:
         points[end:, 2] += 2.0 * math.pi * turns
         return found
 
-    def _anchor(self, begin: int, end: int, variances: FloatArray, work: _Work) -> None:
+    def _anchor(self, begin: int, end: int, variances: FloatArray, smoothed: Smoothed) -> None:
         """Let the second half of a gap that was cut be told by what comes after it."""
         gap = slice(begin, end + 1)
         states, spreads = back_from(
             self.controls[gap],
             variances[gap],
-            work.smoothed[end],
-            work.smoothed_covariance[end],
+            smoothed.states[end],
+            smoothed.covariances[end],
         )
         way = np.cumsum(np.hypot(self.controls[gap, 0], self.controls[gap, 1]))
         half = int(np.searchsorted(way, 0.5 * (way[0] + way[-1]))) + 1
-        work.smoothed[begin + half : end] = states[half:-1]
-        work.smoothed_covariance[begin + half : end] = spreads[half:-1]
+        smoothed.states[begin + half : end] = states[half:-1]
+        smoothed.covariances[begin + half : end] = spreads[half:-1]
 
     def gate(self) -> float:
         """Largest squared normalised innovation."""
@@ -267,65 +283,29 @@ class MovementProblem:
         variances: FloatArray,
         points: FloatArray,
         cuts: NDArray[np.bool_],
-        work: _Work | None,
+        history: FilterHistory | None,
     ) -> MeasurementAccount:
         systematic = (
             self.settings.turn_scale_sigma,
             self.settings.turn_bias_per_metre_sigma,
             self.settings.distance_scale_sigma,
         )
-        squared = np.empty(len(self.nodes))
-        accepted = np.empty(len(self.nodes), dtype=np.bool_)
-        restarted = np.empty(len(self.times_s), dtype=np.int8)
-        kept = work or _Work(1)
-        surprise = filter_forward(
-            self.controls,
-            variances,
-            np.concatenate([self.measured[0], np.zeros(3)]),
-            np.diag(np.concatenate([_RESTART_VARIANCES, np.square(systematic)])),
-            self.nodes,
-            self.measured,
-            self.covariances,
-            self.gate(),
-            _RESTART_AFTER,
-            _RESTART_VARIANCES,
-            _LOST_VARIANCE if len(points) == 1 else math.inf,
-            cuts,
-            points,
-            work is not None,
-            kept.predicted,
-            kept.predicted_covariance,
-            kept.filtered,
-            kept.filtered_covariance,
-            kept.transitions,
-            squared,
-            accepted,
-            restarted,
-        )
-        return MeasurementAccount(squared, accepted, restarted, float(surprise))
-
-
-class _Work:
-    """Arrays that the filter and the smoother fill, for N nodes."""
-
-    def __init__(self, count: int) -> None:
-        self.predicted, self.filtered, self.smoothed = (np.empty((count, STATE)) for _ in range(3))
-        (
-            self.predicted_covariance,
-            self.filtered_covariance,
-            self.smoothed_covariance,
-            self.transitions,
-        ) = (np.empty((count, STATE, STATE)) for _ in range(4))
-
-    def smooth_backward(self) -> None:
-        smooth_backward(
-            self.predicted,
-            self.predicted_covariance,
-            self.filtered,
-            self.filtered_covariance,
-            self.transitions,
-            self.smoothed,
-            self.smoothed_covariance,
+        return MeasurementAccount(
+            *filter_forward(
+                Odometry(self.controls, variances),
+                np.concatenate([self.measured[0], np.zeros(3)]),
+                np.diag(np.concatenate([_RESTART_VARIANCES, np.square(systematic)])),
+                MeasuredPoses(self.nodes, self.measured, self.covariances),
+                Gating(
+                    self.gate(),
+                    _RESTART_AFTER,
+                    _RESTART_VARIANCES,
+                    _LOST_VARIANCE if len(points) == 1 else math.inf,
+                    cuts,
+                ),
+                points,
+                empty_history(0) if history is None else history,
+            )
         )
 
 

@@ -9,6 +9,7 @@ the share by which ways are longer. The control of a node is the movement since 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -97,73 +98,128 @@ def _update(
             p[j, i] = p[i, j]
 
 
+class Odometry(NamedTuple):
+    """Movements to N nodes, each from the node before; the first is not used.
+
+    Attributes
+    ----------
+    controls : (N, 4) float64
+        As `move` takes them.
+    variances : (N, 3) float64
+        Accumulated noise along the way, across it and of the turn.
+    """
+
+    controls: FloatArray
+    variances: FloatArray
+
+
+class MeasuredPoses(NamedTuple):
+    """M poses measured at some of the nodes, in ascending order.
+
+    Attributes
+    ----------
+    nodes : (M,) int64
+    poses, covariances : (M, 3), (M, 3, 3) float64
+    """
+
+    nodes: IntArray
+    poses: FloatArray
+    covariances: FloatArray
+
+
+class Gating(NamedTuple):
+    """When a measurement is rejected, and when the filter restarts from one.
+
+    Attributes
+    ----------
+    largest_squared : float
+        Largest squared normalised innovation.
+    restart_after : int
+        After this number of rejections in a row the pose becomes the measured one, with
+        `restart_variances`, however far off the filter was.
+    restart_variances : (3,) float64
+    lost_variance : float
+        The same at once where the heading's variance (rad^2) is greater.
+    cuts : (N,) bool
+        The same at these nodes, at their first measurement.
+    """
+
+    largest_squared: float
+    restart_after: int
+    restart_variances: FloatArray
+    lost_variance: float
+    cuts: BoolArray
+
+
+class FilterHistory(NamedTuple):
+    """States (N, 6) and covariances (N, 6, 6) at all nodes, for the smoother.
+
+    Attributes
+    ----------
+    predicted, predicted_covariance, filtered, filtered_covariance : float64
+    transitions : (N, 6, 6) float64
+        Derivatives of each node's prediction with respect to the node before.
+    """
+
+    predicted: FloatArray
+    predicted_covariance: FloatArray
+    filtered: FloatArray
+    filtered_covariance: FloatArray
+    transitions: FloatArray
+
+
+def empty_history(nodes: int) -> FilterHistory:
+    """A history to be filled; of no nodes where none is wanted."""
+    states, spreads = (nodes, STATE), (nodes, STATE, STATE)
+    return FilterHistory(
+        np.empty(states), np.empty(spreads), np.empty(states), np.empty(spreads), np.empty(spreads)
+    )
+
+
 @njit(cache=True, error_model="numpy")
 def filter_forward(
-    controls: FloatArray,
-    control_variances: FloatArray,
+    odometry: Odometry,
     start: FloatArray,
     start_covariance: FloatArray,
-    nodes: IntArray,
-    measured: FloatArray,
-    measured_covariances: FloatArray,
-    gate: float,
-    restart_after: int,
-    restart_variances: FloatArray,
-    lost_variance: float,
-    cuts: BoolArray,
+    measured: MeasuredPoses,
+    gating: Gating,
     points: FloatArray,
-    keep: bool,
-    predicted: FloatArray,
-    predicted_covariance: FloatArray,
-    filtered: FloatArray,
-    filtered_covariance: FloatArray,
-    transitions: FloatArray,
-    squared_innovations: FloatArray,
-    accepted: BoolArray,
-    restarted: KindArray,
-) -> float:
-    """Filter N nodes forward, with M measured poses at some of them.
+    history: FilterHistory,
+) -> tuple[FloatArray, BoolArray, KindArray, float]:
+    """Filter N nodes forward.
 
     Parameters
     ----------
-    controls : (N, 4) array
-        Movement to each node from the one before, as `move` takes it; the first is not used.
-    control_variances : (N, 3) array
-        What its noise along the way, across it and of the turn sums up to.
-    start, start_covariance : (6,), (6, 6) arrays
+    odometry : Odometry
+    start, start_covariance : (6,), (6, 6) float64
         Before the measurements at the first node.
-    nodes : (M,) int array
-        Ascending.
-    measured, measured_covariances : (M, 3), (M, 3, 3) arrays
-    gate : float
-        Largest squared normalised innovation.
-    restart_after : int
-        So many rejections in a row, and the pose becomes the measured one, with
-        `restart_variances`: the measurements are believed again, however far off the filter was.
-    restart_variances : (3,) array
-    lost_variance : float
-        The same at once where the heading's variance (rad^2) is greater.
-    cuts : (N,) bool array
-        The same at these nodes, at their first measurement.
-    points : (N, 6) array
+    measured : MeasuredPoses
+    gating : Gating
+    points : (N, 6) float64
         States at which each movement away from a node is linearised, with headings that go on
         without jumps; measured headings are taken to lie within half a turn of them. Of length 1:
         at the filter's own.
-    keep : bool
-        Whether the next five arrays are filled; they may be of length 1 where they are not.
-    predicted, predicted_covariance, filtered, filtered_covariance : (N, 6), (N, 6, 6) arrays
-    transitions : (N, 6, 6) array
-        Derivatives of each node's prediction by the node before.
-    squared_innovations, accepted : (M,) arrays
-        Filled.
-    restarted : (N,) int8 array
-        Filled: whether the filter began anew at a node, and why.
+    history : FilterHistory
+        Filled, unless it is of no nodes.
 
     Returns
     -------
-    float
+    squared_innovations : (M,) float64
+        Normalised.
+    accepted : (M,) bool
+    restarted : (N,) int8
+        Whether the filter began anew at a node, and why.
+    surprise : float
         Minus twice the logarithm of the likelihood of the accepted innovations.
     """
+    controls, nodes = odometry.controls, measured.nodes
+    keep = len(history.predicted) > 0
+    predicted, predicted_covariance = history.predicted, history.predicted_covariance
+    filtered, filtered_covariance = history.filtered, history.filtered_covariance
+    transitions = history.transitions
+    squared_innovations = np.zeros(len(nodes))
+    accepted = np.zeros(len(nodes), np.bool_)
+    restarted = np.empty(len(controls), np.int8)
     x = start.copy()
     p = start_covariance.copy()
     f = np.eye(STATE)
@@ -177,12 +233,12 @@ def filter_forward(
     surprise = 0.0
     for k in range(controls.shape[0]):
         restarted[k] = NOT_ANEW
-        cut = cuts[k]
+        cut = gating.cuts[k]
         if k > 0:
             if points.shape[0] > 1:
-                move(x, p, f, controls[k], control_variances[k], points[k - 1])
+                move(x, p, f, controls[k], odometry.variances[k], points[k - 1])
             else:
-                move(x, p, f, controls[k], control_variances[k], x.copy())
+                move(x, p, f, controls[k], odometry.variances[k], x.copy())
             if keep:
                 transitions[k] = f
         if keep:
@@ -190,20 +246,20 @@ def filter_forward(
             predicted_covariance[k] = p
         while m < nodes.shape[0] and nodes[m] == k:
             for i in range(POSE):
-                innovation[i] = measured[m, i] - x[i]
+                innovation[i] = measured.poses[m, i] - x[i]
             if points.shape[0] > 1:
                 ahead = points[k, 2] - x[2]
                 innovation[2] = ahead + _wrap(innovation[2] - ahead)
             else:
                 innovation[2] = _wrap(innovation[2])
-            lost = m > 0 and (cut or p[2, 2] > lost_variance)
-            if lost or rejections >= restart_after:
+            lost = m > 0 and (cut or p[2, 2] > gating.lost_variance)
+            if lost or rejections >= gating.restart_after:
                 for i in range(POSE):
                     for j in range(STATE):
                         p[i, j] = 0.0
                         p[j, i] = 0.0
                 for i in range(POSE):
-                    p[i, i] = restart_variances[i]
+                    p[i, i] = gating.restart_variances[i]
                     x[i] += innovation[i]
                     innovation[i] = 0.0
                 rejections = 0
@@ -214,22 +270,22 @@ def filter_forward(
                     predicted_covariance[k] = p
                     transitions[k, :POSE] = 0.0
             squared, determinant = _squared_innovation(
-                p, measured_covariances[m], innovation, s, s_inverse
+                p, measured.covariances[m], innovation, s, s_inverse
             )
             squared_innovations[m] = squared
-            accepted[m] = squared <= gate
+            accepted[m] = squared <= gating.largest_squared
             if accepted[m]:
                 rejections = 0
                 surprise += squared + math.log(determinant)
                 _update(x, p, innovation, s_inverse, gain, temporary)
             else:
                 rejections += 1
-                surprise += gate + math.log(determinant)
+                surprise += gating.largest_squared + math.log(determinant)
             m += 1
         if keep:
             filtered[k] = x
             filtered_covariance[k] = p
-    return surprise
+    return squared_innovations, accepted, restarted, surprise
 
 
 @njit(cache=True, error_model="numpy")
@@ -262,20 +318,20 @@ def _solve(lower: FloatArray, right: FloatArray) -> None:
 
 
 @njit(cache=True, error_model="numpy")
-def smooth_backward(
-    predicted: FloatArray,
-    predicted_covariance: FloatArray,
-    filtered: FloatArray,
-    filtered_covariance: FloatArray,
-    transitions: FloatArray,
-    smoothed: FloatArray,
-    smoothed_covariance: FloatArray,
-) -> None:
+def smooth_backward(history: FilterHistory) -> tuple[FloatArray, FloatArray]:
     """Smooth what `filter_forward` left, from the last node to the first.
 
     Where the filter began anew, poses before learn from what came after only what it says of
     odometry's systematic errors.
+
+    Returns
+    -------
+    states, covariances : (N, 6), (N, 6, 6) float64
     """
+    predicted, predicted_covariance = history.predicted, history.predicted_covariance
+    filtered, filtered_covariance = history.filtered, history.filtered_covariance
+    transitions = history.transitions
+    smoothed, smoothed_covariance = np.empty_like(filtered), np.empty_like(filtered_covariance)
     last = predicted.shape[0] - 1
     smoothed[last] = filtered[last]
     smoothed_covariance[last] = filtered_covariance[last]
@@ -318,3 +374,4 @@ def smooth_backward(
                     total += temporary[i, n] * gain[j, n]
                 smoothed_covariance[k, i, j] = total
                 smoothed_covariance[k, j, i] = total
+    return smoothed, smoothed_covariance
