@@ -16,13 +16,22 @@ from groundtruth.geometry.plane import compose
 from groundtruth.lasers.outline import outline_faces, outline_radius_m, outline_symmetries
 from groundtruth.lasers.sets import ScannerTables, ScanSets
 from groundtruth.lasers.settings import LaserSettings
-from groundtruth.lasers.tracking_kernels import explain_set, fit_outline, new_points, refine_outline
+from groundtruth.lasers.tracking_kernels import (
+    OutlineFit,
+    Seen,
+    explain_set,
+    fit_outline,
+    new_points,
+    refine_outline,
+)
 from landmarks import wrap_angle
 
 FloatArray = NDArray[np.float64]
 
 #: A reading within this of where a beam should meet the robot agrees (m).
 AGREES_M = 0.05
+#: Steps of the refinement.
+_STEPS = 8
 
 _EVERYWHERE_M = 1e6
 _LARGEST_CHI2 = 4.0
@@ -50,34 +59,6 @@ class Body:
     symmetries: FloatArray
 
 
-class Seen(NamedTuple):
-    """New readings, as the kernels give and take them.
-
-    Attributes
-    ----------
-    points : (n, 2) float64
-        In the world (m).
-    scanner : (n,) int64
-    direction : (n, 2) float64
-        Of the beams.
-    range_m : (n,) float64
-    """
-
-    points: FloatArray
-    scanner: NDArray[np.int64]
-    direction: FloatArray
-    range_m: FloatArray
-
-    def where(self, chosen: NDArray[np.bool_]) -> Seen:
-        """Those chosen."""
-        return Seen(
-            self.points[chosen],
-            self.scanner[chosen],
-            self.direction[chosen],
-            self.range_m[chosen],
-        )
-
-
 class Refined(NamedTuple):
     """What `groundtruth.lasers.tracking_kernels.refine_outline` returns."""
 
@@ -100,12 +81,11 @@ def refine(
 ) -> Refined:
     """Most likely pose near a start; what the readings leave open holds on to it with `prior_m`."""
     s = settings
-    return Refined(
-        *refine_outline(
-            *seen, body.faces, start, tables.origins, tables.sigmas_m, s.floor_m, s.least_slope,
-            s.gate_sigma, s.gate_m, prior_m, s.weak_sigma_m, body.radius_m, 8,
-        )
+    fit = OutlineFit(
+        s.floor_m, s.least_slope, s.gate_sigma, s.gate_m, prior_m, s.weak_sigma_m, body.radius_m,
+        _STEPS,
     )  # fmt: skip
+    return Refined(*refine_outline(seen, body.faces, start, tables.origins, tables.sigmas_m, fit))
 
 
 def explain(
@@ -113,8 +93,8 @@ def explain(
 ) -> FloatArray:
     """(6,) beams of a set, as in `groundtruth.lasers.tracking_kernels.explain_set`."""
     return explain_set(
-        sets.ranges_mm, sets.rows[index], tables.near_mm, tables.beams, tables.origins,
-        body.faces, body.middle, body.radius_m, pose, AGREES_M,
+        sets.ranges_mm, sets.rows[index], tables.as_beams(), body.faces, body.middle,
+        body.radius_m, pose, AGREES_M,
     )  # fmt: skip
 
 
@@ -142,8 +122,8 @@ def acquire(
     """
     seen = Seen(
         *new_points(
-            sets.ranges_mm, sets.rows[index], tables.near_mm, tables.beams, tables.origins,
-            np.zeros(2), _EVERYWHERE_M, np.zeros(5), sets.ages_s[index],
+            sets.ranges_mm, sets.rows[index], tables.as_beams(), np.zeros(2), _EVERYWHERE_M,
+            np.zeros(5), sets.ages_s[index],
         )
     )  # fmt: skip
     if len(seen.points) < settings.acquire_readings:

@@ -21,7 +21,7 @@ from groundtruth.lasers.icp_kernels import rigid_fit
 from groundtruth.lasers.icp_scan_kernels import align_scans, explained, scan_normals
 from groundtruth.lasers.scanners import Scanner
 from groundtruth.lasers.scans import Scans
-from groundtruth.lasers.tracking_kernels import refine_outline
+from groundtruth.lasers.tracking_kernels import OutlineFit, Seen, refine_outline
 from landmarks import wrap_angle
 from storage.bounds import ABOVE_0, LIMIT_OR_0, SHARE_ABOVE_0, demand, from_to
 
@@ -358,16 +358,14 @@ def _to_map(
     the fit narrows.
     """
     faces = np.vstack([building, building[:, [2, 3, 0, 1]]])
-    count = len(scan.points)
+    lone = np.zeros(len(scan.points), dtype=np.int64)
+    seen = Seen(scan.points, lone, scan.direction, scan.range_m)
     pose, floor = invert(start), _FLOOR_M
     for narrow in (*(n for n in _NARROWING_M if n <= s.gate_m), _FLOOR_M, 0.0):
         # Last, the residuals themselves say how large the errors are.
         floor = narrow if narrow > 0.0 else floor
-        result = refine_outline(
-            scan.points, np.zeros(count, dtype=np.int64), scan.direction, scan.range_m, faces, pose,
-            np.zeros((1, 2)), np.array([scan.sigma_m]), floor, 0.25, 3.0, s.gate_m, 0.5, _WEAK_M,
-            1.0, _LONE_STEPS,
-        )  # fmt: skip
+        fit = OutlineFit(floor, 0.25, 3.0, s.gate_m, 0.5, _WEAK_M, 1.0, _LONE_STEPS)
+        result = refine_outline(seen, faces, pose, np.zeros((1, 2)), np.array([scan.sigma_m]), fit)
         pose, covariance, summary = result[0], result[1], result[3]
         if summary[0] < 10:
             raise GeometryError(

@@ -12,6 +12,7 @@ from groundtruth.errors import GroundTruthError
 from groundtruth.lasers.background import Background
 from groundtruth.lasers.scanners import Scanner
 from groundtruth.lasers.scans import Scans
+from groundtruth.lasers.tracking_kernels import Beams
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -47,6 +48,10 @@ class ScannerTables:
     def origins(self) -> FloatArray:
         """(scanners, 2) places of the scanners (m)."""
         return np.ascontiguousarray(self.poses[:, :2])
+
+    def as_beams(self) -> Beams:
+        """As the kernels take them."""
+        return Beams(self.near_mm, self.beams, self.origins)
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from groundtruth.geometry.plane import compose
-from groundtruth.lasers.acquisition import Body, Seen, acquire, explain, refine
+from groundtruth.lasers.acquisition import Body, acquire, explain, refine
 from groundtruth.lasers.sets import ScannerTables, ScanSets
 from groundtruth.lasers.settings import LaserSettings
-from groundtruth.lasers.tracking_kernels import fit_outline, new_points
+from groundtruth.lasers.tracking_kernels import Seen, fit_outline, new_points
 from landmarks import wrap_angle
 
 FloatArray = NDArray[np.float64]
@@ -116,7 +116,7 @@ class Tracker:
         self.speed, self.turn = largest_speed_m_s, largest_turn_rad_s
         self.settings = LaserSettings() if settings is None else settings
         n, many = len(sets), len(tables.names)
-        self.origins = tables.origins
+        self.seen_by = tables.as_beams()
         self.status = np.full(n, LOST, dtype=np.int64)
         self.segment = np.full(n, -1, dtype=np.int64)
         self.poses = np.full((n, 3), np.nan)
@@ -219,8 +219,8 @@ class Tracker:
         about = np.array([motion[0], motion[1], motion[2], pose[0], pose[1]])
         return Seen(
             *new_points(
-                self.sets.ranges_mm, self.sets.rows[i], self.tables.near_mm, self.tables.beams,
-                self.origins, centre, reach, about, self.sets.ages_s[i],
+                self.sets.ranges_mm, self.sets.rows[i], self.seen_by, centre, reach, about,
+                self.sets.ages_s[i],
             )
         )  # fmt: skip
 

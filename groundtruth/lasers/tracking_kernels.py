@@ -8,6 +8,7 @@ their right. Tables per scanner are padded to the longest scan.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -19,13 +20,85 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 
+class Beams(NamedTuple):
+    """The beams of all scanners.
+
+    Attributes
+    ----------
+    near_mm : (scanners, readings) float64
+        Below this a reading is new: nearer than the background.
+    direction : (scanners, readings, 2) float64
+        In the world.
+    origins : (scanners, 2) float64
+        In the world (m).
+    """
+
+    near_mm: FloatArray
+    direction: FloatArray
+    origins: FloatArray
+
+
+class Seen(NamedTuple):
+    """New readings of a set of scans.
+
+    Attributes
+    ----------
+    points : (n, 2) float64
+        In the world (m).
+    scanner : (n,) int64
+    direction : (n, 2) float64
+        Of the beams.
+    range_m : (n,) float64
+    """
+
+    points: FloatArray
+    scanner: IntArray
+    direction: FloatArray
+    range_m: FloatArray
+
+    def where(self, chosen: NDArray[np.bool_]) -> Seen:
+        """Those chosen."""
+        return Seen(
+            self.points[chosen], self.scanner[chosen], self.direction[chosen], self.range_m[chosen]
+        )
+
+
+class OutlineFit(NamedTuple):
+    """How an outline is fitted.
+
+    Attributes
+    ----------
+    floor_m : float
+        Standard deviation of what the outline and the scanner are not.
+    least_slope : float
+        Beams that graze a face count as if they met it at this sine.
+    gate_sigma, gate_m : float
+        Readings farther off do not count; metres in the first step.
+    prior_sigma_m : float
+        With it, open directions hold on to the start.
+    weak_sigma_m : float
+        Directions along which the standard deviation would be larger are open.
+    scale_m : float
+        A radian counts as this.
+    steps : int
+        At most.
+    """
+
+    floor_m: float
+    least_slope: float
+    gate_sigma: float
+    gate_m: float
+    prior_sigma_m: float
+    weak_sigma_m: float
+    scale_m: float
+    steps: int
+
+
 @njit(cache=True, error_model="numpy")
 def new_points(
     ranges_mm: NDArray[np.uint16],
     rows: IntArray,
-    near_mm: FloatArray,
-    beams: FloatArray,
-    origins: FloatArray,
+    beams: Beams,
     centre: FloatArray,
     reach_m: float,
     motion: FloatArray,
@@ -38,11 +111,7 @@ def new_points(
     ranges_mm : (scans, readings) uint16
     rows : (scanners,) int64
         Each scanner's scan of the set.
-    near_mm : (scanners, readings)
-        Below this a reading is new.
-    beams : (scanners, readings, 2)
-        Directions in the world.
-    origins : (scanners, 2)
+    beams : Beams
     centre : (2,)
         Points farther than `reach_m` from here are left out.
     motion : (5,)
@@ -75,17 +144,17 @@ def new_points(
         then_x, then_y = motion[3] - motion[0] * age, motion[4] - motion[1] * age
         for i in range(ranges_mm.shape[1]):
             r = float(ranges_mm[rows[s], i])
-            if r <= 0.0 or r >= near_mm[s, i]:
+            if r <= 0.0 or r >= beams.near_mm[s, i]:
                 continue
-            x = origins[s, 0] + 1e-3 * r * beams[s, i, 0]
-            y = origins[s, 1] + 1e-3 * r * beams[s, i, 1]
+            x = beams.origins[s, 0] + 1e-3 * r * beams.direction[s, i, 0]
+            y = beams.origins[s, 1] + 1e-3 * r * beams.direction[s, i, 1]
             dx, dy = x - centre[0], y - centre[1]
             if dx * dx + dy * dy > reach_m * reach_m:
                 continue
             dx, dy = x - then_x, y - then_y
             points[n, 0] = motion[3] + c * dx - sn * dy
             points[n, 1] = motion[4] + sn * dx + c * dy
-            bx, by = beams[s, i, 0], beams[s, i, 1]
+            bx, by = beams.direction[s, i, 0], beams.direction[s, i, 1]
             direction[n, 0], direction[n, 1] = c * bx - sn * by, sn * bx + c * by
             scanner[n] = s
             range_m[n] = 1e-3 * r
@@ -147,32 +216,20 @@ def fit_outline(
 
 @njit(cache=True, error_model="numpy")
 def refine_outline(
-    points: FloatArray,
-    scanner: IntArray,
-    direction: FloatArray,
-    range_m: FloatArray,
+    seen: Seen,
     faces: FloatArray,
     start: FloatArray,
     origins: FloatArray,
     sigmas_m: FloatArray,
-    floor_m: float,
-    least_slope: float,
-    gate_sigma: float,
-    gate_m: float,
-    prior_sigma_m: float,
-    weak_sigma_m: float,
-    scale_m: float,
-    steps: int,
+    fit: OutlineFit,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
     """Maximum likelihood pose of the outline near a start, by Gauss-Newton.
 
     A reading is uncertain along its beam: its distance from a face has the standard deviation
     sigma |n . beam|, and a floor for what the outline and the scanner are not. A reading belongs to
     the face that its beam meets first, whatever its noise; at first, while the pose may be off, to
-    the nearest one turned to the scanner. Readings farther off than `gate_sigma` do not count.
-
-    Directions along which the standard deviation would be larger than `weak_sigma_m`, a radian
-    counting as `scale_m`, hold on to the start with `prior_sigma_m`.
+    the nearest one turned to the scanner. Readings beyond the gate do not count, and open
+    directions hold on to the start (see `OutlineFit`).
 
     Returns
     -------
@@ -189,6 +246,7 @@ def refine_outline(
     information, gradient : (scanners, 3, 3), (scanners, 3)
         What the residuals say of each scanner's own pose.
     """
+    points, scanner, direction, range_m = seen
     many = sigmas_m.size
     pose = start.copy()
     normal = np.empty((faces.shape[0], 2))
@@ -203,7 +261,7 @@ def refine_outline(
     summary = np.zeros(4)
     weak = np.zeros(3)
     local_covariance: FloatArray = np.zeros((3, 3))
-    for step in range(steps):
+    for step in range(fit.steps):
         h = np.zeros((3, 3))
         g = np.zeros(3)
         cross = np.zeros((3, 3 * many))
@@ -230,7 +288,7 @@ def refine_outline(
                 if step == 0:
                     t = min(1.0, max(0.0, ((x - x1) * ex + (y - y1) * ey) / length2))
                     d = math.sqrt((x - x1 - t * ex) ** 2 + (y - y1 - t * ey) ** 2)
-                    if d > gate_m:
+                    if d > fit.gate_m:
                         continue
                 else:
                     # From the reading along its beam to the face: the beam's point there.
@@ -245,9 +303,9 @@ def refine_outline(
                 continue
             nx, ny = normal[face, 0], normal[face, 1]
             e = nx * (x - faces[face, 0]) + ny * (y - faces[face, 1])
-            across = min(nx * bx + ny * by, -least_slope) * sigmas_m[scanner[i]]
-            variance = across * across + floor_m * floor_m
-            if e * e > gate_sigma * gate_sigma * variance:
+            across = min(nx * bx + ny * by, -fit.least_slope) * sigmas_m[scanner[i]]
+            variance = across * across + fit.floor_m * fit.floor_m
+            if e * e > fit.gate_sigma * fit.gate_sigma * variance:
                 continue
             w = 1.0 / variance
             used += 1
@@ -289,7 +347,7 @@ def refine_outline(
         summary[3] = math.sqrt(squares / used)
         # Open directions are looked for about the middle of the points, theta in metres there.
         mx, my = sx / used, sy / used
-        scale = scale_m
+        scale = fit.scale_m
         for a in range(3):
             for b in range(a):
                 h[b, a] = h[a, b]
@@ -302,10 +360,10 @@ def refine_outline(
         turn = start[2] - pose[2]
         to_start = np.array([c * dx + s * dy, -s * dx + c * dy, turn])
         for k in range(3):
-            if values[k] < 1.0 / (weak_sigma_m * weak_sigma_m):
+            if values[k] < 1.0 / (fit.weak_sigma_m * fit.weak_sigma_m):
                 open_count += 1
                 row = np.ascontiguousarray(vectors[:, k]) @ there
-                p = 1.0 / (prior_sigma_m * prior_sigma_m)
+                p = 1.0 / (fit.prior_sigma_m * fit.prior_sigma_m)
                 ahead = row @ to_start
                 for a in range(3):
                     g[a] -= p * row[a] * ahead
@@ -316,7 +374,7 @@ def refine_outline(
         weak[0], weak[1], weak[2] = c * v[0] - s * v[1], s * v[0] + c * v[1], v[2]
         local_covariance[:, :] = np.linalg.inv(h)
         delta = -local_covariance @ g
-        if step == steps - 1 or (
+        if step == fit.steps - 1 or (
             step > 0 and math.sqrt(delta[0] ** 2 + delta[1] ** 2) + abs(delta[2]) < 1e-6
         ):
             break
@@ -334,9 +392,7 @@ def refine_outline(
 def explain_set(
     ranges_mm: NDArray[np.uint16],
     rows: IntArray,
-    near_mm: FloatArray,
-    beams: FloatArray,
-    origins: FloatArray,
+    beams: Beams,
     faces: FloatArray,
     middle: FloatArray,
     radius_m: float,
@@ -359,12 +415,12 @@ def explain_set(
     for q in range(rows.size):
         if rows[q] < 0:
             continue
-        to_x, to_y = centre_x - origins[q, 0], centre_y - origins[q, 1]
-        ox = -c * (pose[0] - origins[q, 0]) - s * (pose[1] - origins[q, 1])
-        oy = s * (pose[0] - origins[q, 0]) - c * (pose[1] - origins[q, 1])
+        to_x, to_y = centre_x - beams.origins[q, 0], centre_y - beams.origins[q, 1]
+        ox = -c * (pose[0] - beams.origins[q, 0]) - s * (pose[1] - beams.origins[q, 1])
+        oy = s * (pose[0] - beams.origins[q, 0]) - c * (pose[1] - beams.origins[q, 1])
         for i in range(ranges_mm.shape[1]):
-            bx, by = beams[q, i, 0], beams[q, i, 1]
-            if near_mm[q, i] <= 0.0:
+            bx, by = beams.direction[q, i, 0], beams.direction[q, i, 1]
+            if beams.near_mm[q, i] <= 0.0:
                 continue
             off = to_x * by - to_y * bx
             ahead = to_x * bx + to_y * by
@@ -383,7 +439,7 @@ def explain_set(
                 if r > 0.0 and 0.0 <= t <= 1.0 and r < best:
                     best = r
             reading = 1e-3 * ranges_mm[rows[q], i]
-            if best < 1e-3 * near_mm[q, i]:
+            if best < 1e-3 * beams.near_mm[q, i]:
                 out[0] += 1
                 if reading <= 0.0:
                     out[4] += 1
@@ -393,6 +449,6 @@ def explain_set(
                     out[3] += 1
                 else:
                     out[1] += 1
-            elif 0.0 < reading < 1e-3 * near_mm[q, i] and abs(reading - ahead) < radius_m:
+            elif 0.0 < reading < 1e-3 * beams.near_mm[q, i] and abs(reading - ahead) < radius_m:
                 out[5] += 1
     return out

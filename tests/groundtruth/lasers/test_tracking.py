@@ -14,7 +14,7 @@ from groundtruth.commands.laser import perform
 from groundtruth.commands.options import Laser
 from groundtruth.errors import GroundTruthError
 from groundtruth.geometry.plane import compose, invert
-from groundtruth.lasers.acquisition import AGREES_M, Seen, acquire, explain, refine, robot_body
+from groundtruth.lasers.acquisition import AGREES_M, acquire, explain, refine, robot_body
 from groundtruth.lasers.background import learn_background
 from groundtruth.lasers.blocks import combined_poses
 from groundtruth.lasers.scanners import Robot, Scanner
@@ -23,7 +23,7 @@ from groundtruth.lasers.sets import ScannerTables, ScanSets, scanner_tables, set
 from groundtruth.lasers.settings import LaserSettings
 from groundtruth.lasers.suspects import track_robot, track_without_suspects
 from groundtruth.lasers.tracking import COASTING, LOST, OK, REACQUIRED, UNDETERMINED, UNRESOLVED
-from groundtruth.lasers.tracking_kernels import explain_set, fit_outline, new_points
+from groundtruth.lasers.tracking_kernels import Beams, Seen, explain_set, fit_outline, new_points
 from groundtruth.trajectories.streams import read_planar_poses
 from landmarks import wrap_angle
 from tests.groundtruth.lasers.scene import (
@@ -73,8 +73,8 @@ def one_set(
 def seen_in(sets: ScanSets, tables: ScannerTables, pose: FloatArray, index: int = 0) -> Seen:
     return Seen(
         *new_points(
-            sets.ranges_mm, sets.rows[index], tables.near_mm, tables.beams, tables.origins,
-            pose[:2], 2.0, np.zeros(5), sets.ages_s[index],
+            sets.ranges_mm, sets.rows[index], tables.as_beams(), pose[:2], 2.0, np.zeros(5),
+            sets.ages_s[index],
         )
     )  # fmt: skip
 
@@ -92,8 +92,9 @@ def test_points_are_moved_on_with_the_robot() -> None:
     length = np.hypot(*ray)
     ranges = np.array([[round(1e3 * length)]], dtype=np.uint16)
     points, _, _, range_m = new_points(
-        ranges, np.zeros(1, dtype=np.int64), np.full((1, 1), 1e9), (ray / length)[None, None],
-        origin[None], pose[:2], 1.0, np.array([*motion, *pose[:2]]), np.array([age]),
+        ranges, np.zeros(1, dtype=np.int64),
+        Beams(np.full((1, 1), 1e9), (ray / length)[None, None], origin[None]), pose[:2], 1.0,
+        np.array([*motion, *pose[:2]]), np.array([age]),
     )  # fmt: skip
     c, s = np.cos(pose[2]), np.sin(pose[2])
     expected = pose[:2] + np.array([c * mark[0] - s * mark[1], s * mark[0] + c * mark[1]])
@@ -197,8 +198,8 @@ def test_beams_that_agree_see_through_and_are_hidden(
     without = sets.rows[0].copy()
     without[:] = -1
     assert not explain_set(
-        sets.ranges_mm, without, tables.near_mm, tables.beams, tables.origins, body.faces,
-        body.middle, body.radius_m, pose, AGREES_M,
+        sets.ranges_mm, without, tables.as_beams(), body.faces, body.middle, body.radius_m, pose,
+        AGREES_M,
     ).any()  # fmt: skip
 
 
