@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from landmarks import wrap_angle
-from slam.association.line_points_kernels import best_run, crossings, scores_of
+from slam.association.line_points_kernels import Detection, Rays, best_run, crossings, scores_of
 from slam.association.loop_path import intersect_bearings, solve_path
 from slam.errors import SlamError
 from slam.models.measurement import disc_in_map
@@ -100,42 +100,6 @@ class PointSettings:
             window_frames=whole(1),
             path_rows=whole(1),
         )
-
-
-@dataclass(frozen=True, eq=False)
-class Rays:
-    """Rows of verticals in the map.
-
-    Attributes
-    ----------
-    centre : (n, 2) float64
-        The camera's place (m).
-    angle : (n,) float64
-        Bearing in the map (rad).
-    sigma : (n,) float64
-        Of it (rad).
-    frame : (n,) int64
-        Ascending from 0.
-    start : (F + 1,) int64
-        Rays start[f] to start[f + 1] are those of frame f.
-    heading : (F,) float64
-        Of the robot (rad).
-    widest_rad : float
-        Half the field of view.
-    """
-
-    centre: FloatArray
-    angle: FloatArray
-    sigma: FloatArray
-    frame: IntArray
-    start: IntArray
-    heading: FloatArray
-    widest_rad: float
-
-    @property
-    def clutter(self) -> float:
-        """Rays per frame and radian."""
-        return len(self.angle) / len(self.heading) / (2.0 * self.widest_rad)
 
 
 def lines_by_points(
@@ -260,29 +224,13 @@ def find_points(rays: Rays, setting: PointSettings) -> tuple[IntArray, FloatArra
     """
     window = setting.window_frames
     points, frames = crossings(
-        rays.centre,
-        rays.angle,
-        rays.sigma,
-        rays.frame,
-        rays.start,
+        rays,
         np.array(setting.gaps, dtype=np.int64),
         setting.least_parallax_sigmas,
         setting.farthest_m,
     )
-    scores = scores_of(
-        points,
-        frames,
-        rays.centre,
-        rays.angle,
-        rays.sigma,
-        rays.start,
-        window,
-        rays.heading,
-        rays.widest_rad,
-        rays.clutter,
-        setting.detected,
-        setting.gate_sigmas,
-    )
+    detection = Detection(setting.detected, setting.gate_sigmas)
+    scores = scores_of(points, frames, rays, window, detection)
     free = np.ones(len(rays.angle), dtype=np.bool_)
     rows = np.empty(len(rays.heading), dtype=np.int64)
     labels = np.full(len(free), -1, dtype=np.int64)
@@ -293,24 +241,7 @@ def find_points(rays: Rays, setting: PointSettings) -> tuple[IntArray, FloatArra
 
     def run(place: FloatArray, first: int, last: int) -> float:
         """The score of a place by what is left; its rows are in `rows` then."""
-        return float(
-            best_run(
-                place,
-                rays.centre,
-                rays.angle,
-                rays.sigma,
-                rays.start,
-                free,
-                first,
-                last,
-                rays.heading,
-                rays.widest_rad,
-                rays.clutter,
-                setting.detected,
-                setting.gate_sigmas,
-                rows,
-            )
-        )
+        return float(best_run(place, rays, free, first, last, detection, rows))
 
     while waiting:
         _, k = heapq.heappop(waiting)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -11,6 +12,52 @@ from numpy.typing import NDArray
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
+
+
+class Rays(NamedTuple):
+    """Rows of verticals in the map.
+
+    Attributes
+    ----------
+    centre : (n, 2) float64
+        The camera's place (m).
+    angle : (n,) float64
+        Bearing in the map (rad).
+    sigma : (n,) float64
+        Of it (rad).
+    frame : (n,) int64
+        Ascending from 0.
+    start : (F + 1,) int64
+        Rays start[f] to start[f + 1] are those of frame f.
+    heading : (F,) float64
+        Of the robot (rad).
+    widest_rad : float
+        Half the field of view.
+    """
+
+    centre: FloatArray
+    angle: FloatArray
+    sigma: FloatArray
+    frame: IntArray
+    start: IntArray
+    heading: FloatArray
+    widest_rad: float
+
+
+class Detection(NamedTuple):
+    """How verticals are detected.
+
+    Attributes
+    ----------
+    probability : float
+        That a vertical in view gives a row.
+    gate : float
+        Standard deviations within which a ray may be that row.
+    """
+
+    probability: float
+    gate: float
+
 
 _NEAREST_M = 0.3
 _ROOT_TWO_PI = math.sqrt(2.0 * math.pi)
@@ -35,11 +82,7 @@ def _crossing(centre: FloatArray, angle: FloatArray, i: int, j: int) -> tuple[fl
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def crossings(
-    centre: FloatArray,
-    angle: FloatArray,
-    sigma: FloatArray,
-    frame: IntArray,
-    start: IntArray,
+    rays: Rays,
     gaps: IntArray,
     least_parallax: float,
     farthest_m: float,
@@ -48,16 +91,7 @@ def crossings(
 
     Parameters
     ----------
-    centre : (n, 2) float64
-        Origins of the rays in the map (m).
-    angle : (n,) float64
-        Their bearings in the map (rad).
-    sigma : (n,) float64
-        Of those.
-    frame : (n,) int64
-        The frame of each, ascending.
-    start : (F + 1,) int64
-        The rays of frame f are start[f] to start[f + 1].
+    rays : Rays
     gaps : (g,) int64
         Distances of frames that are tried.
     least_parallax : float
@@ -71,6 +105,7 @@ def crossings(
     frames : (k,) int64
         The first of the two frames.
     """
+    centre, angle, sigma, frame, start = rays.centre, rays.angle, rays.sigma, rays.frame, rays.start
     points = []
     frames = []
     for i in range(len(angle)):
@@ -94,46 +129,29 @@ def crossings(
 @njit(cache=True, error_model="numpy", nogil=True)
 def best_run(
     point: FloatArray,
-    centre: FloatArray,
-    angle: FloatArray,
-    sigma: FloatArray,
-    start: IntArray,
+    rays: Rays,
     free: BoolArray,
     first: int,
     last: int,
-    heading: FloatArray,
-    widest_rad: float,
-    clutter: float,
-    detected: float,
-    gate: float,
+    detection: Detection,
     rows: IntArray,
 ) -> float:
-    """The unbroken stretch of frames that speaks most for a vertical at a point.
+    """The unbroken stretch of frames with the most evidence for a vertical at a point.
 
-    A frame in which a ray passes within the gate speaks for it by the logarithm of how much
-    likelier the ray is from there than from anywhere; one without such a ray, though the point is
-    in the field of view, against it by that of the probability to miss a vertical.
+    A frame in which a ray passes within the gate adds the logarithm of how much likelier the ray is
+    from there than from anywhere; one without such a ray, though the point is in the field of view,
+    adds that of the probability to miss a vertical.
 
     Parameters
     ----------
     point : (2,) float64
         In the map (m).
-    centre, angle, sigma, start
-        The rays, see `crossings`.
+    rays : Rays
     free : (n,) bool
         Rays that may be used.
     first, last : int
-        Frames that are looked at, the second one excluded.
-    heading : (F,) float64
-        Of the robot in each frame (rad).
-    widest_rad : float
-        Half the field of view.
-    clutter : float
-        Rays per frame and radian.
-    detected : float
-        Probability that a vertical in view gives a row.
-    gate : float
-        Standard deviations.
+        Frames considered, the second one excluded.
+    detection : Detection
     rows : (F,) int64
         Is filled with the row of each frame of that stretch, -1 where there is none.
 
@@ -142,23 +160,26 @@ def best_run(
     float
         The sum over the stretch.
     """
+    start, angle, sigma = rays.start, rays.angle, rays.sigma
+    # Rays from anywhere, per frame and radian.
+    clutter = len(angle) / len(rays.heading) / (2.0 * rays.widest_rad)
     best, total = 0.0, 0.0
     best_first, best_last, began = first, first, first
     for f in range(first, last):
         rows[f] = -1
         if start[f] == start[f + 1]:
             continue
-        x, y = point[0] - centre[start[f], 0], point[1] - centre[start[f], 1]
+        x, y = point[0] - rays.centre[start[f], 0], point[1] - rays.centre[start[f], 1]
         if math.hypot(x, y) < _NEAREST_M:
             continue
         bearing = math.atan2(x, -y)
-        if abs(_wrapped(bearing - heading[f])) > widest_rad:
+        if abs(_wrapped(bearing - rays.heading[f])) > rays.widest_rad:
             continue
-        gained = math.log(1.0 - detected)
+        gained = math.log(1.0 - detection.probability)
         for i in range(start[f], start[f + 1]):
             off = _wrapped(bearing - angle[i]) / sigma[i]
-            if free[i] and abs(off) < gate:
-                likelier = detected / (sigma[i] * _ROOT_TWO_PI * clutter)
+            if free[i] and abs(off) < detection.gate:
+                likelier = detection.probability / (sigma[i] * _ROOT_TWO_PI * clutter)
                 value = math.log(likelier) - 0.5 * off * off
                 if value > gained:
                     gained, rows[f] = value, i
@@ -175,39 +196,14 @@ def best_run(
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def scores_of(
-    points: FloatArray,
-    frames: IntArray,
-    centre: FloatArray,
-    angle: FloatArray,
-    sigma: FloatArray,
-    start: IntArray,
-    window: int,
-    heading: FloatArray,
-    widest_rad: float,
-    clutter: float,
-    detected: float,
-    gate: float,
+    points: FloatArray, frames: IntArray, rays: Rays, window: int, detection: Detection
 ) -> FloatArray:
-    """`best_run` of many points, all rays being free; each looks `window` frames both ways."""
-    count = len(start) - 1
+    """`best_run` of many points, all rays being free; each considers `window` frames both ways."""
+    count = len(rays.start) - 1
     rows = np.empty(count, dtype=np.int64)
-    free = np.ones(len(angle), dtype=np.bool_)
+    free = np.ones(len(rays.angle), dtype=np.bool_)
     scores = np.empty(len(points))
     for k in range(len(points)):
-        scores[k] = best_run(
-            points[k],
-            centre,
-            angle,
-            sigma,
-            start,
-            free,
-            max(0, frames[k] - window),
-            min(count, frames[k] + window),
-            heading,
-            widest_rad,
-            clutter,
-            detected,
-            gate,
-            rows,
-        )
+        first, last = max(0, frames[k] - window), min(count, frames[k] + window)
+        scores[k] = best_run(points[k], rays, free, first, last, detection, rows)
     return scores

@@ -22,7 +22,7 @@ from slam.association.compatibility import (
     nearest_compatible,
 )
 from slam.filters.frames import FrameRows
-from slam.filters.innovation_kernels import frame_innovation
+from slam.filters.innovation_kernels import MeasuredDiscs, MeasuredLines, frame_innovation
 from slam.recording import UNKNOWN_ID
 
 FloatArray = NDArray[np.float64]
@@ -38,8 +38,11 @@ FARTHEST_LINE_M = 15.0
 # A disc may be so far from where its row says (m), and so many standard deviations of the pose.
 _NEAR_M, _NEAR_SIGMAS = 0.6, 4.0
 
-_NO_DISCS = (np.zeros(0, dtype=np.int64), np.zeros((0, 2)), np.zeros((0, 2, 2)))
-_NO_LINES = (np.zeros(0, dtype=np.int64), np.zeros(1, dtype=np.int64), np.zeros(0), np.zeros(0))
+_NONE = np.zeros(0, dtype=np.int64)
+_NO_DISCS = MeasuredDiscs(_NONE, np.zeros((0, 2)), np.zeros((0, 2, 2)))
+_NO_LINES = MeasuredLines(
+    np.zeros(0, dtype=np.int64), np.zeros(1, dtype=np.int64), np.zeros(0), np.zeros(0)
+)
 
 
 class Estimate(Protocol):
@@ -110,10 +113,8 @@ class Associator:
             prediction, jacobian, _, index = frame_innovation(
                 estimate.state,
                 estimate.state,
-                slots,
-                np.zeros((len(slots), 2)),
-                np.zeros((len(slots), 2, 2)),
-                *_NO_LINES,
+                MeasuredDiscs(slots, np.zeros((len(slots), 2)), np.zeros((len(slots), 2, 2))),
+                _NO_LINES,
                 estimate.camera_xy,
             )
             predicted = jacobian @ estimate.block(index) @ jacobian.T
@@ -139,11 +140,10 @@ class Associator:
         prediction, jacobian, _, index = frame_innovation(
             state,
             state,
-            *_NO_DISCS,
-            slots,
-            np.arange(len(slots) + 1),
-            np.zeros(len(slots)),
-            np.zeros(len(slots)),
+            _NO_DISCS,
+            MeasuredLines(
+                slots, np.arange(len(slots) + 1), np.zeros(len(slots)), np.zeros(len(slots))
+            ),
             estimate.camera_xy,
         )
         innovation = wrap_angle(rows.bearing_rad[:, None] + prediction)

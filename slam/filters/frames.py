@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from landmarks.map_file import Path2D
-from slam.filters.innovation_kernels import frame_innovation
+from slam.filters.innovation_kernels import MeasuredDiscs, MeasuredLines, frame_innovation
 from slam.recording import UNKNOWN_ID, Recording
 
 FloatArray = NDArray[np.float64]
@@ -83,13 +83,17 @@ class FrameRows:
         return frame_innovation(
             state,
             linearised_at,
-            np.array([disc_slots[self.disc_ids[k]] for k in discs], dtype=np.int64),
-            self.disc_xy[discs],
-            self.disc_covariance[discs],
-            np.array([line_slots[i] for ids in line_ids for i in ids], dtype=np.int64),
-            np.cumsum([0, *map(len, line_ids)]),
-            self.bearing_rad[lines],
-            self.sigma_rad[lines],
+            MeasuredDiscs(
+                np.array([disc_slots[self.disc_ids[k]] for k in discs], dtype=np.int64),
+                self.disc_xy[discs],
+                self.disc_covariance[discs],
+            ),
+            MeasuredLines(
+                np.array([line_slots[i] for ids in line_ids for i in ids], dtype=np.int64),
+                np.cumsum([0, *map(len, line_ids)]),
+                self.bearing_rad[lines],
+                self.sigma_rad[lines],
+            ),
             camera_xy,
         )
 

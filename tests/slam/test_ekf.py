@@ -12,7 +12,7 @@ from landmarks import wrap_angle
 from slam.errors import SlamError
 from slam.filters.association import Associator
 from slam.filters.ekf_slam import EkfSlam, JacobiansAt, run_ekf
-from slam.filters.innovation_kernels import frame_innovation
+from slam.filters.innovation_kernels import MeasuredDiscs, MeasuredLines, frame_innovation
 from slam.filters.joint_covariance import JointCovariance
 from slam.models.measurement import (
     disc_in_map,
@@ -273,30 +273,11 @@ def test_frame_jacobian_is_the_derivative_of_the_prediction() -> None:
     state = np.concatenate([[0.3, -0.2, 0.4], rng.uniform(-3, 3, 6)])
     discs, covariance = rng.normal(0, 1, (2, 2)), np.tile(np.eye(2), (2, 1, 1))
 
-    def innovation(x: FloatArray) -> FloatArray:
-        return frame_innovation(
-            x,
-            x,
-            np.array([3, 5]),
-            discs,
-            covariance,
-            np.array([7]),
-            np.array([0, 1]),
-            np.array([0.2]),
-            np.array([0.1]),
-            CAMERA_XY,
-        )[0]
+    disc_rows = MeasuredDiscs(np.array([3, 5]), discs, covariance)
+    line_rows = MeasuredLines(np.array([7]), np.array([0, 1]), np.array([0.2]), np.array([0.1]))
 
-    jacobian = frame_innovation(
-        state,
-        state,
-        np.array([3, 5]),
-        discs,
-        covariance,
-        np.array([7]),
-        np.array([0, 1]),
-        np.array([0.2]),
-        np.array([0.1]),
-        CAMERA_XY,
-    )[1]
+    def innovation(x: FloatArray) -> FloatArray:
+        return frame_innovation(x, x, disc_rows, line_rows, CAMERA_XY)[0]
+
+    jacobian = frame_innovation(state, state, disc_rows, line_rows, CAMERA_XY)[1]
     np.testing.assert_allclose(jacobian, -check_jacobian(innovation, state), atol=1e-7)

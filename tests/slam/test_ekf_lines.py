@@ -10,7 +10,7 @@ from slam.errors import SlamError
 from slam.filters.association import Associator
 from slam.filters.delayed_lines import start_line, triangulate
 from slam.filters.ekf_slam import EkfSlam, JacobiansAt, run_ekf
-from slam.filters.innovation_kernels import frame_innovation
+from slam.filters.innovation_kernels import MeasuredDiscs, MeasuredLines, frame_innovation
 from slam.filters.views import MOST_KEPT_POSES
 from slam.models.measurement import (
     bearing_jacobians,
@@ -188,13 +188,8 @@ def test_a_row_of_several_lines_measures_the_mean_of_their_bearings() -> None:
     innovation, jacobian, noise, index = frame_innovation(
         state,
         state,
-        np.array([7]),
-        rng.normal(0, 1, (1, 2)),
-        spd(rng, 2, 0.1)[None],
-        np.array([3, 5]),
-        np.array([0, 2]),
-        np.array([0.5]),
-        np.array([0.01]),
+        MeasuredDiscs(np.array([7]), rng.normal(0, 1, (1, 2)), spd(rng, 2, 0.1)[None]),
+        MeasuredLines(np.array([3, 5]), np.array([0, 2]), np.array([0.5]), np.array([0.01])),
         CAMERA_XY,
     )
     places = state[3:7].reshape(2, 2)
@@ -215,13 +210,10 @@ def test_bearings_behind_do_not_jump() -> None:
     innovation = frame_innovation(
         state,
         state,
-        np.zeros(0, dtype=np.int64),
-        np.zeros((0, 2)),
-        np.zeros((0, 2, 2)),
-        np.array([3]),
-        np.array([0, 1]),
-        np.array([-np.pi + 0.001]),
-        np.array([0.01]),
+        MeasuredDiscs(np.zeros(0, dtype=np.int64), np.zeros((0, 2)), np.zeros((0, 2, 2))),
+        MeasuredLines(
+            np.array([3]), np.array([0, 1]), np.array([-np.pi + 0.001]), np.array([0.01])
+        ),
         np.zeros(2),
     )[0]
     assert innovation[0] == pytest.approx(0.003, abs=1e-5)
