@@ -8,7 +8,8 @@ and Numba gets ready where there is something to compile.
 What is compiled is kept as Numba keeps it, but for one thing: it names machine code in the index of
 a kernel before it writes it. A process that is killed in between, or finds no room, would leave an
 index that vouches for what an earlier version of the kernel left under that name, and another one
-that looks at that moment would take it. So such files are removed first.
+that looks at that moment would take it. So such files are removed first. And an index that cannot be
+read, because it names classes of another version of the program, counts as empty.
 
 Attributes of Numba that are not public are used for it; where they have changed, everything is done
 as Numba does it.
@@ -54,6 +55,7 @@ def load_kernels_alone() -> bool:
         environment: Any = import_module("numba.core.environment")
         runtime: Any = import_module("numba.core.runtime").rtsys
         numbas_own = cache_class.load_overload
+        numbas_load_index = file_class._load_index
         numbas_save_index = file_class._save_index
         for holder, name in (
             (cache_class, "_load_overload"),
@@ -90,7 +92,15 @@ def load_kernels_alone() -> bool:
                 os.unlink(self._data_path(name))  # noqa: PTH108 - a string, as Numba has it
         numbas_save_index(self, overloads)
 
+    def load_index(self: Any) -> dict[Any, str]:
+        try:
+            indexed: dict[Any, str] = numbas_load_index(self)
+        except Exception:
+            return {}  # written by another version, whose classes are no longer there
+        return indexed
+
     cache_class.load_overload = load_overload
+    file_class._load_index = load_index
     file_class._save_index = save_index
     return True
 

@@ -137,13 +137,12 @@ class Associator:
         slots, names = slots[away < FARTHEST_LINE_M], names[away < FARTHEST_LINE_M]
         if not len(slots):
             return ((),) * len(rows.line_ids)
+        zeros = np.zeros(len(slots))
         prediction, jacobian, _, index = frame_innovation(
             state,
             state,
             _NO_DISCS,
-            MeasuredLines(
-                slots, np.arange(len(slots) + 1), np.zeros(len(slots)), np.zeros(len(slots))
-            ),
+            MeasuredLines(slots, np.arange(len(slots) + 1), zeros, zeros),
             estimate.camera_xy,
         )
         innovation = wrap_angle(rows.bearing_rad[:, None] + prediction)

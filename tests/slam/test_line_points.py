@@ -9,7 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from landmarks import wrap_angle
-from slam.association.line_points import PointSettings, Rays, find_points, lines_by_points, rays_of
+from slam.association.line_points import PointSettings, find_points, lines_by_points, rays_of
+from slam.association.line_points_kernels import Rays
 from slam.association.score import score_association
 from slam.errors import SlamError
 from slam.models.measurement import bearing_of_vertical

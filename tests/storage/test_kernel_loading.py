@@ -126,6 +126,33 @@ def test_a_process_killed_while_it_keeps_a_kernel_vouches_for_no_earlier_one(
     assert said(tmp_path, program=program) == ["2.0"]
 
 
+PAIRED = """
+from typing import NamedTuple
+from numba import njit
+
+class {name}(NamedTuple):
+    first: float
+    second: float
+
+@njit(cache=True)
+def total(pair):
+    return pair.first + pair.second
+
+def of(first, second):
+    return total({name}(first, second))
+"""
+
+
+def test_an_index_of_an_earlier_version_with_other_classes_counts_as_empty(tmp_path: Path) -> None:
+    program = (
+        "from storage.kernel_loading import load_kernels_alone; load_kernels_alone()\n"
+        "from kernels import of; print(of(1.0, 2.0))"
+    )
+    for name in ("Pair", "Couple"):
+        (tmp_path / "kernels.py").write_text(PAIRED.format(name=name))
+        assert said(tmp_path, program=program) == ["3.0"]
+
+
 def test_a_numba_without_the_attributes_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     from numba.core import environment
     from numba.core.caching import Cache
