@@ -8,8 +8,8 @@ and Numba gets ready where there is something to compile.
 What is compiled is kept as Numba keeps it, but for one thing: it names machine code in the index of
 a kernel before it writes it. A process that is killed in between, or finds no room, would leave an
 index that vouches for what an earlier version of the kernel left under that name, and another one
-that looks at that moment would take it. So such files are removed first. And an index that cannot be
-read, because it names classes of another version of the program, counts as empty.
+that looks at that moment would take it. So such files are removed first. And an index that cannot
+be read, because it names classes of another version of the program, counts as empty.
 
 Attributes of Numba that are not public are used for it; where they have changed, everything is done
 as Numba does it.
