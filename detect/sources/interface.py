@@ -6,7 +6,7 @@ import re
 from collections.abc import Generator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -164,8 +164,3 @@ def only_calibration(folder: Path, stem: str) -> Calibration | None:
         names = ", ".join(path.name for path in found[:4])
         raise DetectError(f"{folder}: several calibrations ({names}): name one by --camera")
     return Calibration(read_camera(found[0])) if found else None
-
-
-def unpacked(pixels: NDArray[Any]) -> NDArray[np.uint8]:
-    """Grey values as an array of their own, which does not keep what they were cut from."""
-    return np.array(pixels, dtype=np.uint8, order="C")

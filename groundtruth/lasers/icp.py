@@ -19,7 +19,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial import cKDTree
 from scipy.special import ndtri
 
 from groundtruth.errors import GeometryError, GroundTruthError
@@ -28,11 +27,6 @@ from storage.bounds import ABOVE_0, SHARE_ABOVE_0, demand, whole
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
-
-#: Points whose neighbourhood is wider than this share of its length lie on no line.
-_LARGEST_SPREAD = 0.3
-
-_NEIGHBOURS = 7
 
 
 @dataclass(frozen=True)
@@ -108,60 +102,6 @@ class IcpResult:
     steps: int
     converged: bool
     undetermined: FloatArray
-
-
-def icp_to_points(
-    points: ArrayLike,
-    target: ArrayLike,
-    start: ArrayLike = (0.0, 0.0, 0.0),
-    settings: IcpSettings | None = None,
-    tree: Any = None,
-) -> IcpResult:
-    """Align points with a cloud of target points.
-
-    Parameters
-    ----------
-    points : (n, 2) array
-        To be moved (m).
-    target : (m, 2) array
-        In the frame that the pose leads to (m).
-    start : (3,) array
-        Pose to start from.
-    settings : IcpSettings, optional
-    tree : scipy.spatial.cKDTree, optional
-        Of the target, if there is one already.
-
-    Returns
-    -------
-    IcpResult
-        Its covariance takes the target for samples of lines, whose directions come from their
-        neighbourhoods: sliding along them is not determined, however well the points lie.
-
-    Raises
-    ------
-    GeometryError
-        If fewer than three pairs are within the gate.
-    GroundTruthError
-        If a shape is wrong or a number not finite.
-    """
-    cloud = _checked(target, 2, "target")
-    tree = cKDTree(cloud) if tree is None else tree
-
-    def nearest(world: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        distance, index = tree.query(world)
-        return cloud[index], distance**2, index
-
-    def normals_of(world: FloatArray, index: FloatArray) -> FloatArray:
-        _, near = tree.query(cloud[index], k=min(_NEIGHBOURS, len(cloud)))
-        around = cloud[near.reshape(len(index), -1)]
-        around = around - around.mean(axis=1, keepdims=True)
-        scatter = np.einsum("nki,nkj->nij", around, around)
-        values, vectors = np.linalg.eigh(scatter)
-        line = values[:, 0] <= _LARGEST_SPREAD**2 * values[:, 1]
-        # A point on no line says nothing that could be relied on.
-        return np.where(line[:, None], vectors[:, :, 0], 0.0)
-
-    return _icp(_checked(points, 2, "points"), nearest, normals_of, start, settings)
 
 
 def icp_to_segments(

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from groundtruth.errors import GeometryError, GroundTruthError
 from groundtruth.geometry.plane import apply, between, compose, composed_covariance, invert
-from groundtruth.lasers.icp import IcpSettings, icp_to_points, icp_to_segments, trimmed_variance
+from groundtruth.lasers.icp import IcpSettings, icp_to_segments, trimmed_variance
 from groundtruth.lasers.icp_kernels import (
     moved,
     nearest_on_segments,
@@ -112,16 +112,6 @@ def test_exact_points_give_the_exact_pose(dx: float, dy: float, dt: float, seed:
     assert len(result.undetermined) == 0
 
 
-def test_points_to_points() -> None:
-    rng = np.random.default_rng(4)
-    true = np.array([0.1, -0.05, 0.04])
-    target = on_walls(ROOM, 4000, rng)
-    points = apply(invert(true), on_walls(ROOM, 300, rng))
-    result = icp_to_points(points, target, settings=IcpSettings(kept=0.95))
-    assert result.pose[:2] == pytest.approx(true[:2], abs=5e-3)
-    assert result.pose[2] == pytest.approx(true[2], abs=2e-3)
-
-
 def test_outliers_beyond_the_gate_and_the_worst_share_do_not_count() -> None:
     rng = np.random.default_rng(5)
     points = on_walls(ROOM, 200, rng)
@@ -187,7 +177,7 @@ def test_bad_input_is_said() -> None:
     with pytest.raises(GroundTruthError, match="segments of shape"):
         icp_to_segments(np.zeros((10, 2)), ROOM[:, :3])
     with pytest.raises(GroundTruthError, match="not finite"):
-        icp_to_points(np.full((10, 2), np.nan), np.zeros((10, 2)))
+        icp_to_segments(np.full((10, 2), np.nan), ROOM)
     with pytest.raises(GroundTruthError, match="start"):
         icp_to_segments(np.zeros((10, 2)), ROOM, (0.0, 0.0))
     with pytest.raises(GroundTruthError, match="gate_m"):
