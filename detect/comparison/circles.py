@@ -36,8 +36,8 @@ from detect.comparison.result import (
     Levelling,
     NormalisedError,
 )
-from detect.runs.image_names import image_name
 from detect.seen import FrameView, Tilt, image_positions, level_seen
+from detect.sources.image_names import image_name
 from landmarks import (
     Association,
     CircleLandmark,

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Generic, TypeVar
 
 from detect.comparison.result import CompareError
-from detect.runs.image_names import image_name
+from detect.sources.image_names import image_name
 from landmarks import Association, CircleLandmark, Frame, LineLandmark
 
 RowType = TypeVar("RowType", bound=CircleLandmark | LineLandmark)

@@ -9,9 +9,9 @@ from pathlib import Path
 from detect.drawing.head import FileHead, read_head
 from detect.errors import DetectError
 from detect.run import ImageRun
-from detect.runs.image_names import image_name
 from detect.runs.known import FramesByImage, TiltsByImage
 from detect.seen import Tilt
+from detect.sources.image_names import image_name
 from detect.viewing_options import RowFiles
 from landmarks import CircleLandmark, FrameTilt, LineLandmark, MarkerLandmark
 

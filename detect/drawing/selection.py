@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from detect.errors import DetectError
 from detect.run import Frames, RunFrame
-from detect.runs.image_names import image_name
+from detect.sources.image_names import image_name
 
 _RANGE = re.compile(r"(\d*):(\d*)(?::(\d+))?")
 
@@ -24,7 +24,7 @@ class FrameSelection:
     ranges : tuple of range
         Positions in the run.
     names : frozenset of str
-        Images, as `detect.runs.image_names.image_name` gives them.
+        Images, as `detect.sources.image_names.image_name` gives them.
 
     Without ranges and names, all frames are selected.
     """

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from detect.errors import FrameError
-from detect.runs.image_bounds import bounded_content, demand_bounded
+from detect.sources.image_bounds import bounded_content, demand_bounded
 from storage.image_header import without_orientation
 
 #: What an image of 16 bits may hold.

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from detect.errors import DetectError
 from detect.run import Frames, RunFrame
-from detect.runs.name_index import NameIndex
 from detect.sources.interface import PoseStream, Source, SourceImage, TimedPose
+from detect.sources.name_index import NameIndex
 from detect.sources.steps import movement_between, pose_between, step_of
 from landmarks import Step, iterate_prefixes, iterate_steps
 

@@ -19,7 +19,7 @@ from detect.run import (
     open_images,
     open_run,
 )
-from detect.runs.image_names import IMAGE_SUFFIXES, images_of_folder
+from detect.sources.image_names import IMAGE_SUFFIXES, images_of_folder
 from detect.sources.options import SourceOptions
 
 if TYPE_CHECKING:

@@ -6,8 +6,8 @@ from collections.abc import Generator
 from pathlib import Path
 
 from detect.errors import DetectError
-from detect.runs.image_names import IMAGE_SUFFIXES, ImageNames
 from detect.sources.gray import significant_bits_of_file
+from detect.sources.image_names import IMAGE_SUFFIXES, ImageNames
 from detect.sources.interface import (
     Calibration,
     PoseStream,

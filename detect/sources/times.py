@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from detect.errors import DetectError
-from detect.runs.name_index import NameIndex
+from detect.sources.name_index import NameIndex
 
 #: Stands at the head of a file of times.
 TIMES_HEAD = "Times of the frames: <image> <seconds>, as their source gives them."

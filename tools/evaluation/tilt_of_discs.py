@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from camera import Camera
-from detect.runs.image_names import image_name
 from detect.seen import image_positions
+from detect.sources.image_names import image_name
 from landmarks import Frame, read_frames, read_tilts
 from landmarks.map_file import read_map, read_path
 

@@ -17,7 +17,6 @@ from camera import CameraError, parse_camera
 from camera.calibration.images import read_grey
 from detect.drawing.head import read_head
 from detect.errors import DetectError, FrameError
-from detect.runs.image_bounds import bounded_content
 from detect.runs.journal import digest_of, left_journal
 from detect.runs.run_log import demand_log_place
 from detect.sources.bag_images import pixels_of_message
@@ -27,6 +26,7 @@ from detect.sources.gray import (
     gray_of_pixels,
     significant_bits_of_file,
 )
+from detect.sources.image_bounds import bounded_content
 from detect.sources.steps import movement_between, step_of
 from detect.sources.times import TimesByImage
 from detect.sources.tum import TumTrajectory

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from detect.errors import DetectError, FrameError
-from detect.runs.name_index import NameIndex
+from detect.sources.name_index import NameIndex
 from storage.inside import leads_out, link_out
 from storage.messages import excerpt
 
