@@ -238,6 +238,12 @@ class Compare:
         Reference rows; by default map.circles (map.lines) in the run folder.
     detected : Path
         Detected rows; by default detected.circles (detected.lines) in the run folder.
+    unlisted : Path
+        Discs that may be detected but need not be: rows on them are neither right nor wrong; by
+        default unlisted.circles beside the reference, if it is there.
+    lookalikes : Path
+        What looks like a disc: extra rows on it are counted apart; by default lookalikes.circles
+        beside the reference, if it is there.
     camera : Path
         Calibration, by default the one in the run folder: discs are compared in the image, each row
         where it was seen. Without one, or with --gate-m or --sigma, on the floor.
@@ -259,6 +265,8 @@ class Compare:
     lines: bool = False
     reference: MaybePath = None
     detected: MaybePath = None
+    unlisted: MaybePath = None
+    lookalikes: MaybePath = None
     camera: MaybePath = None
     tolerance_deg: float = 0.5
     sigmas: float = 2.0

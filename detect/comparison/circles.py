@@ -88,6 +88,45 @@ class Sight:
         return FrameView(self.camera, self.radius_m, reference_by, detected_by)
 
 
+@dataclass(frozen=True, slots=True)
+class Beside:
+    """What is in view besides the reference rows, where that is known.
+
+    Attributes
+    ----------
+    unlisted : tuple of Frame
+        Discs that may be detected but need not be: detected rows on them count neither as right
+        nor as wrong.
+    lookalikes : tuple of Frame or None
+        What looks like a disc: detected rows on them are extra, and counted apart.
+    """
+
+    unlisted: tuple[Frame, ...] = ()
+    lookalikes: tuple[Frame, ...] | None = None
+
+
+def beside_reference(
+    reference: str | os.PathLike[str],
+    unlisted: Path | None = None,
+    lookalikes: Path | None = None,
+) -> Beside:
+    """Read what is in view besides the rows of a reference file.
+
+    By default ``unlisted.circles`` and ``lookalikes.circles`` in its folder, where they are there.
+    """
+    folder = Path(reference).parent
+    unlisted = _if_there(folder / "unlisted.circles") if unlisted is None else unlisted
+    lookalikes = _if_there(folder / "lookalikes.circles") if lookalikes is None else lookalikes
+    return Beside(
+        () if unlisted is None else tuple(read_frames(unlisted)),
+        None if lookalikes is None else tuple(read_frames(lookalikes)),
+    )
+
+
+def _if_there(path: Path) -> Path | None:
+    return path if path.is_file() else None
+
+
 def compare_runs(
     run: str | os.PathLike[str],
     *,
@@ -95,6 +134,7 @@ def compare_runs(
     detected: str | os.PathLike[str] | None = None,
     options: CompareOptions | None = None,
     sight: Sight | None = None,
+    beside: Beside | None = None,
 ) -> Comparison:
     """Compare a run's detected discs with its reference rows.
 
@@ -108,6 +148,8 @@ def compare_runs(
         What counts as the same disc, and which rows count.
     sight : Sight, optional
         How rows come back into the images; without it, they are compared on the floor.
+    beside : Beside, optional
+        What is in view besides the reference rows; by default as the reference's folder has it.
 
     Returns
     -------
@@ -129,6 +171,7 @@ def compare_runs(
         read_frames(detected),
         options or CompareOptions(),
         sight=sight,
+        beside=beside_reference(reference) if beside is None else beside,
         reference_name=os.fspath(reference),
         detected_name=os.fspath(detected),
     )
@@ -140,6 +183,7 @@ def compare_frames(
     options: CompareOptions,
     *,
     sight: Sight | None = None,
+    beside: Beside | None = None,
     reference_name: str = "reference",
     detected_name: str = "detected",
 ) -> Comparison:
@@ -164,8 +208,10 @@ def compare_frames(
         None if sight is None else sight.of(wanted_by.get(name), found_by.get(name))
         for name, *_ in paired.frames
     ]
+    beside = beside or Beside()
+    unlisted = _rows_by_name(beside.unlisted)
     matches = [
-        _match_frame(*frame, options, view if in_image else None)
+        _match_frame(frame, options, view if in_image else None, unlisted.get(frame[0], ()))
         for frame, view in zip(paired.frames, views)
     ]
     wanted = _pool([(match.reference, match.pairs.first) for match in matches])
@@ -185,6 +231,7 @@ def compare_frames(
         detected=len(found.xy),
         matched=len(error_m),
         set_aside=sum(match.set_aside for match in matches),
+        on_lookalikes=_on_lookalikes(matches, beside, options, views if in_image else None),
         recall=_mean(wanted.is_paired),
         precision=_mean(found.is_paired),
         error_median_m=quantile(error_m, 0.5),
@@ -222,13 +269,37 @@ class _Pool:
     is_paired: BoolArray
 
 
+def _rows_by_name(frames: Iterable[Frame]) -> dict[str, tuple[CircleLandmark, ...]]:
+    return {image_name(frame.step.prefix): frame.circles for frame in frames}
+
+
+def _on_lookalikes(
+    matches: Sequence[FrameMatch[CircleLandmark]],
+    beside: Beside,
+    options: CompareOptions,
+    views: Sequence[FrameView | None] | None,
+) -> int | None:
+    """How many extra rows are on look-alikes; None where these are not known."""
+    if beside.lookalikes is None:
+        return None
+    known = _rows_by_name(beside.lookalikes)
+    count = 0
+    for k, match in enumerate(matches):
+        rows = known.get(match.name, ())
+        extra = [match.detected[i] for i in match.pairs.second_alone]
+        if rows and extra:
+            view = None if views is None else views[k]
+            count += len(pair_discs(rows, extra, options, view).first)
+    return count
+
+
 def _match_frame(
-    name: str,
-    reference: Sequence[CircleLandmark],
-    detected: Sequence[CircleLandmark],
+    frame: tuple[str, Sequence[CircleLandmark], Sequence[CircleLandmark]],
     options: CompareOptions,
     view: FrameView | None,
+    optional: Sequence[CircleLandmark],
 ) -> FrameMatch[CircleLandmark]:
+    name, reference, detected = frame
     measurable = is_positive_definite(circle_arrays(reference).covariance)
     if options.sigma is not None and not measurable.all():
         raise CompareError(
@@ -241,6 +312,7 @@ def _match_frame(
         detected,
         lambda some, others: pair_discs(some, others, options, view),
         only_identified=options.only_identified,
+        optional=optional,
     )
 
 

@@ -7,7 +7,7 @@ import sys
 from rich.console import Console, Group
 
 from camera import read_camera
-from detect.comparison.circles import Sight, compare_runs
+from detect.comparison.circles import Sight, beside_reference, compare_runs
 from detect.comparison.lines import compare_line_runs
 from detect.comparison.lines_report import format_line_json, line_comparison_tables
 from detect.comparison.lines_result import LineCompareOptions
@@ -64,6 +64,9 @@ def _compared_discs(command: Compare) -> tuple[Group, str, Rates]:
         detected=command.detected,
         options=command.options,
         sight=sight,
+        beside=beside_reference(
+            command.reference or command.run / "map.circles", command.unlisted, command.lookalikes
+        ),
     )
     return comparison_tables(result), format_json(result), result
 

@@ -109,6 +109,7 @@ def match_rows(
     pair_up: Callable[[Sequence[RowType], Sequence[RowType]], Association],
     *,
     only_identified: bool,
+    optional: Sequence[RowType] = (),
 ) -> FrameMatch[RowType]:
     """Match the rows of one frame one to one.
 
@@ -123,6 +124,9 @@ def match_rows(
     only_identified : bool
         Count only reference rows that have an ID. Detected rows that fit one without, and none of
         the others, are set aside.
+    optional : sequence of rows
+        What may be detected but need not be: detected rows that fit one of these, and no reference
+        row, are set aside, too.
 
     Returns
     -------
@@ -131,6 +135,7 @@ def match_rows(
     """
     counted = [row for row in reference if row.identified or not only_identified]
     uncounted = [row for row in reference if not row.identified and only_identified]
+    uncounted += optional
     pairs = pair_up(counted, detected)
     set_aside = 0
     if uncounted:

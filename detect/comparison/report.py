@@ -83,6 +83,8 @@ def format_json(comparison: Comparison) -> str:
 
 def _summary(c: Comparison) -> Table:
     counts = f"{c.matched} matched, {c.missed} missed, {c.extra} extra"
+    if c.on_lookalikes is not None:
+        counts += f": {c.on_lookalikes} on look-alikes, {c.extra - c.on_lookalikes} elsewhere"
     if c.in_image:
         where = "in the image"
         gate = f" (within half the disc's image or {c.options.least_px:g} px)"

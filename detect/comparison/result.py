@@ -213,7 +213,9 @@ NO_PAIRS = DiscPairs(*(np.zeros((0, 2)),) * 3, np.zeros((0, 2, 2)), np.zeros((0,
 class Comparison:
     """How a run's detected discs compare with reference rows.
 
-    Figures are None where there are no rows to compute them from. Qualities are medians.
+    Figures are None where there are no rows to compute them from. Qualities are medians. Rows set
+    aside count neither as matched nor as extra; `on_lookalikes` of the extra rows are on something
+    that is known to look like a disc.
     """
 
     reference_name: str
@@ -223,6 +225,7 @@ class Comparison:
     detected: int
     matched: int
     set_aside: int
+    on_lookalikes: int | None
     recall: float | None
     precision: float | None
     error_median_m: float | None

@@ -51,6 +51,8 @@ def rows_text(reference: int, detected: int, set_aside: int, *, only_identified:
     text = f"{reference} reference, {detected} detected"
     if only_identified:
         text += f" (with an ID only; {set_aside} on rows without one set aside)"
+    elif set_aside:
+        text += f" ({set_aside} more on what is in view but not listed: neither right nor wrong)"
     return text
 
 

@@ -7,7 +7,7 @@ import time
 from dataclasses import dataclass
 from functools import cached_property
 
-from detect.comparison.circles import Sight, compare_frames
+from detect.comparison.circles import Sight, beside_reference, compare_frames
 from detect.comparison.lines import compare_line_frames
 from detect.comparison.lines_result import LineCompareOptions, LineComparison
 from detect.comparison.result import CompareOptions, Comparison
@@ -103,6 +103,7 @@ class ReportInputs:
             [detected for _, detected in both],
             self.gate,
             sight=self.sight,
+            beside=beside_reference(self.files.reference_circles),
             reference_name=self.files.reference_circles.name,
             detected_name=self.files.detected["circles"].name,
         )

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from camera import write_camera
+from camera import Camera, write_camera
 from landmarks import CircleLandmark, Frame, Landmark, LineLandmark, write_frames
 from storage import write_whole
 from tools.simulator.observation import (
@@ -26,6 +26,8 @@ from tools.simulator.odometry import step_record
 from tools.simulator.plan import RunPlan, RunSettings, plan_run, random_for, random_for_frame
 from tools.simulator.renderer import render_light, smeared
 from tools.simulator.sensor import encode_jpeg, grey_values
+
+FloatArray = NDArray[np.float64]
 
 SIMULATED = """\
 SIMULATED, rendered by tools/simulator ({what}): no real robot drove here.
@@ -58,6 +60,18 @@ true bearing, its inclination as the (level) calibration measures it, one pixel 
 deviation."""
 
 
+_UNLISTED_FORMAT = """\
+LANDMARK_C <pX> <pY> 1 <cXX> <cXY> <cYY> <ID>
+A disc that is at least partly in view but not listed in map.circles: nearly hidden, cut, or far."""
+
+_LOOKALIKE_FORMAT = """\
+LANDMARK_C <pX> <pY> 1 <cXX> <cXY> <cYY> <number>
+Something at least partly in view that looks like a disc but is none; truth.json says what."""
+
+#: Variance of the places in these two files, which are exact: a gate, square metres.
+_NOMINAL_VARIANCE = 0.04**2
+
+
 @dataclass(frozen=True)
 class FrameTruth:
     """What is truly in view in one frame, and the image's bytes if there is one."""
@@ -68,6 +82,7 @@ class FrameTruth:
     lines: tuple[LineLandmark, ...]
     discs: tuple[SeenDisc, ...]
     edges: tuple[SeenEdge, ...]
+    lookalikes: tuple[SeenDisc, ...]
 
 
 def render_frame(plan: RunPlan, frame: int) -> FrameTruth:
@@ -115,7 +130,17 @@ def _truth(
         lines=tuple(line_row(e, plan.camera) for e in edges if e.listed),
         discs=tuple(discs),
         edges=tuple(edges),
+        lookalikes=_seen_lookalikes(plan, camera, pose),
     )
+
+
+def _seen_lookalikes(plan: RunPlan, camera: Camera, pose: FloatArray) -> tuple[SeenDisc, ...]:
+    """What looks like a disc and is in view, by its number in the plan."""
+    if not plan.lookalikes:
+        return ()
+    xy = np.array([(x, y) for _, x, y in plan.lookalikes])
+    numbers = np.arange(len(xy))
+    return tuple(see_discs(plan.scene, plan.camera, camera, pose, numbers, xy, plan.disc_radius_m))
 
 
 def write_run(
@@ -167,9 +192,7 @@ def write_run(
             ) as out:
                 out.write(truth.jpeg)
         # The bytes of all images need not be kept.
-        truths.append(
-            FrameTruth(truth.frame, None, truth.circles, truth.lines, truth.discs, truth.edges)
-        )
+        truths.append(replace(truth, jpeg=None))
         if on_frame is not None:
             on_frame(truth.frame)
     _write_steps(plan, folder, what, overwrite)
@@ -177,9 +200,30 @@ def write_run(
                      [t.circles for t in truths], overwrite)  # fmt: skip
     _write_landmarks(plan, folder / "map.lines", what, _LINE_FORMAT, [t.lines for t in truths],
                      overwrite)  # fmt: skip
+    write_beside(plan, folder, what, truths, overwrite=overwrite)
     with write_whole(folder / "truth.json", overwrite=overwrite) as out:
         out.write(_truth_json(plan, truths, what).encode())
     return sum(len(t.circles) for t in truths)
+
+
+def write_beside(
+    plan: RunPlan, folder: Path, what: str, truths: Iterable[FrameTruth], *, overwrite: bool
+) -> None:
+    """Write what is in view besides the listed discs, as `detect compare` reads it."""
+    unlisted, lookalikes = [], []
+    for truth in truths:
+        unlisted.append(tuple(_nominal_row(disc) for disc in truth.discs if not disc.listed))
+        lookalikes.append(tuple(_nominal_row(disc) for disc in truth.lookalikes))
+    for name, text, rows in (
+        ("unlisted.circles", _UNLISTED_FORMAT, unlisted),
+        ("lookalikes.circles", _LOOKALIKE_FORMAT, lookalikes),
+    ):
+        _write_landmarks(plan, folder / name, what, text, rows, overwrite)
+
+
+def _nominal_row(disc: SeenDisc) -> CircleLandmark:
+    x, y = disc.robot_xy.tolist()
+    return CircleLandmark(x, y, 1.0, _NOMINAL_VARIANCE, 0.0, _NOMINAL_VARIANCE, (disc.disc_id,))
 
 
 def write_rows(

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from detect.comparison.circles import compare_frames, compare_runs, image_name
+from detect.comparison.circles import Beside, compare_frames, compare_runs, image_name
 from detect.comparison.report import format_json, format_text
 from detect.comparison.result import CompareError, CompareOptions, Comparison, unmet_demands
 from landmarks import CircleLandmark, Frame, LandmarkFileError, Step, write_frames
@@ -55,6 +55,28 @@ def test_rows_are_matched_missed_or_extra() -> None:
     assert found.recall == found.precision == pytest.approx(4 / 5)
     assert found.frames_only_in_reference == ("e.0002",)
     assert found.frames_only_in_detected == ()
+
+
+def test_rows_on_what_is_known_besides_are_told_apart() -> None:
+    unlisted = (frame("e.0000", disc(2, 2.2, 1.0)),)
+    lookalikes = (frame("e.0001", disc(-0.6, 1.9, 1.0), disc(3, 3, 1.0)),)
+    detected = [
+        frame("e.0000", *DETECTED[0].circles, disc(1.5, 1.5, 0.5)),
+        frame("e.0001", *DETECTED[1].circles, disc(-0.6, 1.92, 0.9)),
+    ]
+    found = compare_frames(REFERENCE, detected, STANDARD, beside=Beside(unlisted, lookalikes))
+    assert (found.matched, found.missed, found.extra) == (4, 1, 2)
+    assert (found.set_aside, found.on_lookalikes) == (1, 1)
+    assert found.precision == pytest.approx(4 / 6)
+    without = compare_frames(REFERENCE, detected, STANDARD)
+    assert (without.extra, without.set_aside, without.on_lookalikes) == (3, 0, None)
+
+
+def test_a_reference_row_comes_before_an_unlisted_one() -> None:
+    """An unlisted disc beside a listed one must not take its row."""
+    unlisted = (frame("e.0000", disc(0.03, 1.04, 1.0)),)
+    found = compare_frames(REFERENCE, DETECTED, STANDARD, beside=Beside(unlisted))
+    assert (found.matched, found.set_aside) == (4, 0)
 
 
 def test_errors_are_distances_of_matched_rows() -> None:
