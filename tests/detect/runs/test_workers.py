@@ -247,6 +247,7 @@ def cluster(folder: Path, workers: int) -> Iterator[tuple[str, list[subprocess.P
             process.wait()
 
 
+@pytest.mark.lowest
 @pytest.mark.long
 def test_a_cluster_writes_what_one_process_does(run_folder: Path, tmp_path: Path) -> None:
     """Also when one of its workers is killed half-way."""
