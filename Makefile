@@ -21,24 +21,25 @@ demo: setup
 	$(BIN)/detect circles images/e --force
 	$(BIN)/detect compare images/e
 
-# Kernels are compiled beforehand: processes of tests that need the same one at once would each compile it. Those of discs
-# and of lines are compiled at the same time. A kernel that others call exists several times, optimised among different
-# code, and which of them runs depends on what was compiled in the same process: so what was found by kernels just
-# compiled is compared with what the same ones find when they are loaded.
+# Kernels are compiled beforehand, those of discs and of lines at the same time: processes of tests that need the same
+# one at once would each compile it.
 define compile_kernels
 mkdir -p $(2)
 $(1) circles images/e --jobs 1 -o $(2)/compiled.circles --json $(2)/compiled.json --force & discs=$$!; \
-    $(1) lines images/e --jobs 1 -o $(2)/compiled.lines --force && wait $$discs
-$(1) circles images/e --jobs 1 -o $(2)/loaded.circles --json $(2)/loaded.json --force
-$(1) lines images/e --jobs 1 -o $(2)/loaded.lines --force
-cmp $(2)/compiled.json $(2)/loaded.json
-cmp $(2)/compiled.lines $(2)/loaded.lines
-$(1) all images/e --output $(2) --force
-$(1) markers images/m/a --output $(2)/m.markers --force
+    $(1) lines images/e --jobs 1 -o $(2)/compiled.lines --force; lines=$$?; wait $$discs && exit $$lines
 endef
 
+# A kernel that others call exists several times, optimised among different code, and which of them runs depends on what
+# was compiled in the same process: so what kernels find that were just compiled is compared with what they find when
+# they are loaded.
 kernels: setup
 	$(call compile_kernels,$(BIN)/detect,build/kernels)
+	$(BIN)/detect circles images/e --jobs 1 -o build/kernels/loaded.circles --json build/kernels/loaded.json --force
+	$(BIN)/detect lines images/e --jobs 1 -o build/kernels/loaded.lines --force
+	cmp build/kernels/compiled.json build/kernels/loaded.json
+	cmp build/kernels/compiled.lines build/kernels/loaded.lines
+	$(BIN)/detect all images/e --output build/kernels --force
+	$(BIN)/detect markers images/m/a --output build/kernels/m.markers --force
 
 test: setup
 	$(BIN)/python -m pytest -n auto --dist worksteal

@@ -19,8 +19,9 @@ def spread(values):
     if len(values) < 2:
         raise ValueError("expected two values or more")
     off = np.empty(len(values))
-    off[:] = values - values.mean()
-    return np.sqrt((off * off).sum() / np.sum(np.ones(len(values))))
+    off[:] = values
+    off -= values.sum() / len(values)
+    return np.sqrt((off * off).sum() / len(values))
 
 @njit(cache=True, error_model="numpy")
 def spread_of_two(values):
