@@ -14,8 +14,9 @@ from hypothesis import settings
 
 from camera import Camera, parse_camera
 
-# Compiling takes longer than any deadline, and a test that fails must fail again.
-settings.register_profile("project", deadline=None, derandomize=True)
+# Compiling takes longer than any deadline, and a test that fails must fail again. Half as many
+# examples as by default: the same ones each time, more of them tell little.
+settings.register_profile("project", deadline=None, derandomize=True, max_examples=50)
 settings.load_profile("project")
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -43,51 +44,6 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         metavar="DIR",
         help="also re-detect this run folder and compare with its shipped rows (repeatable)",
     )
-
-
-#: Files whose tests take longest, so that they are begun first: at the end no worker is left alone
-#: with one of them. The first compiles the detectors' kernels, which takes minutes; those after it
-#: need none of them, so that the other worker does not compile the same ones at the same time.
-LONGEST_FILES = (
-    "tests/detect/runs/test_determinism.py",
-    "tests/tools/reenactment/test_prepare.py",
-    "tests/camera/test_calibration.py",
-    "tests/camera/test_calibrate_command.py",
-    "tests/groundtruth/markers/test_rig.py",
-    "tests/groundtruth/clocks/test_sync.py",
-    "tests/groundtruth/markers/test_refinement.py",
-    "tests/groundtruth/markers/test_network.py",
-    "tests/tools/simulator/test_simulated_run.py",
-    "tests/docs/test_examples.py",
-    "tests/detect/runs/test_concurrent.py",
-    "tests/detect/runs/test_killed.py",
-    "tests/detect/discs/test_centres.py",
-    "tests/detect/markers/test_detect.py",
-    "tests/detect/verticals/test_step.py",
-    "tests/detect/runs/test_workers.py",
-    "tests/camera/test_calibrate_photographs.py",
-    "tests/detect/sources/test_memory.py",
-    "tests/groundtruth/fusion/test_fuse.py",
-    "tests/tools/evaluation/test_marker_evaluation.py",
-    "tests/detect/runs/test_full_disks.py",
-    "tests/groundtruth/lasers/test_alignment.py",
-    "tests/tools/benchmark/test_benchmark.py",
-    "tests/tools/soak/test_soak.py",
-)
-
-
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Order files by how long they take, if all are run; their tests stay as they are."""
-    missing = [name for name in LONGEST_FILES if not (ROOT / name).is_file()]
-    if missing:
-        raise pytest.UsageError(f"tests/conftest.py: no such file: {', '.join(missing)}")
-    if set(LONGEST_FILES) <= {_file_of(item) for item in items}:
-        places = {name: place for place, name in enumerate(LONGEST_FILES)}
-        items.sort(key=lambda item: places.get(_file_of(item), len(places)))
-
-
-def _file_of(item: pytest.Item) -> str:
-    return item.nodeid.partition("::")[0]
 
 
 @pytest.fixture(scope="session")

@@ -41,6 +41,7 @@ def examples_in(text: str) -> list[list[str]]:
     return found
 
 
+@pytest.mark.lowest
 @pytest.mark.parametrize("program", PROGRAMS)
 def test_every_help_shows_an_example_that_parses(
     program: str, capsys: pytest.CaptureFixture[str]
@@ -104,6 +105,7 @@ def test_what_is_said_to_be_compiled_is_and_nothing_else(program: str) -> None:
     assert (process.returncode, process.stderr) == (0, "")
 
 
+@pytest.mark.lowest
 @pytest.mark.parametrize("program", PROGRAMS)
 def test_every_program_says_its_version(program: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as end:

@@ -216,7 +216,7 @@ def test_the_polynomial_is_chosen_where_the_rational_function_cannot_follow() ->
         640, 480, 517.0, 517.0, 318.6, 255.3, (0.0,) * 5, IDENTITY,
         polynomial=(0.2624, -0.9531, 1.1633),
     )  # fmt: skip
-    views = seen_views(wavy, 9, 0.05, seed=7)
+    views = seen_views(wavy, 6, 0.05, seed=7)
     result = calibrate(views, BOARD, (640, 480), CalibrationSettings(tangential=False))
     assert result.lens == FreeLens(0, False, 3)
     found = with_intrinsics(wavy, result.intrinsics)
@@ -242,12 +242,12 @@ def test_predicted_covariance_of_a_decentred_lens_is_what_repetition_shows() -> 
 
 @pytest.mark.long
 def test_predicted_covariance_is_what_repetition_shows(published_camera: Camera) -> None:
-    trials = monte_carlo(published_camera, BOARD, views=15, trials=80, sigma_px=0.02, seed=4)
+    trials = monte_carlo(published_camera, BOARD, views=15, trials=40, sigma_px=0.02, seed=4)
     predicted = np.sqrt(np.diag(trials.covariances.mean(axis=0)))
     ratio = trials.errors.std(axis=0)[:9] / predicted[:9]
     assert not np.any(trials.errors[:, 9:])
-    # 80 trials know a standard deviation to 8 %.
-    assert np.all((ratio > 0.75) & (ratio < 1.3)), ratio
+    # 40 trials know a standard deviation to 11 %.
+    assert np.all((ratio > 0.67) & (ratio < 1.4)), ratio
     limit = 3.0 * np.sqrt(2.0 * trials.freedom / len(trials.nees))
     assert trials.nees.mean() == pytest.approx(trials.freedom, abs=limit)
 

@@ -55,6 +55,7 @@ def as_opencv_projects(camera: ForeignCamera, rays: FloatArray) -> FloatArray:
     return np.asarray(found, dtype=np.float64).reshape(-1, 2)
 
 
+@pytest.mark.lowest
 @pytest.mark.parametrize("camera", [RADTAN, RATIONAL, FISHEYE], ids=lambda c: c.model)
 def test_models_are_opencvs_and_invert(camera: ForeignCamera) -> None:
     pixels = camera.distort(RAYS)
@@ -62,6 +63,7 @@ def test_models_are_opencvs_and_invert(camera: ForeignCamera) -> None:
     np.testing.assert_allclose(camera.undistort(pixels), RAYS, atol=1e-9)
 
 
+@pytest.mark.lowest
 @pytest.mark.parametrize("camera", [RADTAN, FISHEYE], ids=lambda c: c.model)
 def test_colmap_counts_from_the_corner(camera: ForeignCamera) -> None:
     theirs = pycolmap_from_camera(camera)
@@ -72,6 +74,7 @@ def test_colmap_counts_from_the_corner(camera: ForeignCamera) -> None:
     assert camera_from_pycolmap(theirs) == camera
 
 
+@pytest.mark.lowest
 def test_formats_read_back_what_they_wrote() -> None:
     thin = RATIONAL
     plain = ForeignCamera("rational", 640, 480, 500.0, 505.0, 318.5, 241.0,
@@ -85,6 +88,7 @@ def test_formats_read_back_what_they_wrote() -> None:
         assert parse_colmap(format_colmap(camera)) == camera
 
 
+@pytest.mark.lowest
 def test_opencv_reads_what_is_written_and_the_other_way(tmp_path: Path) -> None:
     path = tmp_path / "ours.yaml"
     path.write_text(format_opencv(RADTAN))
@@ -104,6 +108,7 @@ def test_opencv_reads_what_is_written_and_the_other_way(tmp_path: Path) -> None:
     assert parse_opencv(theirs.read_text()) == RADTAN
 
 
+@pytest.mark.lowest
 def test_an_echoed_ros_message_is_read() -> None:
     text = (
         "header:\n  frame_id: camera\nheight: 480\nwidth: 640\ndistortion_model: plumb_bob\n"
@@ -119,22 +124,19 @@ def test_an_uncalibrated_ros_camera_is_refused() -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("model", ["rational"])
-@pytest.mark.parametrize(("out", "home"), [("same", "same"), ("double", "halve")])
-def test_the_published_camera_there_and_back(
-    published_camera: Camera, model: str, out: str, home: str
-) -> None:
-    there = convert_to_foreign(published_camera, model, out)  # type: ignore[arg-type]
+def test_the_published_camera_there_and_back(published_camera: Camera) -> None:
+    there = convert_to_foreign(published_camera, "rational", "double")
     assert there.deviation_px < 0.05
-    assert there.camera.height == (576 if out == "double" else 288)
+    assert there.camera.height == 576
     # Measured apart from the conversion's own measure: OpenCV's projection of the camera's rays.
     rng = np.random.default_rng(4)
     pixels = rng.uniform([0.0, 0.0], [767.0, 287.0], size=(3000, 2))
     assert isinstance(there.camera, ForeignCamera)
     found = as_opencv_projects(there.camera, published_camera.undistort(pixels))
-    expected = pixels * ([1.0, 2.0] if out == "double" else [1.0, 1.0])
-    assert np.linalg.norm(found - expected, axis=1).max() < 1.05 * there.deviation_px + 1e-3
-    back = convert_to_camera(there.camera, home)  # type: ignore[arg-type]
+    assert (
+        np.linalg.norm(found - pixels * [1.0, 2.0], axis=1).max() < 1.05 * there.deviation_px + 1e-3
+    )
+    back = convert_to_camera(there.camera, "halve")
     assert isinstance(back.camera, Camera)
     assert projection_difference(published_camera, back.camera, rotate=False).max() < 0.01
 

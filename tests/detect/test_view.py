@@ -59,6 +59,7 @@ def plain(column: Any) -> list[Any]:
     return list(column.to_pylist())
 
 
+@pytest.mark.lowest
 @pytest.mark.long
 def test_recording_holds_frames_rows_and_path(
     small_run: Path, tmp_path: Path, capsys: Captured

@@ -99,6 +99,7 @@ def refused(arguments: list[str], names: str, captured: Captured) -> None:
     assert names in line
 
 
+@pytest.mark.lowest
 @pytest.mark.long
 def test_a_sessions_poses_and_their_score(tmp_path: Path, capsys: Captured) -> None:
     session = write_session(tmp_path / "s")

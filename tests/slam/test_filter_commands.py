@@ -35,6 +35,7 @@ def run(tmp_path: Path, project_root: Path) -> Path:
     return folder
 
 
+@pytest.mark.lowest
 @pytest.mark.long
 def test_map_then_localise(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["ekf", str(run), "--circles", "--lines"]) == 0

@@ -119,6 +119,7 @@ def test_the_published_error_of_the_real_run(tmp_path: Path, shared_data: Path) 
     assert total == pytest.approx(56_871.45, abs=0.1)
 
 
+@pytest.mark.lowest
 def test_the_documented_way_from_the_tables_to_factors(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

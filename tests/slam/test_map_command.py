@@ -33,6 +33,7 @@ def both_kinds(demo_run: Path) -> Path:
     return output
 
 
+@pytest.mark.lowest
 def test_landmarks_stand_where_they_truly_are(demo_run: Path, both_kinds: Path) -> None:
     truth = json.loads((demo_run / "truth.json").read_text(encoding="utf-8"))
     start = np.array(truth["start"])

@@ -107,6 +107,7 @@ def test_csv_has_the_files_numbers(file: Path) -> None:
         assert {row[2] for row in found} <= {None}
 
 
+@pytest.mark.lowest
 def test_parquet_has_the_files_numbers_and_units(file: Path) -> None:
     pytest.importorskip("pyarrow", reason="the extra [parquet] is not installed")
     import pyarrow.parquet as pq  # type: ignore[import-untyped]
@@ -124,6 +125,7 @@ def test_parquet_has_the_files_numbers_and_units(file: Path) -> None:
         assert read.schema.metadata[b"source"].decode() == file.name
 
 
+@pytest.mark.lowest
 def test_mcap_has_the_files_numbers(file: Path) -> None:
     pytest.importorskip("rosbags", reason="the extra [bags] is not installed")
     from rosbags.highlevel import AnyReader

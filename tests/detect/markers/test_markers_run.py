@@ -39,6 +39,7 @@ def folder(tmp_path: Path) -> Path:
     return run
 
 
+@pytest.mark.lowest
 def test_rows_of_a_folder_without_a_calibration(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -228,6 +228,7 @@ def judged_run(small_run: Path) -> Path:
     return small_run
 
 
+@pytest.mark.lowest
 def test_page_states_what_comparing_does(judged_run: Path, tmp_path: Path) -> None:
     page = reported(judged_run, tmp_path / "r.html")
     words = " ".join(" ".join(page.words).split())

@@ -38,6 +38,7 @@ def detected(
     return detect_run(run, plan, places, conduct=conduct, **others)
 
 
+@pytest.mark.lowest
 def test_rows_are_the_discs_of_each_image(small_run: Path) -> None:
     output = small_run / "out.circles"
     summary = detected(open_run(small_run), CircleSettings(), output)
@@ -64,6 +65,7 @@ def test_steps_are_those_of_the_odometry(small_run: Path) -> None:
     assert written[1].dx == -0.00375
 
 
+@pytest.mark.lowest
 def test_published_rows_are_printed_like_the_data_sets(
     small_run: Path, published_camera: Camera
 ) -> None:

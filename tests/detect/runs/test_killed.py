@@ -167,11 +167,11 @@ def test_killed_at_any_moment(
     undisturbed: dict[str, bytes],
     capsys: Captured,
 ) -> None:
-    """At fifty moments, from the program's start to its end, with and without workers."""
+    """At moments from the program's start to its end, with and without workers."""
     moments = random.Random(5)
     outcomes = {"previous": 0, "new": 0, "between": 0}
     whole_s = processor_s_of(command(run_folder, output))
-    for trial in range(50):
+    for trial in range(20):
         jobs = "2" if trial % 5 == 4 else "1"
         before = lay_previous(output)
         arguments = command(run_folder, output, "--jobs", jobs)
@@ -190,10 +190,10 @@ def test_killed_at_any_moment(
             code, err = runs.ended(arguments, DieAfter(moments.uniform(0.0, 1.1 * whole_s)))
             assert code in (-signal.SIGPROF, 3), err
         outcomes[state_of(results(output), before, undisturbed)] += 1
-        resumed(run_folder, output, capsys, "--jobs", "2" if trial in (4, 9) else "1")
+        resumed(run_folder, output, capsys, "--jobs", "2" if trial == 4 else "1")
         assert results(output) == undisturbed
         assert hidden(output) == set()
-    assert outcomes["previous"] > 20
+    assert outcomes["previous"] > 8
     # They take them by four calls in a row: hardly any kill falls between those.
     assert outcomes["between"] <= 1
 

@@ -77,6 +77,7 @@ def test_bad_frame_costs_its_frame_only(
     assert sorted(read_tilts(short_run / "detected.tilt")) == ["e.0000", "e.0001", "e.0003"]
 
 
+@pytest.mark.lowest
 def test_all_corrects_discs_for_the_tilt(short_run: Path) -> None:
     assert main(["all", str(short_run), "--tilt", "frame", "--circles.polarity", "light"]) == 0
     levelled = [f.circles for f in read_frames(short_run / "detected.circles")]

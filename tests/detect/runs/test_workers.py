@@ -168,7 +168,7 @@ def started(run: Path, jobs: int, mark: str) -> Iterator[subprocess.Popen[str]]:
 
 @pytest.mark.long
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="looks for processes in /proc")
-@pytest.mark.parametrize(("jobs", "delay_s"), [(1, 0.3), (1, 1.0), (2, 0.3), (2, 1.0), (2, 2.5)])
+@pytest.mark.parametrize(("jobs", "delay_s"), [(1, 0.5), (2, 0.3), (2, 2.5)])
 def test_an_interrupt_ends_everything(run_folder: Path, jobs: int, delay_s: float) -> None:
     """Control-C reaches the whole group of processes, at whatever they are."""
     mark = f"REDETECT_TEST={run_folder}"
@@ -247,6 +247,7 @@ def cluster(folder: Path, workers: int) -> Iterator[tuple[str, list[subprocess.P
             process.wait()
 
 
+@pytest.mark.lowest
 @pytest.mark.long
 def test_a_cluster_writes_what_one_process_does(run_folder: Path, tmp_path: Path) -> None:
     """Also when one of its workers is killed half-way."""

@@ -69,6 +69,7 @@ def recorded(ros: Ros, run: Path, compressed: bool = False) -> list[Said]:
     return sorted(said, key=lambda item: item.time_s)
 
 
+@pytest.mark.lowest
 @pytest.mark.parametrize("compressed", [False, True])
 @pytest.mark.parametrize("kind", BAG_KINDS)
 def test_a_bag_gives_the_rows_of_its_images(

@@ -51,6 +51,7 @@ def expected_rows(small_run: Path, tmp_path: Path) -> list[str]:
 # -- video ----------------------------------------------------------------------------------
 
 
+@pytest.mark.lowest
 def test_a_video_gives_the_rows_of_its_images(
     small_run: Path, video: Path, expected_rows: list[str], capsys: Captured
 ) -> None:

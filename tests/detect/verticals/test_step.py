@@ -34,8 +34,7 @@ def bearing_at(camera: Camera, table: VerticalTable, offset_px: float) -> float:
 
 
 @pytest.mark.parametrize("slant_deg", [0.0, 2.0, -9.0, 20.0, -20.0])
-@pytest.mark.parametrize("contrast", [200.0, -200.0, 60.0])
-@pytest.mark.parametrize("blur_px", [0.2, 0.6, 1.2])
+@pytest.mark.parametrize(("contrast", "blur_px"), [(200.0, 0.2), (-200.0, 0.6), (60.0, 1.2)])
 def test_no_bias_over_a_period_of_subpixel_offsets(
     slant_deg: float, contrast: float, blur_px: float
 ) -> None:
@@ -84,7 +83,7 @@ def test_scatter_under_noise_is_the_predicted_one(
     camera = pinhole(120, 90, roll_deg=slant_deg)
     table = build_vertical_table(camera)
     errors, predicted, leans = [], [], []
-    for offset in rng.uniform(0.0, 1.0, 400):
+    for offset in rng.uniform(0.0, 1.0, 200):
         bearing = bearing_at(camera, table, offset)
         grey = 128.0 - 0.5 * contrast
         image = render(camera, [Edge(bearing, contrast)], grey=grey, noise=noise, rng=rng)
@@ -93,10 +92,10 @@ def test_scatter_under_noise_is_the_predicted_one(
         predicted.append(sigma)
         track = found.members[0][0]
         leans.append(found.fits.line[track, 1] / np.sqrt(found.fits.covariance[track, 1, 1]))
-    # 400 draws know a standard deviation to 3.5 %.
-    assert np.std(errors) == pytest.approx(np.sqrt(np.mean(np.square(predicted))), rel=0.10)
+    # 200 draws know a standard deviation to 5 %.
+    assert np.std(errors) == pytest.approx(np.sqrt(np.mean(np.square(predicted))), rel=0.15)
     assert abs(np.mean(errors)) < 0.02
-    assert np.std(leans) == pytest.approx(1.0, rel=0.15)
+    assert np.std(leans) == pytest.approx(1.0, rel=0.2)
 
 
 def test_uncertainty_of_a_row_has_a_floor_of_sigma_px() -> None:

@@ -58,6 +58,7 @@ def drawing(**header: int) -> Any:
     return document
 
 
+@pytest.mark.lowest
 def test_lines_polylines_and_blocks_are_walls_and_texts_are_not(tmp_path: Path) -> None:
     document = drawing(INSUNITS=6)
     space = document.modelspace()
@@ -96,6 +97,7 @@ def test_curved_walls_are_cut_finely(tmp_path: Path) -> None:
     assert middles[~circle, 1].max() < 0.0
 
 
+@pytest.mark.lowest
 @pytest.mark.parametrize(
     ("unit", "given_unit", "metres"),
     [(4, None, 1e-3), (0, None, 1.0), (4, 0.5, 0.5), (1, None, 0.0254)],

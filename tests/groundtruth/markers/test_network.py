@@ -121,7 +121,7 @@ def test_its_covariance_is_true(kind: str) -> None:
     """With an offset that is exactly known, known with sigmas, and estimated."""
     generator = np.random.default_rng(2)
     sigmas = np.array([2e-3, 2e-3, 2e-3, 4e-3, 4e-3, 4e-3])
-    squares, draws = 0.0, 12
+    squares, draws = 0.0, 6
     for seed in range(draws):
         found = shots(0.15, 10 + seed, per_pair=3)
         offset: FloatArray | None = {"known": OFFSET, "unknown": None}.get(

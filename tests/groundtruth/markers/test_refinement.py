@@ -101,7 +101,10 @@ def test_covariances_of_composed_and_inverse_poses() -> None:
 # -- exact recovery -------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize(
+    "solver",
+    [pytest.param(s, marks=pytest.mark.lowest) if s == "pycolmap" else s for s in SOLVERS],
+)
 @pytest.mark.parametrize("cameras", [1, 2, 3, 4])
 @pytest.mark.parametrize("markers", [1, 2, 3, 6])
 def test_every_solver_recovers_the_pose_exactly(solver: Solver, cameras: int, markers: int) -> None:
@@ -200,12 +203,12 @@ def normalised_errors(
 def test_the_normalised_error_is_that_of_its_distribution(
     calibration_sigma: float, floor: bool, cameras: int
 ) -> None:
-    draws = 300
+    draws = 100
     squares, plane, costs = normalised_errors(
         draws, seed=7, calibration_sigma=calibration_sigma, floor=floor, cameras=cameras
     )
     for values, dof in ((squares, 6), (plane, 3)):
-        low, high = chi2.ppf([0.025, 0.975], dof * draws) / draws
+        low, high = chi2.ppf([0.005, 0.995], dof * draws) / draws
         assert low < np.mean(values) < high
     assert np.mean(costs) == pytest.approx(1.0, abs=0.1)
 

@@ -126,8 +126,8 @@ def test_a_free_camera_can_be_the_reference() -> None:
 def test_the_rigs_covariance_is_true() -> None:
     rig = box_rig()
     squares, freedom = 0.0, 0
-    for seed in range(8):  # 240 degrees of freedom: the sum is known to 9 %
-        estimate = estimated(walk_round(rig, 40, seed=100 + seed), rig)
+    for seed in range(5):  # 150 degrees of freedom: the sum is known to 12 %
+        estimate = estimated(walk_round(rig, 25, seed=100 + seed), rig)
         square, dof = normalised_error(estimate, rig, estimate.adjusted.part_covariance)
         squares, freedom = squares + square, freedom + dof
         assert estimate.adjusted.reduced_cost == pytest.approx(1.0, abs=0.2)

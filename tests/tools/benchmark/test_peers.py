@@ -10,6 +10,7 @@ from tools.benchmark.functions import peers_of_other_libraries
 from tools.benchmark.material import jpeg_picture
 
 
+@pytest.mark.lowest
 def test_hough_circles_of_scikit_image_are_where_they_were_painted() -> None:
     present, _ = peers_of_other_libraries()
     (hough,) = (measured for measured in present if measured.name == "skimage hough_circle")

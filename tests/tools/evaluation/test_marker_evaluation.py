@@ -119,7 +119,7 @@ def test_bins_compare_like_with_like() -> None:
 
 
 def test_every_marker_is_in_one_bin_of_each_quantity() -> None:
-    frames = score_frames(SampleSettings(samples=4), (OURS,), frames=4, seed=2)
+    frames = score_frames(SampleSettings(samples=4), (OURS,), frames=2, seed=2)
     table = table_of(frames)
     bins = binned(table)
     clear = table.columns["clear"] > 0.0
@@ -128,7 +128,7 @@ def test_every_marker_is_in_one_bin_of_each_quantity() -> None:
         inside = np.count_nonzero((values >= limits[0]) & (values <= limits[-1]))
         assert sum(b.own[OURS].markers for b in bins if b.quantity == quantity) == inside
     assert statistics_picture(bins, "a title") == statistics_picture(bins, "a title")
-    assert counts_lines(table)[0].startswith("4 frames")
+    assert counts_lines(table)[0].startswith("2 frames")
 
 
 def test_opencv_is_measured_as_it_is() -> None:
@@ -197,12 +197,12 @@ def test_searches_are_timed_beside_decoding() -> None:
 
 @pytest.mark.long
 def test_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    arguments = ["markers", "--statistics", "4", "--no-spot", "--frames", "3", "--output",
+    arguments = ["markers", "--statistics", "2", "--no-spot", "--frames", "2", "--output",
                  str(tmp_path / "out"), "--dictionary", "4x4_50"]  # fmt: skip
     assert main(arguments) in (0, 1)
     assert "clearly in view" in capsys.readouterr().out
     content = json.loads((tmp_path / "out" / "markers.json").read_text())
-    assert content["search"]["frames"] == 3
+    assert content["search"]["frames"] == 2
     assert len(content["statistics"]["bins"]) == 1 + sum(len(b) - 1 for b in BINS.values())
     assert (tmp_path / "out" / "statistics.png").read_bytes().startswith(b"\x89PNG")
     assert main(arguments) == 1

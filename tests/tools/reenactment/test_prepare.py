@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -101,36 +102,39 @@ def run_e(shared_data: Path, published_camera: Camera) -> Recording:
 
 
 @pytest.fixture(scope="module")
-def run_e_stages(shared_data: Path, published_camera: Camera, run_e: Recording) -> list[Stage]:
+def least_squares(shared_data: Path, published_camera: Camera, run_e: Recording) -> list[Stage]:
+    """The published solution of run e, and the one with the true mounting."""
     folder = shared_data / "dlr"
     start = (
         read_path(folder / "least_squares_path.csv", len(run_e.steps)),
         read_map(folder / "least_squares_map.csv", run_e.disc_ids),
     )
-    return list(stages(published_camera, run_e, start))
+    return list(islice(stages(published_camera, run_e, start), 2))
 
 
 @pytest.mark.long
-def test_run_e_from_its_least_squares_solution(run_e: Recording, run_e_stages: list[Stage]) -> None:
+def test_run_e_from_its_least_squares_solution(
+    run_e: Recording, least_squares: list[Stage]
+) -> None:
     counts = len(run_e.steps), len(run_e.frame), len(run_e.disc_ids)
     assert counts == (3297, 14_309, 576)
-    published, corrected, _, _, world = (stage.quality for stage in run_e_stages)
+    published, corrected = (stage.quality for stage in least_squares)
     assert published.chi_squared == pytest.approx(56_871.4, abs=0.15)
     assert corrected.chi_squared == pytest.approx(37_450.2, abs=1.0)
     np.testing.assert_allclose(corrected.rotation, [-0.0366, 0.0099, 0.0024], atol=2e-4)
     assert corrected.height == pytest.approx(-0.0111, abs=5e-4)
-    assert world.share_whole_pixel >= 0.999
-    assert world.median_px < 0.8
-    assert world.out_of_sight <= 3
-    assert published.share_whole_pixel < corrected.share_whole_pixel < world.share_whole_pixel
+    assert published.share_whole_pixel < corrected.share_whole_pixel < 0.999
 
 
 @pytest.mark.long
 def test_run_e_from_odometry_alone(
-    published_camera: Camera, run_e: Recording, run_e_stages: list[Stage]
+    published_camera: Camera, run_e: Recording, least_squares: list[Stage]
 ) -> None:
     *_, world = stages(published_camera, run_e, None)
     assert world.quality.share_whole_pixel >= 0.999
-    np.testing.assert_allclose(
-        world.geometry.poses[:, :2], run_e_stages[-1].geometry.poses[:, :2], atol=0.05
-    )
+    assert world.quality.median_px < 0.8
+    assert world.quality.out_of_sight <= 3
+    corrected = least_squares[-1].geometry
+    off = np.hypot(*(world.geometry.poses - corrected.poses)[:, :2].T)
+    # Plain least squares is drawn aside by rows of confused discs.
+    assert off.max() < 1.2
