@@ -64,7 +64,7 @@ def read_camera(path: str | os.PathLike[str]) -> Camera:
 
 
 def parse_camera(text: str, name: str = "<text>") -> Camera:
-    """Make a camera of the text of a ``.cam`` file; `name` stands for the file in errors."""
+    """Parse the text of a ``.cam`` file; `name` is what errors call the file."""
     entries = _split(text, name)
 
     def numbers(key: str, count: int) -> list[float]:

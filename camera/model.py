@@ -55,7 +55,7 @@ Pose = tuple[tuple[float, float, float, float], ...]
 class Camera:
     """A calibrated camera on a robot, with its distortion. A value.
 
-    Two cameras are equal, and hash alike, when all that they were made of is equal.
+    Two cameras are equal, and have the same hash, if all their parameters are equal.
 
     Parameters
     ----------

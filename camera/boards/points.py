@@ -21,9 +21,9 @@ _WINDOW = 0.3
 _SMALLEST_HALF_WINDOW = 2
 _LARGEST_HALF_WINDOW = 9
 _FEWEST_POINTS = 8
-# A checkerboard is looked for in pictures reduced to so many pixels along their longer side, one
-# after the other: what OpenCV's search takes grows faster than the picture, most where there is no
-# board, and squares of a few pixels are enough for it.
+# Lengths of the longer side (px) to which an image is reduced, in turn, to search a checkerboard.
+# The time of OpenCV's search grows faster than the image, most of all in images without a board,
+# and squares of a few pixels suffice.
 _SEARCHED_PX = (1280, 2048)
 
 

@@ -47,8 +47,8 @@ FREE_COEFFICIENTS: tuple[tuple[str, ...], ...] = (
 
 # The image's corner must be seen at a radius that stays below the fold by this share.
 _FOLD_MARGIN = 0.01
-# Directions in which it is looked how far such a lens sees, and places on each of the border's
-# sides.
+# Number of directions in which the limit of such a lens is searched, and of places on each side
+# of the border.
 _DIRECTIONS = 128
 _BORDER_PLACES = 9
 

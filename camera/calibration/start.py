@@ -23,7 +23,7 @@ FloatArray = NDArray[np.float64]
 
 # Focal lengths that are tried, in widths of the image: from 130 to 6 degrees across.
 _FOCAL_WIDTHS = (0.25, 0.4, 0.6, 0.9, 1.4, 2.2, 4.0, 8.0)
-# Views that are enough to tell a good start from a bad one.
+# Number of views used to compare starts.
 _FEW_VIEWS = 10
 _LOOSE = 1e-4
 

@@ -343,9 +343,9 @@ def _contained(source: AnyCamera, model: Model, number: int) -> ForeignCamera | 
         return ForeignCamera(model, source.width, source.height, fx, fy, cx, cy, found)
     if (source.model == "fisheye") != (model == "fisheye"):
         return None
-    room = COEFFICIENTS[model]
-    padded = (*source.distortion, *(0.0,) * room)[:room]
-    if any(source.distortion[room:]) or any(padded[number:]):
+    count = COEFFICIENTS[model]
+    padded = (*source.distortion, *(0.0,) * count)[:count]
+    if any(source.distortion[count:]) or any(padded[number:]):
         return None
     return replace(source, model=model, distortion=padded)
 
@@ -383,7 +383,7 @@ def _rays(source: AnyCamera, pixels: FloatArray) -> FloatArray:
 
 
 def _check(source: AnyCamera, rows: Rows) -> tuple[FloatArray, FloatArray]:
-    """The target's pixels that the deviation is looked for at, and their rays."""
+    """The target's pixels at which the deviation is evaluated, and their rays."""
     pixels = _grid(*target_size(source, rows), _CHECK_GRID)
     return pixels, _rays(source, source_pixels(pixels, rows))
 

@@ -45,7 +45,7 @@ def camera_from_message(
     k : 9 floats
         The camera matrix of the raw image, row by row.
     name : str
-        Stands for the message in errors.
+        What errors call the message.
 
     Raises
     ------
