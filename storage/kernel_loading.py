@@ -2,13 +2,13 @@
 
 Before it looks into its cache, Numba gets ready to compile: it imports what it can compile of
 Python, NumPy and SciPy, and registers all of it, which takes a third of the time that a command
-has before its first landmark. Machine code needs none of that. So the cache is looked into first,
-and Numba gets ready where there is something to compile.
+has before its first landmark. Machine code needs none of that. So the cache is read first, and
+Numba is initialised only if there is something to compile.
 
-What is compiled is kept as Numba keeps it, but for one thing: it names machine code in the index of
-a kernel before it writes it. A process that is killed in between, or finds no room, would leave an
-index that vouches for what an earlier version of the kernel left under that name, and another one
-that looks at that moment would take it. So such files are removed first.
+Compiled kernels are cached as Numba caches them, with one exception. Numba adds a file of machine
+code to a kernel's index before it writes the file. If the process is killed in between, or the disk
+is full, the index refers to a file of that name that an earlier version of the kernel left; another
+process that reads the cache at that moment would load it. So such files are removed first.
 
 Attributes of Numba that are not public are used for it; where they have changed, everything is done
 as Numba does it.
@@ -82,7 +82,7 @@ def load_kernels_alone() -> bool:
             with _environments_alone(environment), self._guard_against_spurious_io_errors():
                 return self._load_overload(signature, target_context)
         except Exception:
-            return None  # whatever it is: Numba itself will tell
+            return None  # Numba itself reports the error
 
     def save_index(self: Any, overloads: dict[Any, str]) -> None:
         for name in {*overloads.values()} - {*self._load_index().values()}:

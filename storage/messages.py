@@ -1,4 +1,4 @@
-"""What is shown of files whose content nobody vouches for: escaped, bounded, on one line.
+"""Quotes the content of untrusted files in messages: escaped, bounded, on one line.
 
 A terminal acts upon control characters, so none of a file's own may reach it; and a file may hold
 a word of a gigabyte. Every typed error of the project passes its message through `one_line`.

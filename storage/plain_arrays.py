@@ -1,4 +1,4 @@
-"""NumPy's ``.npy`` format from strangers: no objects, and no size believed before it is checked."""
+"""Reads untrusted files in NumPy's ``.npy`` format: no objects, and sizes are checked first."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def read_plain_array(
     Raises
     ------
     ValueError
-        If there is no such array; the message says what stands there, on one line.
+        If there is no such array; the message says what was found, on one line.
     """
     expected = f"expected {dimensions}-dimensional {dtype}, row by row"
     try:
