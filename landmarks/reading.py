@@ -44,9 +44,9 @@ _NUMBER_PATTERN = rb"[+-]?(?:[0-9]++(?:\.[0-9]*+)?|\.[0-9]++)(?:[eE][+-]?[0-9]++
 _NUMBER = re.compile(_NUMBER_PATTERN)
 _NUMBERS = re.compile(rb"(?:%b )*+" % _NUMBER_PATTERN)
 _WHOLE_NUMBER = re.compile(rb"[+-]?[0-9]+")
-# A comment, so that programs that know nothing of it read the file as well.
+# A comment, so that other programs can read the file as well.
 _LEVELLED = re.compile(rb"# levelled (%b) (%b)\r?\n?" % (_NUMBER_PATTERN, _NUMBER_PATTERN))
-# A STEP as programs write it, in a line of its own: of a long run all are. Such numbers are finite.
+# A STEP as programs write it, in a line of its own, with finite numbers: the usual case.
 _PLAIN_STEP = re.compile(
     rb"STEP ((?!#)[!-\[\]-~]{1,255}+)"
     + len(STEP_NUMBERS) * rb" {1,32}+(-?[0-9]{1,15}\.[0-9]{1,20})"
@@ -72,7 +72,7 @@ def read_rows(path: str | os.PathLike[str]) -> Iterator[Row]:
     Raises
     ------
     LandmarkFileError
-        If the file cannot be opened, a row is malformed, or a landmark stands before any STEP; the
+        If the file cannot be opened, a row is malformed, or a landmark precedes the first STEP; the
         message names the file, the line and what was expected.
     """
     with _opened(path) as stream:
@@ -145,7 +145,7 @@ def frames_of_rows(rows: Iterable[Row]) -> Iterator[Frame]:
 
 
 def parse_rows(stream: BinaryIO, name: str = "<stream>") -> Iterator[Row]:
-    """Read rows from a binary stream; `name` stands for the file in errors (see `read_rows`)."""
+    """Read rows from a binary stream; errors name the file `name` (see `read_rows`)."""
     for record, source, line in _parsed(stream, name, _plain_step):
         yield Row(record, source, line)
 

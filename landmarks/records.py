@@ -217,7 +217,7 @@ class MarkerLandmark:
 class DetectorSettings:
     """How a detector was set, as the data set's files may say at their head.
 
-    The data set knows ``CIRCLEMARKDETECTOR <camfile> nohalf|half <radius> <threshold>``.
+    The data set has ``CIRCLEMARKDETECTOR <camfile> nohalf|half <radius> <threshold>``.
 
     Attributes
     ----------
