@@ -52,11 +52,11 @@ class DiscShape:
         Far limit: the floor moves at most this far from one image row to the next, metres;
         infinite: however far.
     least_pairs : int
-        Samples vote in pairs, an inner and an outer one, of which so many must be inside the image;
-        0: each for itself.
+        Samples are counted in pairs, an inner and an outer one, at least this many of which must be
+        inside the image; 0: samples are counted singly.
     apart_px : float
         How far the samples of a pair that fall on the same pixel are moved, one inwards and one
-        outwards: the length on the floor of so many pixels down the image.
+        outwards: the length on the floor of this many pixels down the image.
     stride_m : float
         After a usable centre, those nearer than this along the row are left out, metres: counted
         in pixels as long as one down the image, rounded up; 0: none.
