@@ -73,7 +73,7 @@ class LineRows:
     sigma_rad : (n,) float64
         Its standard deviation, above 0.
     ids : tuple of n tuples of int
-        All lines that a row stands for (joined rows have several); empty where unknown.
+        All lines that a row shows (joined rows have several); empty where unknown.
     """
 
     frame: IntArray
@@ -246,7 +246,7 @@ def recording_of_frames(
     frames : sequence of Frame
         The run in order.
     name : str
-        What stands for the file in messages.
+        What messages call the file.
     noise : OdometryNoise
         Of the steps that state no covariance: zeros.
 
@@ -274,7 +274,7 @@ def recording_of_frames(
     for bad in _not_positive_definite(covariance):
         raise SlamError(
             f"{name}: step {bad + 1} ({steps[bad].prefix}): its covariance is not positive "
-            "definite: expected one that weighs all of dx, dy and dphi"
+            "definite: expected a covariance of dx, dy and dphi of full rank"
         )
     return Recording(
         prefixes=tuple(step.prefix for step in steps),

@@ -146,7 +146,7 @@ def chi_squared_gates(probability: float, width: int, most_pairs: int) -> FloatA
     width : int
         Degrees of freedom of a pair.
     most_pairs : int
-        Largest number of pairs asked for.
+        Largest number of pairs to return.
 
     Returns
     -------

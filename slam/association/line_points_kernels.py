@@ -108,11 +108,11 @@ def best_run(
     gate: float,
     rows: IntArray,
 ) -> float:
-    """The unbroken stretch of frames that speaks most for a vertical at a point.
+    """Score of a vertical at a point, over the contiguous frames that support it most.
 
-    A frame in which a ray passes within the gate speaks for it by the logarithm of how much
-    likelier the ray is from there than from anywhere; one without such a ray, though the point is
-    in the field of view, against it by that of the probability to miss a vertical.
+    A frame with a ray within the gate adds the logarithm of the ratio of the ray's likelihood for
+    this point to that for clutter. A frame without such a ray, though the point is in the field of
+    view, adds the logarithm of the probability to miss a vertical.
 
     Parameters
     ----------
@@ -123,7 +123,7 @@ def best_run(
     free : (n,) bool
         Rays that may be used.
     first, last : int
-        Frames that are looked at, the second one excluded.
+        Range of frames to score, `last` excluded.
     heading : (F,) float64
         Of the robot in each frame (rad).
     widest_rad : float

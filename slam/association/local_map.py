@@ -187,7 +187,7 @@ def kept(
 def line_places(
     local: LocalMap, frame: int, camera_xy: tuple[float, float]
 ) -> tuple[FloatArray, IntArray]:
-    """Where the lines seen in a frame stand.
+    """Positions of the lines seen in a frame.
 
     Parameters
     ----------

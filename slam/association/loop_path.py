@@ -181,8 +181,8 @@ def solve_path(
     path : (N + 1, 3) float64, optional
         Where to start from; by default odometry.
     line_xy : (L, 2) float64, optional
-        Where lines stand at the start (m); rows of lines that are NaN do not count. Without it no
-        lines do.
+        Initial positions of the lines (m); rows of lines with NaN are ignored. Without it, all
+        lines are ignored.
     camera_xy : (2,)
         The camera's centre in the robot frame (m).
     sigma_scale : float

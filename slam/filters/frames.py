@@ -31,7 +31,7 @@ class FrameRows:
         In the robot frame (m).
     disc_covariance : (d, 2, 2) float64
     line_ids : tuple of l tuples of int
-        All lines that a row stands for; empty where unknown.
+        All lines that a row shows; empty where unknown.
     bearing_rad : (l,) float64
     sigma_rad : (l,) float64
     """

@@ -44,7 +44,7 @@ def frame_innovation(
     line_slot : (e,) int64
         Where in the state the lines of the rows begin.
     line_start : (l + 1,) int64
-        Row i stands for lines line_slot[line_start[i] : line_start[i + 1]]; it is a measurement of
+        Row i shows the lines line_slot[line_start[i] : line_start[i + 1]]; it is a measurement of
         the mean of their bearings.
     bearing_rad, sigma_rad : (l,) float64
         The rows of lines.
@@ -60,7 +60,7 @@ def frame_innovation(
     noise : (m, m) float64
         Covariance of the measurements.
     index : (3 + 2 d + 2 e,) int64
-        Into the state. A landmark that several rows show stands in it several times.
+        Into the state. A landmark that several rows show is included several times.
     """
     discs, lines = len(disc_slot), len(bearing_rad)
     rows = 2 * discs + lines

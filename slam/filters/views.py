@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-# A line that was out of sight for so many frames begins anew.
+# A line that was out of sight for this many frames is initialised again.
 LONGEST_ABSENCE_FRAMES = 50
 # Poses kept at most. If there are more, every other one is given up: what counts is the span.
 MOST_KEPT_POSES = 24

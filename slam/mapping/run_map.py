@@ -125,9 +125,9 @@ def map_run(
     weighting : Weighting, optional
         Loss and unknowns; plain least squares by default.
     solver : "separable" or "gtsam"
-        Who goes the last way to the minimum.
+        The solver that does the final optimisation.
     name : str
-        What stands for the run in messages.
+        What messages call the run.
 
     Returns
     -------

@@ -88,7 +88,7 @@ def solve(
     tolerance : float
         Stop at a step that lowers the cost by less than this share of it.
     most_steps : int
-        Give up after so many.
+        Largest number of steps before giving up.
 
     Returns
     -------
@@ -186,7 +186,7 @@ def moved(estimate: Estimate, layout: Layout, step: FloatArray, mounting: FloatA
     estimate : Estimate
         Before.
     layout : Layout
-        Where in the step things stand.
+        Layout of the step.
     step : (K,) float64
         Changes of all unknowns but the mounting.
     mounting : (0,) or (4,) float64

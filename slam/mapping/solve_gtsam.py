@@ -58,7 +58,7 @@ def solve_gtsam(
     tolerance : float
         Stop at a step that lowers the cost by less than this share of it.
     most_steps : int
-        Give up after so many.
+        Largest number of steps before giving up.
 
     Returns
     -------

@@ -125,7 +125,7 @@ def bearing_of_vertical(pose: ArrayLike, line_xy: ArrayLike, camera_xy: ArrayLik
     pose : (..., 3) array_like
         The robot's pose in the map.
     line_xy : (..., 2) array_like
-        Where the line stands in the map (m).
+        Position of the line in the map (m).
     camera_xy : (2,) array_like
         (cx, cy): the camera's centre in the robot frame (m), from `sensor2World`.
 

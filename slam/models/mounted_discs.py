@@ -79,7 +79,7 @@ class Geometry:
 
 
 def nominal_geometry(camera: Camera, poses: FloatArray, disc_xy: FloatArray) -> Geometry:
-    """A geometry whose camera is mounted as calibrated and whose robot stands upright."""
+    """The geometry with the camera mounted as calibrated and the robot upright."""
     return Geometry(
         poses=poses,
         disc_xy=disc_xy,
