@@ -111,7 +111,7 @@ def pair_headings(
     Returns
     -------
     HeadingPair or None
-        None where too few samples are covered by the other stream wherever the search looks.
+        None if the other stream covers too few samples in the whole search range.
     """
     if len(segment) < fewest:
         return None
@@ -140,7 +140,7 @@ def pair_headings(
     pair = HeadingPair(times, headings, window, other, reference, sign, systematic)
     if len(times) == 0:
         return None
-    # Wherever the search looks, the other stream must have a say.
+    # The other stream must cover the samples in the whole search range.
     corners = [
         pair.warped(times + end * window, offset, drift)
         for end in (-0.5, 0.5)

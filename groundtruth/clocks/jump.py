@@ -14,8 +14,8 @@ from groundtruth.clocks.wandering import Wandering, estimate_wandering
 FloatArray = NDArray[np.float64]
 
 _PLACES = 60
-# By how much a step must explain more than chance would at the best of so many places: beside the
-# drift, and in its stead (100 draws without a jump reached 13 and 11).
+# By how much a step must reduce the squared error, more than the best of `_PLACES` would by chance:
+# in addition to the drift, and instead of it (100 draws without a jump reached 13 and 11).
 _BEYOND_DRIFT = 20.0
 _INSTEAD_OF_DRIFT = 15.0
 _LEAST_JUMP_S = 0.004

@@ -30,7 +30,7 @@ from storage import write_whole
 
 FloatArray = NDArray[np.float64]
 
-#: So many readings that hide the robot, or of things beside it, mark a set as disturbed.
+#: A set is disturbed by this many readings that hide the robot or are of objects beside it.
 _DISTURBED = 3
 
 

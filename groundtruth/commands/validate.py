@@ -38,7 +38,7 @@ from groundtruth.validation.validate import (
 )
 from storage import write_whole
 
-#: What stands in the folder.
+#: Files written to the folder.
 OUTPUTS = ("table.csv", "reference.csv", "errors.png", "validation.json")
 
 _FARTHEST_S = 0.5

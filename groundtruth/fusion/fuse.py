@@ -90,7 +90,7 @@ class Fusion:
     used : dict of str to int
         Measurements that went in, by stream.
     odometry : OdometryErrors
-        What was learnt of it.
+        The estimated errors of odometry.
     repaired : dict of str to int
         Covariances that were not positive definite as written, by stream; they were raised by their
         file's rounding.
@@ -153,7 +153,7 @@ def fuse(
     at = np.searchsorted(problem.times_s, inside)
     poses = smoothed[at, :3]
     poses[:, 2] = wrap_angle(poses[:, 2])
-    # Odometry's errors are constants: all that is known of them is known at the end.
+    # Odometry's errors are constants: their final estimate uses all measurements.
     last_spread = np.sqrt(np.maximum(np.diagonal(spread[-1]), 0.0))
     return Fusion(
         poses=PlanarPoses(inside, poses, spread[at][:, :3, :3].copy()),

@@ -1,12 +1,12 @@
-"""Gaps at whose ends the filter is lost: bridged anew from both ends, or cut in their middle.
+"""Bridges gaps at whose ends the filter is lost, from both ends, or cuts them in the middle.
 
-Over a long way without measurements the heading that odometry tells goes astray so far that
-derivatives along the filter's own path say nothing of the true one. So such gaps are taken by
-themselves: the path before and the path after are known from their own measurements, odometry is
-laid between them, bent evenly, and from there Gauss-Newton steps (a filter forward and a smoother
-backward, linearised along the path so far) lead to the likeliest path. Headings are told but for
-whole turns; each number of turns that may be is tried, and the gap is bridged only if one of them
-explains the other end much better than all others. Otherwise both sides are left to themselves.
+Over a long path without measurements odometry's heading drifts so far that derivatives along the
+filter's own path do not hold for the true one. Such gaps are treated separately. The paths before
+and after are known from their own measurements. Odometry is placed between them, bent evenly, and
+refined to the likeliest path by Gauss-Newton steps (a forward filter and a backward smoother,
+linearised along the current path). Headings are known up to whole turns: each possible number of
+turns is tried, and the gap is bridged only if one of them explains the other end much better than
+all others. Otherwise the two sides are not connected.
 """
 
 from __future__ import annotations
@@ -221,7 +221,7 @@ def _step(
 def back_from(
     controls: FloatArray, variances: FloatArray, end: FloatArray, end_spread: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """States and covariances that odometry tells backward from a gap's end.
+    """States and covariances predicted backward by odometry from a gap's end.
 
     Parameters
     ----------

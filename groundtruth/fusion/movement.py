@@ -95,7 +95,7 @@ class MovementProblem:
     settings: FuseSettings
 
     def shortened(self, count: int) -> MovementProblem:
-        """The run of nodes with most measurements among them, of at most so many."""
+        """The contiguous nodes, at most `count`, that have the most measurements."""
         if len(self.times_s) <= count:
             return self
         begins = self.nodes[self.nodes + count <= len(self.times_s)]
@@ -134,7 +134,7 @@ class MovementProblem:
         return self.account(noise).surprise
 
     def account(self, noise: FloatArray) -> MeasurementAccount:
-        """What becomes of the measurements in a filter that goes forward only."""
+        """How a forward-only filter uses the measurements."""
         return self._forward(
             self._variances(noise),
             np.empty((1, STATE)),
@@ -218,9 +218,9 @@ class MovementProblem:
     def _bridge(
         self, begin: int, end: int, variances: FloatArray, points: FloatArray, work: _Work
     ) -> Bridge:
-        """Lay points over a gap that was cut, if it can be bridged.
+        """Bridge a gap that was cut with points, if possible.
 
-        The least noise that explains the other end tells by how many whole turns headings differ.
+        The number of whole turns by which headings differ is that with the least noise.
         """
         gap = slice(begin, end + 1)
         found = bridge(
@@ -241,7 +241,7 @@ class MovementProblem:
         return found
 
     def _anchor(self, begin: int, end: int, variances: FloatArray, work: _Work) -> None:
-        """Let the second half of a gap that was cut be told by what comes after it."""
+        """Determine the second half of a gap that was cut from the measurements after it."""
         gap = slice(begin, end + 1)
         states, spreads = back_from(
             self.controls[gap],

@@ -138,8 +138,8 @@ def filter_forward(
     gate : float
         Largest squared normalised innovation.
     restart_after : int
-        So many rejections in a row, and the pose becomes the measured one, with
-        `restart_variances`: the measurements are believed again, however far off the filter was.
+        After this many consecutive rejections, the pose is reset to the measured one, with
+        `restart_variances`: measurements are accepted again, however far off the filter was.
     restart_variances : (3,) array
     lost_variance : float
         The same at once where the heading's variance (rad^2) is greater.
@@ -147,7 +147,7 @@ def filter_forward(
         The same at these nodes, at their first measurement.
     points : (N, 6) array
         States at which each movement away from a node is linearised, with headings that go on
-        without jumps; measured headings are taken to lie within half a turn of them. Of length 1:
+        without jumps; measured headings are assumed to be within half a turn of them. Of length 1:
         at the filter's own.
     keep : bool
         Whether the next five arrays are filled; they may be of length 1 where they are not.

@@ -30,7 +30,7 @@ _LARGEST_CHI2 = 4.0
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """What the kernels know of the robot.
+    """The robot's data for the kernels.
 
     Attributes
     ----------
@@ -167,7 +167,7 @@ def acquire(
 def _places(points: FloatArray, body: Body, settings: LaserSettings) -> list[FloatArray]:
     """Where the robot's middle might be: the middles of heaps, those of parts of large ones."""
     pairs = cKDTree(points).query_pairs(settings.link_m, output_type="ndarray")
-    # SciPy before 1.12 knows no graphs with indices of 64 bits.
+    # SciPy before 1.12 does not support graphs with 64-bit indices.
     ends = (pairs[:, 0].astype(np.int32), pairs[:, 1].astype(np.int32))
     graph = coo_array((np.ones(len(pairs), dtype=np.int8), ends), (len(points),) * 2)
     count, label = connected_components(graph, directed=False)

@@ -1,4 +1,4 @@
-"""What a fixed scanner sees when nobody is there, learned from scans of the empty area."""
+"""Background of a fixed scanner, learned from scans of the empty area."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def learn_background(
         return np.asarray(values[row, beams])
 
     median = quantile(ordered, 0.5)
-    # Two readings in a hundred scans tell nothing of what stands there.
+    # Two readings in a hundred scans say nothing about the background.
     seen = count >= max(1, round(0.02 * len(ranges_mm)))
     deviation = np.full_like(metres, np.inf)
     np.subtract(metres, median, out=deviation, where=hit)

@@ -29,7 +29,7 @@ from storage.bounds import ABOVE_0, SHARE_ABOVE_0, demand, whole
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
-#: Points whose neighbourhood is wider than this share of its length lie on no line.
+#: Points whose neighbourhood is wider than this share of its length are on no line.
 _LARGEST_SPREAD = 0.3
 
 _NEIGHBOURS = 7
@@ -48,7 +48,7 @@ class IcpSettings:
     threshold_m : float
         The ICP ends when the root mean square error changes by less than this (m).
     most_steps : int
-        It ends unconverged after so many steps.
+        Largest number of steps; after these the ICP has not converged.
     weak_sigma_m : float
         A direction is undetermined if the pose's standard deviation along it is larger than this
         (m; a rotation counts by what it does to the points, root mean square).
@@ -135,7 +135,7 @@ def icp_to_points(
     -------
     IcpResult
         Its covariance takes the target for samples of lines, whose directions come from their
-        neighbourhoods: sliding along them is not determined, however well the points lie.
+        neighbourhoods: sliding along them is not determined, however well the points match.
 
     Raises
     ------
@@ -306,7 +306,7 @@ def _uncertainty(
     variance = float(residual @ residual) / freedom / shrinkage
     # Exactly fitting points do not make a pose exact to less than rounding.
     information = rows.T @ rows / max(variance * inflation, 1e-18)
-    # About the middle of the points, where turning and moving are told apart best.
+    # About the middle of the points, where rotation and translation are least correlated.
     middle = lever.mean(axis=0)
     scale_m = math.sqrt(float(np.mean(np.sum((lever - middle) ** 2, axis=1))))
     shift = np.array([[1.0, 0.0, middle[1]], [0.0, 1.0, -middle[0]], [0.0, 0.0, 1.0]])

@@ -79,7 +79,7 @@ def scanner_tables(
     backgrounds: Sequence[Background],
     joint_covariance: FloatArray | None = None,
 ) -> ScannerTables:
-    """Lay scanners and what they have learned out for the kernels.
+    """Arrange scanners and their backgrounds for the kernels.
 
     Parameters
     ----------

@@ -68,7 +68,7 @@ class LaserTrack:
     reasons : dict of int to str
         Why a set has no pose, where the robot was expected.
     corrections : (scanners, 3) float64
-        Poses of the scanners that their residuals ask for, as against those given.
+        Corrections of the scanners' given poses that their residuals suggest.
     correction_sigma : (scanners, 3) float64
     """
 
@@ -277,16 +277,16 @@ class Tracker:
             self.status[i], self.poses[i] = COASTING, np.nan
             return
         self._store(i, refined, summary, self._explain(i, refined))
-        # What was known of the whole visit, or of its first set, stays known.
+        # Keeps what the whole visit, or its first set, has determined.
         if status == UNRESOLVED or (status == REACQUIRED and self.status[i] == OK):
             self.status[i] = status
         self.information += self._evidence[0]
         self.gradient += self._evidence[1]
 
     def _front(self, rows: IntArray, velocity: FloatArray) -> str:
-        """Choose among the poses that the outline hardly tells apart, and say by what.
+        """Choose among the poses that the outline hardly distinguishes; returns the criterion.
 
-        First by the readings themselves, in a sample of the sets; if they do not tell, by the
+        First by the readings themselves, in a sample of the sets; if they are ambiguous, by the
         motion: robots drive forward.
         """
         if len(self.body.symmetries) == 0:

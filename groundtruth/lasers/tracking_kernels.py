@@ -287,7 +287,7 @@ def refine_outline(
         if used < 3:
             return pose, covariance, calibration, summary, weak, information, gradient
         summary[3] = math.sqrt(squares / used)
-        # Open directions are looked for about the middle of the points, theta in metres there.
+        # Undetermined directions are evaluated about the middle of the points, theta in metres.
         mx, my = sx / used, sy / used
         scale = scale_m
         for a in range(3):
@@ -350,7 +350,7 @@ def explain_set(
     (6,) float64
         Beams that should see the robot before the background; of these: as far as they should,
         farther (through it), nearer (hidden by something), without a reading; and new readings
-        in the outline's circle where the robot is not: things that stand there beside it.
+        in the outline's circle where the robot is not: objects beside it.
     """
     out = np.zeros(6)
     c, s = math.cos(pose[2]), math.sin(pose[2])

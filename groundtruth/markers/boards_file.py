@@ -1,4 +1,4 @@
-"""``boards.json``: which checkerboard is in which image of which camera, and what is known of them.
+"""``boards.json``: which checkerboard is in which image of which camera, and the boards' data.
 
 ::
 
@@ -45,7 +45,7 @@ FIRST, SECOND, WORLD = "first", "second", "world"
 
 @dataclass(frozen=True, eq=False)
 class BoardImage:
-    """A board in an image that was not looked at yet."""
+    """A board in an image that has not been read yet."""
 
     camera: str
     board: str
@@ -83,7 +83,7 @@ def read_boards(path: Path) -> BoardsFile:
     Parameters
     ----------
     path : path
-        The file, or the folder in which it stands.
+        The file, or its folder.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Checkerboards of which only one way to hold them is right; they are found by the camera room.
+"""Checkerboards with a unique orientation; `camera.boards` finds them in images.
 
 A board's frame is that of `camera.boards.board`: origin at the middle of its inner corners, x
 right, y up, z out of the print, held so that the square in its top left corner is black. With one
@@ -58,7 +58,7 @@ class Checkerboard:
 
     @property
     def board(self) -> Board:
-        """The board, as the camera room knows it."""
+        """The board as used in the package `camera`."""
         return Board("checkerboard", self.columns, self.rows, self.square_m)
 
     @property

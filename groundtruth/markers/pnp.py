@@ -102,7 +102,7 @@ def solve_robot(problem: PoseProblem, solver: Solver = "sqpnp") -> list[PnpSolut
     -------
     list of PnpSolution
         `world_from_robot`, with residuals over all cameras; the best first. Solutions in which a
-        corner lies behind its camera are left out.
+        corner is behind its camera are left out.
 
     Raises
     ------

@@ -1,7 +1,7 @@
 """A rig in the robot's frame: by markers whose place on the robot is known, or by known poses.
 
-What is known becomes a prior of one more adjustment in which all markers are free. So the
-covariance is that of the robot's frame: markers far from what defines it are less sure.
+These become priors of a further adjustment in which all markers are free. So the covariance is that
+in the robot's frame: markers far from those that define it are less certain.
 """
 
 from __future__ import annotations

@@ -35,7 +35,7 @@ class PoseSettings:
     ambiguity_odds : float
         A second solution is taken for impossible only if the first is this many times likelier.
     floor : bool
-        Take it that the robot stands on the floor: z, roll and pitch are known.
+        Assume that the robot is on the floor: z, roll and pitch are known.
     floor_z_m : float
         Height of the robot's origin there (m).
     floor_sigma_z_m : float

@@ -1,4 +1,4 @@
-"""What stands on the report's page, before it is HTML; and how it becomes that."""
+"""Content of the report's page and its conversion to HTML."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class Part:
 
 @dataclass(frozen=True)
 class Section:
-    """A section of the page: its anchor, its heading, and what stands in it."""
+    """A section of the page: its anchor, its heading and its content."""
 
     key: str
     name: str

@@ -1,8 +1,8 @@
-"""Reference poses of a standing robot from distances of points on it to surveyed points.
+"""Reference poses of a robot at rest from distances of points on it to surveyed points.
 
-All minima are sought, from starts all round: distances to two points, or to points in a line, fit
-mirrored poses as well. A pose counts only if it is determined, no other fits nearly as well, and
-its distances agree within their noise, but for gross errors that can be told apart.
+All minima are searched, from starts all round: distances to two points, or to points on a line, fit
+mirrored poses as well. A pose is accepted only if it is determined, no other fits nearly as well,
+and its distances agree within their noise, except for gross errors that can be identified.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class DistanceSettings:
     gross_probability : float
         Distances that fit less well than this share of right ones hold a gross error.
     most_gross : int
-        At most so many of a pose's distances are left out as gross errors.
+        At most this many of a pose's distances are left out as gross errors.
     ambiguity_chi2 : float
         Another pose within this squared normalised misfit of the best makes it ambiguous.
     largest_sigma_m, largest_sigma_deg : float

@@ -27,7 +27,7 @@ _COLUMNS = 8
 
 @dataclass(frozen=True, eq=False)
 class Relations:
-    """How the robot lay at one time to where it was at another.
+    """Poses of the robot at one time relative to another.
 
     Attributes
     ----------
@@ -126,7 +126,7 @@ def score_steps(
     poses, truth : PlanarPoses
         With the same times.
     step : int
-        From each pose to the one so many poses later.
+        From each pose to the one `step` poses later.
     longest_s : float
         Steps that take longer, as across a gap, do not count (s).
 
