@@ -43,7 +43,7 @@ class RunFlags:
 
 @dataclass(frozen=True, kw_only=True)
 class PickedFrames:
-    """Which frames of a run are looked at.
+    """Selects the frames of a run.
 
     Parameters
     ----------

@@ -25,7 +25,7 @@ def estimate_noise(image: NDArray[np.uint8], most_rows: int | None = None) -> fl
     image : (H, W) uint8
         The image.
     most_rows : int, optional
-        Look at so many rows, evenly spread; by default at all.
+        Use at most this many rows, evenly spread; by default all.
 
     Returns
     -------

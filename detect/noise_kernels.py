@@ -9,15 +9,15 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-# Numba knows it as the type, the type checker as a function.
+# A type to Numba, a function to the type checker.
 _I: Callable[[Any], Any] = np.int16
 
 #: What takes the place of responses that do not count: above all of them.
 _NONE = _I(32767)
 _DARK, _LIGHT = _I(2), _I(253)
 
-#: A median is first guessed from so many responses, as far as it is below this; a guess that is
-#: wrong is moved so often by one.
+#: A median is first guessed from about `_SAMPLE` responses, at most as `_SMALL` - 1; a wrong guess
+#: is corrected by one, at most `_TRIES` times.
 _SAMPLE, _SMALL = 2048, 256
 _TRIES = 4
 

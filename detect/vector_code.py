@@ -36,7 +36,7 @@ def operation(define: Callable[..., Any]) -> Any:
 
 
 def constant(vector: Any, value: Any) -> Any:
-    """A vector of equal numbers that are known beforehand."""
+    """A vector of equal constants."""
     return ir.Constant(vector, [value] * vector.count)
 
 

@@ -143,7 +143,7 @@ def compare_frames(
     reference_name: str = "reference",
     detected_name: str = "detected",
 ) -> Comparison:
-    """Compare the discs of two sets of frames; the names stand for them in errors and reports.
+    """Compare the discs of two sets of frames; errors and reports use their names.
 
     See `compare_runs`.
     """

@@ -44,7 +44,7 @@ def _demand_rows(command: Compare) -> None:
     detected = command.detected or command.run / f"detected.{kind}"
     if not reference.exists():
         raise DetectError(
-            f"{reference}: no such landmark file: name the reference rows by --reference"
+            f"{reference}: no such landmark file: give the reference rows with --reference"
         )
     if not detected.exists():
         raise DetectError(

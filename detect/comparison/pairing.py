@@ -75,7 +75,7 @@ def pair_frames(
     all_frames : bool
         Keep frames that only one run has: with no rows on the other side.
     reference_name, detected_name : str
-        Stand for the runs in errors.
+        What errors call the runs.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""What a comparison of two runs is asked for, and what it answers."""
+"""Options and result of a comparison of two runs."""
 
 from __future__ import annotations
 
@@ -106,11 +106,11 @@ class NormalisedError:
     Attributes
     ----------
     per_dof : float or None
-        Mean per degree of freedom: 1 if the covariance is right, more if it promises too much.
+        Mean per degree of freedom: 1 if the covariance is right, more if it is too small.
     dof : int
         Degrees of freedom: two for each matched disc, one for each matched line.
     band : (float, float) or None
-        Where `per_dof` lies with 95 % probability if errors are normal, independent and have that
+        Interval of `per_dof` with 95 % probability if errors are normal, independent and have that
         covariance.
     left_out : int
         Matched rows whose covariance is not positive definite, or whose sigma is not positive.

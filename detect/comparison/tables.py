@@ -16,7 +16,7 @@ NONE = "-"
 
 
 def summary_table(rows: Iterable[tuple[str, str]]) -> Table:
-    """Lay out names and their values, which may wrap."""
+    """A table of names and values, which may wrap."""
     table = Table(box=None, show_header=False, pad_edge=False)
     table.add_column(style="bold", no_wrap=True)
     table.add_column(overflow="fold")

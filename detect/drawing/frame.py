@@ -69,7 +69,7 @@ def draw_rows(
     gate, line_gate : CompareOptions, LineCompareOptions
         What counts as the same disc or vertical as one of the reference.
     title : str
-        Stands first in the line below.
+        Beginning of the line below the picture.
 
     Returns
     -------
@@ -122,7 +122,7 @@ def sigma_bars(camera: Camera, ends: FloatArray, sigma_rad: FloatArray) -> Float
     Parameters
     ----------
     camera : Camera
-        Its own horizon is meant, that of the level robot.
+        Gives the horizon, that of the level robot.
     ends : (N, 4) float64
         As for `line_curves`; a line that ends before the horizon is made longer.
     sigma_rad : (N,) float64

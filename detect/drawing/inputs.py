@@ -33,7 +33,7 @@ class SeenRows:
     reference_by : (float, float) or None
         The same of the reference rows.
     reference_circles, reference_lines : tuple of rows or None
-        What they are held against; None also where that file does not know the image.
+        What they are compared with; None also if that file does not have the image.
     """
 
     circles: tuple[CircleLandmark, ...] | None = None
@@ -78,7 +78,7 @@ class SeenFiles:
 
 @dataclass(frozen=True)
 class RowSource:
-    """Rows of a run, looked up by image; of the files, only where frames stand is in memory."""
+    """Rows of a run by image; of the files, only the offsets of frames are in memory."""
 
     files: SeenFiles
     _frames: dict[str, FramesByImage] = field(default_factory=dict)

@@ -1,4 +1,4 @@
-"""Which frames of a run are looked at."""
+"""Selection of frames of a run."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class FrameSelection:
     names: frozenset[str] = frozenset()
 
     def expected(self, frames: Frames) -> int | None:
-        """About how many frames that will be; None if nobody knows."""
+        """Approximate number of these frames; None if unknown."""
         if self.ranges or self.names or frames.expected is None:
             return None
         return -(-frames.expected // self.every)

@@ -84,7 +84,7 @@ class MarkerDictionary:
 
 
 def dictionary_names() -> tuple[str, ...]:
-    """Names that `marker_dictionary` knows."""
+    """Names that `marker_dictionary` accepts."""
     return (RAWSEEDS, ARTOOLKITPLUS_12, ARTOOLKITPLUS_8, *sorted(_opencv_constants()))
 
 

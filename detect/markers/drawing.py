@@ -23,7 +23,7 @@ _EDGE_COLOUR: Colour = (60, 220, 60)
 _TOP_LEFT_COLOUR: Colour = (0, 0, 255)
 _TEXT_COLOUR: Colour = (0, 230, 255)
 _CANDIDATE_COLOUR: Colour = (255, 150, 40)
-#: Ellipses of the corners show so many standard deviations.
+#: Size of the ellipses of the corners, in standard deviations.
 _SIGMAS = 20.0
 
 

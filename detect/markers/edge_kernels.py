@@ -31,7 +31,7 @@ _LARGEST_REST = 0.6
 _ROOT_HALF = math.sqrt(0.5)
 _ROOT_2PI = math.sqrt(2.0 * math.pi)
 _SEGMENTS = 8
-#: Places across an edge at which it may begin to be looked for.
+#: Number of places across an edge at which its search may begin.
 _SPLITS = 14
 #: Standard deviation of the light's change across an edge, in contrasts per pixel.
 _LIGHT_SLOPE = 0.004
@@ -371,10 +371,10 @@ def fit_edges(
         inwards = min(reach, max(1.0, 0.85 * thickness[k]))
         margin = min(max(1.0, 0.7 * reach), 0.2 * length)
         stride = max(1, int(length * (inwards + reach) / most_pixels))
-        room = int((length + 4.0) * (inwards + reach + 2.0)) + 64
-        along = np.empty(room)
-        across = np.empty(room)
-        grey = np.empty(room)
+        capacity = int((length + 4.0) * (inwards + reach + 2.0)) + 64
+        along = np.empty(capacity)
+        across = np.empty(capacity)
+        grey = np.empty(capacity)
         count = _pixels_along(
             image, grid, step, p0, p1, guess, inwards, reach, margin, stride, along, across, grey
         )

@@ -19,7 +19,7 @@ from detect.markers.lens_kernels import bend_points, straighten_points, straight
 
 FloatArray = NDArray[np.float64]
 
-#: Bilinear interpolation over so many pixels: off by an eighth of its square times the curvature.
+#: Spacing for bilinear interpolation; the error is an eighth of its square times the curvature.
 _STEP_PX = 2
 
 

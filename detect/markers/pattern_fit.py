@@ -1,8 +1,8 @@
 """Phase 3, last part: the whole marker fitted to the grey values.
 
-Four edges know little about a small marker: its cells have edges too. Once it is known which
-marker it may be, all of it is fitted at once (`detect.markers.pattern_fit_kernels`): corners,
-light, blur. What each cell then shows on its own says whether it is that marker indeed.
+The four edges of a small marker give little information, but its cells have edges, too. Given a
+candidate pattern, the whole marker is fitted at once (`detect.markers.pattern_fit_kernels`):
+corners, light, blur. Each cell by itself then confirms or refutes the pattern.
 """
 
 from __future__ import annotations
@@ -128,10 +128,10 @@ def fit_marker(
     box = _pixel_box(image, lens, corners, seam)
     if box is None:
         return None
-    room = int((box[1] - box[0] + 1) * (box[3] - box[2] + 1))
-    pixels = np.empty((room, 2), np.int32)
-    straight = np.empty((room, 2))
-    grey = np.empty(room)
+    capacity = int((box[1] - box[0] + 1) * (box[3] - box[2] + 1))
+    pixels = np.empty((capacity, 2), np.int32)
+    straight = np.empty((capacity, 2))
+    grey = np.empty(capacity)
     most_pixels = _FIRST_LOOK_PIXELS if first_look else _MOST_PIXELS
     count = select_pixels(
         image, lens.grid, lens.step, corners, box, templates.lines, seam,

@@ -74,11 +74,11 @@ def inflation_of(
     weights: NDArray[np.float64],
     count: int,
 ) -> float:
-    """How much less a pixel tells for what is left over being alike at neighbouring pixels.
+    """Share of information that a pixel keeps when residuals of neighbours are correlated.
 
     A pixel's residual that is correlated with its neighbours' by rho along a row (geometrically
     falling off) counts as (1 - rho) / (1 + rho) of an independent one; rows and columns alike. Only
-    what stands out of chance counts.
+    significant correlation is considered.
     """
     first_u = pixels[0, 0]
     last_u = pixels[0, 0]

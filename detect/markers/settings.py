@@ -1,4 +1,4 @@
-"""What the detector of square markers can be told."""
+"""Settings of the detector of square markers."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class MarkerSettings:
         Dark pixels are darker than the closing by at least this many standard deviations of the
         image's noise.
     least_width_px : float
-        Narrowest marker looked for (square root of its area), pixels, where no width is given.
+        Narrowest marker to search (square root of its area), pixels, where no width is given.
     area_factor : float
         A candidate's area is within this factor of the expected width squared.
     least_holes, most_holes : int
@@ -63,7 +63,7 @@ class MarkerSettings:
         Area of the rough quadrangle over that of the convex hull.
     joint : bool
         Fit the whole marker, cells included, to the grey values; its corners are more exact than
-        those of four separate edges, and what it leaves over tells false markers from true ones.
+        those of four separate edges, and its residuals reveal false markers.
     least_contrast : float
         Least contrast of each edge, in standard deviations of the image's noise.
     edge_balance : float

@@ -33,9 +33,9 @@ class Templates:
     weakness : float
         How easily a pattern is met by chance, from 0 (next to never) to 1.
     decoys : (D, G * G) float32
-        What other things show that are framed in black: nothing, or a bar, or a half.
+        Content of other black frames: nothing, a bar, or a half.
     plain : (T,) bool
-        Which of the templates are like such things themselves.
+        Which of the templates are similar to these.
     marker : (T,) int64
         Index of the marker in the dictionary.
     turns : (T,) int64

@@ -26,13 +26,13 @@ from detect.runs.rows import FrameRows, rows_of_failure, rows_of_frames
 
 Chunk = tuple[FrameTask, ...]
 
-#: After so many frames that killed their workers, and none between that did not, it is not them.
+#: After this many consecutive frames that killed their workers, the frames are not the cause.
 _DEADLY_FRAMES = 10
 
 
 @dataclass(frozen=True)
 class Workers:
-    """Who does the work.
+    """Workers that process the frames.
 
     Attributes
     ----------
@@ -42,12 +42,12 @@ class Workers:
     chunk : int
         How many frames a task has.
     window : callable
-        How many tasks may be under way; asked again and again, as clusters grow.
+        How many tasks may be under way; called repeatedly, as clusters grow.
     died : tuple of exception types
         What a task raises, besides `BrokenExecutor`, when its worker has died.
     tell_of_tables : bool
-        Whether the first task tells what is wrong with the tables of a plan: this process need not
-        make them then, and gets ready sooner.
+        Whether the first task reports errors in the tables of a plan: this process then need not
+        compute them and starts sooner.
     """
 
     start: Callable[[FramePlan], AbstractContextManager[Executor]]
@@ -75,7 +75,7 @@ def detect_chunks(
     ------
     list of (FrameTask, FrameRows)
         In the order of the tasks, as many at a time as a worker gives back. Close the generator
-        (`contextlib.closing`) when it is not asked for all of them: that ends the workers.
+        (`contextlib.closing`) if not all of them are consumed: that ends the workers.
 
     Raises
     ------
@@ -89,8 +89,8 @@ def detect_chunks(
         under_way: deque[tuple[Chunk, Future[list[FrameRows]] | None]] = deque()
         while True:
             suspects = any(future is None for _, future in under_way)
-            room = 0 if suspects else max(0, workers.window() - len(under_way))
-            under_way.extend((chunk, crew.submit(chunk)) for chunk in islice(chunks, room))
+            more = 0 if suspects else max(0, workers.window() - len(under_way))
+            under_way.extend((chunk, crew.submit(chunk)) for chunk in islice(chunks, more))
             if not under_way:
                 return
             chunk, future = under_way.popleft()
@@ -112,7 +112,7 @@ def work_on_chunk(plan: FramePlan, chunk: Chunk) -> list[FrameRows]:
 
 @lru_cache(maxsize=4)
 def _known(plan: FramePlan) -> FramePlan:
-    """The first of equal plans, which come with every task: what is made of it is kept."""
+    """The first of equal plans, which come with every task, so that results for it are cached."""
     return plan
 
 

@@ -59,7 +59,7 @@ def progress_bar(label: str, total: int | None) -> Iterator[Callable[[], None]]:
 
 
 def print_failures(count: int, first: Sequence[str]) -> None:
-    """Tell which frames could not be worked on, as far as they fit on a screen."""
+    """Print which frames could not be processed, as many as fit on a screen."""
     if not count:
         return
     print(f"{count} frames could not be worked on:", file=sys.stderr)

@@ -54,7 +54,7 @@ from storage.parts import PartFile, folder_locked, left_part, new_part, remove_l
 
 _log = logging.getLogger("redetect")
 
-# Rows for the files that are made of others, from those (by their kinds): kind and rows.
+# Makes the rows of files that follow from others, given those by kind: yields kind and rows.
 SecondPass = Callable[[Mapping[str, BinaryIO]], Iterable[tuple[str, bytes]]]
 
 
@@ -118,7 +118,7 @@ class RunFiles:
         for output, place in zip(self._outputs, places):
             if places.count(place) > 1:  # the last one would be all there is
                 raise DetectError(f"{output.path}: named for two results: expected a file for each")
-        # Else they may be half of those of a run that was killed: told when that is over.
+        # If there is a journal, existing files may be those of a killed run: checked later.
         if conduct.log is None or not journal_place(conduct.log).exists():
             self._demand_new()
 
@@ -171,7 +171,7 @@ class RunFiles:
             demand_log_place(self._conduct.log, overwrite=self._conduct.overwrite)
 
     def _may_replace(self, path: Path) -> bool:
-        """Whether what stands in a file's place may go: a log always, if it is one."""
+        """Whether an existing file may be replaced: the log always, if it is one."""
         return self._conduct.overwrite or path == self._conduct.log
 
     def _look_at(self, left: Journal) -> None:
@@ -284,7 +284,7 @@ class RunFiles:
         return chain(beyond, tasks)
 
     def _content_of(self, frame: JournalFrame) -> list[bytes] | None:
-        """The rows that a line of the journal stands for; None if they are not there."""
+        """The rows that a line of the journal records; None if they are not there."""
         content = [
             file.part.read(file.size, length) for file, length in zip(self._files, frame.lengths)
         ]
@@ -339,7 +339,7 @@ class RunFiles:
     # -- ending -----------------------------------------------------------------------------
 
     def finish(self, found: RunSummary, second_pass: SecondPass | None = None) -> None:
-        """Write what stands after the frames, and have the files take their places.
+        """Write the files' ends, and move the files to their final paths.
 
         Raises
         ------
@@ -364,7 +364,7 @@ class RunFiles:
             for path, _ in results:
                 if not self._may_replace(path) and os.path.lexists(path):
                     raise OutputExistsError(path)
-                # What a replaced file has on the disk is given back when nobody has it open any
+                # The disk space of a replaced file is freed when no process has it open any
                 # more. That takes much longer than to replace it, and so happens behind the last
                 # one: hardly any kill falls between the calls that replace them.
                 if path.is_file():
@@ -377,7 +377,7 @@ class RunFiles:
         self._done = True
 
     def _write_late(self, second_pass: SecondPass) -> None:
-        """Fill the files that are made of the others."""
+        """Fill the files that are made from the others."""
         files = {file.output.kind: file for file in self._files}
         first = {kind: file for kind, file in files.items() if kind not in LATE_KINDS}
         with ExitStack() as stack:

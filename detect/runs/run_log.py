@@ -41,7 +41,7 @@ def demand_log_place(place: Path, *, overwrite: bool) -> None:
     Raises
     ------
     storage.OutputExistsError
-        If something else than a log stands there, and must not be overwritten.
+        If there is a file that is no log and must not be overwritten.
     """
     if overwrite or not os.path.lexists(place):
         return
@@ -53,7 +53,7 @@ def demand_log_place(place: Path, *, overwrite: bool) -> None:
 
 
 def log_head(plan: FramePlan, conduct: Conduct) -> bytes:
-    """What stands before the failures."""
+    """The text before the failures."""
     settings = {"circles": plan.circles, "lines": plan.lines, "markers": plan.markers}
     document: dict[str, Any] = {
         "program": "redetect",
@@ -77,7 +77,7 @@ def log_failure(place: int, prefix: str, reason: str) -> bytes:
 
 
 def log_tail(found: RunSummary, outputs: Sequence[Mapping[str, object]]) -> bytes:
-    """What stands after the failures; of each output the name, the size and the hash."""
+    """The text after the failures; of each output the name, the size and the hash."""
     document = {
         "frames": found.frames,
         "failed": found.failed,

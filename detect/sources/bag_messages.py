@@ -64,7 +64,7 @@ def messages(reader: AnyReader, path: Path, topic: str) -> Iterator[tuple[str, f
     while True:
         try:
             connection, recorded_ns, content = next(stream)
-            recorded_s = recorded_ns / 1e9  # whatever stands in a database's column
+            recorded_s = recorded_ns / 1e9  # a database's column may hold anything
             message = reader.deserialize(content, connection.msgtype)
         except StopIteration:
             return

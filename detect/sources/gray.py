@@ -2,7 +2,7 @@
 
 Colour becomes 0.299 R + 0.587 G + 0.114 B, as OpenCV has it (of a JPEG, the brightness that it
 stores). Of images with more than 8 bits, the 8 highest of their *significant* bits are kept: a
-12-bit camera's values stand in 16-bit files, and would be nearly black if all 16 were taken.
+12-bit camera's values are stored in 16-bit files, and would be nearly black if all 16 were used.
 """
 
 from __future__ import annotations
@@ -122,7 +122,7 @@ def significant_bits_of_file(path: Path) -> int | None:
         content = bounded_content(path, path, None)
         demand_bounded(content, path, None)
     except FrameError:
-        return None  # told when it is the file's turn
+        return None  # reported when the file is processed
     image = _decoded(content, deep=True)
     return None if image is None or image.dtype != np.uint16 else significant_bits(image)
 

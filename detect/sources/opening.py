@@ -100,7 +100,7 @@ def open_source(
 
 
 def demand_recording(name: Path) -> None:
-    """Refuse a live camera where rows are looked at: it shows other images than theirs.
+    """Refuse a live camera where existing rows are used: its images are not theirs.
 
     Raises
     ------

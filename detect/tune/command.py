@@ -118,7 +118,7 @@ def perform(options: Tune) -> int:
 
 def _reference(path: Path) -> FramesByImage:
     if not path.is_file():
-        raise LandmarkFileError(path, None, "no such reference rows: name some by --reference")
+        raise LandmarkFileError(path, None, "no such reference rows: give some with --reference")
     return FramesByImage(path)
 
 

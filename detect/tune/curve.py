@@ -46,7 +46,7 @@ def knee(recall: ArrayLike, precision: ArrayLike) -> int | None:
 
     That is the point of the front farthest beyond the chord between the front's ends, both axes
     scaled to the front's extent. Where no point is beyond it, there is no knee, and the point with
-    the greatest harmonic mean of recall and precision stands for it.
+    the greatest harmonic mean of recall and precision is used instead.
 
     Parameters
     ----------

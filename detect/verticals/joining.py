@@ -243,7 +243,7 @@ def join_tracks(
     members, bounds
         See `group_tracks`.
     sigma_px : float
-        Standard deviation of an edge about the line of the building that it stands for, pixels.
+        Standard deviation of an edge about the line of the building that it shows, pixels.
 
     Returns
     -------

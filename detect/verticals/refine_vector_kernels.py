@@ -31,7 +31,7 @@ __all__ = ["ROWS", "SUBPIXELS", "heights", "move_crossings", "newton_sums"]
 #: Positions in a pixel for which weights are tabulated; between them the derivative helps out.
 SUBPIXELS = 64
 
-#: Rows that are looked at together.
+#: Number of rows that are processed together.
 ROWS = LANES
 # How many numbers `newton_sums` returns.
 _SUMS = 9
