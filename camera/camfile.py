@@ -1,6 +1,6 @@
 """Reading and writing ``.cam`` files (``SmRadialDistortedCamera``).
 
-The grammar is the data set's, read generously: any white space, commas or none, keys in any order,
+The grammar is the data set's, read tolerantly: any white space, commas or none, keys in any order,
 ``#`` comments. Keys that mean nothing here are kept and written back. Two keys are this project's:
 ``tangential: { p1 p2 }`` and ``polynomial: { k1 k2 k3 }``, each written only for a lens that has
 such terms.
@@ -49,7 +49,7 @@ def read_camera(path: str | os.PathLike[str]) -> Camera:
     ------
     CameraError
         If the file cannot be read or does not describe a possible camera; the message names the
-        file and, where it is one line's fault, the line.
+        file and, if a single line is wrong, the line.
     """
     path = Path(path)
     try:

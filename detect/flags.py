@@ -21,7 +21,7 @@ LineEnds = Literal["lf", "crlf"]
 
 @dataclass(frozen=True, kw_only=True)
 class RunFlags:
-    """What every command needs that goes through the frames of a run.
+    """Options of all commands that process the frames of a run.
 
     Parameters
     ----------

@@ -85,6 +85,6 @@ def _interrupts_blocked() -> Iterator[None]:
 
 
 def raise_if_interrupted() -> None:
-    """Raise the interrupt again that got lost, if there was one."""
+    """Raise an interrupt that was lost, if there was one."""
     if _received.is_set():
         raise KeyboardInterrupt

@@ -190,8 +190,7 @@ def _search(table: VerticalTable, settings: LineSettings) -> Search:
         is_guided=settings.guided,
         by_few=by_few,
         by_chains=by_few and band.supported and band_px >= _BAND_PX,
-        # A track follows a lean that is wrong by so much that what it yields in a row makes up for
-        # it.
+        # A track follows a wrong lean at the distance where its correction per row equals it.
         lag_rad=_LAG_PX * settings.guided_pull / aspect,
         least_sharpness=float(settings.blurred_sharpness) if settings.blurred_widths else 0.0,
     )

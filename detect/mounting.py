@@ -56,7 +56,7 @@ class Mounting:
     frames_with_discs: int
 
     def sentences(self) -> list[str]:
-        """What was found, in words."""
+        """The result in words."""
         pitch, roll = math.degrees(self.pitch_rad), math.degrees(self.roll_rad)
         sigmas = math.degrees(self.pitch_sigma_rad), math.degrees(self.roll_sigma_rad)
         lines = [

@@ -43,7 +43,7 @@ def estimate_noise(image: NDArray[np.uint8], most_rows: int | None = None) -> fl
 
 @lru_cache(maxsize=8)
 def _rows(height: int, most_rows: int | None) -> NDArray[np.intp]:
-    """Which rows to look at."""
+    """The rows to use."""
     if most_rows is None:
         rows = np.arange(1, height - 1)
     else:

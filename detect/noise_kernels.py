@@ -35,7 +35,7 @@ def second_differences(
     ----------
     image : (H, W) uint8
     rows : (R,) int64
-        The rows to look at, none of them the first or the last.
+        The rows to use, none of them the first or the last.
     countable_only : bool
         Leave out pixels that are nearly black or saturated.
     response : (R * (W - 2),) int16

@@ -69,9 +69,9 @@ def _frame(step: Step, image: str | None, *others: Any) -> RunFrame:
 
 
 class Frames(Protocol):
-    """The frames of a run, made as they are asked for.
+    """The frames of a run, made on demand.
 
-    Iterating again begins anew (with a live camera: from then on).
+    Iterating again starts over (with a live camera: from then on).
     """
 
     #: Whether frames carry contents of images, not paths.
@@ -214,7 +214,7 @@ class Run(ImageRun):
 
 
 def open_run(folder: Path, camera_path: Path | None = None, *, bits: int | None = None) -> Run:
-    """Look through a run folder.
+    """Read a run folder.
 
     Parameters
     ----------
@@ -245,7 +245,7 @@ def open_run(folder: Path, camera_path: Path | None = None, *, bits: int | None 
 def open_images(
     folder: Path, camera_path: Path | None = None, *, bits: int | None = None
 ) -> ImageRun:
-    """Look through a run folder that may be without a calibration.
+    """Read a run folder that may be without a calibration.
 
     Parameters
     ----------

@@ -87,7 +87,7 @@ class RunTilt:
     tilt : (N, 2) float64
         Pitch and roll of each frame (rad).
     variance : (N, 2) float64
-        Of them (rad^2), the constant's included; the two axes are taken for independent.
+        Of them (rad^2), the constant's included; the two axes are assumed to be independent.
     """
 
     axes: tuple[AxisModel, AxisModel]

@@ -25,7 +25,7 @@ Polarity = Literal["any", "light", "dark"]
 
 @dataclass(frozen=True)
 class CircleSettings:
-    """Everything that decides what the disc detector finds.
+    """All settings of the disc detector.
 
     Parameters
     ----------
@@ -54,7 +54,7 @@ class CircleSettings:
         Centres are so near that the floor moves at most this share of the radius per image row;
         infinite: however far.
     polarity : {"any", "light", "dark"}
-        Which discs to look for: lighter than the floor, darker, or both.
+        Which discs to detect: lighter than the floor, darker, or both.
     rows_apart : float
         If detections are fitted (`verify` and `refine`), rows of centres are skipped, as long as
         each row of a disc is at most this share of the distance between the disc's edge and the

@@ -41,7 +41,7 @@ def constant(vector: Any, value: Any) -> Any:
 
 
 class Code:
-    """What an operation is written with: its arguments, and instructions."""
+    """Builder of an operation: its arguments, and instructions."""
 
     def __init__(self, context: Any, builder: Any, signature: Any, args: Any) -> None:
         self.builder = builder

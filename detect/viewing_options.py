@@ -1,4 +1,4 @@
-"""The flags of the commands that look at what was found: one frozen dataclass per command.
+"""The flags of the commands that show results: one frozen dataclass per command.
 
 Nothing heavy is imported: `--help` needs it all.
 """

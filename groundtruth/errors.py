@@ -22,7 +22,7 @@ class StreamError(GroundTruthError):
     file : path
         The file.
     line : int or None
-        The line at fault, counted from 1; None where the file as a whole is.
+        The wrong line, counted from 1; None where the file as a whole is.
     problem : str
         What was found and what was expected.
     """

@@ -48,7 +48,7 @@ def associate(costs: ArrayLike, allowed: ArrayLike) -> Association:
     Returns
     -------
     Association
-        The pairs and what is left over.
+        The pairs and the unpaired elements.
 
     Raises
     ------
@@ -110,7 +110,7 @@ def associate_positions(first: ArrayLike, second: ArrayLike, *, gate_m: float) -
     Association
         See `associate`.
     """
-    with np.errstate(over="ignore"):  # what is too far apart for a number is beyond any gate
+    with np.errstate(over="ignore"):  # distances that overflow are beyond any gate
         distance = np.linalg.norm(_differences(first, second), axis=-1)
         squared = distance**2
     return associate(squared, distance <= gate_m)

@@ -1,6 +1,6 @@
 """Reading landmark files: ``.circles``, ``.lines``, ``.markers``, and the STEP rows of ``.txt``.
 
-A file is read row by row as it is asked for, so that its size does not matter. Line ends may be
+A file is read row by row on demand, so that its size does not matter. Line ends may be
 LF or CRLF. ``#`` at the start of a word begins a comment. A trailing backslash continues a row, but
 not a comment: that would swallow the row after it.
 """
@@ -62,7 +62,7 @@ def read_rows(path: str | os.PathLike[str]) -> Iterator[Row]:
     Parameters
     ----------
     path : path
-        The file. It is opened when the first row is asked for.
+        The file. It is opened when the first row is requested.
 
     Yields
     ------
@@ -163,7 +163,7 @@ def parse_record(text: str) -> Record | None:
 
 @contextmanager
 def _opened(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
-    """A landmark file for reading; what the system has against it is a `LandmarkFileError`."""
+    """Open a landmark file for reading; errors of the system become `LandmarkFileError`s."""
     try:
         with Path(path).open("rb") as stream:
             yield stream
@@ -306,7 +306,7 @@ def _parse_marker(words: list[bytes]) -> MarkerLandmark:
 _PARSERS: dict[bytes, Callable[[list[bytes]], Record]] = {
     b"STEP": _parse_step,
     b"LANDMARK_C": _parse_circle,
-    # What the comments at the head of the data set's files of circles call the row.
+    # Name of the row in the comments at the head of the data set's files of circles.
     b"LANDMARK": _parse_circle,
     b"LANDMARK_L": _parse_line,
     b"LANDMARK_M": _parse_marker,

@@ -249,7 +249,7 @@ Record = Step | Landmark | DetectorSettings
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """A step and what was seen in the image taken after it.
+    """A step and the landmarks in the image taken after it.
 
     Attributes
     ----------
@@ -322,7 +322,7 @@ def _demand_finite(record: object, names: tuple[str, ...]) -> None:
 
 
 def _demand_word(word: str, name: str) -> None:
-    """Refuse what a file would not give back as one word."""
+    """Refuse text that a file would not preserve as one word."""
     if not _WORD.fullmatch(word):
         shown = excerpt(word.encode("utf-8", "surrogatepass"))
         raise LandmarkError(

@@ -59,7 +59,7 @@ def format_tilt(tilt: FrameTilt) -> str:
 
 
 def format_outline_tilt(tilt: FrameTilt) -> str:
-    """The row of what the outlines of a frame's discs show, without line end."""
+    """The row of the tilt by the outlines of a frame's discs, without line end."""
     return f"TILT_D{format_tilt(tilt).removeprefix('TILT')}"
 
 

@@ -6,4 +6,4 @@ from storage.messages import OneLineError
 
 
 class TableError(OneLineError, ValueError):
-    """A table that cannot be made; the message names the quantity and what was expected."""
+    """A table that cannot be computed; the message names the quantity and what was expected."""

@@ -94,7 +94,7 @@ def fill_floor_positions(
     for u in range(width):
         x_seen[u] = (u - pinhole[2]) / pinhole[0]
     decentred = lens[7] != 0.0 or lens[8] != 0.0
-    # A loop for what is looked up, and one that the compiler can do for several pixels at once.
+    # A loop for lookups, and one that the compiler can vectorise.
     ratio = np.empty(width)
     x_normalised = np.empty(width)
     y_normalised = np.empty(width)
@@ -230,7 +230,7 @@ def encode_outlines(
     floor_xy : (H, W, 2) float64
         Floor position of each pixel, metres.
     candidate : (H, W) bool
-        Centres to look at.
+        Centres to evaluate.
     inner, outer : (K, 2) float64
         Samples of the outlines relative to their centre, metres.
     enough : float

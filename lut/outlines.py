@@ -1,4 +1,4 @@
-"""Which grey values vote on a disc: the outlines' pixels around every possible centre.
+"""Table of the outlines' pixels around every possible centre of a disc.
 
 A disc on the floor centred where pixel (u, v) meets it has an inner outline (inside the disc's
 edge) and an outer one (outside). Where their equally spaced samples fall in the image depends on
@@ -6,13 +6,13 @@ the calibration alone, so it is computed ahead of time, for every pixel (DLR Spa
 set report, circle detection).
 
 From one pixel to the next along a row, a sample nearly always moves by one pixel as well: its
-offset from the centre stays the same for some 40 pixels. So what the table stores is not an offset
-for each centre and sample but a list of *copies*: 64 neighbouring bytes of the image each, which,
-put one after the other, line up the grey values of one sample for centre after centre. What a copy
-brings too much is overwritten by the next.
+offset from the centre stays the same for some 40 pixels. So the table does not store an offset for
+each centre and sample but a list of *copies*: 64 neighbouring bytes of the image each. Placed one
+after the other, they align the grey values of one sample for consecutive centres. Excess bytes of a
+copy are overwritten by the next.
 
-Samples outside the image do not vote: the table takes them from behind the image's last pixel,
-where a detector has zeros. A centre is usable when at least half of each outline's samples are
+Samples outside the image do not count: the table takes them from behind the image's last pixel,
+where a detector has zeros. A centre is usable if at least half of each outline's samples are
 inside, it keeps its distance from the border, and the floor there moves by no more than a given
 length per image row.
 """
@@ -38,7 +38,7 @@ MIN_SHARE_INSIDE = 0.5
 
 @dataclass(frozen=True)
 class DiscShape:
-    """What is sampled around a centre, and how near and far centres may be.
+    """Samples around a centre, and the nearest and farthest centres.
 
     Parameters
     ----------

@@ -30,7 +30,7 @@ _ROOT_STEPS = 12
 _LEAST_SEEN = 0.5
 #: Else the anchor is, in most columns, at least this share of the height from the border,
 _MARGIN = 1.0 / 12.0
-#: and no farther from the horizon than this: who looks so far down sees the floor alone.
+#: and no farther from the horizon than this: cameras that look farther down see only the floor.
 _LARGEST_ELEVATION = math.radians(45.0)
 
 

@@ -182,7 +182,7 @@ class Associate(RunFlags):
         `nearest`: Mahalanobis distance of one row at a time; `joint`: joint compatibility of a
         frame's rows (JCBB).
     map_level : bool
-        Then look for loops by fitting local maps of landmarks to each other.
+        Then search loops by fitting local maps of landmarks to each other.
     gate_probability : float
         Share of right rows that pass the gate.
     sigma_scale : float

@@ -1,4 +1,4 @@
-"""A run's odometry and landmark rows as arrays, checked for what an estimator cannot use."""
+"""A run's odometry and landmark rows as arrays, checked for values that estimators cannot use."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ class LineRows:
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """A run: N steps of odometry and what was seen after each.
+    """A run: N steps of odometry and the measurements after each.
 
     Attributes
     ----------
@@ -99,7 +99,7 @@ class Recording:
         Of `steps`, positive definite.
     circles : CircleRows
     lines : LineRows
-        Without rows where they were not asked for.
+        Without rows if they were not requested.
     unstated_steps : int
         Steps whose covariance their source does not state: it is an assumed one.
     """

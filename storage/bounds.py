@@ -1,4 +1,4 @@
-"""What numbers a setting may have; others are refused by name, with value and what was expected.
+"""Bounds of settings; other values are refused with the name, the value and what was expected.
 
     demand(self, DetectError, radius_m=ABOVE_0, samples=whole(3, 128))
 
@@ -86,7 +86,7 @@ def demand(settings: object, error: type[Exception], /, **bounds: Bounds) -> Non
     settings : object
         Has the numbers as attributes; each number of a tuple is checked.
     error : type of exception
-        What is raised.
+        The exception to raise.
     bounds : Bounds
         By the attributes' names.
 

@@ -61,7 +61,7 @@ def claimed_size(content: bytes) -> tuple[int, int] | None:
 def _png_size(content: bytes) -> tuple[int, int] | None:
     """That of the first chunk, if every chunk ends within the file.
 
-    OpenCV takes as much memory for a chunk as it claims to have, up to 4 GiB, before it looks.
+    OpenCV takes as much memory for a chunk as it claims to have, up to 4 GiB, before it reads it.
     """
     if content[12:16] != b"IHDR":
         return None

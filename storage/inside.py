@@ -11,7 +11,7 @@ _DRIVE = re.compile(r"[A-Za-z]:")
 # What Windows takes for a device in any folder, whatever the ending.
 _DEVICES = "(?:con|prn|aux|nul|com[0-9]|lpt[0-9])"
 _DEVICE = re.compile(rf"(?:\A|/){_DEVICES}(?: *\.[^/]*)?(?:/|\Z)", re.IGNORECASE)
-# Most names: one look is enough.
+# Most names: one match is enough.
 _PLAIN = re.compile(
     rf"(?!{_DEVICES}(?:\.|\Z))[0-9a-z_-]++(?:\.[0-9a-z_-]++)*+", re.IGNORECASE | re.ASCII
 )

@@ -1,6 +1,6 @@
 """Compiled kernels loaded from Numba's cache without what only a compiler needs.
 
-Before it looks into its cache, Numba gets ready to compile: it imports what it can compile of
+Before it reads its cache, Numba prepares to compile: it imports what it can compile of
 Python, NumPy and SciPy, and registers all of it, which takes a third of the time that a command
 has before its first landmark. Machine code needs none of that. So the cache is read first, and
 Numba is initialised only if there is something to compile.
@@ -24,13 +24,13 @@ from functools import cache
 from importlib import import_module
 from typing import Any
 
-#: What is done before a kernel is compiled, if anything: it may be in the cache afterwards.
+#: Called before a kernel is compiled, if set: the kernel may be in the cache afterwards.
 _before_compiling: Callable[[], object] | None = None
 
 
 @contextmanager
 def waiting_before_compiling(wait: Callable[[], object]) -> Iterator[bool]:
-    """Have `wait` called, during a block, before a kernel is compiled, and the cache asked again.
+    """Have `wait` called, during a block, before a kernel is compiled; then read the cache again.
 
     Gives whether that can be done: else the caller waits before anything is loaded.
     """

@@ -59,7 +59,7 @@ class PartFile:
         self._handle = handle
 
     def fileno(self) -> int:
-        """The descriptor, for reading what is there and for cutting it off."""
+        """The descriptor, for reading and truncating the file."""
         return self._handle
 
     def write(self, content: bytes) -> None:
@@ -218,7 +218,7 @@ def folder_locked(folder: Path) -> Iterator[None]:
 
 
 def new_locked(place: Path) -> int | None:
-    """A new file, locked; None if another process writes there, or what is there is no part."""
+    """A new file, locked; None if another process writes it, or the existing file is no part."""
     while True:
         try:
             handle = os.open(place, _NEW, 0o666)
@@ -233,7 +233,7 @@ def new_locked(place: Path) -> int | None:
             continue
         if _lock(handle) is not False and _is_at(handle, place):
             return handle
-        os.close(handle)  # taken for something left behind before it was locked
+        os.close(handle)  # mistaken for a leftover file before it was locked
 
 
 def old_locked(place: Path) -> int | None:
@@ -271,7 +271,7 @@ def _is_at(handle: int, place: Path) -> bool:
 
 
 def _place_new(temporary: Path, path: Path) -> None:
-    """Give the file its name unless somebody took it meanwhile."""
+    """Give the file its name unless the name was taken meanwhile."""
     try:
         os.link(temporary, path)
     except FileExistsError:
@@ -295,7 +295,7 @@ def _rename_new(temporary: Path, path: Path) -> None:
     failed = _rename_without_replacing(temporary, path)
     if failed == errno.EEXIST or (failed and os.path.lexists(path)):
         raise OutputExistsError(path) from None
-    if failed:  # here somebody can still come between
+    if failed:  # another process can still create the file here
         temporary.replace(path)
 
 

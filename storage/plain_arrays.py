@@ -53,7 +53,7 @@ def read_plain_array(
         if min(shape, default=0) < 0 or size > largest_bytes:
             raise ValueError(f"its shape {shape} does not fit in {largest_bytes} bytes")
         data = stream.read(size)
-    # What a damaged header raises is as manifold as Python's own grammar.
+    # A damaged header can raise almost any exception.
     except (
         ValueError, SyntaxError, TypeError, OverflowError, EOFError, MemoryError, RecursionError,
         tokenize.TokenError, Warning,

@@ -128,7 +128,7 @@ def _interpolated(image: GreyImage, board: Board) -> tuple[IntArray, FloatArray]
 
 
 def measured_corners(image: GreyImage, grid: FloatArray, marker_share: float) -> FloatArray:
-    """Measure a grid of corners on their edges, and look for those that are missing.
+    """Measure a grid of corners on their edges, and search those that are missing.
 
     Parameters
     ----------
@@ -151,7 +151,7 @@ def measured_corners(image: GreyImage, grid: FloatArray, marker_share: float) ->
     rough, result = grid, np.full(grid.shape, np.nan)
     tried = np.zeros(grid.shape[:2], dtype=bool)
     while True:
-        # First those that were given, then, ring by ring, what borders on what was found.
+        # First the given corners, then, ring by ring, the neighbours of those found.
         known = rough if not tried.any() else result
         present = np.isfinite(known[..., 0])
         wanted = (present if not tried.any() else _bordering(present)) & ~tried
@@ -194,7 +194,7 @@ def _expected(
 ) -> tuple[FloatArray, FloatArray]:
     """Where a corner is expected, (2,), and the pixels of a square to the right and down, (2, 2).
 
-    The homography of all, plus what the nearest corners differ from it: that is the lens.
+    The homography of all corners, plus the deviation of the nearest ones, due to the lens.
     """
     places = np.argwhere(present)[:, ::-1].astype(np.float64)
     here = np.array([column, row], dtype=np.float64)

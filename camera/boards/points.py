@@ -190,7 +190,7 @@ def _circles(image: GreyImage, board: Board) -> FloatArray:
         else cv2.CALIB_CB_SYMMETRIC_GRID
     )
     size = (board.columns, board.rows)
-    # Clustering bears more perspective, the plain search more clutter; light circles on a dark
+    # Clustering tolerates more perspective, the plain search more clutter; light circles on a dark
     # ground are dark ones in the negative; and half-height images flatten circle and grid.
     for taller in (False, True):
         for negative in (False, True):
@@ -235,7 +235,7 @@ def circle_centroids(image: GreyImage, grid: FloatArray) -> FloatArray:
     Returns
     -------
     (rows, columns, 2) array
-        The area centroid of each; a place where there is no circle to measure stays as it is.
+        The area centroid of each; places without a measurable circle are unchanged.
     """
     spacing = _least_spacing(grid.astype(np.float32))
     result = grid.copy()

@@ -203,7 +203,7 @@ def _without_wrong_points(
     residuals = seen - project_estimate(estimate, points)[0]
     right = np.all(np.abs(residuals) < _WRONG_POINT * sigma_px, axis=1)
     counts = np.add.reduceat(right.astype(np.int64), points.starts)
-    # A picture of which too little is left stays as it is: the robust loss deals with it.
+    # A picture with too few points left is unchanged: the robust loss deals with it.
     right |= np.repeat(counts < _FEWEST_POINTS, points.counts)
     counts = np.add.reduceat(right.astype(np.int64), points.starts)
     trimmed = replace(

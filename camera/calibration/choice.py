@@ -150,7 +150,7 @@ def _fewest_needed(tried: Candidates) -> FreeLens:
 
 
 def _is_worth_it(radial: Candidate, decentred: Candidate) -> bool:
-    """Whether tangential terms explain what was held out, and are more than noise."""
+    """Whether tangential terms explain the held-out points and are more than noise."""
     lower = _is_lower(decentred, radial, _TANGENTIAL_WORTH)
     return lower and tangential_significance(decentred.adjusted) >= _TANGENTIAL_SIGNIFICANCE
 
@@ -183,7 +183,7 @@ def holdout_error(
 ) -> float:
     """RMS reprojection error in views that the intrinsics were not fitted to, pixels.
 
-    Of what is held out only the poses are fitted.
+    For held-out points only the poses are fitted.
 
     Parameters
     ----------

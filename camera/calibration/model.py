@@ -1,4 +1,4 @@
-"""What a calibration adjusts: the projection with its derivatives, rigid poses, and the parameters.
+"""Model of the calibration: the projection with its derivatives, rigid poses, and the parameters.
 
 Intrinsics are always the vector ``(scaleX, scaleY, offsetX, offsetY, a2, a3, b1, b2, b3, p1, p2,
 k1, k2, k3)``, the order of the ``.cam`` file. What is free of them is a matrix `span`, so that

@@ -209,7 +209,7 @@ def radius_on_floor(path: Path, board: Board) -> float:
 
 
 def describe(calibration: Calibration, camera: Camera) -> str:
-    """What was found, for people."""
+    """Human-readable summary of the result."""
     sigma = np.sqrt(np.diag(calibration.adjusted.covariance))
     lines = [
         f"  {name:8s} {value:12.6g}" + (f" +- {s:.2g}" if s > 0.0 else "  (fixed)")

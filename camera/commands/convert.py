@@ -103,7 +103,7 @@ def _label(camera: Camera) -> str:
 
 
 def format_of_name(path: Path) -> Format:
-    """The format that a file's name asks for.
+    """The format that a file's name implies.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Converting a camera to another model: taken over where that contains it, else fitted."""
+"""Converts a camera to another model: exactly if the model contains it, else by a fit."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Rows = Literal["same", "halve", "double"]
 
 _IDENTITY = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
 
-# Grids of pixels: to fit on, and to look for the largest deviation on.
+# Grids of pixels: for the fit, and for the largest deviation.
 _FIT_GRID = (41, 31)
 _CHECK_GRID = (129, 97)
 _MANY_STEPS = 200
@@ -145,16 +145,16 @@ def convert_to_foreign(
 
 
 def contains(model: Model, source: AnyCamera, *, free: int = -1) -> bool:
-    """Whether a model holds a camera as it is; parameters as of `convert_to_foreign`."""
+    """Whether a model represents a camera exactly; parameters as of `convert_to_foreign`."""
     return _contained(source, model, COEFFICIENTS[model] if free < 0 else free) is not None
 
 
 def convert_to_camera(
     source: AnyCamera, rows: Rows = "same", pose: Camera | None = None
 ) -> Converted:
-    """Take over, or fit, the project's model.
+    """Convert to the project's model, exactly or by a fit.
 
-    A polynomial and tangential terms without a denominator are taken over as they are. Else the
+    A polynomial and tangential terms without a denominator are copied. Else the
     rational part is fitted beside the source's tangential terms and, where it comes not near, all
     of them and a polynomial together.
 
@@ -223,7 +223,7 @@ def convert_to_camera(
         raise ConversionError("the source's focal lengths or principal point are not possible here")
     spans = [free_span(count, None) for count in range(6)]
     if any(_tangential(source)):
-        # Last, the terms taken over may make up for what the radial part can't follow.
+        # Finally, the copied terms may compensate for what the radial part cannot follow.
         spans.append(free_span(5, None, tangential=True))
     together = free_span(5, None, tangential=any(_tangential(source)), polynomial=3)
     radius = np.hypot(rays[:, 0], rays[:, 1])

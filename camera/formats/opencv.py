@@ -35,7 +35,7 @@ def parse_opencv(text: str, name: str = "<text>") -> ForeignCamera:
     sides = []
     for key, other in (("image_width", "image_Width"), ("image_height", "image_Height")):
         if key not in content and other not in content:
-            # OpenCV itself does not ask for the size; its stereo sample writes none.
+            # OpenCV itself does not require the size; its stereo sample writes none.
             raise ConversionError(
                 f"{name}: lacks {key}: add the images' size, a line such as '{key}: 640'"
             )

@@ -1,4 +1,4 @@
-"""Detected discs held against reference rows of the same run.
+"""Compares detected discs with reference rows of the same run.
 
 Frames are matched by the names of their images; in each, detected rows are paired with reference
 rows one to one within a gate: in the image, each where it was seen, or on the floor. What is left

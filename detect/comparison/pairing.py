@@ -1,4 +1,4 @@
-"""Which rows of two runs can be held against each other: frames by image, rows one to one."""
+"""Pairs rows of two runs: frames by image, rows one to one."""
 
 from __future__ import annotations
 

@@ -166,7 +166,7 @@ def _any_levelled(c: Comparison) -> bool:
 
 
 def lean_text(lean: CommonLean) -> str:
-    """What would explain the differences on the floor, and what is left."""
+    """Tilt and height that would explain the differences on the floor, and the residuals."""
     left = _median_and_most(lean.left.median_m, lean.left.most_m, 4, "m")
     return (
         f"pitch {lean.pitch_deg:.3f} +- {lean.pitch_sigma_deg:.3f} deg, "

@@ -168,7 +168,7 @@ class FloorBin:
 
 @dataclass(frozen=True, slots=True)
 class CommonLean:
-    """What constant tilt and height of the camera explain the differences, and what is left.
+    """Constant tilt and height of the camera that explain the differences, and the residuals.
 
     Each figure with its standard deviation; positive pitch and roll as in a ``.tilt`` file.
     """

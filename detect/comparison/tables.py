@@ -73,5 +73,5 @@ def number(value: float | None, decimals: int) -> str:
 
 
 def printable(name: str) -> str:
-    """A name from a file, with what a terminal would choke on or obey escaped."""
+    """A name from a file, with control characters escaped."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in name)

@@ -1,4 +1,4 @@
-"""Rows of a run from files, image by image: what was detected, and what it is held against."""
+"""Rows of a run from files, image by image: detections and reference rows."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class SeenFiles:
     heads : dict
         Their heads, by kind.
     reference_circles, reference_lines : path or None
-        What they are held against.
+        The reference rows.
     """
 
     detected: dict[str, Path]
@@ -113,7 +113,7 @@ def find_files(run: ImageRun, options: RowFiles) -> SeenFiles:
     run : ImageRun
         The run.
     options : RowFiles
-        What a command line says of them.
+        The options of a command line.
 
     Returns
     -------
@@ -148,7 +148,7 @@ def find_files(run: ImageRun, options: RowFiles) -> SeenFiles:
 
 
 def open_rows(files: SeenFiles) -> RowSource:
-    """Look through the files.
+    """Find and index the files.
 
     Raises
     ------

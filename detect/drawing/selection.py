@@ -55,7 +55,7 @@ class FrameSelection:
 
 
 def select_frames(frames: Frames, wanted: Sequence[str], every: int) -> FrameSelection:
-    """Read what a command line says about frames.
+    """Parse the selection of frames of a command line.
 
     Parameters
     ----------

@@ -102,7 +102,7 @@ def detect_markers(
     image : (H, W) uint8
         Grey image.
     settings : MarkerSettings
-        What to look for.
+        The settings.
     camera : Camera, optional
         The calibration, whose distortion bends the markers' edges; without one they are taken to
         be straight in the image.

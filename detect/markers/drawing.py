@@ -1,4 +1,4 @@
-"""Detected markers, and what was not taken for one, drawn for people."""
+"""Draws detected markers and rejected candidates."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def draw_markers(
     image : (H, W) uint8
         The grey image.
     found : MarkerDetections
-        What was found in it.
+        The markers found in it.
     rejected : bool
         Whether to draw candidates that are no markers.
 

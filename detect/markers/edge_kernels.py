@@ -205,7 +205,7 @@ def _fit_step(
         for i in range(_PARAMETERS):
             for j in range(i):
                 normal[i, j] = normal[j, i]
-        # Weak knowledge: light changes little along an edge; the blur is about what was guessed.
+        # Weak prior: light changes little along an edge; the blur is about what was guessed.
         variance = scale * scale
         contrast = max(abs(p[3] - p[2]), scale)
         light = variance / (0.3 * contrast) ** 2

@@ -157,7 +157,7 @@ def likely_patterns(
 def verified_identity(
     fit: PatternFit, template: int, templates: Templates, settings: MarkerSettings
 ) -> Identity | str:
-    """What a fitted marker's cells say about its identity, or the cause of rejecting it.
+    """The identity of a fitted marker by its cells, or the cause of its rejection.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Compiled measures of what a marker's fit leaves over: each cell's own whiteness, correlation."""
+"""Compiled measures of the residuals of a marker's fit: each cell's own whiteness, correlation."""
 
 from __future__ import annotations
 

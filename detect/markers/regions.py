@@ -1,4 +1,4 @@
-"""Phase 2, first part: which dark regions may be markers, by what is cheap to measure.
+"""Phase 2, first part: selects dark regions that may be markers, by inexpensive measures.
 
 RAWSEEDS deliverable D2.1 part 2: area, number of holes, solidity, share of the holes; the cheapest
 first. OpenCV labels and outlines the regions.

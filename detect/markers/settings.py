@@ -22,12 +22,12 @@ def _expect(condition: bool, name: str, value: object, expected: str) -> None:
 
 @dataclass(frozen=True)
 class MarkerSettings:
-    """Everything that decides what the marker detector finds. The defaults are the best known.
+    """All settings of the marker detector. The defaults are the best known.
 
     Parameters
     ----------
     dictionary : str
-        What is printed on the markers: rawseeds, artoolkitplus12, artoolkitplus8, or an OpenCV
+        Dictionary of the markers: rawseeds, artoolkitplus12, artoolkitplus8, or an OpenCV
         dictionary (4x4_50 ... 7x7_1000, aruco_original, aruco_mip_36h12, apriltag_16h5 ...).
     ids : tuple of int
         The markers to expect; none: all of the dictionary.
@@ -41,7 +41,7 @@ class MarkerSettings:
     disc_widths : float
         Radius of the closing's disc in widths of the marker.
     pyramid : bool
-        Look for large markers in reduced images.
+        Search large markers in reduced images.
     dark_noise : float
         Dark pixels are darker than the closing by at least this many standard deviations of the
         image's noise.

@@ -22,7 +22,7 @@ _BLURS_CELLS = (0.2, 0.35, 0.5, 0.7, 1.0)
 
 @dataclass(frozen=True, eq=False)
 class Templates:
-    """What the cells of the expected markers show, for each marker turned by 0, 90, 180, 270 deg.
+    """Templates of the expected markers' cells, for each marker turned by 0, 90, 180, 270 deg.
 
     Attributes
     ----------

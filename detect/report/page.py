@@ -86,7 +86,7 @@ def report_page(
 
 
 def _clean(value: Any) -> Any:
-    """Text without characters that no page may hold; everything else as it is."""
+    """Text without characters that are not allowed in a page."""
     if type(value) is not str:
         return value
     return "".join(

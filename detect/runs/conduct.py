@@ -8,7 +8,7 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class ConductOptions:
-    """How faults are met.
+    """How failures are handled.
 
     Parameters
     ----------

@@ -67,7 +67,7 @@ def detect_chunks(
     tasks : iterable of FrameTask
         The frames; taken from as they are needed.
     plan : FramePlan
-        What is done with each.
+        The plan for each.
     workers : Workers
         By whom.
 
@@ -80,7 +80,7 @@ def detect_chunks(
     Raises
     ------
     WorkerError
-        If workers die whatever they are given, go away, or have not got this program.
+        If workers die with any frame, disappear, or do not have this program.
     """
     source = iter(tasks)
     chunks = iter(lambda: tuple(islice(source, workers.chunk)), ())
@@ -105,7 +105,7 @@ def detect_chunks(
 
 
 def work_on_chunk(plan: FramePlan, chunk: Chunk) -> list[FrameRows]:
-    """What a worker does with a task; all it needs, and all that it gives back, is small."""
+    """Process a task in a worker; its input and output are small."""
     plan = _known(plan)
     return rows_of_frames(chunk, plan, tables_of(plan))
 
@@ -157,7 +157,7 @@ class _Crew:
         return rows
 
     def bury(self, error: BaseException) -> None:
-        """End what is left of broken workers; the next chunk gets new ones."""
+        """End the remaining broken workers; the next chunk gets new ones."""
         if isinstance(error, BrokenExecutor):
             self._executor = None
             self._started.close()

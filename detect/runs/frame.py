@@ -35,13 +35,13 @@ if TYPE_CHECKING:
 
 Drawing = Literal["discs", "lines", "tracks", "markers"]
 
-#: What is wrong with one frame, not with the run.
+#: Errors of one frame, not of the run.
 COSTS_THE_FRAME = (FrameError, ArithmeticError, np.linalg.LinAlgError, MemoryError)
 
 
 @dataclass(frozen=True)
 class FramePlan:
-    """What is done with every frame of a run. Small: it travels with every task.
+    """The plan for every frame of a run. Small: it is sent with every task.
 
     Attributes
     ----------
@@ -106,7 +106,7 @@ class FrameDetections:
     discs : CircleDetections or None
         The same, corrected for the tilt where there is one and the plan says so.
     outline_tilt : FrameTilt or None
-        What the outlines of the discs show of the tilt, where a run is levelled by all frames.
+        The tilt by the outlines of the discs, if a run is levelled by all frames.
     markers : MarkerDetections or None
     error : str or None
         Why the frame cannot be worked on.
@@ -130,7 +130,7 @@ class FrameDetections:
 
 @dataclass(frozen=True)
 class Tables:
-    """What the calibration decides before the first image, as far as a plan needs it."""
+    """The tables by the calibration that a plan needs."""
 
     verticals: VerticalTable | None
     discs: DiscTable | None
@@ -150,7 +150,7 @@ def detect_batch(
     tasks : sequence of FrameTask
         The frames; as many images are in memory at once.
     plan : FramePlan
-        What to look for.
+        The landmarks to detect.
     tables : Tables
         See `tables_of`.
 
@@ -295,7 +295,7 @@ def _tables(camera: Camera | None, verticals: bool, shape: DiscShape | None) -> 
 
 
 def import_detectors(plan: FramePlan) -> None:
-    """Import what a plan needs: what can be done while others make its tables."""
+    """Import the modules that a plan needs, while other processes compute its tables."""
     if plan.lines is not None:
         import detect.lines
     if plan.circles is not None:

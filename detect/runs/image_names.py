@@ -1,6 +1,6 @@
 """The images of a folder, and which of them belongs to a step: never one outside the run.
 
-A run may have a million frames: what is kept of one is the name of its image, twice, and 4 bytes.
+A run may have a million frames: the memory per frame is the name of its image, twice, and 4 bytes.
 """
 
 from __future__ import annotations

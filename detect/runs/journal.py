@@ -37,7 +37,7 @@ _LONGEST_LINE = 1 << 20
 
 
 class JournalHead(NamedTuple):
-    """What the first line says."""
+    """Content of the first line."""
 
     made_by: str  #: Digest of whatever decides the rows: program, settings, camera, heads of files.
     parts: Sequence[int]  #: Which parts the files of the run grow in (see `storage.parts`).
@@ -45,11 +45,11 @@ class JournalHead(NamedTuple):
 
 
 class JournalFrame(NamedTuple):
-    """What a line says of a frame."""
+    """Record of a frame."""
 
     lengths: Sequence[int]  #: How many bytes the frame has in each of the files.
     content: str  #: Digest of them.
-    task: str  #: Digest of what was to be done.
+    task: str  #: Digest of the task.
     found: Mapping[str, int]  #: This and what follows: see `detect.runs.rows.FrameRows`.
     rejected: Mapping[str, int]
     error: str | None
@@ -87,7 +87,7 @@ class Journal:
         return os.read(self._handle, len(end)) == end
 
     def head(self) -> JournalHead | None:
-        """What the first line says, if it counts."""
+        """Content of the first line, if it is valid."""
         first = next(self._records(), None)
         return JournalHead(*first) if isinstance(first, list) else None
 
@@ -103,7 +103,7 @@ class Journal:
                 yield JournalFrame(*record)
 
     def cut(self) -> None:
-        """Forget what was not taken over; the next line is written there."""
+        """Discard the lines that were not taken over; the next line is written there."""
         os.ftruncate(self._handle, self._end)
         os.lseek(self._handle, self._end, os.SEEK_SET)
 

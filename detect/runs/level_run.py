@@ -108,7 +108,7 @@ def _counts(row: bytes) -> bool:
 
 
 def _tilts_of_rows(rows: BinaryIO) -> tuple[list[_Tilted], list[FrameTilt | None]]:
-    """Prefix, lines and tilt of each frame, and what the outlines of its discs show."""
+    """Prefix, lines and tilt of each frame, and the tilt by the outlines of its discs."""
     frames: list[_Tilted] = []
     outlines: list[FrameTilt | None] = []
     for row in filter(_counts, rows):

@@ -167,7 +167,7 @@ def _markers_text(run: ImageRun, plan: FramePlan, version: str) -> list[str]:
         *(_STEP, _odometry(run)),
         "LANDMARK_M <dictionary> <ID> <quality>, and for each corner <u> <v> <cUU> <cUV> <cVV>",
         "  corners top left, top right, bottom right, bottom left of the marker as printed;",
-        "  pixels of the image as it is, the top left pixel's centre is 0 0; quality: 1 is perfect",
+        "  pixels of the original image, the top left pixel's centre is 0 0; quality: 1 is perfect",
         *_made_with(plan, plan.markers),
     ]
 

@@ -1,4 +1,4 @@
-"""What a long run shows on a terminal."""
+"""Progress of a long run on a terminal."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _SHOWN_FAILURES = 10
 def progress_bar(label: str, total: int | None) -> Iterator[Callable[[], None]]:
     """A progress bar with the rate, on a terminal; yields what to call after every frame.
 
-    Calling it raises an interrupt that got lost (see `detect.interrupts`).
+    Calling it raises an interrupt that was lost (see `detect.interrupts`).
 
     Without a total, it shows how many there were.
 

@@ -1,4 +1,4 @@
-"""What is written of one frame: rows, JSON and pictures, as bytes.
+"""Output of one frame: rows, JSON and pictures, as bytes.
 
 This is all that a worker sends back, whichever process or machine it runs on: some kilobytes.
 """
@@ -126,7 +126,7 @@ def rows_of_frames(tasks: Sequence[FrameTask], plan: FramePlan, tables: Tables) 
     tasks : sequence of FrameTask
         The frames.
     plan : FramePlan
-        What is done with each.
+        The plan for each.
     tables : Tables
         See `detect.runs.frame.tables_of`.
 
@@ -191,7 +191,7 @@ def _rows_by_kind(task: FrameTask, found: FrameDetections, plan: FramePlan) -> d
 
 
 def rows_of_failure(task: FrameTask, reason: str) -> FrameRows:
-    """What is written of a frame that could not be worked on."""
+    """Output of a frame that could not be processed."""
     step = task.frame.step
     rows = dict.fromkeys(("circles", "lines", "markers"), encoded(format_record(step)))
     rows["tilt"] = encoded(format_no_tilt(step.prefix, 0))
@@ -203,7 +203,7 @@ def rows_of_failure(task: FrameTask, reason: str) -> FrameRows:
 def landmark_rows(
     keyword: str, numbers: NDArray[np.float64], ids: Sequence[tuple[int, ...]]
 ) -> bytes:
-    """Rows of landmarks, as `landmarks.format_record` lays them out.
+    """Rows of landmarks, as `landmarks.format_record` formats them.
 
     Parameters
     ----------

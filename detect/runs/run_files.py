@@ -1,4 +1,4 @@
-"""The files of a run while they grow, so that a run that ends early keeps what is done.
+"""The files of a run while they grow, so that an interrupted run keeps its completed frames.
 
 The rows of the frames that a worker gives back together are written at once to the parts of the
 files (`storage.parts`), then noted in the journal (`detect.runs.journal`). However a run ends, by a
@@ -59,7 +59,7 @@ SecondPass = Callable[[Mapping[str, BinaryIO]], Iterable[tuple[str, bytes]]]
 
 
 class _GrowingFile:
-    """A file of a run, its part, and what is in it so far."""
+    """A file of a run, its part, and its size."""
 
     def __init__(self, output: Output, part: PartFile) -> None:
         self.output, self.part = output, part
@@ -68,7 +68,7 @@ class _GrowingFile:
         self.has_rows = False
 
     def next_rows(self, rows: bytes) -> bytes:
-        """What a frame adds, from its rows."""
+        """The bytes that a frame adds, from its rows."""
         between = self.output.between if self.has_rows and rows else b""
         self.has_rows = self.has_rows or bool(rows)
         return between + self.output.ended(rows)
@@ -80,20 +80,20 @@ class _GrowingFile:
             self.count(content)
 
     def count(self, content: bytes) -> None:
-        """Count what is there already."""
+        """Count the existing content."""
         self.size += len(content)
         self.digest.update(content)
 
 
 class RunFiles:
-    """The files of a run: a context manager that opens them, and keeps or removes what there is.
+    """The files of a run: a context manager that opens them, and keeps or removes partial files.
 
     Parameters
     ----------
     outputs : sequence of Output
         The files.
     plan : FramePlan
-        What is done with every frame.
+        The plan for every frame.
     conduct : Conduct
         Whether there are a log and a journal, and a run to be resumed.
 
@@ -175,7 +175,7 @@ class RunFiles:
         return self._conduct.overwrite or path == self._conduct.log
 
     def _look_at(self, left: Journal) -> None:
-        """Complete, take over, or remove what a run that ended early left."""
+        """Complete, take over, or remove the files of an interrupted run."""
         try:
             head = left.head()
             numbers = () if head is None else head.parts
@@ -406,7 +406,7 @@ class RunFiles:
     def _is_worth_keeping(self, journal: Journal, error: BaseException | None) -> bool:
         """Whether there is something, of this run or the one resumed, that can be gone on with."""
         if isinstance(error, OutputExistsError):
-            return False  # somebody else was faster
+            return False  # another process was faster
         if not os.path.lexists(journal.place):
             return False  # it went with its folder
         return self._noted > 0 or self._resumes

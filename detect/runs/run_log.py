@@ -1,8 +1,8 @@
-"""What a run says of itself for machines to read: ``<output>.log.json``.
+"""Machine-readable log of a run: ``<output>.log.json``.
 
-Which program ran with which settings, which frames could not be worked on and why, how much was
-found, and what the other files are, by size and hash. Nothing in it depends on the time of day or
-on who did the work: the same run writes the same bytes.
+It states the program and its settings, the frames that could not be processed and why, how much was
+found, and the size and hash of the other files. Nothing in it depends on the time of day or on the
+workers: the same run writes the same bytes.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class FailedFrameError(DetectError):
 
 
 def log_place(output: Path) -> Path:
-    """Where the log of a result goes."""
+    """Path of the log of a result."""
     return output.with_name(f"{output.name}.log.json")
 
 

@@ -40,7 +40,7 @@ def detect_run(
     on_progress: Callable[[], None] | None = None,
     conduct: Conduct | None = None,
 ) -> RunSummary:
-    """Do with every frame of a run what a plan says, and write what comes of it.
+    """Process every frame of a run by a plan, and write the results.
 
     Each image is decoded once. Levelled by frames, discs and lines together give the files that
     they give one after the other, with the tilts that were written. Levelled by the run, the tilt
@@ -52,14 +52,14 @@ def detect_run(
     run : ImageRun
         The run; without a calibration, only markers can be detected.
     plan : FramePlan
-        What to look for.
+        The landmarks to detect.
     places : mapping
         The files to write, by kind: "circles", "lines", "tilt", "markers", "json" (the discs once
         more). Where the frames' times are known, they go beside them.
     known : Known, optional
         Prior data on the frames.
     pictures : path, optional
-        Folder for what the plan has drawn.
+        Folder for the plan's pictures.
     workers : Workers, optional
         Who does the work; by default this process (see `detect.runs.workers`).
     on_progress : callable, optional

@@ -133,7 +133,7 @@ def cluster_workers(address: str, *, large: bool = False) -> Workers:
 
 
 class _InProcess(Executor):
-    """Does what it is given at once, before it gives the future back."""
+    """Runs each task immediately, before it returns the future."""
 
     def submit(self, fn: Callable[P, R], /, *args: P.args, **kwargs: P.kwargs) -> Future[R]:
         future: Future[R] = Future()
@@ -183,9 +183,8 @@ class _ProcessPool(ProcessPoolExecutor):
     def end(self) -> None:
         """End them, whatever they are doing; a further interrupt waits for that.
 
-        The thread that looks after them is waited for: an interrupted program leaves threads
-        behind, and this one would be stopped between the removal of a semaphore and the note of
-        that.
+        The thread that manages them is joined: an interrupted program leaves threads behind, and
+        this one could be stopped after it has removed a semaphore and before it has recorded that.
         """
         with interrupts_deferred():
             processes = list((self._processes or {}).values())
@@ -206,7 +205,7 @@ class _ProcessPool(ProcessPoolExecutor):
 
 
 class _Beginning(NamedTuple):
-    """What new worker processes share: one of them makes what is not in the caches yet, for all.
+    """What new worker processes share: one of them fills the caches for all.
 
     Attributes
     ----------
@@ -242,7 +241,7 @@ def _rehearse_together(plan: FramePlan, beginning: _Beginning) -> None:
             tables_of(plan)
             beginning.tables.set()
             rehearse(plan)
-        finally:  # the others see for themselves what is wrong
+        finally:  # the other processes find the error themselves
             beginning.tables.set()
             beginning.kernels.set()
         return

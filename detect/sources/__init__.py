@@ -2,7 +2,7 @@
 
 ::
 
-    source             module       what it is named by
+    source             module       how it is named
     run folder         detect.run   the folder
     images             pictures     a folder, one image, or a pattern such as 'drive/*.png'
     video file         video        the file

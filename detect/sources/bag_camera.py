@@ -154,7 +154,7 @@ def rotation_of(qx: float, qy: float, qz: float, qw: float) -> Matrix:
     largest = np.abs(q).max()
     if not 0.0 < largest < np.inf:
         raise ValueError(f"a rotation of {qx:g}, {qy:g}, {qz:g}, {qw:g}")
-    q = q / largest  # squares of what is very large or small are no numbers
+    q = q / largest  # squares of very large or small numbers overflow or underflow
     x, y, z, w = q / np.linalg.norm(q)
     return np.array(
         [

@@ -22,7 +22,7 @@ _LUMA = {"yuv422": 1, "uyvy": 1, "yuv422_yuy2": 0, "yuyv": 0}
 
 
 class ImageMessage(Protocol):
-    """What is read of a `sensor_msgs/Image`."""
+    """The fields of a `sensor_msgs/Image` that are used."""
 
     height: int
     width: int

@@ -1,4 +1,4 @@
-"""What a source of images is, and what the detectors see of it."""
+"""Interface of sources of images."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class Calibration:
 
 
 class PoseStream(Protocol):
-    """Poses of the robot over time, as recorded; iterating again begins anew."""
+    """Poses of the robot over time, as recorded; iterating again starts over."""
 
     #: What messages call it.
     name: str
@@ -167,5 +167,5 @@ def only_calibration(folder: Path, stem: str) -> Calibration | None:
 
 
 def unpacked(pixels: NDArray[Any]) -> NDArray[np.uint8]:
-    """Grey values as an array of their own, which does not keep what they were cut from."""
+    """Grey values as a copy, which does not keep the array that they are a view of."""
     return np.array(pixels, dtype=np.uint8, order="C")

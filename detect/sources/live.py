@@ -105,11 +105,11 @@ class _Newest:
                     image, self._image = self._image, None
                     return image
                 if self._ended:
-                    _log.info("the camera gives no more images: what was seen is written")
+                    _log.info("the camera gives no more images: the results so far are written")
                     return None
                 self._changed.wait(_LOOK_S)  # an interrupt is noticed in between
         if not stop.is_set():
-            _log.info(f"no image came within {PATIENCE_S:g} s: what was seen is written")
+            _log.info(f"no image came within {PATIENCE_S:g} s: the results so far are written")
         return None
 
     def end(self) -> None:

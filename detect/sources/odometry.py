@@ -1,4 +1,4 @@
-"""Steps laid over images: from poses over time, from a file of STEP rows, or none."""
+"""Combines images with steps: from poses over time, from a file of STEP rows, or none."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The command ``detect tune``: parameters over a grid, held against reference rows."""
+"""The command ``detect tune``: parameters over a grid, compared with reference rows."""
 
 from __future__ import annotations
 
@@ -123,7 +123,7 @@ def _reference(path: Path) -> FramesByImage:
 
 
 def _jsonable(settings: CircleSettings | LineSettings) -> dict[str, Any]:
-    """Settings by name; what is no number of JSON's (infinity) as a word."""
+    """Settings by name; numbers that JSON does not have (infinity) as words."""
     return {
         name: value if isinstance(value, bool | int | str) else _finite_or_word(value)
         for name, value in dataclasses.asdict(settings).items()

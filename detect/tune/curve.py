@@ -30,7 +30,7 @@ def pareto_front(recall: ArrayLike, precision: ArrayLike) -> NDArray[np.intp]:
     """
     r, p = np.asarray(recall, np.float64), np.asarray(precision, np.float64)
     known = np.flatnonzero(np.isfinite(r) & np.isfinite(p))
-    # By falling recall, then falling precision: what is no better than before is beaten.
+    # By falling recall, then falling precision: points no better than before are dominated.
     order = known[np.lexsort((known, -p[known], -r[known]))]
     front = []
     best = -np.inf

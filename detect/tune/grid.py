@@ -1,4 +1,4 @@
-"""Grids of parameters: what a command line says, as settings to be tried."""
+"""Grids of parameters: converts a command line to settings to be tried."""
 
 from __future__ import annotations
 

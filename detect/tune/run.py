@@ -1,4 +1,4 @@
-"""Settings tried on the same frames, each held against the same reference rows."""
+"""Tries settings on the same frames, and compares each with the same reference rows."""
 
 from __future__ import annotations
 

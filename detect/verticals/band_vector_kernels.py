@@ -211,7 +211,7 @@ def sums_along(
     taps : int64
         How many rows.
     scale : float32, contiguous
-        What the sums of each column are multiplied with.
+        The factor of each column's sums.
     at_scale : int64
         Index there of the first column.
     sums, sums_plane, to

@@ -1,4 +1,4 @@
-"""What was found in one image: lines, their tilt, and all that they were made from."""
+"""Detections in one image: lines, their tilt, and the tracks behind them."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ FloatArray = NDArray[np.float64]
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class LineDetections:
-    """What was found in one image.
+    """Detections in one image.
 
     Parameters
     ----------

@@ -123,7 +123,7 @@ class JudgementLimits(NamedTuple):
 
 
 class Judgement(NamedTuple):
-    """Lines through tracks, and what they are.
+    """Lines through tracks, and their fates.
 
     Attributes
     ----------

@@ -266,7 +266,7 @@ def fit_eigenlines(
     for t in range(len(bounds) - 1):
         begin, end = bounds[t], bounds[t + 1]
         n = end - begin
-        # Views: that no index of theirs is negative the compiler knows.
+        # Views, so that the compiler knows that indices are not negative.
         own_row = row[begin:end]
         own_column = column[begin:end]
         own_score = score[begin:end]
@@ -400,7 +400,7 @@ def refine_lines(
             continue
         phi = reference[t]
         n = end - begin
-        # Views: that no index of theirs is negative the compiler knows.
+        # Views, so that the compiler knows that indices are not negative.
         own_row = row[begin:end]
         own_column = column[begin:end]
         own_rise = rise[begin:end]

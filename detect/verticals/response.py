@@ -63,7 +63,7 @@ class LineFilter(NamedTuple):
 
 
 class StartBand(NamedTuple):
-    """The rows parallel to the anchor on which tracks start, and what the filter needs there.
+    """The rows parallel to the anchor on which tracks start, and the filter's tables for them.
 
     The anchor is the horizon or its replacement (`lut.verticals`). Rows of the band are counted
     from its upper end; the filter is evaluated on row s (half the filter's length) and every
@@ -280,7 +280,7 @@ def start_band(table: VerticalTable, settings: LineSettings) -> StartBand:
     spacing_px = [_typical_spacing(x[i], on_vertical[i]) for i in range(*evaluated.indices(len(x)))]
     weights = [_weights_across(settings.sigma_across_px, px) for px in spacing_px]
     beyond = [(0, 0), (0, -width % TILE)]
-    # What is there counts nowhere; that it goes on like this makes it fast.
+    # These values are not used; continuing the run makes it fast.
     further = np.minimum(pixel[:, -1:] + np.arange(1, beyond[1][1] + 1), height * width - 2)
     pixel = _in_tiles(np.concatenate([pixel, further], axis=1).astype(np.int32))
     runs, lengths, odd, odd_bounds = _runs_of_neighbours(pixel, height * width)
@@ -412,7 +412,7 @@ def start_response(
 
 
 def padded_pixels(image: NDArray[np.uint8], window: LineFilter) -> NDArray[np.uint8]:
-    """The image in scan order, and behind it what the filter's weights of zero need."""
+    """The image in scan order, followed by padding for the filter's weights of zero."""
     flat = image.reshape(-1)
     missing = window.weights_between.shape[1] - window.weights.shape[1] - 1
     return np.pad(flat, (0, missing)) if missing else flat

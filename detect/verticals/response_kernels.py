@@ -209,7 +209,7 @@ def band_response(
     flat_scale = band.scale.reshape(-1)
     flat_weights = band.weights.reshape(-1)
     runs, lengths, odd = band.runs, band.lengths, band.odd
-    # Some columns at a time: what is between the pixels stays in the innermost cache.
+    # Some columns at a time, so that interpolated values stay in the innermost cache.
     plane = rows * TILE
     between = _from_cache_line(np.empty(2 * plane + 16, np.float32))
     length = padded + (BLOCK + taps + 15) // 16 * 16

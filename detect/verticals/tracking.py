@@ -553,7 +553,7 @@ def follow_edges(
             else:
                 end = height + count
         if begin == end:
-            # Starts were looked for with less care.
+            # Starts were searched less thoroughly.
             continue
         if n + height > capacity:
             capacity *= 2
@@ -566,7 +566,7 @@ def follow_edges(
             grown_score = np.empty(capacity, np.float32)
             grown_score[:n] = score[:n]
             score = grown_score
-        # Views: that no index of theirs is negative the compiler knows.
+        # Views, so that the compiler knows that indices are not negative.
         points = end - begin
         seen_row = own_row[begin:end]
         seen_column = own_column[begin:end]

@@ -26,7 +26,7 @@ _FEWEST_PER_WINDOW = 5
 _SHORT_WINDOW_S = 0.1
 _LARGEST_STREAM_GAP_S = 0.5
 _STRIDE_S = 0.5
-# What a robot's odometry may be off by, systematically: a share of each turn, and a bend.
+# Systematic errors of a robot's odometry: a share of each turn, and a curvature.
 _TURN_SCALE_SIGMA = 0.03
 _TURN_PER_METRE_SIGMA = 0.01
 

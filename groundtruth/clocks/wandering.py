@@ -1,4 +1,4 @@
-"""Differences that wander: white noise of each sample on top of a random walk, and least squares.
+"""Least squares for differences with a random walk plus white noise of each sample.
 
 The model of a difference between two headings: odometry's error adds up (a random walk, variance
 `rate` per second), the other's does not (white, `sigma`). Systematic errors may come on top, such

@@ -68,7 +68,7 @@ def perform(options: Laser) -> int:
         if scanner["suspect"]:
             shift = scanner["correction"]
             print(
-                f"warning: scanner {scanner['name']} does not fit the others: its readings ask for "
+                f"warning: scanner {scanner['name']} does not fit the others: its readings suggest "
                 f"a shift of {1e3 * shift[0]:.1f}, {1e3 * shift[1]:.1f} mm and "
                 f"{np.degrees(shift[2]):.2f} deg; "
                 + ("it was left out" if scanner["left_out"] else "it was used all the same"),

@@ -1,4 +1,4 @@
-"""What every command does: looks after its outputs, says what they rest on, shows progress."""
+"""Common parts of the commands: checks of outputs, metadata, progress."""
 
 from __future__ import annotations
 

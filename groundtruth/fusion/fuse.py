@@ -35,7 +35,7 @@ class Rejected:
         Whose it was.
     time_s : float
     squared_innovation : float
-        Squared normalised distance from what was expected.
+        Squared normalised innovation.
     """
 
     stream: str
@@ -45,7 +45,7 @@ class Rejected:
 
 @dataclass(frozen=True)
 class OdometryErrors:
-    """What the measurements say of odometry.
+    """Odometry's errors estimated from the measurements.
 
     Attributes
     ----------
@@ -86,7 +86,7 @@ class Fusion:
     rejected : tuple of Rejected
         In order of time.
     restarts_s : tuple of float
-        When the filter began anew, since nothing of what was measured fitted any more.
+        When the filter was restarted because no measurement fitted any more.
     used : dict of str to int
         Measurements that went in, by stream.
     odometry : OdometryErrors

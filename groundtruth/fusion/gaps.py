@@ -74,7 +74,7 @@ def ends_that_did_not_fit(
     accepted: NDArray[np.bool_],
     restarted: NDArray[np.int8],
 ) -> list[int]:
-    """Nodes after gaps where rejections began that made the filter begin anew in the end."""
+    """Nodes after gaps where those rejections began that made the filter restart."""
     found = []
     for node in np.flatnonzero(restarted == AFTER_REJECTIONS):
         first = int(np.searchsorted(nodes, node))
@@ -185,7 +185,7 @@ def _step(
     measured: FloatArray,
     measured_covariances: FloatArray,
 ) -> tuple[float, float, FloatArray]:
-    """Filter and smooth over a gap with what is measured at its end (nothing, or one pose)."""
+    """Filter and smooth over a gap with the measurement at its end (none, or one pose)."""
     count = len(controls)
     states = [np.empty((count, STATE)) for _ in range(3)]
     spreads = [np.empty((count, STATE, STATE)) for _ in range(4)]

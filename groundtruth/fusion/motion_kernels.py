@@ -32,7 +32,7 @@ _SERIES_BELOW = 0.1
 
 @njit(cache=True, error_model="numpy")
 def arc_integrals(half_turn: float) -> tuple[float, float, float, float, float]:
-    """What an arc of length 1 makes of errors along it.
+    """Effect of errors along an arc of length 1.
 
     Parameters
     ----------

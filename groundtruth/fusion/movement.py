@@ -45,7 +45,7 @@ class MeasurementAccount:
         Squared normalised innovations.
     accepted : (M,) bool
     restarted : (N,) int8
-        Whether the filter began anew at a node, and why (see `smoother_kernels`).
+        Whether the filter was restarted at a node, and why (see `smoother_kernels`).
     surprise : float
         Minus twice the logarithm of their likelihood.
     """

@@ -21,7 +21,7 @@ IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 KindArray = NDArray[np.int8]
 
-#: How the filter began anew at a node: not at all, after many rejections, where it was lost.
+#: Restart of the filter at a node: none, after many rejections, where it was lost.
 NOT_ANEW, AFTER_REJECTIONS, WHERE_LOST = 0, 1, 2
 
 
@@ -157,7 +157,7 @@ def filter_forward(
     squared_innovations, accepted : (M,) arrays
         Filled.
     restarted : (N,) int8 array
-        Filled: whether the filter began anew at a node, and why.
+        Filled: whether the filter was restarted at a node, and why.
 
     Returns
     -------

@@ -98,7 +98,7 @@ def refine(
     settings: LaserSettings,
     prior_m: float,
 ) -> Refined:
-    """Most likely pose near a start; what the readings leave open holds on to it with `prior_m`."""
+    """Most likely pose near a start; undetermined directions are held by a prior `prior_m`."""
     s = settings
     return Refined(
         *refine_outline(

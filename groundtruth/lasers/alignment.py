@@ -81,7 +81,7 @@ class AlignmentSettings:
 
 @dataclass(frozen=True, eq=False)
 class StillScan:
-    """What a scanner sees of the empty area, averaged over its scans.
+    """Points of a scanner in the empty area, averaged over its scans.
 
     Attributes
     ----------

@@ -49,7 +49,7 @@ def learn_background(
     margin_sigma: float = 5.0,
     passing: float = 0.02,
 ) -> Background:
-    """Learn what the beams see from scans of the empty area.
+    """Learn the background of the beams from scans of the empty area.
 
     Parameters
     ----------
@@ -60,11 +60,11 @@ def learn_background(
     least_sigma_m : float
         Standard deviation that a beam has at least (m).
     margin_sigma : float
-        A reading is new if it is this many standard deviations nearer than the nearest thing that
+        A reading is new if it is this many standard deviations nearer than the nearest object that
         the beam saw.
     passing : float
-        The nearest thing is this quantile of the beam's readings: beams along an edge see near and
-        far in turn, and nearer readings than that are taken for something that passed.
+        The nearest object is at this quantile of the beam's readings: beams along an edge see near
+        and far in turn, and nearer readings than that are treated as passing objects.
 
     Returns
     -------

@@ -151,7 +151,7 @@ def write_scans(path: str | os.PathLike[str], scans: Scans, *, overwrite: bool =
 
 
 def _read_npz(path: str | os.PathLike[str]) -> Scans:
-    """Read the two arrays without trusting a size that the file claims, nor unpickling."""
+    """Read the two arrays, checking sizes that the file claims and without unpickling."""
     try:
         with zipfile.ZipFile(path) as archive:
             times = _member(path, archive, "times_s", np.dtype(np.float64), 1)

@@ -1,4 +1,4 @@
-"""How the robot is tracked by lasers: what the command line and library callers can choose."""
+"""Settings of laser tracking, for the command line and library callers."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class LaserSettings:
     least_readings : int
         A pose needs as many.
     acquire_readings : int
-        A robot that is found anew needs as many.
+        A robot that is found again needs as many.
     coast_s : float
         The robot is lost after so long without a pose (s).
     acquire_s : float

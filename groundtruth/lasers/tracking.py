@@ -1,8 +1,8 @@
 """Tracking the robot by fixed scanners, one set of scans after the other.
 
-Per set: what is new against the background and where the robot can have got to; trimmed ICP of the
-outline from where it should be by now; the most likely pose from there; whether the beams agree.
-Nothing of one set's errors goes into the next one's pose but where to start.
+Per set: select the readings that are new against the background and within the robot's reach; run a
+trimmed ICP of the outline from the predicted pose; refine the result to the most likely pose; check
+that the beams agree. Errors of one set affect the next one's pose only through its start.
 """
 
 from __future__ import annotations
@@ -160,7 +160,7 @@ class Tracker:
             before = t
             predicted = pose + motion * step
             self.segment[i] = segment
-            # What the readings leave open is as uncertain as the motion since they last did not.
+            # Undetermined directions: as uncertain as the motion since they were last determined.
             self.prior_m[i] = 0.02 + 0.5 * self.speed * (t - sure)
             fitted = self._fit(i, predicted, motion, t - last)
             if fitted is None:

@@ -1,4 +1,4 @@
-"""Kernels of laser tracking: what is new in a set of scans, and how the robot explains it.
+"""Kernels of laser tracking: new readings in a set of scans, and their fit to the robot.
 
 A set of scans is a row of `ranges` per scanner (-1: none). Poses are (x, y, theta) of the robot in
 the world; its faces (k, 4) run counter-clockwise in its own frame, so that outward normals are to
@@ -187,7 +187,7 @@ def refine_outline(
     weak : (3,)
         The least determined direction of (x, y, theta), theta times `scale_m`.
     information, gradient : (scanners, 3, 3), (scanners, 3)
-        What the residuals say of each scanner's own pose.
+        Correction of each scanner's own pose by the residuals.
     """
     many = sigmas_m.size
     pose = start.copy()

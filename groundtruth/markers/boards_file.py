@@ -56,7 +56,7 @@ class BoardImage:
 
 @dataclass(frozen=True, eq=False)
 class BoardsFile:
-    """What a ``boards.json`` says.
+    """Content of a ``boards.json``.
 
     Attributes
     ----------
@@ -151,7 +151,7 @@ def find_boards(image: BoardImage, board: Checkerboard, camera: Camera) -> Board
     except OSError as error:
         raise GroundTruthError(f"{image.image}: cannot be read: {error.strerror}") from None
     size = claimed_size(content)
-    # What claims more is not decoded: memory is taken only for what there should be.
+    # Larger claims are not decoded: memory is allocated for the expected size only.
     if size is not None and size != (camera.width, camera.height):
         raise _other_size(image.image, size, camera)
     if size is None:

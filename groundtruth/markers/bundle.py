@@ -2,7 +2,7 @@
 
 The unknowns are poses, not points: a marker's four corners and a board's are rigid and of
 known size, which gives the result its scale. Bundle adjusters for reconstruction (as
-pycolmap's) move each point by itself and cannot hold a square square.
+pycolmap's) move each point independently and cannot keep a square rigid.
 """
 
 from __future__ import annotations

@@ -20,7 +20,7 @@ from groundtruth.errors import GeometryError, GroundTruthError
 FloatArray = NDArray[np.float64]
 
 #: Half the side of the window in which a corner is refined, as a share of its squares: calibrated
-#: cameras look from afar here, and what blur and noise cost is more than the lens's bending.
+#: cameras look from afar here, and blur and noise cause larger errors than the lens's distortion.
 _WINDOW = 0.4
 
 
@@ -38,7 +38,7 @@ class Checkerboard:
     Raises
     ------
     GroundTruthError
-        If the board looks the same turned by 180 degrees, or is too small.
+        If the board is symmetric under rotation by 180 degrees, or is too small.
     """
 
     columns: int

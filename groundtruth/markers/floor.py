@@ -22,7 +22,7 @@ class Floor:
 
 
 def floor_residuals(pose: FloatArray, floor: Floor) -> tuple[FloatArray, FloatArray]:
-    """What a pose misses of the floor's z, roll, pitch: (3,) normalised, and its (3, 6) Jacobian.
+    """Deviation of a pose from the floor's z, roll, pitch: (3,) normalised, and (3, 6) Jacobian.
 
     The Jacobian is that of the normalised z, roll and pitch by the pose's right perturbation.
     """

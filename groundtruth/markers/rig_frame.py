@@ -23,9 +23,9 @@ from groundtruth.trajectories.streams import PlanarPoses
 
 FloatArray = NDArray[np.float64]
 
-# What is exactly known is held to a micrometre and a microradian.
+# Exactly known poses are held to a micrometre and a microradian.
 _EXACT = 1e-12
-# A reference pose without covariance is taken to be this good (m, rad), and any to be this level.
+# Assumed deviations of a reference pose without covariance (m, rad), and of any one's level.
 _REFERENCE_SIGMA_M, _REFERENCE_SIGMA_RAD = 0.005, 0.005
 
 

@@ -1,4 +1,4 @@
-"""How poses are worked out: what the command line and library callers can choose."""
+"""Settings of the estimation of poses, for the command line and library callers."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ class PoseSettings:
     outlier_px : float
         and its root mean square residual is larger than this (px).
     corner_floor_px : float
-        Standard deviation added to each corner's own covariance, for what a fit to the image
-        cannot know: the lens' calibration, the print (px).
+        Standard deviation added to each corner's own covariance, for errors that a fit to the image
+        does not include: the lens' calibration, the print (px).
     ambiguity_odds : float
-        A second solution is taken for impossible only if the first is this many times likelier.
+        A second solution is ruled out only if the first is this many times likelier.
     floor : bool
         Assume that the robot is on the floor: z, roll and pitch are known.
     floor_z_m : float

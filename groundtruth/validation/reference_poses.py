@@ -72,7 +72,7 @@ class DistanceSettings:
 
 @dataclass(frozen=True, eq=False)
 class DistancePose:
-    """What a pose's distances say of it.
+    """A reference pose from its distances.
 
     Attributes
     ----------
@@ -84,7 +84,7 @@ class DistancePose:
         `ok`; `ambiguous`: several poses fit; `undetermined`: a direction is open; `inconsistent`:
         no pose fits.
     reason : str
-        What is at fault, if anything.
+        What is wrong, if anything.
     candidates : (C, 3) float64
         Poses x, y (m), theta (rad) that fit, the best first; one if the status is `ok`.
     covariances : (C, 3, 3) float64

@@ -153,7 +153,7 @@ class RefinedPose:
 def still_points(
     onboard: Sequence[Onboard], time_s: float, settings: RefineSettings | None = None
 ) -> StillPoints:
-    """Average what the scanners on board saw about a time.
+    """Average the readings of the on-board scanners about a time.
 
     Parameters
     ----------
@@ -248,7 +248,7 @@ def refine_pose(
         return unrefined(
             "disagrees",
             f"{1e3 * math.hypot(apart[0], apart[1]):.0f} mm and {math.degrees(apart[2]):.2f} deg "
-            "from what the distances say, more than both allow",
+            "from the pose by distances, more than both allow",
         )
     gain = np.linalg.solve(own + covariance, covariance).T
     pose = prior + gain @ apart

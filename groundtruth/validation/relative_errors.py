@@ -52,7 +52,7 @@ class RelativeScore:
     Attributes
     ----------
     pairs : int
-        Pairs of times held against the truth.
+        Pairs of times compared with the truth.
     unmatched : int
         Pairs that one side has no pose for, or that are too far apart.
     position_mean_m, position_sigma_m, position_median_m, position_rmse_m, position_max_m : float

@@ -1,4 +1,4 @@
-"""A ground truth held against reference poses: errors at each, their figures, and NEES."""
+"""Compares a ground truth with reference poses: errors at each, statistics, and NEES."""
 
 from __future__ import annotations
 
@@ -65,9 +65,9 @@ class ReferencePose:
     covariance : (3, 3) float64
     distances : DistancePose
     scans : str
-        What the scans on board did (`groundtruth.validation.reference_poses_scans.RefinedPose`).
+        Use of the on-board scans (`groundtruth.validation.reference_poses_scans.RefinedPose`).
     note : str
-        What there is to say of it.
+        Remarks.
     points : int
         Points of the scans on walls.
     rms_m : float
@@ -178,7 +178,7 @@ def reference_poses(
     segments : (S, 4) array, optional
         The building's walls, needed with scanners.
     clock : ClockModel, optional
-        Without it the robot's clock is taken for the ground truth's.
+        Without it the robot's clock is assumed to be the ground truth's.
     settings : RefineSettings, optional
 
     Returns

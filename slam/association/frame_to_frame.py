@@ -90,7 +90,7 @@ class LocalSettings:
 
 @dataclass(frozen=True, eq=False)
 class LocalAssociation:
-    """What was found from frame to frame.
+    """Result of the association from frame to frame.
 
     Attributes
     ----------
@@ -208,7 +208,7 @@ def _observed(
     innovations = seen[:, None] - local.mean[candidates, :width][None]
     if is_line:
         innovations = wrap_angle(innovations)
-    # A sway is the same for all rows of the frame: it correlates what they measure.
+    # A tilt is the same for all rows of the frame: it correlates their measurements.
     sway = np.zeros((len(index), 2))
     sway_of_rows = np.zeros((len(seen), width, 2))
     if not is_line:

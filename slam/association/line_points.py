@@ -292,7 +292,7 @@ def find_points(rays: Rays, setting: PointSettings) -> tuple[IntArray, FloatArra
     heapq.heapify(waiting)
 
     def run(place: FloatArray, first: int, last: int) -> float:
-        """The score of a place by what is left; its rows are in `rows` then."""
+        """The score of a place by the remaining rays; stores its rows in `rows`."""
         return float(
             best_run(
                 place,

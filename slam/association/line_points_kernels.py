@@ -188,7 +188,7 @@ def scores_of(
     detected: float,
     gate: float,
 ) -> FloatArray:
-    """`best_run` of many points, all rays being free; each looks `window` frames both ways."""
+    """`best_run` of many points, all rays being free; each uses `window` frames both ways."""
     count = len(start) - 1
     rows = np.empty(count, dtype=np.int64)
     free = np.ones(len(angle), dtype=np.bool_)

@@ -50,7 +50,7 @@ class Solution:
     circle_squared, line_squared : (n,) float64
         Squared normalised residual of each row (of a row of an unknown line 0).
     cost : float
-        What was minimised: sum of Huber's function of the squared normalised residuals.
+        The minimum: sum of Huber's function of the squared normalised residuals.
     """
 
     path: FloatArray

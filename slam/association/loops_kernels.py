@@ -1,4 +1,4 @@
-"""Compiled search for the rigid motion that lays one constellation of landmarks on another."""
+"""Compiled search for the rigid motion that aligns one constellation of landmarks with another."""
 
 from __future__ import annotations
 

@@ -155,7 +155,7 @@ class EkfSlam:
             self._view_lines(rows, single)
 
     def finish(self) -> None:
-        """The run is over: lines that still wait are given up."""
+        """The run is over: lines that were not initialised are dropped."""
         given_up = self._waiting.forget_all()
         if given_up:
             self.count.left_out[_GIVEN_UP] += given_up

@@ -1,4 +1,4 @@
-"""A recording frame by frame, as filters take it, and what a filter's run comes to."""
+"""A recording frame by frame, as input of filters, and the result of a filter."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ NO_CAMERA = np.zeros(2)
 
 @dataclass(frozen=True, eq=False)
 class FrameRows:
-    """What was seen in one frame.
+    """Measurements of one frame.
 
     Attributes
     ----------
@@ -61,7 +61,7 @@ class FrameRows:
         linearised_at: FloatArray,
         camera_xy: FloatArray,
     ) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
-        """What some of the rows say beyond what the state predicts.
+        """Innovation of some of the rows.
 
         Parameters
         ----------

@@ -1,6 +1,6 @@
 """Compiled measurement equations of a frame, for the filters: innovation and Jacobian in one pass.
 
-The same models as in `slam.models.measurement`, which are held against them in the tests.
+The same models as in `slam.models.measurement`, with which the tests compare them.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ It is kept as P = B - W W^T. An update by a frame's rows subtracts a product of 
 from all of P; here its factor only becomes further columns of W, and is subtracted from B once W is
 full, by one symmetric product of high rank (BLAS dsyrk). That is exact, and several times
 quicker: a product of high rank keeps the processor busy, one of low rank waits for the memory. What
-a frame needs of P (the columns of what it shows) is computed from B and W.
+a frame needs of P (the columns of its landmarks) is computed from B and W.
 
 Of B only the lower triangle is kept, so that P is symmetric whatever is done to it; and P changes
 by congruences (F P F^T) and by symmetric products alone.

@@ -129,7 +129,7 @@ def frames_of_graph(graph: RunGraph) -> list[Frame]:
 
 
 def demand_readable(frames: Sequence[Frame], name: str) -> None:
-    """Refuse what the digits of a landmark file cannot hold.
+    """Refuse values that the digits of a landmark file cannot represent.
 
     Parameters
     ----------

@@ -45,7 +45,7 @@ _SWAY_RAD = Bounds("from 0 to less than a right angle", 0.0, 0.5 * math.pi, belo
 
 @dataclass(frozen=True)
 class Weighting:
-    """What is minimised and what is unknown.
+    """The cost function and the unknowns.
 
     Attributes
     ----------
@@ -58,7 +58,7 @@ class Weighting:
     row_errors : "corrected" or "recorded"
         Where rows and discs are compared when the mounting is unknown. `corrected`: the row's pixel
         is put on the floor by the camera as mounted, under the row's own covariance. `recorded`:
-        what the camera as calibrated would have written of the disc is compared with what it wrote,
+        the row that the calibrated camera would have written is compared with the one it wrote,
         which is where that covariance belongs.
     tilt_sigma_rad : float
         Standard deviation of each pose's pitch and roll; 0: the robot is upright. With a tilt, rows
@@ -239,7 +239,7 @@ def linearise(graph: Graph, estimate: Estimate, weighting: Weighting) -> Lineari
         border[first_disc_row:first_line_row] = (by_mounting * scale).reshape(-1, 4)
         if estimate.mounting is not None and graph.camera is not None:
             # Rows' bearings were put into the robot frame as calibrated: a camera that is really
-            # turned to the left sees things further to the right than they are.
+            # turned to the left sees landmarks further to the right than they are.
             _, by_turn = turn_to_the_left(graph.camera, estimate.mounting)
             lines = -(line_root / graph.bearing_sigma_rad)[:, None] * by_turn
             border[first_line_row:first_tilt_row] = lines

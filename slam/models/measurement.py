@@ -1,4 +1,4 @@
-"""What a robot at a pose measures of landmarks in the map, with Jacobians (the report's J5, J6).
+"""Measurements of landmarks in the map from a pose, with Jacobians (the report's J5, J6).
 
 Robot frame: X left, Y backward, so a bearing is atan2(x, -y): 0 forward, positive to the left.
 Everything is vectorised over leading axes.
