@@ -110,7 +110,7 @@ def parse_camera(text: str, name: str = "<text>") -> Camera:
 
 
 def format_camera(camera: Camera) -> str:
-    """The text of a ``.cam`` file, laid out as the data set's; `parse_camera` gives it back."""
+    """The text of a ``.cam`` file in the data set's layout; `parse_camera` gives it back."""
     lines = [f"{{ {CLASS_NAME}"]
     if camera.sensor_to_tcp is not None:
         lines += _pose_lines("sensor2Tcp", camera.sensor_to_tcp)

@@ -42,8 +42,7 @@ Command = Circles | Lines | Markers | All | Compare | Export | Draw | View | Rep
 
 PROGRAM = Program(
     "detect",
-    "Landmarks with covariances out of a calibrated camera's images.\n\n"
-    "Example: detect all images/e",
+    "Landmarks with covariances from a calibrated camera's images.\n\nExample: detect all images/e",
     {
         **dict.fromkeys((Circles, Lines, Markers, All), "detect.runs.command"),
         Compare: "detect.comparison.command",

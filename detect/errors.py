@@ -1,4 +1,4 @@
-"""What can go wrong with a detection."""
+"""Exceptions of the package `detect`."""
 
 from __future__ import annotations
 

@@ -276,7 +276,7 @@ def tilt_beyond_doubt(
     Returns
     -------
     TiltEstimate or None
-        None where it is in doubt. Lines are not refined to the end for it.
+        None if it is in doubt. Lines are only partly refined for it.
     """
     tilt = judge_tracks(image, tracks, table, settings, steps=_FIRST_STEPS).tilt
     return tilt if beyond_doubt(tilt, _FIRST_LINES) else None

@@ -1,6 +1,6 @@
-"""``camera level``: how a camera is mounted, by a drive with it.
+"""``camera level``: estimates how a camera is mounted from a run.
 
-The command is one of the program `camera`; it is carried out here, for it detects.
+The command is one of the program `camera`; it is implemented here because it needs detection.
 """
 
 from __future__ import annotations

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 # A type to Numba, a function to the type checker.
 _I: Callable[[Any], Any] = np.int16
 
-#: What takes the place of responses that do not count: above all of them.
+#: Replaces responses that are ignored: above all of them.
 _NONE = _I(32767)
 _DARK, _LIGHT = _I(2), _I(253)
 

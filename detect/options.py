@@ -33,7 +33,7 @@ from storage.bounds import NOT_NEGATIVE, demand
 
 @dataclass(frozen=True, kw_only=True)
 class DetectorFlags(RunFlags):
-    """What every detector needs besides its settings.
+    """Options of all detectors besides their settings.
 
     Parameters
     ----------

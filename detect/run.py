@@ -260,7 +260,7 @@ def open_images(
     Raises
     ------
     DetectError, camera.CameraError, landmarks.LandmarkFileError
-        As `open_run` does, but for a missing calibration.
+        As `open_run`, except for a missing calibration.
     """
     _demand_folder(folder)
     if camera_path is None and not any(folder.glob("*.cam")):

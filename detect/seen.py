@@ -96,7 +96,7 @@ class FrameView:
     radius_m : float
         Of the discs.
     reference_by, detected_by : (float, float) or None
-        What levelled the rows of either side.
+        Tilts by which the rows of either side were levelled.
     """
 
     camera: Camera

@@ -1,4 +1,4 @@
-"""What decides the detectors' results: configuration and command line flags in one."""
+"""Settings of the detectors, which are also the flags of the command line."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from storage.bounds import (
     whole,
 )
 
-#: By what positions are corrected for the tilt.
+#: Tilt by which positions are corrected.
 Levelling = Literal["none", "frame", "run"]
 Polarity = Literal["any", "light", "dark"]
 
@@ -180,7 +180,7 @@ PUBLISHED = CircleSettings(
     refine=False,
 )
 
-#: What the report on the data set prints of it: other outlines, every pixel, all local maxima.
+#: The parameters in the report on the data set: other outlines, every pixel, all local maxima.
 REPORT = CircleSettings(
     threshold=0.6,
     border_px=12,

@@ -1,4 +1,4 @@
-"""What can be wrong with landmark records and their files."""
+"""Exceptions of the package `landmarks`."""
 
 from __future__ import annotations
 

@@ -306,7 +306,7 @@ class Row:
 
 @cache
 def _values_of(names: tuple[str, ...]) -> Callable[[object], tuple[float, ...]]:
-    """What takes attributes of those names off a record."""
+    """A function that gets attributes of those names from a record."""
     if len(names) == 1:
         return lambda record: (getattr(record, names[0]),)
     return attrgetter(*names)

@@ -1,4 +1,4 @@
-"""Writing landmark files, laid out as the data set's own."""
+"""Writes landmark files in the data set's own layout."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ from lut.table_checks import check_disc_table, check_vertical_table
 from lut.verticals import VerticalTable, build_vertical_table
 from storage import write_whole
 
-#: Raised with every change of what tables hold or how they are computed.
+#: Incremented with every change of the tables' content or computation.
 TABLE_VERSION = 9
 
 Made = TypeVar("Made")

@@ -1,4 +1,4 @@
-"""What can be wrong with a table."""
+"""Exceptions of the package `lut`."""
 
 from __future__ import annotations
 

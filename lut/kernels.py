@@ -1,7 +1,7 @@
 """Compiled loops that build tables: arrays in, arrays out.
 
 `encode_outlines` projects as `camera.kernels.project_floor_point` does, operation by operation, but
-without a branch, so that several pixels are worked on at once; a test holds the two together.
+without a branch, so that several pixels are processed at once; a test compares the two.
 """
 
 from __future__ import annotations

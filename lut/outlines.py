@@ -97,7 +97,7 @@ class DiscTable:
 
     Hashed and compared by identity.
 
-    Centres are worked on in *blocks* of 64 neighbouring columns of a row. For each block ``2 R``
+    Centres are processed in *blocks* of 64 neighbouring columns of a row. For each block ``2 R``
     rows of 64 grey values are gathered, a column for each centre: R = `samples` rounded up to a
     multiple of 4 for the inner outline, then R for the outer one; rows that are no samples are 0.
 

@@ -17,7 +17,7 @@ MaybeStr = Optional[str]  # noqa: UP045
 
 @dataclass(frozen=True, kw_only=True)
 class RunFlags:
-    """What every command needs that reads the landmarks of a run.
+    """Options of all commands that read the landmarks of a run.
 
     Parameters
     ----------
@@ -90,7 +90,7 @@ class Map(RunFlags):
 
 @dataclass(frozen=True, kw_only=True)
 class FilterFlags(RunFlags):
-    """What both filters need.
+    """Options of both filters.
 
     Parameters
     ----------

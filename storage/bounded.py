@@ -1,4 +1,4 @@
-"""Reading a file from strangers: of bounded size, and nothing but a file."""
+"""Reads untrusted files: regular files of bounded size only."""
 
 from __future__ import annotations
 

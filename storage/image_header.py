@@ -14,7 +14,7 @@ from collections.abc import Iterator
 #: The largest image that there can be: it fills as many bytes as grey values.
 MOST_PIXELS = 1 << 27
 
-#: The start-of-frame markers of a JPEG: C0 to CF but for tables (C4), extensions (C8, CC).
+#: The start-of-frame markers of a JPEG: C0 to CF except tables (C4), extensions (C8, CC).
 _JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _JPEG_WITHOUT_LENGTH = frozenset({0x01, *range(0xD0, 0xD9)})
 _PNG = b"\x89PNG\r\n\x1a\n"

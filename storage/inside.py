@@ -1,4 +1,4 @@
-"""Names of files that other files give: they must not lead out of the folder they are given for."""
+"""Checks names of files that other files give: they must not lead out of a given folder."""
 
 from __future__ import annotations
 

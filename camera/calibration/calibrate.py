@@ -53,7 +53,7 @@ class Calibration:
     ----------
     adjusted : Adjusted
     points : Points
-        What it was fitted to; circles' shifts are taken off.
+        The points that it was fitted to, corrected for the circles' shifts.
     names : tuple of str
         The views' names.
     outliers : tuple of (str, float)

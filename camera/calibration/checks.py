@@ -46,7 +46,7 @@ def demand_different_views(fit: Adjusted, spread_deg: float) -> None:
 
 
 def warnings_of(fit: Adjusted, points: Points, spread_deg: float) -> list[str]:
-    """What would make a calibration firmer."""
+    """Warnings about weaknesses of a calibration."""
     warnings = []
     if fit.rms_px > max(_LARGEST_RMS_PX, _LARGEST_RMS_WIDTHS * points.width):
         warnings.append(
@@ -76,7 +76,7 @@ def coverage(points: Points, columns: int = 8, rows: int = 6) -> IntArray:
 
 
 def coverage_warnings(intrinsics: FloatArray, points: Points) -> list[str]:
-    """What of the image no point was seen in."""
+    """Parts of the image in which no point was seen."""
     warnings = []
     thirds = coverage(points, 3, 3)
     across, down = ("left", "middle", "right"), ("top", "middle", "bottom")

@@ -36,7 +36,7 @@ class Candidate:
     ----------
     adjusted : Adjusted
     points : Points
-        What it was fitted to; circles' shifts are taken off.
+        The points that it was fitted to, corrected for the circles' shifts.
     holdout_px : float
         `holdout_error`.
     """

@@ -1,6 +1,6 @@
 """The distortion models of other programs: OpenCV, ROS, Kalibr and COLMAP.
 
-All of them are pinhole cameras with pixel centres at integers (COLMAP's half a pixel is taken off
+All of them are pinhole cameras with pixel centres at integers (COLMAP's half a pixel is subtracted
 where its files are read) and a distortion of normalised coordinates x = X/Z, y = Y/Z:
 
 radtan

@@ -11,7 +11,7 @@ from camera.formats.opencv import foreign
 from camera.formats.plain_yaml import first_of, numbers, parse_yaml, pinhole_matrix, shortest, whole
 from storage.messages import excerpt
 
-#: What ROS calls the models (sensor_msgs/distortion_models.h).
+#: Names of the models in ROS (sensor_msgs/distortion_models.h).
 ROS_NAMES: dict[Model, str] = {
     "radtan": "plumb_bob",
     "rational": "rational_polynomial",

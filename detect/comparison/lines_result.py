@@ -40,7 +40,7 @@ class LineCompareOptions:
 
 @dataclass(frozen=True, slots=True)
 class LineFrameScore:
-    """What became of one frame's rows; `joined` ones were found with another row's match."""
+    """Result for one frame's rows; `joined` ones were found with another row's match."""
 
     name: str
     matched: int

@@ -63,7 +63,7 @@ class CompareOptions:
 
 @dataclass(frozen=True, slots=True)
 class FrameScore:
-    """What became of one frame's rows."""
+    """Result for one frame's rows."""
 
     name: str
     matched: int
@@ -265,7 +265,7 @@ class Comparison:
 
 
 class Rates(Protocol):
-    """What demands are made on: a comparison of discs or of lines."""
+    """A comparison of discs or of lines, for which limits can be demanded."""
 
     @property
     def recall(self) -> float | None:

@@ -1,4 +1,4 @@
-"""The pieces that the reports of comparisons are laid out of."""
+"""The parts of the reports of comparisons."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ KINDS = ("circles", "lines", "markers", "tilt")
 
 @dataclass(frozen=True, slots=True)
 class SeenRows:
-    """What files say of one image; None where there is no file.
+    """The files' rows of one image; None where there is no file.
 
     Attributes
     ----------

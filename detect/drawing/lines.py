@@ -94,7 +94,7 @@ def draw_tracks(
     rejected: bool = True,
     reasons: bool = True,
 ) -> NDArray[np.uint8]:
-    """Draw the points of tracks, coloured by what became of them, with a legend.
+    """Draw the points of tracks, coloured by their fates, with a legend.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What ``detect export`` does."""
+"""The command ``detect export``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Straight pixels: the image's positions with the lens's distortion taken off.
+"""Straight pixels: the image's positions with the lens's distortion removed.
 
 Edges of markers are straight in a pinhole image only. Everything that is fitted to edges is
 therefore fitted at *straight* positions, ``(scale x + offset)`` of the undistorted normalised

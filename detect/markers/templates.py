@@ -31,7 +31,7 @@ class Templates:
     cells : (T, G * G) float32
         1 for white; T is four times the number of markers.
     weakness : float
-        How easily a pattern is met by chance, from 0 (next to never) to 1.
+        How likely a pattern occurs by chance, from 0 (hardly ever) to 1.
     decoys : (D, G * G) float32
         Content of other black frames: nothing, a bar, or a half.
     plain : (T,) bool

@@ -220,7 +220,7 @@ def _known(
 
 
 def _workers(command: DetectorFlags, job: _Job) -> Workers:
-    """Who does the work of a command."""
+    """The workers of a command."""
     frames = job.run.frames
     large = job.pictures is not None or frames.ships_images
     if command.cluster is not None:

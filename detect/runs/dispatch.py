@@ -1,13 +1,13 @@
-"""Frames worked on by any number of workers, their rows in the order of the run.
+"""Processes frames with any number of workers, and gives their rows in the order of the run.
 
 Workers are a standard `concurrent.futures.Executor`: this process, others on this machine, or a
 cluster (`detect.runs.workers`). Frames travel in chunks. Only a window of them is under way at any
 time, so that neither what waits nor what is finished grows with the run, and a slow frame holds the
 others up only when they are a window ahead of it.
 
-A worker that dies, killed or out of memory, costs no frame of its neighbours: whatever was under
-way is worked on again, one chunk at a time and then one frame at a time, until the frame that kills
-its worker is alone; that one is reported like an image that cannot be read.
+A worker that dies, killed or out of memory, loses no other frame: all frames under way are
+processed again, one chunk at a time and then one frame at a time, until the frame that kills its
+worker is alone; that one is reported like an image that cannot be read.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ def detect_chunks(
     source = iter(tasks)
     chunks = iter(lambda: tuple(islice(source, workers.chunk)), ())
     with _Crew(workers, plan) as crew:
-        # A chunk without a future is under suspicion: to be worked on alone.
+        # A chunk without a future is suspect: to be processed alone.
         under_way: deque[tuple[Chunk, Future[list[FrameRows]] | None]] = deque()
         while True:
             suspects = any(future is None for _, future in under_way)

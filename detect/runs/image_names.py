@@ -150,7 +150,7 @@ def images_of_folder(folder: Path) -> ImageNames:
 
 
 def _natural_order(name: str) -> str:
-    """What sorts names with numbers by value, then by the name itself, which follows the last /.
+    """Sort key of names, with numbers by value, then by the name itself, which follows the last /.
 
     A number becomes NUL, how many digits it has, and the digits: longer numbers are larger ones.
     """

@@ -92,7 +92,7 @@ class Journal:
         return JournalHead(*first) if isinstance(first, list) else None
 
     def frames(self) -> Iterator[JournalFrame]:
-        """What counts of the lines behind the head.
+        """The valid lines behind the head.
 
         Requesting the next one takes it over; `cut` discards the last one and all that follow.
         """

@@ -194,7 +194,7 @@ def _level_tilt_text(version: str) -> list[str]:
 
 
 def _json_file(path: Path, plan: FramePlan, version: str) -> Output:
-    """What `json.dumps` with an indent of 1 gives."""
+    """The text that `json.dumps` with an indent of 1 gives."""
     assert plan.circles is not None
     assert plan.camera is not None
     document = {

@@ -54,7 +54,7 @@ _NONE: Mapping[str, int] = {}
 
 
 class FrameRows(NamedTuple):
-    """What came of a frame.
+    """Result of a frame.
 
     Attributes
     ----------

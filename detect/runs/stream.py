@@ -61,7 +61,7 @@ def detect_run(
     pictures : path, optional
         Folder for the plan's pictures.
     workers : Workers, optional
-        Who does the work; by default this process (see `detect.runs.workers`).
+        The workers; by default this process (see `detect.runs.workers`).
     on_progress : callable, optional
         Called once after every frame.
     conduct : Conduct, optional
@@ -138,7 +138,7 @@ def _demand_possible(plan: FramePlan, workers: Workers) -> None:
 
 
 def _second_pass(plan: FramePlan, summary: RunSummary) -> SecondPass | None:
-    """What makes files of those of the frames, if anything."""
+    """The second pass over the files of the frames, if there is one."""
     if plan.levelling != "run" or not (plan.camera and plan.lines and plan.circles):
         return None
     from detect.runs.level_run import level_run

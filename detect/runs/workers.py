@@ -1,4 +1,4 @@
-"""Who works on the frames of a run: this process, processes of this machine, or a cluster.
+"""Workers for the frames of a run: this process, processes of this machine, or a cluster.
 
 Each is a standard executor with its number of frames per task, put together as
 `detect.runs.dispatch.Workers`.

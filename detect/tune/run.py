@@ -27,7 +27,7 @@ Settings = CircleSettings | LineSettings
 
 @dataclass(frozen=True)
 class Trial:
-    """What came of one setting.
+    """Result of one setting.
 
     Attributes
     ----------

@@ -32,7 +32,7 @@ def trial_records(
     combinations : sequence of combinations
         See `detect.tune.grid.combinations`.
     trials : sequence of Trial
-        What came of each.
+        Their results.
     unit : str
         Of the errors: ends the name of their column.
     """

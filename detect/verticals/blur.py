@@ -58,7 +58,7 @@ def blur_of_sharpness(sharpness: float, fine_px: float, coarse_px: float) -> flo
 
 
 def width_for(sharpness: float, settings: LineSettings) -> float:
-    """How many times as wide as it is set the filter has to be for an image's edges.
+    """Factor by which the filter must be widened for an image's edges.
 
     Parameters
     ----------

@@ -205,7 +205,7 @@ def fit_and_judge(
     image: NDArray[np.uint8], strip: Strip, tracks: LineTracks, filters: StepFilters,
     limits: JudgementLimits,
 ) -> tuple[Judgement, Verticals, NDArray[np.int64]]:  # fmt: skip
-    """As `judge_tracks`, but for the tilt's covariance, which is that of least squares.
+    """As `judge_tracks`, except that the tilt's covariance is that of least squares.
 
     Also returned is what `detect.verticals.tilt.with_error` needs for another one: what the
     accepted tracks say about the tilt, and one of them for each, the same for all of an edge.
@@ -306,7 +306,7 @@ def weigh_verticals(
     fits: LineFits, evidence: FloatArray, accepted: NDArray[np.int64], leaning: Leaning,
     weight_limit: float,
 ) -> Verticals:  # fmt: skip
-    """What accepted lines say about the tilt."""
+    """The tilt's constraints by accepted lines."""
     count = len(accepted)
     normal = np.empty((count, 3))
     variance = np.empty(count)

@@ -160,7 +160,7 @@ def step_filters(sigmas_px: tuple[float, ...], farthest_px: tuple[float, ...]) -
         weights = np.stack(
             [d / sigma**2 * gaussian, (q - 1.0) * gaussian, (q - 3.0) * d / sigma**2 * gaussian]
         )
-        # What is cut off must not see the image's brightness.
+        # Windows that are cut off must not depend on the image's brightness.
         weights -= weights.mean(axis=-1, keepdims=True)
         weights = np.pad(weights, [(0, 0), (0, 1), (0, 0)])
         tables.append(weights.reshape(3, -1))

@@ -173,7 +173,7 @@ def _from_cache_line(numbers: NDArray[np.float32]) -> NDArray[np.float32]:
 def band_response(
     image: NDArray[np.uint8], band: StartBand, window: LineFilter
 ) -> NDArray[np.float32]:
-    """Responses on rows parallel to the horizon, with the window laid over the strip itself.
+    """Responses on rows parallel to the horizon, with the window applied to the strip itself.
 
     Near the horizon the strip's columns are a pixel wide. There it hardly matters whether the
     moments across the vertical are taken in the image and interpolated, or the grey values and

@@ -87,7 +87,7 @@ class ConsensusSettings(NamedTuple):
 
 
 class Verticals(NamedTuple):
-    """What lines that may be verticals say about the tilt.
+    """Constraints of the tilt by lines that may be verticals.
 
     Attributes
     ----------
@@ -143,7 +143,7 @@ def level_rotation(pitch_rad: float, roll_rad: float) -> FloatArray:
 
 @njit(cache=True, error_model="numpy")
 def no_tilt() -> TiltEstimate:
-    """What compiled code has where there is no estimate."""
+    """The value in compiled code for no estimate."""
     return TiltEstimate(np.nan, np.nan, np.full((2, 2), np.nan), 0, np.nan, np.nan)
 
 

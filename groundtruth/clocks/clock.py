@@ -2,7 +2,7 @@
 
 Within a segment ``robot_time = time + offset + (rate - 1) (time - reference)``, `time` being the
 ground truth's; between segments the offset is interpolated, before the first and after the last
-their lines go on.
+their lines are extrapolated.
 """
 
 from __future__ import annotations

@@ -95,7 +95,7 @@ def pair_headings(
     largest_drift: float,
     fewest: int,
 ) -> HeadingPair | None:
-    """What of two streams can be compared, fixed for a whole search of offset and drift.
+    """The comparable part of two streams, fixed for a whole search of offset and drift.
 
     Parameters
     ----------
@@ -179,7 +179,7 @@ def without_turns(differences: FloatArray, *, keep_mean: bool = False) -> FloatA
     ----------
     differences : (N,) array
     keep_mean : bool
-        Whether their mean angle stays in; else it is taken off, which eliminates the angle between
+        Whether their mean angle stays in; else it is subtracted, which eliminates the angle between
         the streams' axes.
 
     Returns

@@ -298,7 +298,7 @@ class Fuse:
     camera : Path
         Ground truth from the markers, in the same columns.
     clock : Path
-        What `groundtruth sync` wrote; without it all clocks are one.
+        Output of `groundtruth sync`; without it all clocks are assumed to be one.
     distance_sigma : float
         Standard deviation of odometry's distance per square root of a metre driven (m).
     lateral_sigma : float
@@ -308,7 +308,7 @@ class Fuse:
     turn_per_metre_sigma : float
         The same per square root of a metre driven (rad).
     learn_noise : bool
-        Scale these by what makes the measurements likeliest.
+        Scale these to maximise the likelihood of the measurements.
     gate_probability : float
         Share of right poses that pass the gate.
     covariance_scale : two floats
@@ -349,7 +349,7 @@ class Validate:
     poses : Path
         The ground truth (t, x, y, theta, and perhaps 9 of covariance).
     clock : Path
-        What `groundtruth sync` wrote, for the on-board scans.
+        Output of `groundtruth sync`, for the on-board scans.
     refine : str
         `scans`: refine the reference poses by ICP of the on-board scans to the building; `none`:
         distances alone.

@@ -32,7 +32,7 @@ class Rejected:
     Attributes
     ----------
     stream : str
-        Whose it was.
+        Its stream.
     time_s : float
     squared_innovation : float
         Squared normalised innovation.
@@ -76,7 +76,7 @@ class OdometryErrors:
 
 @dataclass(frozen=True, eq=False)
 class Fusion:
-    """The robot's path out of all streams.
+    """The robot's path from all streams.
 
     Attributes
     ----------

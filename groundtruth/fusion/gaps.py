@@ -28,7 +28,7 @@ from landmarks import wrap_angle
 
 FloatArray = NDArray[np.float64]
 
-#: So long without measurements is a gap: rejections that begin after it are laid to it.
+#: Least time without measurements that is a gap: rejections after it are attributed to it.
 UNMEASURED_S = 1.0
 _MOST_TURNS = 2
 _MOST_STEPS = 15
@@ -47,7 +47,7 @@ class Bridge:
     Attributes
     ----------
     path : (N, 6) float64 or None
-        States from the gap's begin to its end; headings go on without jumps. None if more than one
+        States from the gap's begin to its end; headings have no jumps. None if more than one
         number of whole turns may be, or if none explains the end.
     looser : float
         By what factor odometry's variances had to be raised to explain it, 1 or more.

@@ -37,7 +37,7 @@ _RELINEARISATIONS_WHERE_LOST = 3
 
 @dataclass(frozen=True, eq=False)
 class MeasurementAccount:
-    """What became of the measurements.
+    """How the measurements were used.
 
     Attributes
     ----------
@@ -75,7 +75,7 @@ class MovementProblem:
     measured, covariances : (M, 3), (M, 3, 3) float64
         The measured poses.
     streams : tuple of M str
-        Whose they are.
+        Their streams.
     repaired : dict of str to int
         Covariances that had to be raised, by stream.
     repeated : dict of str to int
@@ -235,7 +235,7 @@ class MovementProblem:
         if found.path is None:
             return found
         points[begin:end] = found.path[:-1]
-        # Whole turns, so that headings go on without a jump.
+        # Whole turns, so that headings continue without a jump.
         turns = np.round((found.path[-1, 2] - points[end, 2]) / (2.0 * math.pi))
         points[end:, 2] += 2.0 * math.pi * turns
         return found

@@ -79,7 +79,7 @@ class Seen(NamedTuple):
 
 
 class Refined(NamedTuple):
-    """What `groundtruth.lasers.tracking_kernels.refine_outline` returns."""
+    """Result of `groundtruth.lasers.tracking_kernels.refine_outline`."""
 
     pose: FloatArray
     covariance: FloatArray
@@ -233,7 +233,7 @@ def _close(a: FloatArray, b: FloatArray) -> bool:
 
 
 def _same(a: FloatArray, b: FloatArray, body: Body) -> bool:
-    """Whether two poses are one, but for noise and the outline's symmetries."""
+    """Whether two poses are equal up to noise and the outline's symmetries."""
     for other in (b, *(compose(b, symmetry) for symmetry in body.symmetries)):
         near = math.hypot(a[0] - other[0], a[1] - other[1]) < 0.1
         if near and abs(float(wrap_angle(a[2] - other[2]))) < math.radians(8.0):

@@ -210,7 +210,7 @@ def icp_to_segments(
 
 
 def trimmed_variance(kept: float) -> tuple[float, float]:
-    """What keeping the best share of Gaussian residuals does to variances.
+    """Factor of variances due to keeping only the best share of Gaussian residuals.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""What laser scanners measured over time, and its files.
+"""Readings of laser scanners over time, and their files.
 
 ``<name>.scans.npz``
     `times_s` (N,) float64 and `ranges_mm` (N, readings) uint16, nothing pickled.
@@ -162,7 +162,7 @@ def _read_npz(path: str | os.PathLike[str]) -> Scans:
         raise GroundTruthError(f"{path}: no such file") from None
     except OSError as error:
         raise GroundTruthError(f"{path}: cannot be read: {error.strerror}") from None
-    # What a damaged archive raises: names that are no UTF-8, offsets beyond any file, ...
+    # Errors of damaged archives: names that are no UTF-8, offsets beyond any file, ...
     except (
         zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, ValueError, OverflowError,
         struct.error,

@@ -36,7 +36,7 @@ _FRONT_SAMPLE = 60
 
 @dataclass(frozen=True, eq=False)
 class LaserTrack:
-    """What came of every set of scans.
+    """Result for every set of scans.
 
     Attributes
     ----------

@@ -95,7 +95,7 @@ class Bundle:
 
 @dataclass(frozen=True, eq=False)
 class Whiteners:
-    """What makes residuals independent, each of variance 1.
+    """Whitening of residuals: independent, each of variance 1.
 
     Attributes
     ----------

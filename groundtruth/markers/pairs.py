@@ -146,7 +146,7 @@ def spanning_tree(pairs: Mapping[tuple[int, int], int], count: int, root: int) -
     Returns
     -------
     list of int
-        Parents; the root's is itself, -1 for what is not connected.
+        Parents; the root's is itself, -1 for unconnected ones.
     """
     parents = [-1] * count
     parents[root] = root

@@ -52,7 +52,7 @@ def solve_camera(
         In the object's frame (m). For `ippe` they are the corners of one square marker in its own
         frame, as `groundtruth.markers.calibration.marker_corners` gives them.
     pixels : (N, 2) array
-        In the image as it is; the lens' distortion is taken off here.
+        In the original image; the lens' distortion is removed here.
     solver : str
         `sqpnp` (Terzakis & Lourakis 2020), `epnp` (Lepetit et al. 2009; of points in one plane it
         may give the mirror image), `iterative` (DLT or homography, then least squares), `ippe`

@@ -61,7 +61,7 @@ class PoseCandidate:
 
 @dataclass(frozen=True, eq=False)
 class PoseEstimate:
-    """What one time's corners say.
+    """Pose estimate from the corners of one time.
 
     Attributes
     ----------
@@ -145,7 +145,7 @@ def _starts(problem: PoseProblem, settings: PoseSettings) -> list[FloatArray]:
 
 
 def _own_poses(problem: PoseProblem) -> list[FloatArray]:
-    """What single views say alone: those that explain all of them best."""
+    """Poses by single views: those that explain all views best."""
     poses = [pose for view in range(problem.views) for pose in view_poses(problem, view)]
     return sorted(poses, key=lambda pose: robot_rms_px(problem, pose))[:_OWN_STARTS]
 

@@ -20,7 +20,7 @@ class PoseSettings:
     Parameters
     ----------
     solver : str
-        What finds the pose that least squares start from.
+        The solver for the initial pose of least squares.
     loss : str
         How markers that fit badly are weighted in the least squares.
     loss_scale : float

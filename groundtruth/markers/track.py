@@ -34,7 +34,7 @@ STATUSES: tuple[Status, ...] = (
 
 @dataclass(frozen=True, eq=False)
 class TrackedTime:
-    """What became of one time.
+    """Result for one time.
 
     Attributes
     ----------

@@ -62,7 +62,7 @@ class Inputs:
     documents : dict of str to dict
         Contents of `laser.json`, `fused.json`, `clock.json`, `validation.json`, `aligned.json`.
     sets : dict of str to int
-        Sets of scans by what became of them.
+        Numbers of sets of scans by status.
     intervals : list of Interval
         Where the laser's track was not determined within visits.
     picture : bytes or None
@@ -70,9 +70,9 @@ class Inputs:
     visits : list of (float, float)
         Times between which the robot was in the covered area.
     missing : list of str
-        What is not there.
+        Missing files.
     problems : list of str
-        What is there but cannot be read.
+        Files that cannot be read.
     """
 
     name: str

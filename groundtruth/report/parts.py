@@ -74,7 +74,7 @@ def figure(caption: str, *drawings: Element) -> Part:
 
 
 def picture(caption: str, address: str, instead: str) -> Part:
-    """A picture (a ``data:`` address) over its caption; `instead` is for who cannot see it."""
+    """A picture (a ``data:`` address) over its caption; `instead` is its alternative text."""
     return Part("picture", caption, address=address, instead=instead)
 
 

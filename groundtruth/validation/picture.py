@@ -24,7 +24,7 @@ def draw_errors(
     figures: Figures,
     building: FloatArray | None = None,
 ) -> bytes:
-    """Draw errors with what their covariances allow; a PNG's bytes.
+    """Draw errors with bounds by their covariances; returns a PNG's bytes.
 
     The same input gives the same bytes.
 

@@ -28,7 +28,7 @@ from storage.bounds import ABOVE_0, PROBABILITY, SHARE_ABOVE_0, demand
 FloatArray = NDArray[np.float64]
 ScanStatus = Literal["used", "undetermined", "disagrees", "moved", "no scans", "not asked"]
 
-# Beams whose readings jump about, as at edges, say where nothing is.
+# Beams with fewer readings than this share near their median, as at edges, give no point.
 _FEWEST_READINGS = 0.5
 # Along a corridor only the beams to its ends change; a passer-by hides fewer than these.
 _MOVED_SHARE = 0.25

@@ -167,7 +167,7 @@ def reference_poses(
     clock: ClockModel | None = None,
     settings: RefineSettings | None = None,
 ) -> tuple[list[ReferencePose], list[Refused]]:
-    """Poses out of distances, refined by scans where these help.
+    """Poses from distances, refined by scans where these help.
 
     Parameters
     ----------

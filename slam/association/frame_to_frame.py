@@ -185,7 +185,7 @@ def associate_locally(
 def _measured(
     circles: CircleRows, lines: LineRows, rows: slice, is_line: bool, setting: LocalSettings
 ) -> tuple[FloatArray, FloatArray]:
-    """What rows of a frame measure (n, d), and their covariances (n, d, d)."""
+    """Measurements of a frame's rows (n, d), and their covariances (n, d, d)."""
     if is_line:
         variance = lines.sigma_rad[rows] ** 2
         return lines.bearing_rad[rows][:, None], variance[:, None, None]

@@ -1,6 +1,6 @@
 """The path and the landmarks that a run's rows and labels say: sparse least squares.
 
-What closing loops needs between two rounds: Gauss-Newton steps, damped where they fail, from the
+For loop closing between two rounds: Gauss-Newton steps, damped where they fail, from the
 last round's solution, with weights that let rows count less which contradict all others. The map
 for its own sake, with marginal covariances and calibration, is `slam map`.
 """
@@ -63,7 +63,7 @@ class Solution:
 
 @dataclass(frozen=True, eq=False)
 class _System:
-    """What stays the same from step to step: rows, labels and roots of the information."""
+    """Constants of all steps: rows, labels and roots of the information."""
 
     recording: Recording
     circle_label: IntArray

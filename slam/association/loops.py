@@ -348,7 +348,7 @@ def _refined(
     tried: int,
     settings: LoopSettings,
 ) -> Match | None:
-    """Least squares over all landmarks that agree, which ones do then, and how surely."""
+    """Match by least squares over all landmarks that agree; None if too few agree then."""
     place, target = later.xy[moved], earlier.xy[fixed]
     centre = place.mean(axis=0)
     shift = centre + offset - _turned(centre, turn)

@@ -43,7 +43,7 @@ _NO_LINES = (np.zeros(0, dtype=np.int64), np.zeros(1, dtype=np.int64), np.zeros(
 
 
 class Estimate(Protocol):
-    """What pairing needs of a filter."""
+    """The part of a filter that pairing needs."""
 
     disc_slots: dict[int, int]
     line_slots: dict[int, int]

@@ -96,7 +96,7 @@ class FrameRows:
 
 @dataclass
 class RowCount:
-    """What became of a run's rows.
+    """How a run's rows were used.
 
     Attributes
     ----------

@@ -41,7 +41,7 @@ _PENDING = 128
 
 
 class JointCovariance:
-    """Covariance of a pose and of what else is estimated, which grows.
+    """Covariance of a pose and of a growing number of landmarks.
 
     Parameters
     ----------
@@ -94,7 +94,7 @@ class JointCovariance:
         return np.asarray(product)
 
     def move_pose(self, by_pose: FloatArray, noise: FloatArray) -> None:
-        """The pose moves: P becomes F P F^T + Q, F the identity but for the pose.
+        """The pose moves: P becomes F P F^T + Q, F the identity except for the pose.
 
         Parameters
         ----------
@@ -162,7 +162,7 @@ class JointCovariance:
         Parameters
         ----------
         index : (k,) int64 array
-            What of the state they depend on.
+            Indices of the state that they depend on.
         jacobian : (d, k) array
             Their derivative by that.
         noise : (d, d) array
@@ -180,7 +180,7 @@ class JointCovariance:
         return first
 
     def replace(self, first: int, index: IntArray, jacobian: FloatArray, noise: FloatArray) -> None:
-        """Forget numbers from `first` on and put others in their place; see `append`."""
+        """Replace numbers from `first` on by others; see `append`."""
         count, size = len(jacobian), self.size
         columns = np.empty((size, len(index)), order="F")
         symmetric_columns(self._base, size, index, columns)
