@@ -1,4 +1,4 @@
-"""What a pixel sees: the camera model and its calibration files.
+"""The camera model and its calibration files.
 
 >>> from camera import read_camera
 >>> camera = read_camera("images/e/e.cam")          # doctest: +SKIP

@@ -44,7 +44,7 @@ Tangential = tuple[float, float]
 NOT_TANGENTIAL: Tangential = (0.0, 0.0)
 
 _NODES = 4096
-# Rounds of looking more closely where the first fold is; the last is between neighbouring doubles.
+# Rounds of refining the place of the first fold; the last is between neighbouring doubles.
 _REFINEMENTS = 6
 _NODES_BETWEEN = 513
 
@@ -193,7 +193,7 @@ def straightened(distorted: FloatArray, coef: Coef, brown: Brown, r_max: float) 
 def first_unseen(border: FloatArray, coef: Coef, brown: Brown) -> int:
     """Index of the first of (N, 2) distorted normalised places at which nothing is seen; -1: none.
 
-    What is seen is a region without holes: it holds an image whose border it holds.
+    The visible region has no holes: it contains an image whose border it contains.
     """
     r_max = one_to_one_radius(coef, brown)
     unseen = np.isnan(straightened(border, coef, brown, r_max)[:, 0])

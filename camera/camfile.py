@@ -1,6 +1,6 @@
 """Reading and writing ``.cam`` files (``SmRadialDistortedCamera``).
 
-The grammar is the data set's, read generously: any white space, commas or none, keys in any order,
+The grammar is the data set's, read tolerantly: any white space, commas or none, keys in any order,
 ``#`` comments. Keys that mean nothing here are kept and written back. Two keys are this project's:
 ``tangential: { p1 p2 }`` and ``polynomial: { k1 k2 k3 }``, each written only for a lens that has
 such terms.
@@ -49,7 +49,7 @@ def read_camera(path: str | os.PathLike[str]) -> Camera:
     ------
     CameraError
         If the file cannot be read or does not describe a possible camera; the message names the
-        file and, where it is one line's fault, the line.
+        file and, if a single line is wrong, the line.
     """
     path = Path(path)
     try:
@@ -64,7 +64,7 @@ def read_camera(path: str | os.PathLike[str]) -> Camera:
 
 
 def parse_camera(text: str, name: str = "<text>") -> Camera:
-    """Make a camera of the text of a ``.cam`` file; `name` stands for the file in errors."""
+    """Parse the text of a ``.cam`` file; `name` is what errors call the file."""
     entries = _split(text, name)
 
     def numbers(key: str, count: int) -> list[float]:
@@ -110,7 +110,7 @@ def parse_camera(text: str, name: str = "<text>") -> Camera:
 
 
 def format_camera(camera: Camera) -> str:
-    """The text of a ``.cam`` file, laid out as the data set's; `parse_camera` gives it back."""
+    """The text of a ``.cam`` file in the data set's layout; `parse_camera` gives it back."""
     lines = [f"{{ {CLASS_NAME}"]
     if camera.sensor_to_tcp is not None:
         lines += _pose_lines("sensor2Tcp", camera.sensor_to_tcp)

@@ -18,7 +18,7 @@ PROGRAM = Program(
     {
         Calibrate: "camera.commands.calibrate",
         Floor: "camera.commands.floor",
-        # It detects: the room above carries it out.
+        # Needs detection, so the command is implemented in `detect`.
         Level: "detect.mounting_command",
         Convert: "camera.commands.convert",
     },

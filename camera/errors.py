@@ -1,4 +1,4 @@
-"""What can be wrong with a camera."""
+"""Exceptions of the package `camera`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a pixel sees: the calibrated camera, from points to pixels and back.
+"""The calibrated camera: projection of points to pixels and back.
 
 Frames and conventions
 ----------------------
@@ -55,7 +55,7 @@ Pose = tuple[tuple[float, float, float, float], ...]
 class Camera:
     """A calibrated camera on a robot, with its distortion. A value.
 
-    Two cameras are equal, and hash alike, when all that they were made of is equal.
+    Two cameras are equal, and have the same hash, if all their parameters are equal.
 
     Parameters
     ----------
@@ -84,8 +84,8 @@ class Camera:
     ------
     CameraError
         If a number is not finite, a size or scale not positive, the rotation not a rotation, or the
-        distortion folds so that less than half of the image sees anything. The message calls things
-        by the file's names.
+        distortion folds so that less than half of the image sees anything. The message uses the
+        file's names.
 
     References
     ----------
@@ -164,7 +164,7 @@ class Camera:
 
     @cached_property
     def content_hash(self) -> str:
-        """Hexadecimal digest of all that decides what a pixel sees; the key of cached tables."""
+        """Hexadecimal digest of the parameters of projection and pose; the key of cached tables."""
         numbers = (
             self.width, self.height, self.scale_x, self.scale_y, self.offset_x, self.offset_y,
             *self.coef, *(x for row in self.robot_from_camera for x in row),

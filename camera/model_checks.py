@@ -1,4 +1,4 @@
-"""What cannot be a camera, refused by the names that a ``.cam`` file has for things."""
+"""Checks of camera parameters; messages use the names of the ``.cam`` file."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _ROTATION_TOLERANCE = 1e-3
 _LARGEST_SIDE_PX = 65536
 #: Least share of the image that must see anything.
 LEAST_SEEN_SHARE = 0.5
-# Places along each side of the image at which it is looked whether anything is seen.
+# Number of places along each side of the image that are checked to be inside the lens's limit.
 _PLACES = 65
 
 

@@ -62,9 +62,9 @@ class Calibrate:
     keep_outliers : bool
         Keep pictures whose residuals are far above the others'.
     every : int
-        Of a video take every so many-th frame.
+        Use only every N-th frame of a video.
     max_images : int
-        Take at most so many pictures, evenly over all; likewise of each video.
+        Use at most this many pictures, evenly spaced, and at most this many frames per video.
     floor : Path
         A picture of the board lying on the floor, or a .csv with the columns u,v,x,y of places on
         it (pixels; metres, X left and Y backward of the robot): gives the camera's pose.
@@ -73,7 +73,7 @@ class Calibrate:
     floor_yaw : float
         By how much that board is turned (degrees): from the robot's X axis (left) to the board's x
         axis, counterclockwise seen from above. 0: a checkerboard's black corner square is at the
-        back right, 180: at the front left. 180 is a board that stands upright for the camera.
+        back right, 180: at the front left. With 180 the board appears upright in the image.
     output : Path
         The .cam file. Beside it: .json with everything, and pictures of residuals and coverage.
     force : bool
@@ -177,9 +177,9 @@ class Convert:
     target : Path
         The file to write.
     from_format : str
-        `auto`: told by ending and content.
+        `auto`: from the file's ending and content.
     to_format : str
-        `auto`: told by the ending: .cam; cameras.txt; .opencv.yaml, .ros.yaml or .kalibr.yaml, and
+        `auto`: from the ending: .cam; cameras.txt; .opencv.yaml, .ros.yaml or .kalibr.yaml, and
         camera_info.yaml, camchain.yaml.
     model : str
         Distortion model of the target: `radtan` (k1 k2 p1 p2, with OpenCV and ROS also k3),

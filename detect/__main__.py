@@ -1,7 +1,7 @@
 """The program ``detect``, also as ``python -m detect``.
 
-Worker processes import this module too, before they know what for: whatever the command line needs
-is imported where it is used.
+Worker processes import this module, too, so what only the command line needs is imported where it
+is used.
 """
 
 import sys

@@ -1,4 +1,4 @@
-"""What takes long, once, is said while it does: compiled kernels and tables.
+"""Announces slow one-time work: compilation of kernels and computation of tables.
 
 Said through the logger ``redetect``, so that a program that uses the detectors decides who hears
 it; the command line shows it on stderr.

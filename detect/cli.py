@@ -4,7 +4,7 @@ Only what `--help` needs is imported at once; everything heavy waits for the com
 
 Exit codes: 0 all went well; 1 the command could not be carried out, or a demand of `compare` or
 `--strict` was not met; 2 the command line was wrong; 3 some frames could not be worked on (the
-others were); 130 it was interrupted, and wrote nothing but what `--resume` goes on with.
+others were); 130 it was interrupted, and wrote only what `--resume` needs.
 """
 
 from __future__ import annotations
@@ -35,15 +35,14 @@ from storage.exit_codes import say_error, say_interrupted
 _NO_KERNEL_CACHE = "no locator available"
 _WHERE_KERNELS_GO = (
     "compiled kernels cannot be kept, neither beside the program nor in the user's cache folder: "
-    "name a folder for them by the environment variable NUMBA_CACHE_DIR"
+    "set the environment variable NUMBA_CACHE_DIR to a folder"
 )
 
 Command = Circles | Lines | Markers | All | Compare | Export | Draw | View | Report | Tune
 
 PROGRAM = Program(
     "detect",
-    "Landmarks with covariances out of a calibrated camera's images.\n\n"
-    "Example: detect all images/e",
+    "Landmarks with covariances from a calibrated camera's images.\n\nExample: detect all images/e",
     {
         **dict.fromkeys((Circles, Lines, Markers, All), "detect.runs.command"),
         Compare: "detect.comparison.command",
@@ -91,7 +90,7 @@ def carry_out(command: Command) -> int:
 
 
 def parsed(arguments: Sequence[str]) -> Command:
-    """What a command line says; exits, as `--help` does, where it says nothing that can be done."""
+    """Parse a command line; exits after `--help` and on errors."""
     arguments = _with_radius_found(arguments)
     preset = _preset(arguments)
     circles = CIRCLE_PRESETS.get(preset, CircleSettings())

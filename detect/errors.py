@@ -1,4 +1,4 @@
-"""What can go wrong with a detection."""
+"""Exceptions of the package `detect`."""
 
 from __future__ import annotations
 
@@ -20,4 +20,4 @@ class FrameError(OneLineError, ValueError):
 
 
 class WorkerError(OneLineError, RuntimeError):
-    """The processes or machines that should do the work cannot; one line says what is missing."""
+    """Worker processes or machines cannot do the work; the message says what is missing."""

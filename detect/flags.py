@@ -21,7 +21,7 @@ LineEnds = Literal["lf", "crlf"]
 
 @dataclass(frozen=True, kw_only=True)
 class RunFlags:
-    """What every command needs that goes through the frames of a run.
+    """Options of all commands that process the frames of a run.
 
     Parameters
     ----------
@@ -43,7 +43,7 @@ class RunFlags:
 
 @dataclass(frozen=True, kw_only=True)
 class PickedFrames:
-    """Which frames of a run are looked at.
+    """Selects the frames of a run.
 
     Parameters
     ----------

@@ -1,11 +1,11 @@
-"""Interrupts from the keyboard, also those that get lost.
+"""Handles keyboard interrupts, including those that Python would lose.
 
-Python turns an interrupt into an exception wherever it happens to be. While a kernel is compiled,
-that may be where nobody lets the exception through: it is printed and forgotten, or comes out as
-another one. So it is noted that there was one, and looked at after every frame.
+Python raises an interrupt as an exception wherever it is executing. While a kernel is compiled, the
+exception may be swallowed: it is printed and ignored, or replaced by another one. So interrupts are
+recorded, and the record is checked after every frame.
 
-While processes are started or ended, an exception out of nowhere leaves half of one behind: there
-an interrupt waits until that is done.
+While processes are started or ended, an exception could leave a process half started: there an
+interrupt is deferred until that is done.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _received = threading.Event()
 
 @contextmanager
 def interrupts_noted() -> Iterator[threading.Event]:
-    """Note interrupts for the time of a block; yields what is set by one."""
+    """Record interrupts during a block; yields an event that an interrupt sets."""
     _received.clear()
     if threading.current_thread() is not threading.main_thread():
         yield _received
@@ -95,6 +95,6 @@ def _interrupts_blocked() -> Iterator[None]:
 
 
 def raise_if_interrupted() -> None:
-    """Raise the interrupt again that got lost, if there was one."""
+    """Raise an interrupt that was lost, if there was one."""
     if _received.is_set():
         raise KeyboardInterrupt

@@ -1,4 +1,4 @@
-"""What was made of an object is kept for when it is asked for again."""
+"""Caches the result of a function for its latest argument."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ R = TypeVar("R")
 
 
 def kept_for_latest(make: Callable[[T], R]) -> Callable[[T], R]:
-    """Keep a function's result as long as it is asked about the very same object.
+    """Cache a function's result as long as it is called with the identical object.
 
-    In a run it is, frame after frame; to tell whether cameras or plans are equal, or their hash,
-    takes longer than most of what is done with the result.
+    In a run this is the case frame after frame. Comparing or hashing cameras or plans would take
+    longer than most of what is done with the result.
 
     Parameters
     ----------

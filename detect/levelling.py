@@ -52,7 +52,7 @@ def level_positions(
 ) -> FloatArray:
     """Where on the floor discs are, of which the tilted robot's camera saw them at `floor_xy`.
 
-    The robot tilts where it stands: about the origin of its frame, on the floor.
+    The robot tilts about the origin of its frame, on the floor.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What the detector of verticals can be told."""
+"""Settings of the detector of verticals."""
 
 from __future__ import annotations
 
@@ -82,8 +82,8 @@ class LineSettings:
     """Parameters of the detector of verticals. The defaults are the all-round preset.
 
     Lengths along a line are given in widths of a pixel, so that they mean the same for full frames
-    and for single fields, whose rows are twice as high; what belongs to the filter is in rows.
-    What is called largest may be infinite: there is no such limit.
+    and for single fields, whose rows are twice as high; parameters of the filter are in rows.
+    Parameters named `largest_...` may be infinite: no limit.
 
     Parameters
     ----------
@@ -97,21 +97,23 @@ class LineSettings:
     border_rows : int
         Rows at the upper and lower border that are left out.
     start_band_rows, start_spacing_rows : int
-        Tracks start on the horizon and on every so manieth row up to so far from it.
+        Tracks start on the horizon and on every `start_spacing_rows`-th row up to `start_band_rows`
+        from it.
     gap_rows : int
         Rows without a point that a track bridges.
     guided : bool
         Whether tracks are followed a second time, along the verticals of the estimated tilt.
     first_edges : int
-        The first time only so many edges are followed, those with the highest responses on the
-        horizon, if their tilt is beyond doubt; 0 for all in any case.
+        In the first pass only this many edges are followed, those with the highest responses on the
+        horizon, if they determine the tilt beyond doubt; 0: all edges, always.
     guided_pull, guided_reach_px : float
-        In the second time, part of a point's offset that the track yields to, and largest offset.
+        In the second pass, the share of a point's offset by which the track is corrected, and the
+        largest offset.
     refine_steps_px : tuple of (float, float)
-        Steps in which lines are refined on the grey values: width of the Gaussian and the farthest
-        that the step may take a line; none for the eigen-decomposition of the tracked points alone.
-        Small widths keep neighbours out of each other's way, but suffer from aliasing: if a wide
-        one agrees with them in the end, the edge stands alone and the wide one is right.
+        Steps in which lines are refined on the grey values: width of the Gaussian and largest
+        displacement of a line by the step; none for the eigen-decomposition of the tracked points
+        alone. Small widths exclude neighbouring edges, but suffer from aliasing: if a wide one
+        agrees with them in the end, the edge is isolated and the wide one is right.
     fine_scale_px, coarse_scale_px : float
         Widths whose contrasts are compared: their ratio is the edge's sharpness.
     least_rows : int
@@ -126,19 +128,19 @@ class LineSettings:
     soft_evidence : float
         Unless they have this evidence.
     largest_horizon_gap_px : float
-        How far a line may end from the horizon (or from what stands for it where the camera does
-        not see it: `lut.verticals`).
+        Largest distance of a line's end from the horizon (or from the anchor that replaces it where
+        the camera does not see it: `lut.verticals`).
     largest_scatter_px : float
         Largest root-mean-square distance of the points from the line.
     largest_shift_px : float
-        Farthest that the refinement may take a line.
+        Largest displacement of a line by the refinement.
     largest_noise_px : float
         Largest standard deviation of a line's place at the horizon due to noise.
     bend_px : float
-        Standard deviation of a line's lean over its length due to all but noise.
+        Standard deviation of a line's lean over its length due to causes other than noise.
     lean_noise : float
-        Variance of a line's lean due to noise, relative to that of noise which differs from row to
-        row: what stands beside an edge, and what its blur makes of it, is alike on many.
+        Variance of a line's lean due to noise, relative to that of noise which is independent from
+        row to row: the surroundings of an edge and its blur are correlated over many rows.
     largest_lean_deg, largest_lean_sigmas, largest_lean_px : float
         How far a line may lean from the vertical: its angle, standard deviations due to noise, and
         pixels over its length, added in squares.
@@ -149,7 +151,7 @@ class LineSettings:
     building_deg : float
         Standard deviation of real verticals about the vertical.
     proposers : int
-        The tilt is looked for among those that pairs of this many lines, the strongest, agree with.
+        Candidates for the tilt come from pairs of this many lines, the strongest.
     least_lines : int
         With fewer lines that agree there is no tilt.
     stray_share : float
@@ -164,17 +166,18 @@ class LineSettings:
     join_share : float
         Lines with less than this part of the other's evidence are dropped instead.
     joined : "evidence" or "equal"
-        Joined lines count by their evidence, and the row has the ends of the strongest; or all
-        count the same, and ends and inclination are means as well, as in the data set's own rows.
+        Joined lines are weighted by their evidence, and the row has the ends of the strongest; or
+        all have equal weight, and ends and inclination are means as well, as in the data set's own
+        rows.
     shoulder_px, shoulder_share : float
-        Lines closer than this to one with so much more contrast (the part that theirs is of it) are
-        dropped: they are what light does beside an edge.
+        Lines closer than this to another one, with at most this share of its contrast, are dropped:
+        they are effects of light beside an edge.
     sigma_px : float
-        Standard deviation of an edge about the line of the building that it stands for.
+        Standard deviation of an edge about the line of the building that it shows.
     blurred_sharpness : float
-        Images whose edges have less sharpness than this (the median) are looked at once more,
+        Images whose edges have a median sharpness below this are processed again,
     blurred_widths : tuple of float
-        with a filter so many times as wide as it is set, whichever of these suits the blur (see
+        with a filter wider by whichever of these factors suits the blur (see
         `detect.verticals.blur`); none: never.
     alpha : "level" or "published"
         Bearings compensated for the tilt, or with the sign that the data set's own rows have.
@@ -255,7 +258,7 @@ class LineSettings:
 
     @cached_property
     def consensus(self) -> ConsensusSettings:
-        """What of this the estimation of the tilt is told."""
+        """The settings of the estimation of the tilt."""
         from detect.verticals.tilt import ConsensusSettings  # numpy is too much for `--help`
 
         return ConsensusSettings(
@@ -267,7 +270,7 @@ class LineSettings:
         )
 
 
-#: What gives the data set's own rows back as far as these are known (docs/verticals.md).
+#: Reproduces the data set's own rows as far as these are known (docs/verticals.md).
 PUBLISHED = LineSettings(
     sigma_across_px=2.05,
     sigma_along_rows=7.33,

@@ -3,18 +3,17 @@
 The path of an image, each step a function of its own:
 
     response        how well a step along the local vertical explains the grey values
-    starts          its maxima on the horizon (or what stands for it: `lut.verticals`)
+    starts          its maxima on the horizon (or the anchor: `lut.verticals`)
     tracks          the edges through them, followed up and down
     fits            straight lines, refined on the grey values
     consensus       the tilt that most of them agree with; the others are no verticals
     tracks, fits    once more along the verticals of that tilt
     lines           bearings; one line for each edge, close ones joined
 
-The first time is left out where the starts themselves, of which an edge has one on each of several
-rows, leave no doubt about the tilt (`detect.verticals.judgement.tilt_of_chains`); a few edges will
-do if these leave none. Where all edges turn out to be blurred, everything is done again with
-filters as wide as the blur (`detect.verticals.blur`).
-`detect_lines` goes it in one compiled call (`find_lines`).
+The first pass is omitted if the starts alone, of which an edge has one on each of several rows,
+determine the tilt beyond doubt (`detect.verticals.judgement.tilt_of_chains`); a few edges suffice
+if these do. If all edges are blurred, everything is repeated with filters as wide as the blur
+(`detect.verticals.blur`). `detect_lines` does all of this in one compiled call (`find_lines`).
 """
 
 from __future__ import annotations
@@ -67,27 +66,28 @@ from lut.verticals import VerticalTable
 
 __all__ = ["ACCEPTED", "JOINED", "LineDetections", "detect_lines", "tilt_beyond_doubt"]
 
-#: What becomes of a track that is a line, or part of one.
+#: Fates of tracks that are a line, or part of one.
 ACCEPTED, JOINED = FATES[:2]
 
-#: A few edges tell the tilt beyond doubt if so many lines and such a part of the votes agree with
-#: it, and if it tells the lean of verticals as well as this everywhere in the image. A track that
-#: yields to its points by 7 % follows a lean that is wrong by twice as much at 0.15 px from it.
+#: A few edges determine the tilt beyond doubt if at least this many lines and this share of the
+#: votes agree with it, and if it predicts the lean of verticals to this accuracy everywhere in the
+#: image. A track that is corrected by 7 % of its points' offsets follows a lean that is wrong by
+#: twice as much at a distance of 0.15 px.
 _FIRST_LINES = 6
 _FIRST_VOTES = 0.75
 _FIRST_LEAN_RAD = math.radians(0.15)
-#: Chains of the band are short: so many must agree, and the band must be so high, pixels.
+#: Chains of the band are short: least number that must agree, and least height of the band, pixels.
 _CHAINS = 7
 _BAND_PX = 60.0
-#: Edges that were followed by a tilt are followed again if the one that they show leaves tracks
-#: farther behind their edges, pixels.
+#: Edges that were followed along a tilt are followed again if their own tilt differs so much that
+#: tracks were farther than this from their edges, pixels.
 _LAG_PX = 0.1
 #: The refinement's steps that lines need for that.
 _FIRST_STEPS = 2
 
 
 class Search(NamedTuple):
-    """What `find_lines` knows besides the image.
+    """Inputs of `find_lines` besides the image.
 
     Attributes
     ----------
@@ -96,17 +96,17 @@ class Search(NamedTuple):
     filters, few_filters : StepFilters
         Steps of the refinement, and those for the few edges that are followed first.
     free, few, guided : Following
-        How edges are followed: all wherever they go, a few of them, and by a tilt.
+        How edges are followed: all without a tilt, a few of them, and along a tilt.
     limits, joining
-        By what tracks are judged and lines are joined.
+        Limits for accepting tracks and joining lines.
     is_guided : bool
-        Whether edges are followed by a tilt at all.
+        Whether edges are followed along a tilt at all.
     by_few : bool
         Whether a few are followed first.
     by_chains : bool
         Whether the band is high enough for chains of starts.
     lag_rad : float
-        Edges followed by a tilt are followed again if theirs makes more difference to the lean.
+        Edges followed along a tilt are followed again if their own tilt changes the lean by more.
     least_sharpness : float
         Images of less are done again with wider filters.
     """
@@ -187,8 +187,7 @@ def _search(table: VerticalTable, settings: LineSettings) -> Search:
         is_guided=settings.guided,
         by_few=by_few,
         by_chains=by_few and band.supported and band_px >= _BAND_PX,
-        # A track follows a lean that is wrong by so much that what it yields in a row makes up for
-        # it.
+        # A track follows a wrong lean at the distance where its correction per row equals it.
         lag_rad=_LAG_PX * settings.guided_pull / aspect,
         least_sharpness=float(settings.blurred_sharpness) if settings.blurred_widths else 0.0,
     )
@@ -196,7 +195,7 @@ def _search(table: VerticalTable, settings: LineSettings) -> Search:
 
 @njit(cache=True, error_model="numpy")
 def beyond_doubt(tilt: TiltEstimate, least_lines: int) -> bool:
-    """Whether a tilt of at least so many lines is good enough to follow all edges by."""
+    """Whether a tilt of `least_lines` lines or more is good enough to follow all edges along it."""
     # NaN is not.
     sure = tilt.lines >= least_lines and tilt.votes >= _FIRST_VOTES
     return bool(sure and tilt.lean_rad <= _FIRST_LEAN_RAD)
@@ -214,7 +213,7 @@ def find_lines(
     response = band_response(image, band, search.window)
     maxima = find_maxima(response, band.row, search.free.threshold, band.supported)
     tilt = no_tilt()
-    # Of images full of maxima everywhere the band tells nothing.
+    # The band is useless in images that are full of maxima everywhere.
     if search.by_chains and len(maxima.level) <= image.shape[1]:
         tilt = tilt_of_chains(response, band.row, maxima, strip, search.limits)
     starts = ordered_starts(response, band.row, maxima)
@@ -274,7 +273,7 @@ def tilt_beyond_doubt(
     Returns
     -------
     TiltEstimate or None
-        None where it is in doubt. Lines are not refined to the end for it.
+        None if it is in doubt. Lines are only partly refined for it.
     """
     tilt = judge_tracks(image, tracks, table, settings, steps=_FIRST_STEPS).tilt
     return tilt if beyond_doubt(tilt, _FIRST_LINES) else None

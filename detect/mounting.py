@@ -1,6 +1,6 @@
-"""How a camera is mounted, by a drive with it: its constant lean, and its height over the floor.
+"""Estimates a camera's mounting from a run: its constant lean, and its height over the floor.
 
-The lean is what the verticals of all frames show (`detect.run_tilt`). The height follows from the
+The lean comes from the verticals of all frames (`detect.run_tilt`). The height follows from the
 outlines of discs of known size: at a wrong height they agree with a circle at another pitch than
 that of the verticals (`detect.discs.outline_tilt`). Both assume that the lens is right.
 """
@@ -21,9 +21,9 @@ FloatArray = NDArray[np.float64]
 
 #: Outlines of discs are tried at heights that differ by these shares of the calibrated one.
 HEIGHT_STEPS = (-0.06, 0.0, 0.06)
-#: How well a radius is known, relative: where the edge of a blurred disc is, and of its print.
+#: Relative standard deviation of a radius: of the edge of a blurred disc, and of the print.
 _RADIUS_SIGMA = 0.01
-#: So many neighbouring frames see the same discs.
+#: Number of neighbouring frames that see the same discs.
 _TOGETHER = 5.0
 
 
@@ -39,11 +39,11 @@ class Mounting:
     pitch_sigma_rad, roll_sigma_rad : float
         Standard deviations, that of the lens included.
     raised_m, raised_sigma_m : float
-        How much higher the camera is than calibrated; NaN where too few discs tell.
+        How much higher the camera is than calibrated; NaN if there are too few discs.
     frames : int
         Frames whose verticals have a tilt.
     frames_with_discs : int
-        Those of them whose discs told the height.
+        Those of them whose discs contribute to the height.
     """
 
     pitch_rad: float
@@ -56,7 +56,7 @@ class Mounting:
     frames_with_discs: int
 
     def sentences(self) -> list[str]:
-        """What was found, in words."""
+        """The result in words."""
         pitch, roll = math.degrees(self.pitch_rad), math.degrees(self.roll_rad)
         sigmas = math.degrees(self.pitch_sigma_rad), math.degrees(self.roll_sigma_rad)
         lines = [
@@ -64,7 +64,7 @@ class Mounting:
             f"{sigmas[1]:.2f} (roll) from its calibration, by the verticals of {self.frames} frames"
         ]
         if math.isnan(self.raised_m):
-            lines.append("its height is left as calibrated: too few discs tell it")
+            lines.append("its height is left as calibrated: too few discs to estimate it")
         else:
             lines.append(
                 f"it hangs {100.0 * self.raised_m:+.1f} +- {100.0 * self.raised_sigma_m:.1f} cm "

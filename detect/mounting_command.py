@@ -1,6 +1,6 @@
-"""``camera level``: how a camera is mounted, by a drive with it.
+"""``camera level``: estimates how a camera is mounted from a run.
 
-The command is one of the program `camera`; it is carried out here, for it detects.
+The command is one of the program `camera`; it is implemented here because it needs detection.
 """
 
 from __future__ import annotations
@@ -55,8 +55,8 @@ def perform(options: Level) -> int:
     )
     if mounting is None:
         raise DetectError(
-            f"{options.run}: too few frames whose verticals tell a tilt: expected {LEAST_FRAMES}; "
-            "drive through rooms with doors, shelves or walls in view"
+            f"{options.run}: too few frames with a tilt from verticals: expected {LEAST_FRAMES}; "
+            "drive where doors, shelves or walls are in view"
         )
     print("\n".join(mounting.sentences()))
     write_camera(remounted(camera, mounting), options.output, overwrite=options.force)

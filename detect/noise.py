@@ -25,7 +25,7 @@ def estimate_noise(image: NDArray[np.uint8], most_rows: int | None = None) -> fl
     image : (H, W) uint8
         The image.
     most_rows : int, optional
-        Look at so many rows, evenly spread; by default at all.
+        Use at most this many rows, evenly spread; by default all.
 
     Returns
     -------
@@ -43,7 +43,7 @@ def estimate_noise(image: NDArray[np.uint8], most_rows: int | None = None) -> fl
 
 @lru_cache(maxsize=8)
 def _rows(height: int, most_rows: int | None) -> NDArray[np.intp]:
-    """Which rows to look at."""
+    """The rows to use."""
     if most_rows is None:
         rows = np.arange(1, height - 1)
     else:

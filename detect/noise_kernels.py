@@ -9,15 +9,15 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-# Numba knows it as the type, the type checker as a function.
+# A type to Numba, a function to the type checker.
 _I: Callable[[Any], Any] = np.int16
 
-#: What takes the place of responses that do not count: above all of them.
+#: Replaces responses that are ignored: above all of them.
 _NONE = _I(32767)
 _DARK, _LIGHT = _I(2), _I(253)
 
-#: A median is first guessed from so many responses, as far as it is below this; a guess that is
-#: wrong is moved so often by one.
+#: A median is first guessed from about `_SAMPLE` responses, at most as `_SMALL` - 1; a wrong guess
+#: is corrected by one, at most `_TRIES` times.
 _SAMPLE, _SMALL = 2048, 256
 _TRIES = 4
 
@@ -35,7 +35,7 @@ def second_differences(
     ----------
     image : (H, W) uint8
     rows : (R,) int64
-        The rows to look at, none of them the first or the last.
+        The rows to use, none of them the first or the last.
     countable_only : bool
         Leave out pixels that are nearly black or saturated.
     response : (R * (W - 2),) int16

@@ -33,7 +33,7 @@ from storage.bounds import NOT_NEGATIVE, demand
 
 @dataclass(frozen=True, kw_only=True)
 class DetectorFlags(RunFlags):
-    """What every detector needs besides its settings.
+    """Options of all detectors besides their settings.
 
     Parameters
     ----------
@@ -66,12 +66,12 @@ class DiscIdOptions:
     ids_from : Path
         A .circles file whose IDs are carried over to the rows of the same discs, levelled or not.
     ids_from_map : Path
-        A map (map.csv of `slam map`): rows that --ids-from knows nothing of get the ID of the disc
-        they fall on,
+        A map (map.csv of `slam map`): rows without an ID by --ids-from get the ID of the disc they
+        fall on,
     path : Path
         seen from the frame's pose in this path (path.csv of `slam map`),
     id_slack_m : float
-        which map and path know to this standard deviation besides the covariances, metres.
+        with this standard deviation of map and path added to the covariances, metres.
     """
 
     ids_from: MaybePath = None
@@ -210,7 +210,7 @@ class All(DetectorFlags):
         How lines end in files of landmarks; the data set's own end with CR and LF.
     tilt : str
         What levels the discs: `none`, the tilt of the single `frame`, or the `run`'s (a constant
-        lean, and what frames are believed to deviate from it).
+        lean, and the estimated deviation of each frame from it).
     """
 
     ids: OmitArgPrefixes[DiscIdOptions] = field(default_factory=DiscIdOptions)

@@ -4,9 +4,9 @@ Either a run folder of the data set (``images/``, ``<run>.cam``, ``<run>.txt``, 
 or any folder of images with a ``.cam`` in it. A frame is a STEP row with its image; without
 odometry, an image with a STEP row of zeros.
 
-A run may be long. All that is kept of it are the names of its images, some 20 bytes each; the
-odometry is read along with the frames, and once before, so that what is wrong with it is told
-before any work is done.
+A run may be long. Only the names of its images are kept in memory, some 20 bytes each. The odometry
+is read along with the frames, and once before, so that errors in it are reported before any work is
+done.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class RunFrame:
     failure : str or None
         Why there is no image, although there should be.
     stamp : (int, int) or None
-        The file's size and time of change, where they have been looked at.
+        The file's size and time of change, if they are known.
     """
 
     step: Step
@@ -69,9 +69,9 @@ def _frame(step: Step, image: str | None, *others: Any) -> RunFrame:
 
 
 class Frames(Protocol):
-    """The frames of a run, made as they are asked for.
+    """The frames of a run, made on demand.
 
-    Iterating again begins anew (with a live camera: from then on).
+    Iterating again starts over (with a live camera: from then on).
     """
 
     #: Whether frames carry contents of images, not paths.
@@ -79,7 +79,7 @@ class Frames(Protocol):
 
     @property
     def expected(self) -> int | None:
-        """About how many frames there will be; None if nobody knows."""
+        """Approximate number of frames; None if unknown."""
         ...
 
     @property
@@ -89,7 +89,7 @@ class Frames(Protocol):
 
     @property
     def why_left_out(self) -> str:
-        """What is told of them, after their number."""
+        """Why frames were left out; printed after their number."""
         ...
 
     def __iter__(self) -> Generator[RunFrame, None, None]: ...
@@ -152,7 +152,7 @@ class RunFrames:
 
 @dataclass(frozen=True)
 class ImageRun:
-    """A run that was looked through, whether or not there is a calibration.
+    """A run whose files were found and read, with or without a calibration.
 
     Attributes
     ----------
@@ -214,7 +214,7 @@ class Run(ImageRun):
 
 
 def open_run(folder: Path, camera_path: Path | None = None, *, bits: int | None = None) -> Run:
-    """Look through a run folder.
+    """Read a run folder.
 
     Parameters
     ----------
@@ -245,7 +245,7 @@ def open_run(folder: Path, camera_path: Path | None = None, *, bits: int | None 
 def open_images(
     folder: Path, camera_path: Path | None = None, *, bits: int | None = None
 ) -> ImageRun:
-    """Look through a run folder that may be without a calibration.
+    """Read a run folder that may be without a calibration.
 
     Parameters
     ----------
@@ -260,7 +260,7 @@ def open_images(
     Raises
     ------
     DetectError, camera.CameraError, landmarks.LandmarkFileError
-        As `open_run` does, but for a missing calibration.
+        As `open_run`, except for a missing calibration.
     """
     _demand_folder(folder)
     if camera_path is None and not any(folder.glob("*.cam")):
@@ -293,7 +293,7 @@ def _image_run(folder: Path, bits: int | None) -> ImageRun:
                         images.checked(found)
                     named[found] = True
             except FrameError:
-                continue  # told when it is the frame's turn
+                continue  # reported when the frame is processed
         frames = RunFrames(images, odometry, count, int(np.count_nonzero(~named)), bits)
     return ImageRun(folder, frames, odometry, folder / "detected")
 

@@ -1,12 +1,12 @@
-"""The tilt of the frames of a run: a constant lean, and what a frame deviates from it.
+"""The tilt of the frames of a run: a constant lean, and each frame's deviation from it.
 
-One frame's verticals are easily wrong together: trunks, folds of a curtain, a board that leans.
-Over a run they tell how the camera leans against its calibration, and how far the robot tilts about
-that. The outlines of discs (`detect.discs.outline_tilt`) tell how a frame deviates, too; their
-constant is that of the verticals, for theirs depends on the camera's height. Each axis is an
-autoregression about a constant, seen through errors that last as long as their scene is in view
-(`detect.run_tilt_kernels`). The constant and the spread about it are those of the largest
-likelihood.
+The verticals of one frame often have a common error: trunks, folds of a curtain, a board that
+leans. Those of a run determine how the camera leans relative to its calibration, and how far the
+robot tilts about that. The outlines of discs (`detect.discs.outline_tilt`) show a frame's
+deviation, too; their constant is taken from the verticals, since their own depends on the camera's
+height. Each axis is an autoregression about a constant, measured with errors that last as long as
+their scene is in view (`detect.run_tilt_kernels`). The constant and the spread about it maximise
+the likelihood.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from landmarks import FrameTilt
 
 FloatArray = NDArray[np.float64]
 
-#: With fewer measured frames there is no telling the errors from the tilt.
+#: With fewer measured frames the errors cannot be separated from the tilt.
 LEAST_FRAMES = 20
 #: The model's constants are learned from no more frames than this, evenly spaced runs of them.
 LEARNED_FROM = 4000
@@ -35,8 +35,8 @@ _OUTLIER_SIGMAS, _STATED_FRAMES = 3.0, 4.0
 #: standard deviation of its logarithm.
 _SPREAD_RAD, _LOG_SPREAD_SIGMA = math.radians(0.3), 0.3
 _SEARCH = {"fatol": 1e-4, "xatol": 1e-3}
-#: What verticals cannot know, however many: what the lens does to all of them alike towards the
-#: image's border (rad). It is stated, not learned: a run shows the sum of it and the true lean.
+#: Systematic error of any number of verticals: the lens's error common to all of them towards the
+#: image's border (rad). It is given, not estimated: a run shows its sum with the true lean.
 COMMON_RAD = math.radians(0.15)
 
 
@@ -61,7 +61,7 @@ def frame_tilts(tilts: Sequence[FrameTilt | None]) -> FrameTilts:
 
 @dataclass(frozen=True, eq=False)
 class AxisModel:
-    """What was learned of one axis.
+    """Estimated model of one axis.
 
     Attributes
     ----------
@@ -87,7 +87,7 @@ class RunTilt:
     tilt : (N, 2) float64
         Pitch and roll of each frame (rad).
     variance : (N, 2) float64
-        Of them (rad^2), the constant's included; the two axes are taken for independent.
+        Of them (rad^2), the constant's included; the two axes are assumed to be independent.
     """
 
     axes: tuple[AxisModel, AxisModel]
@@ -138,9 +138,9 @@ def tilt_of_run(verticals: FrameTilts, outlines: FrameTilts | None = None) -> Ru
 def _joined(verticals: FrameTilts, outlines: FrameTilts) -> FrameTilts:
     """Means of both, weighed by their variances; outlines are moved onto the verticals' lean.
 
-    Two measurements that know nothing of each other show how far their variances hold in this run:
-    both are scaled by the mean square of what is between them, in units of what they state. Frames
-    beyond `_OUTLIER_SIGMAS` are strays, and `_STATED_FRAMES` frames stand for what is stated.
+    Two independent measurements show how well their variances hold in this run:
+    both are scaled by the mean squared difference in units of the stated variances. Frames beyond
+    `_OUTLIER_SIGMAS` are outliers; the stated variances count as much as `_STATED_FRAMES` frames.
     """
     both = np.isfinite(verticals.tilt[:, 0]) & np.isfinite(outlines.tilt[:, 0])
     if np.count_nonzero(both) < LEAST_FRAMES:

@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 MEMORY = 0.65
 #: Share of the variance of a frame's error that lasts, and its correlation: a scene stays in view.
 LASTING_SHARE, LASTING = 0.5, 0.9
-#: How often, and how far, a frame shows another tilt than the robot's (rad): a consensus of strays.
+#: How often, and how far, a frame shows a wrong tilt (rad): a consensus of lines that are no
+#: verticals.
 STRAY_SHARE, STRAY_RAD = 0.02, math.radians(2.0)
 #: How often, and how far, the robot tilts for a moment (rad): a wheel is on a sill or a cable.
 JUMP_SHARE, JUMP_RAD = 0.03, math.radians(2.0)
-#: No frame tells its tilt better than this (rad).
+#: Least standard deviation of a frame's tilt (rad).
 _LEAST_RAD = math.radians(0.03)
 
 
@@ -33,10 +34,10 @@ def smooth_axis(
     """True deviations of one angle from the run's constant lean, by all frames.
 
     The state is the deviation x and the lasting error u of the verticals in units of its standard
-    deviation; both are first-order autoregressions: what is wrong with verticals (a tree, a
-    curtain) stays in view. A measurement is x + a u + white noise, or a stray. The two filtered
-    densities are merged into the normal one of the same moments before the next frame. What is left
-    of a frame's measurement in the end may be a stray or a jump of the robot; the mean and the
+    deviation; both are first-order autoregressions: wrong verticals (a tree, a curtain) stay in
+    view. A measurement is x + a u + white noise, or an outlier. The two filtered densities are
+    merged into the normal one of the same moments before the next frame. The final residual of a
+    frame's measurement may be an outlier or a jump of the robot; the mean and the
     variance are those of the mixture.
 
     Parameters
@@ -109,7 +110,7 @@ def smooth_axis(
         if math.isnan(deviation[k]):
             variance[k] += JUMP_SHARE * JUMP_RAD**2
             continue
-        # What is left of the measurement: noise, a stray, or a jump.
+        # The residual of the measurement: noise, an outlier, or a jump.
         left = deviation[k] - x
         good = xx + sigma[k] ** 2
         jumped = _weighed(JUMP_SHARE, left, good + JUMP_RAD**2)

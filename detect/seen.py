@@ -52,7 +52,7 @@ def image_positions(
 def level_seen(
     camera: Camera, floor_xy: ArrayLike, levelled_by: Tilt, raised_m: float = 0.0
 ) -> FloatArray:
-    """Level positions of what the camera as calibrated sees at `floor_xy`.
+    """Level positions of discs that the calibrated camera sees at `floor_xy`.
 
     Parameters
     ----------
@@ -96,7 +96,7 @@ class FrameView:
     radius_m : float
         Of the discs.
     reference_by, detected_by : (float, float) or None
-        What levelled the rows of either side.
+        Tilts by which the rows of either side were levelled.
     """
 
     camera: Camera

@@ -1,4 +1,4 @@
-"""What decides the detectors' results: configuration and command line flags in one."""
+"""Settings of the detectors, which are also the flags of the command line."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from storage.bounds import (
     whole,
 )
 
-#: By what positions are corrected for the tilt.
+#: Tilt by which positions are corrected.
 Levelling = Literal["none", "frame", "run"]
 Polarity = Literal["any", "light", "dark"]
 
 
 @dataclass(frozen=True)
 class CircleSettings:
-    """Everything that decides what the disc detector finds.
+    """All settings of the disc detector.
 
     Parameters
     ----------
@@ -38,11 +38,11 @@ class CircleSettings:
     samples : int
         Samples on each outline.
     pairs_inside : float
-        Samples count in pairs, an inner and an outer one, and at least this share of them must lie
-        inside the image; 0: each counts for itself.
+        Samples are counted in pairs, an inner and an outer one, and at least this share of them
+        must be inside the image; 0: samples are counted singly.
     apart_px : float
         How far the samples of a pair that fall on the same pixel are moved, one inwards and one
-        outwards: the length on the floor of so many pixels down the image.
+        outwards: the length on the floor of this many pixels down the image.
     stride : float
         From one centre to the next along a row: this share of the distance between the outlines,
         in pixels as long as one down the image, rounded up; 0: every pixel is a centre.
@@ -54,11 +54,11 @@ class CircleSettings:
         Centres are so near that the floor moves at most this share of the radius per image row;
         infinite: however far.
     polarity : {"any", "light", "dark"}
-        Which discs to look for: lighter than the floor, darker, or both.
+        Which discs to detect: lighter than the floor, darker, or both.
     rows_apart : float
-        Where all that is found is fitted (`verify` and `refine`), so many rows of centres are left
-        out that none of a disc's is farther from one that is looked at than this share of the
-        distance between the disc's edge and the nearer outline; 0: every row is looked at.
+        If detections are fitted (`verify` and `refine`), rows of centres are skipped, as long as
+        each row of a disc is at most this share of the distance between the disc's edge and the
+        nearer outline from an evaluated row; 0: every row is evaluated.
     least_contrast : float
         Without a fit: the mean grey values of the outlines differ by more than this.
     noise_floor : float
@@ -73,15 +73,15 @@ class CircleSettings:
     evidence : float
         Least evidence (log-odds, see `detect.discs.fit.disc_evidence`).
     blur_px : float
-        Standard deviation of the optics' blur along u, pixels. Blurred edges speak against a disc
-        unless the camera blurs everything: the data set's own does, by about 6.
+        Standard deviation of the optics' blur along u, pixels. Blurred edges are evidence against a
+        disc unless the camera blurs everything: the data set's own does, by about 6.
     refine : bool
         Report the fitted position and its covariance instead of the pixel's.
     systematic_px : float
         Systematic error of a refined position, pixels: added to its covariance.
     tilt_sigma_deg : float
         Standard deviation of the robot's pitch and of its roll about level, degrees: added to a
-        refined position's covariance where nothing tells the frame's tilt.
+        refined position's covariance if the frame's tilt is unknown.
     """
 
     radius_m: float = 0.10
@@ -159,7 +159,7 @@ class CircleSettings:
 
     @property
     def least_pairs(self) -> int:
-        """Pairs of samples that must lie inside the image; 0: samples count each for itself."""
+        """Pairs of samples that must be inside the image; 0: samples are counted singly."""
         return math.ceil(self.pairs_inside * self.samples)
 
 
@@ -180,7 +180,7 @@ PUBLISHED = CircleSettings(
     refine=False,
 )
 
-#: What the report on the data set prints of it: other outlines, every pixel, all local maxima.
+#: The parameters in the report on the data set: other outlines, every pixel, all local maxima.
 REPORT = CircleSettings(
     threshold=0.6,
     border_px=12,

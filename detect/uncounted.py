@@ -1,4 +1,4 @@
-"""Compiling kernels that work in given memory: without counting references to arrays."""
+"""Compiles kernels that allocate nothing, without counting references to arrays."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from numba import njit
 
 Kernel = TypeVar("Kernel", bound=Callable[..., object])
 
-# What its types do not know, Numba does.
+# Numba accepts options that its type hints do not have.
 _njit: Any = njit
 
 
 def uncounted(kernel: Kernel) -> Kernel:
     """Compile a kernel that takes arrays in tuples, allocates nothing and returns no array.
 
-    Numba leaves out counting references by itself only where arrays are arguments of their own:
-    else every part of a tuple that is looked at is counted, with locked additions, which took a
-    tenth of the search for discs, and of verticals longer than filtering a row. Kernels that
-    allocate are refused by the compiler.
+    By itself Numba omits reference counting only if arrays are separate arguments. For arrays in
+    tuples every access is counted with atomic additions, which took a tenth of the search for
+    discs, and with verticals longer than filtering a row. Kernels that allocate are refused by the
+    compiler.
     """
     return _compiled(kernel)
 

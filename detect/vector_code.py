@@ -36,12 +36,12 @@ def operation(define: Callable[..., Any]) -> Any:
 
 
 def constant(vector: Any, value: Any) -> Any:
-    """A vector of equal numbers that are known beforehand."""
+    """A vector of equal constants."""
     return ir.Constant(vector, [value] * vector.count)
 
 
 class Code:
-    """What an operation is written with: its arguments, and instructions."""
+    """Builder of an operation: its arguments, and instructions."""
 
     def __init__(self, context: Any, builder: Any, signature: Any, args: Any) -> None:
         self.builder = builder

@@ -30,7 +30,7 @@ from storage import OutputExistsError, write_whole
 FloatArray = NDArray[np.float64]
 
 _EDGE, _LINE, _SIGMA, _MAP = (255, 170, 0), (60, 220, 60), (255, 170, 0), (80, 140, 220)
-# Times of this and more are taken for UNIX time: no recording is three years long.
+# Times of this and more are assumed to be UNIX time: no recording is three years long.
 _EARLIEST_DATE_S = 1e8
 # Rerun counts from the corner of the top left pixel, not from its centre.
 _CORNER = 0.5

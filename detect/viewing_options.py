@@ -1,4 +1,4 @@
-"""The flags of the commands that look at what was found: one frozen dataclass per command.
+"""The flags of the commands that show results: one frozen dataclass per command.
 
 Nothing heavy is imported: `--help` needs it all.
 """
@@ -20,7 +20,7 @@ from storage.bounds import ABOVE_0, NOT_NEGATIVE, demand
 
 @dataclass(frozen=True)
 class RowFiles:
-    """Which files' rows are looked at.
+    """Selects the files of rows.
 
     Parameters
     ----------
@@ -85,7 +85,7 @@ class Gates:
 
 @dataclass(frozen=True, kw_only=True)
 class RowsFlags(RunFlags):
-    """What every command needs that looks at the frames of a run."""
+    """Options of all commands that show frames of a run."""
 
     source: SourceOptions = field(default_factory=SourceOptions)
 
@@ -148,8 +148,8 @@ class Report(RowsFlags):
     worst : int
         How many of the worst frames are shown.
     time_frames : int
-        Detect so many frames again, with the settings that the files name, and state how long that
-        takes beside decoding; 0 measures nothing.
+        Detect this many frames again, with the settings that the files name, and state how long
+        that takes besides decoding; 0: none.
     force : bool
         Replace an existing page.
     """
@@ -213,7 +213,7 @@ class Tune(PickedFrames, RowsFlags):
         Refuse grids of more combinations than this.
     jobs : int
         Processes that share the work, 1 for none beside this one; by default one for every 500
-        frames to be looked at, at most as many as there are cores. What is written is the same.
+        frames to process, at most as many as there are cores. What is written is the same.
     """
 
     verticals: bool = False

@@ -1,4 +1,4 @@
-"""What can go wrong with ground truth."""
+"""Exceptions of the package `groundtruth`."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from storage.messages import OneLineError
 
 
 class GroundTruthError(OneLineError, ValueError):
-    """A session, calibration or setting that cannot be worked on.
+    """A session, calibration or setting that cannot be used.
 
     The message names the file, frame or setting, its value and what was expected.
     """
@@ -22,7 +22,7 @@ class StreamError(GroundTruthError):
     file : path
         The file.
     line : int or None
-        The line at fault, counted from 1; None where the file as a whole is.
+        The wrong line, counted from 1; None where the file as a whole is.
     problem : str
         What was found and what was expected.
     """

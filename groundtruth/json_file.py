@@ -61,7 +61,7 @@ def write_json(
 
 
 def _laid_out(value: Any, indent: str = "") -> str:
-    """JSON with objects over several lines and arrays on one, but for matrices: a line per row."""
+    """JSON with objects over several lines and arrays on one, except matrices: a line per row."""
     deeper = indent + " "
     if isinstance(value, Mapping) and value:
         items = (f"{deeper}{json.dumps(k)}: {_laid_out(v, deeper)}" for k, v in value.items())

@@ -37,7 +37,7 @@ class CircleArrays:
 
 
 def circle_arrays(circles: Sequence[CircleLandmark]) -> CircleArrays:
-    """Gather rows of discs to arrays (none give arrays of length 0)."""
+    """Collect rows of discs in arrays (of length 0 if there are none)."""
     numbers = np.array(
         [(c.px, c.py, c.quality, c.cxx, c.cxy, c.cyy) for c in circles], dtype=np.float64
     ).reshape(-1, 6)
@@ -52,7 +52,7 @@ def circle_arrays(circles: Sequence[CircleLandmark]) -> CircleArrays:
 def circle_landmarks(
     xy: ArrayLike, quality: ArrayLike, covariance: ArrayLike, ids: ArrayLike | None = None
 ) -> tuple[CircleLandmark, ...]:
-    """Make rows of discs of arrays.
+    """Convert arrays to rows of discs.
 
     Parameters
     ----------
@@ -102,14 +102,14 @@ def circle_landmarks(
 
 
 def is_positive_definite(covariance: ArrayLike) -> NDArray[np.bool_]:
-    """Tell which covariance matrices are positive definite, that is, can be inverted and used.
+    """Which covariance matrices are positive definite, that is, can be inverted and used.
 
-    Files are read as they are: whoever needs proper covariances asks here.
+    Covariances are read from files unchecked; callers that need valid ones check them here.
 
     Parameters
     ----------
     covariance : (..., n, n) array_like
-        Symmetric matrices; only their lower triangles are looked at.
+        Symmetric matrices; only their lower triangles are used.
 
     Returns
     -------

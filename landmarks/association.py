@@ -40,15 +40,15 @@ def associate(costs: ArrayLike, allowed: ArrayLike) -> Association:
     Parameters
     ----------
     costs : (N, M) array_like
-        Cost of pairing row n of the first set with row m of the second, at least 0. Whatever stands
-        where a pair is not allowed is not looked at.
+        Cost of pairing row n of the first set with row m of the second, at least 0. Costs of pairs
+        that are not allowed are ignored.
     allowed : (N, M) array_like of bool
         The gate.
 
     Returns
     -------
     Association
-        The pairs and what is left over.
+        The pairs and the unpaired elements.
 
     Raises
     ------
@@ -68,7 +68,7 @@ def associate(costs: ArrayLike, allowed: ArrayLike) -> Association:
         raise ValueError("a cost is negative or not finite where a pair is allowed")
 
     n_first, n_second = cost.shape
-    # SciPy before 1.12 knows no graphs with indices of 64 bits.
+    # SciPy before 1.12 does not support graphs with 64-bit indices.
     ends = (rows.astype(np.int32), (n_first + columns).astype(np.int32))
     edges = coo_array((np.ones(len(rows)), ends), shape=(n_first + n_second,) * 2)
     _, group = connected_components(edges, directed=False)
@@ -110,7 +110,7 @@ def associate_positions(first: ArrayLike, second: ArrayLike, *, gate_m: float) -
     Association
         See `associate`.
     """
-    with np.errstate(over="ignore"):  # what is too far apart for a number is beyond any gate
+    with np.errstate(over="ignore"):  # distances that overflow are beyond any gate
         distance = np.linalg.norm(_differences(first, second), axis=-1)
         squared = distance**2
     return associate(squared, distance <= gate_m)

@@ -31,13 +31,13 @@ class Column:
     Attributes
     ----------
     name : str
-        What it is called; ends in the unit, where it has one.
+        Its name, ending in the unit if it has one.
     kind : str
         What its values are.
     unit : str
         "1" for pure numbers, empty where there is nothing to measure.
     meaning : str
-        What it says.
+        Its description.
     """
 
     name: str
@@ -145,7 +145,7 @@ def table_of(record: Step | Landmark | FrameTilt) -> TableName:
 
 
 def values_of(record: Step | Landmark | FrameTilt) -> tuple[Value, ...]:
-    """What a record says, in the order of its table's columns after `FRAME_COLUMNS`."""
+    """The values of a record, in the order of its table's columns after `FRAME_COLUMNS`."""
     r = record
     if isinstance(r, Step):
         return (r.dx, r.dy, r.dphi, r.cxx, r.cxy, r.cyy, r.cxphi, r.cyphi, r.cphiphi)

@@ -1,4 +1,4 @@
-"""What can be wrong with landmark records and their files."""
+"""Exceptions of the package `landmarks`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ _LONGEST_EXCERPT = 40
 
 
 class LandmarkError(OneLineError, ValueError):
-    """A record that cannot be; the message names the quantity, its value and what was expected."""
+    """An invalid record; the message names the quantity, its value and what was expected."""
 
 
 class LandmarkFileError(LandmarkError):
@@ -21,7 +21,7 @@ class LandmarkFileError(LandmarkError):
     file : path
         The file.
     line : int or None
-        The line at fault, counted from 1; None where the file as a whole is.
+        The wrong line, counted from 1; None where the file as a whole is.
     problem : str
         What was found and what was expected.
     """
@@ -36,7 +36,7 @@ class LandmarkFileError(LandmarkError):
 
 def excerpt(text: bytes) -> str:
     """Show text of unknown origin on one line: ASCII, escaped, at most 40 characters and quotes."""
-    # Escapes make a text longer, never shorter: what is past the limit cannot be shown.
+    # Escapes make a text longer, never shorter: text past the limit is never shown.
     shown = text[: _LONGEST_EXCERPT + 1].decode("latin-1").encode("unicode_escape").decode("ascii")
     if len(shown) > _LONGEST_EXCERPT:
         shown = shown[: _LONGEST_EXCERPT - 3] + "..."

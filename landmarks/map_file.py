@@ -148,8 +148,8 @@ def read_map(path: str | os.PathLike[str]) -> LandmarkMap:
     Raises
     ------
     LandmarkFileError
-        If the file cannot be read or a row is malformed, a landmark stands twice or a covariance is
-        negative; the message names file and line.
+        If the file cannot be read, a row is malformed, a landmark is listed twice or a covariance
+        is negative; the message names file and line.
     """
     found: dict[str, dict[int, tuple[list[float], int]]] = {"disc": {}, "line": {}}
     for line, words in _read(path, MAP_COLUMNS):
@@ -161,7 +161,7 @@ def read_map(path: str | os.PathLike[str]) -> LandmarkMap:
         ]
         rows = _whole(path, line, "rows", words[7])
         if number in found[words[0]]:
-            raise LandmarkFileError(path, line, f"{words[0]} {number} stands in the map already")
+            raise LandmarkFileError(path, line, f"{words[0]} {number} is in the map already")
         if (
             values[2] < 0.0
             or values[4] < 0.0

@@ -1,6 +1,6 @@
 """Reading landmark files: ``.circles``, ``.lines``, ``.markers``, and the STEP rows of ``.txt``.
 
-A file is read row by row as it is asked for, so that its size does not matter. Line ends may be
+A file is read row by row on demand, so that its size does not matter. Line ends may be
 LF or CRLF. ``#`` at the start of a word begins a comment. A trailing backslash continues a row, but
 not a comment: that would swallow the row after it.
 """
@@ -44,9 +44,9 @@ _NUMBER_PATTERN = rb"[+-]?(?:[0-9]++(?:\.[0-9]*+)?|\.[0-9]++)(?:[eE][+-]?[0-9]++
 _NUMBER = re.compile(_NUMBER_PATTERN)
 _NUMBERS = re.compile(rb"(?:%b )*+" % _NUMBER_PATTERN)
 _WHOLE_NUMBER = re.compile(rb"[+-]?[0-9]+")
-# A comment, so that programs that know nothing of it read the file as well.
+# A comment, so that other programs can read the file as well.
 _LEVELLED = re.compile(rb"# levelled (%b) (%b)\r?\n?" % (_NUMBER_PATTERN, _NUMBER_PATTERN))
-# A STEP as programs write it, in a line of its own: of a long run all are. Such numbers are finite.
+# A STEP as programs write it, in a line of its own, with finite numbers: the usual case.
 _PLAIN_STEP = re.compile(
     rb"STEP ((?!#)[!-\[\]-~]{1,255}+)"
     + len(STEP_NUMBERS) * rb" {1,32}+(-?[0-9]{1,15}\.[0-9]{1,20})"
@@ -62,7 +62,7 @@ def read_rows(path: str | os.PathLike[str]) -> Iterator[Row]:
     Parameters
     ----------
     path : path
-        The file. It is opened when the first row is asked for.
+        The file. It is opened when the first row is requested.
 
     Yields
     ------
@@ -72,7 +72,7 @@ def read_rows(path: str | os.PathLike[str]) -> Iterator[Row]:
     Raises
     ------
     LandmarkFileError
-        If the file cannot be opened, a row is malformed, or a landmark stands before any STEP; the
+        If the file cannot be opened, a row is malformed, or a landmark precedes the first STEP; the
         message names the file, the line and what was expected.
     """
     with _opened(path) as stream:
@@ -145,7 +145,7 @@ def frames_of_rows(rows: Iterable[Row]) -> Iterator[Frame]:
 
 
 def parse_rows(stream: BinaryIO, name: str = "<stream>") -> Iterator[Row]:
-    """Read rows from a binary stream; `name` stands for the file in errors (see `read_rows`)."""
+    """Read rows from a binary stream; errors name the file `name` (see `read_rows`)."""
     for record, source, line in _parsed(stream, name, _plain_step):
         yield Row(record, source, line)
 
@@ -163,7 +163,7 @@ def parse_record(text: str) -> Record | None:
 
 @contextmanager
 def _opened(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
-    """A landmark file for reading; what the system has against it is a `LandmarkFileError`."""
+    """Open a landmark file for reading; errors of the system become `LandmarkFileError`s."""
     try:
         with Path(path).open("rb") as stream:
             yield stream
@@ -306,7 +306,7 @@ def _parse_marker(words: list[bytes]) -> MarkerLandmark:
 _PARSERS: dict[bytes, Callable[[list[bytes]], Record]] = {
     b"STEP": _parse_step,
     b"LANDMARK_C": _parse_circle,
-    # What the comments at the head of the data set's files of circles call the row.
+    # Name of the row in the comments at the head of the data set's files of circles.
     b"LANDMARK": _parse_circle,
     b"LANDMARK_L": _parse_line,
     b"LANDMARK_M": _parse_marker,

@@ -217,7 +217,7 @@ class MarkerLandmark:
 class DetectorSettings:
     """How a detector was set, as the data set's files may say at their head.
 
-    The data set knows ``CIRCLEMARKDETECTOR <camfile> nohalf|half <radius> <threshold>``.
+    The data set has ``CIRCLEMARKDETECTOR <camfile> nohalf|half <radius> <threshold>``.
 
     Attributes
     ----------
@@ -249,7 +249,7 @@ Record = Step | Landmark | DetectorSettings
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """A step and what was seen in the image taken after it.
+    """A step and the landmarks in the image taken after it.
 
     Attributes
     ----------
@@ -306,7 +306,7 @@ class Row:
 
 @cache
 def _values_of(names: tuple[str, ...]) -> Callable[[object], tuple[float, ...]]:
-    """What takes attributes of those names off a record."""
+    """A function that gets attributes of those names from a record."""
     if len(names) == 1:
         return lambda record: (getattr(record, names[0]),)
     return attrgetter(*names)
@@ -322,7 +322,7 @@ def _demand_finite(record: object, names: tuple[str, ...]) -> None:
 
 
 def _demand_word(word: str, name: str) -> None:
-    """Refuse what a file would not give back as one word."""
+    """Refuse text that a file would not preserve as one word."""
     if not _WORD.fullmatch(word):
         shown = excerpt(word.encode("utf-8", "surrogatepass"))
         raise LandmarkError(

@@ -9,7 +9,7 @@ One row per frame, ``#`` comments and blank lines skipped:
 Pitch and roll (radians) are the rotation vector (pitch, roll, 0) about the robot's X and Y axes
 that turns measured directions level; then its covariance and the number of verticals that agree
 with it. A frame with too few of them has a NOTILT row. A TILT_D row after either is what the
-outlines of discs show of the same frame; whoever reads the tilts of a file passes over it.
+outlines of discs show of the same frame; readers of tilts skip it.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def format_tilt(tilt: FrameTilt) -> str:
 
 
 def format_outline_tilt(tilt: FrameTilt) -> str:
-    """The row of what the outlines of a frame's discs show, without line end."""
+    """The row of the tilt by the outlines of a frame's discs, without line end."""
     return f"TILT_D{format_tilt(tilt).removeprefix('TILT')}"
 
 
@@ -69,7 +69,7 @@ def format_no_tilt(prefix: str, lines: int) -> str:
 
 
 def tilt_as_written(tilt: FrameTilt) -> FrameTilt:
-    """The tilt as whoever reads its row will know it: with the row's digits."""
+    """The tilt rounded to the digits that its row has."""
     _, _, *numbers, _ = format_tilt(tilt).split()
     pitch, roll, cpp, cpr, crr = map(float, numbers)
     return FrameTilt(tilt.prefix, pitch, roll, cpp, cpr, crr, tilt.lines)

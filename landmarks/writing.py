@@ -1,4 +1,4 @@
-"""Writing landmark files, laid out as the data set's own."""
+"""Writes landmark files in the data set's own layout."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ LineEnd = Literal["\n", "\r\n"]
 
 
 def format_record(record: Record) -> str:
-    """Lay a record out as a row of a file, without line end.
+    """Format a record as a row of a file, without line end.
 
     Poses of steps have 5 decimals and their covariances 12, as C's ``%8.5f`` and ``%.12f``;
     landmarks have 6 significant digits, as C's ``%g``; corners of markers, in pixels, 4 decimals.
@@ -64,7 +64,7 @@ def format_head(head: str, line_end: LineEnd = "\n") -> bytes:
 
 
 def format_frame(frame: Frame, line_end: LineEnd = "\n") -> bytes:
-    """The rows of a frame as they stand in a file: its STEP, its levelling and its landmarks."""
+    """The rows of a frame in a file: its STEP, its levelling and its landmarks."""
     rows = [format_record(record) for record in (frame.step, *frame.landmarks)]
     if frame.levelled_by is not None:
         rows.insert(1, format_levelling(frame.levelled_by))
@@ -88,7 +88,7 @@ def write_frames(
     frames : iterable of Frame
         Written as they come: they need not be in memory at once.
     head : str
-        Text that stands above them, each of its lines as a comment.
+        Text to write above them, each line as a comment.
     line_end : str
         LF, or CRLF as in the data set's own files.
     overwrite : bool

@@ -1,4 +1,4 @@
-"""What a calibration decides before the first image: tables, and their cache."""
+"""Tables that depend on the calibration only, and their cache."""
 
 from lut.cache import TABLE_VERSION, cache_folder, cached_disc_table, cached_vertical_table
 from lut.errors import TableError

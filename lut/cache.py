@@ -2,9 +2,9 @@
 
 A cached table is a file named by the hash of everything that decides its content. It begins with
 a hash of that name and of the bytes that follow, so damage of any kind is noticed, and so is a
-table under another's name. What passes is looked through before it is used (`lut.table_checks`).
-None of this tells a table that somebody else made on purpose: only files and folders count that
-belong to the user and that nobody else can write to. Whatever fails is computed again, and said.
+table under another's name. Tables that pass are validated before use (`lut.table_checks`). This
+does not detect tables that another user forged, so only files and folders are used that belong to
+the user and that no one else can write to. Rejected tables are computed again, with a warning.
 
 Files appear whole or not at all, so any number of processes may share a cache. A cache that cannot
 be written to is no error: the next run just computes again.
@@ -31,7 +31,7 @@ from lut.table_checks import check_disc_table, check_vertical_table
 from lut.verticals import VerticalTable, build_vertical_table
 from storage import write_whole
 
-#: Raised with every change of what tables hold or how they are computed.
+#: Incremented with every change of the tables' content or computation.
 TABLE_VERSION = 9
 
 Made = TypeVar("Made")
@@ -79,7 +79,7 @@ def cached_disc_table(camera: Camera, shape: DiscShape, folder: Path | None = No
     path = folder / f"discs-{_key(camera, shape)}.table"
     table: DiscTable | None = None
     if (fields := _read(path)) is not None:
-        # Apart from what follows: whatever goes wrong here is not the file's fault.
+        # Outside of the checks that follow: an error here is not the file's.
         floor_xy = floor_positions(camera).astype(np.float32)
 
         def complete() -> DiscTable:
@@ -154,21 +154,21 @@ def _read(path: Path) -> dict[str, Any] | None:
 
 
 def _sound(path: Path, make: Callable[[], Made]) -> Made | None:
-    """What is made of a file's content alone; None, and said, where that cannot be."""
+    """What `make` returns for a file's content; None, with a warning, if the content is invalid."""
     try:
         return make()
-    except Exception:  # what a hostile archive raises is as manifold as its bytes
+    except Exception:  # a damaged or forged archive can raise anything
         _log.info("%s: is damaged: it is computed again", path)
         return None
 
 
 def _own_content(path: Path) -> bytes | None:
-    """The bytes of a file that nobody but the user can have written; None if there is none."""
+    """The bytes of a file that only the user can have written; None if there is none."""
     try:
         if (why := _foreign(path.parent.stat())) is not None:
             _log.warning("cache %s: %s: its tables are not used", path.parent, why)
             return None
-        # Whatever stands there is not waited for, and what is looked at is what is read.
+        # Does not block on a pipe; the checks are of the same open file that is read.
         handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
     except OSError:
         return None
@@ -191,7 +191,7 @@ def _own_content(path: Path) -> bytes | None:
 
 
 def _foreign(state: os.stat_result) -> str | None:
-    """Why somebody else may have written to it; None if nobody can have."""
+    """Why another user may have written to it; None if none can have."""
     if state.st_uid != os.geteuid():
         return f"belongs to user {state.st_uid}, not {os.geteuid()}"
     if state.st_mode & _OTHERS_WRITE:
@@ -200,7 +200,7 @@ def _foreign(state: os.stat_result) -> str | None:
 
 
 def _digest(path: Path, payload: bytes) -> bytes:
-    """What stands at the beginning of a file: a hash of its name and of what follows."""
+    """The hash that begins a file: of its name and of the bytes that follow."""
     digest = hashlib.sha256(path.name.encode() + b"\0")
     digest.update(payload)
     return digest.digest()
@@ -218,7 +218,7 @@ def _keep(path: Path, table: DiscTable | VerticalTable, without: Sequence[str] =
         with write_whole(path, overwrite=True) as stream:
             stream.write(_digest(path, payload))
             stream.write(payload)
-        # Some users' files can be written to by their group unless told otherwise.
+        # By default, some users' files are writable by their group.
         path.chmod(0o600)
     except OSError:
         pass

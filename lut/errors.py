@@ -1,4 +1,4 @@
-"""What can be wrong with a table."""
+"""Exceptions of the package `lut`."""
 
 from __future__ import annotations
 
@@ -6,4 +6,4 @@ from storage.messages import OneLineError
 
 
 class TableError(OneLineError, ValueError):
-    """A table that cannot be made; the message names the quantity and what was expected."""
+    """A table that cannot be computed; the message names the quantity and what was expected."""

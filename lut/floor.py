@@ -3,7 +3,7 @@
 A radial lens matters only through one function of the distance from the principal point: the factor
 that undoes the distortion. So it is computed by the camera at some hundred distances, and between
 them by polynomials that reproduce it to the last digits. With tangential terms that is where each
-pixel's inverse is looked for.
+pixel's inverse is searched.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Compiled loops that build tables: arrays in, arrays out.
 
 `encode_outlines` projects as `camera.kernels.project_floor_point` does, operation by operation, but
-without a branch, so that several pixels are worked on at once; a test holds the two together.
+without a branch, so that several pixels are processed at once; a test compares the two.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from camera.kernels import has_brown, project_floor_point
 #: Neighbouring pixels of a row that a detector works on at once; bytes of one copy.
 BLOCK = 64
 
-#: Low bits of a copy that say how far the place that is copied to moves on.
+#: Low bits of a copy: how far the destination advances.
 ADVANCE_BITS = 7
 
-#: Rows of grey values are summed, and copies carried out, in groups of so many.
+#: Size of the groups in which rows of grey values are summed and copies are made.
 GROUP = 4
 
-#: A block has at least so many copies for every two groups of its rows, one of each outline: they
-#: are carried out while other rows are summed.
+#: Least number of copies of a block for every two groups of its rows, one of each outline: they
+#: are made while other rows are summed.
 LEAST_COPIES = 16
 
 
@@ -94,7 +94,7 @@ def fill_floor_positions(
     for u in range(width):
         x_seen[u] = (u - pinhole[2]) / pinhole[0]
     decentred = lens[7] != 0.0 or lens[8] != 0.0
-    # A loop for what is looked up, and one that the compiler can do for several pixels at once.
+    # A loop for lookups, and one that the compiler can vectorise.
     ratio = np.empty(width)
     x_normalised = np.empty(width)
     y_normalised = np.empty(width)
@@ -230,7 +230,7 @@ def encode_outlines(
     floor_xy : (H, W, 2) float64
         Floor position of each pixel, metres.
     candidate : (H, W) bool
-        Centres to look at.
+        Centres to evaluate.
     inner, outer : (K, 2) float64
         Samples of the outlines relative to their centre, metres.
     enough : float
@@ -324,9 +324,9 @@ def encode_outlines(
                 last = u + 1
                 following = u + max(1, math.ceil(scan.stride / scan.size[v, u]))
 
-        room = count + (2 * padded + LEAST_COPIES) * (width + BLOCK)
-        if room > len(copies):
-            more = np.empty(2 * room, np.uint64)
+        needed = count + (2 * padded + LEAST_COPIES) * (width + BLOCK)
+        if needed > len(copies):
+            more = np.empty(2 * needed, np.uint64)
             for i in range(count):
                 more[i] = copies[i]
             copies = more
@@ -352,7 +352,7 @@ def encode_outlines(
                     continue
                 here = nearest[outline * samples + sample]
                 # Centres around which the sample has the same offset: `run_source` is the pixel
-                # that the centre in column `run_u` looks at. What is not usable changes nothing.
+                # of the sample for the centre in column `run_u`. Unusable centres change nothing.
                 run_u = from_u
                 run_source = int(here[from_u]) if here[from_u] >= 0.0 else nothing
                 for u in range(from_u + 1, to_u):

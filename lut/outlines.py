@@ -1,4 +1,4 @@
-"""Which grey values vote on a disc: the outlines' pixels around every possible centre.
+"""Table of the outlines' pixels around every possible centre of a disc.
 
 A disc on the floor centred where pixel (u, v) meets it has an inner outline (inside the disc's
 edge) and an outer one (outside). Where their equally spaced samples fall in the image depends on
@@ -6,13 +6,13 @@ the calibration alone, so it is computed ahead of time, for every pixel (DLR Spa
 set report, circle detection).
 
 From one pixel to the next along a row, a sample nearly always moves by one pixel as well: its
-offset from the centre stays the same for some 40 pixels. So what the table stores is not an offset
-for each centre and sample but a list of *copies*: 64 neighbouring bytes of the image each, which,
-put one after the other, line up the grey values of one sample for centre after centre. What a copy
-brings too much is overwritten by the next.
+offset from the centre stays the same for some 40 pixels. So the table does not store an offset for
+each centre and sample but a list of *copies*: 64 neighbouring bytes of the image each. Placed one
+after the other, they align the grey values of one sample for consecutive centres. Excess bytes of a
+copy are overwritten by the next.
 
-Samples outside the image do not vote: the table takes them from behind the image's last pixel,
-where a detector has zeros. A centre is usable when at least half of each outline's samples are
+Samples outside the image do not count: the table takes them from behind the image's last pixel,
+where a detector has zeros. A centre is usable if at least half of each outline's samples are
 inside, it keeps its distance from the border, and the floor there moves by no more than a given
 length per image row.
 """
@@ -38,7 +38,7 @@ MIN_SHARE_INSIDE = 0.5
 
 @dataclass(frozen=True)
 class DiscShape:
-    """What is sampled around a centre, and how near and far centres may be.
+    """Samples around a centre, and the nearest and farthest centres.
 
     Parameters
     ----------
@@ -52,11 +52,11 @@ class DiscShape:
         Far limit: the floor moves at most this far from one image row to the next, metres;
         infinite: however far.
     least_pairs : int
-        Samples vote in pairs, an inner and an outer one, of which so many must be inside the image;
-        0: each for itself.
+        Samples are counted in pairs, an inner and an outer one, at least this many of which must be
+        inside the image; 0: samples are counted singly.
     apart_px : float
         How far the samples of a pair that fall on the same pixel are moved, one inwards and one
-        outwards: the length on the floor of so many pixels down the image.
+        outwards: the length on the floor of this many pixels down the image.
     stride_m : float
         After a usable centre, those nearer than this along the row are left out, metres: counted
         in pixels as long as one down the image, rounded up; 0: none.
@@ -97,7 +97,7 @@ class DiscTable:
 
     Hashed and compared by identity.
 
-    Centres are worked on in *blocks* of 64 neighbouring columns of a row. For each block ``2 R``
+    Centres are processed in *blocks* of 64 neighbouring columns of a row. For each block ``2 R``
     rows of 64 grey values are gathered, a column for each centre: R = `samples` rounded up to a
     multiple of 4 for the inner outline, then R for the outer one; rows that are no samples are 0.
 

@@ -1,6 +1,6 @@
-"""Whether the arrays of a table are such that the compiled loops may index by them.
+"""Checks that the compiled loops can use a table's arrays as indices.
 
-The loops check nothing: a table that came from a file is looked through once, before they get it.
+The loops check nothing, so a table that was read from a file is checked once before use.
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ each image column the table holds the row of the horizon and the vertical throug
 column for each row, through the distortion (DLR Spatial Cognition data set report, line detection).
 
 A camera that looks down so far that it does not see the horizon still sees verticals. There a line
-of constant elevation near the border of the image stands for the horizon; both are called *anchor*.
+of constant elevation near the border of the image replaces the horizon; both are called *anchor*.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _ROOT_STEPS = 12
 _LEAST_SEEN = 0.5
 #: Else the anchor is, in most columns, at least this share of the height from the border,
 _MARGIN = 1.0 / 12.0
-#: and no farther from the horizon than this: who looks so far down sees the floor alone.
+#: and no farther from the horizon than this: cameras that look farther down see only the floor.
 _LARGEST_ELEVATION = math.radians(45.0)
 
 
@@ -52,7 +52,7 @@ class VerticalTable:
         45 deg of the image's vertical; ``first_row > last_row`` where there are none.
     column : (H, W) float32
         Column at which the vertical named by its second index crosses each row; NaN outside those
-        rows. In Fortran's order: whoever follows a vertical reads memory in sequence.
+        rows. In Fortran order, so that following a vertical reads memory in sequence.
     elevation_tan : (H, W) float32
         Tangent of the elevation above the horizon at which it does so; NaN as `column`.
     robot_from_camera : (3, 3) float64

@@ -13,7 +13,7 @@ from storage.command_line import Program
 
 PROGRAM = Program(
     "slam",
-    "What landmarks are for: map, localisation, SLAM, association, noise.\n\n"
+    "Uses of landmarks: map, localisation, SLAM, association, noise.\n\n"
     "Example: slam map images/e --circles --lines -o /tmp/e-map",
     {
         Map: "slam.commands.map",

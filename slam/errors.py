@@ -1,4 +1,4 @@
-"""What can be wrong with a run that is to be mapped or localised in."""
+"""Exceptions of the package `slam`."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from storage.messages import OneLineError
 
 
 class SlamError(OneLineError, ValueError):
-    """A run, map or setting that cannot be worked on.
+    """A run, map or setting that cannot be used.
 
     The message names the file, step, landmark or setting, its value and what was expected.
     """

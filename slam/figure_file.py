@@ -1,4 +1,4 @@
-"""A figure that becomes a PNG file, the same bytes each time, and a window if asked for."""
+"""Writes a figure to a PNG file, reproducibly, and shows it in a window on request."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _WITHOUT_WINDOWS = ("agg", "cairo", "pdf", "pgf", "ps", "svg", "template")
 def picture(
     png: Path, size: tuple[float, float], *, overwrite: bool, interactive: bool
 ) -> Iterator[Figure]:
-    """A figure to draw into; at the end it is written and, if asked for, shown.
+    """A figure to draw into; at the end it is written and, on request, shown.
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ def picture(
     storage.OutputExistsError
         If the file exists and may not be replaced.
     SlamError
-        If a window is asked for where none can be opened.
+        If a window is requested but cannot be opened.
     """
     if not overwrite and png.exists():  # before the work instead of after it
         raise OutputExistsError(png)

@@ -16,7 +16,7 @@ from storage.bounds import NOT_NEGATIVE, demand, whole
 
 @dataclass(frozen=True)
 class AddedNoise:
-    """Standard deviations of what is added, each to every number of its kind independently.
+    """Standard deviations of the added noise, independent for each number.
 
     Attributes
     ----------
@@ -62,7 +62,7 @@ class AddedNoise:
 
     @property
     def comment(self) -> str:
-        """What is written at the head of the file."""
+        """The head of the file."""
         return (
             f"Noise was added, standard deviations: discs {self.disc_m:g} m, bearings "
             f"{self.bearing_rad:g} rad, dx and dy {self.step_m:g} m, dphi {self.turn_rad:g} rad; "

@@ -17,14 +17,14 @@ MaybeStr = Optional[str]  # noqa: UP045
 
 @dataclass(frozen=True, kw_only=True)
 class RunFlags:
-    """What every command needs that reads the landmarks of a run.
+    """Options of all commands that read the landmarks of a run.
 
     Parameters
     ----------
     run : Path
         Run folder, or a .circles or .lines file.
     circles : bool
-        Use the discs; so it is, too, where neither kind is asked for.
+        Use the discs; the default if neither kind is given.
     lines : bool
         Use the vertical lines.
     stem : str
@@ -63,8 +63,8 @@ class Map(RunFlags):
         camera as mounted sees it; `recorded`, as the rows were written, where their covariances
         belong.
     tilt_deg : float
-        Let the robot tilt by so much (standard deviation of pitch and roll, degrees) in each frame;
-        with --row-errors recorded.
+        Standard deviation of the robot's pitch and roll in each frame (degrees); with --row-errors
+        recorded.
     solver : str
         `separable`: the project's own; `gtsam`: GTSAM's Levenberg-Marquardt takes the last steps
         (extra [slam]).
@@ -90,7 +90,7 @@ class Map(RunFlags):
 
 @dataclass(frozen=True, kw_only=True)
 class FilterFlags(RunFlags):
-    """What both filters need.
+    """Options of both filters.
 
     Parameters
     ----------
@@ -154,8 +154,9 @@ class Ekf(FilterFlags):
         out.
     jacobians : str
         Where the models are linearised: at the `first` estimate of each landmark, so that the
-        filter does not believe to learn its heading from landmarks it has placed itself; or at the
-        `latest`, as the textbook filter does, which is inconsistent at large heading error.
+        filter gains no spurious information about its heading from landmarks that it has placed
+        itself; or at the `latest`, as the textbook filter does, which is inconsistent at large
+        heading errors.
     reference_map : Path
         A map.csv to measure the distance of the landmarks from.
     output : Path
@@ -181,7 +182,7 @@ class Associate(RunFlags):
         `nearest`: Mahalanobis distance of one row at a time; `joint`: joint compatibility of a
         frame's rows (JCBB).
     map_level : bool
-        Then look for loops by fitting local maps of landmarks to each other.
+        Then search loops by fitting local maps of landmarks to each other.
     gate_probability : float
         Share of right rows that pass the gate.
     sigma_scale : float
@@ -191,8 +192,7 @@ class Associate(RunFlags):
         Standard deviation of the robot's sway, which moves all discs of a frame together: for rows
         whose covariances leave it out and are smaller than that.
     noise : several floats
-        Score once more with so much noise added to the measurements (factor on their standard
-        deviation).
+        Score again with noise added to the measurements (factors on their standard deviation).
     seed : int
         Of that noise.
     output : Path

@@ -31,9 +31,9 @@ NEES_BAND = (0.21579528262389785, 9.348403604496145)
 _PATH, _REFERENCE, _DISC, _LINE, _BAND = "#1f5f99", "#777777", "#c8501e", "#3a8f4c", "#2a78b5"
 _SIGMA = "\N{GREEK SMALL LETTER SIGMA}"
 _ELLIPSE_POINTS = 40
-# So many discs can be told apart by numbers beside them.
+# Largest number of discs that are labelled with their numbers.
 _MOST_NUMBERED = 40
-# How far beyond path and discs a vertical may stand and still be in the picture.
+# How far beyond path and discs a vertical may be and still be drawn.
 _MARGIN_M, _MARGIN_SHARE = 10.0, 0.25
 
 
@@ -126,7 +126,7 @@ def draw_map(
     png : Path
         The picture's file.
     landmark_map : LandmarkMap
-        Discs and verticals. Verticals that stand far outside are counted in the legend, not drawn.
+        Discs and verticals. Verticals far outside are counted in the legend, not drawn.
     path : Path2D
         The robot's path.
     before, before_map : Path2D, LandmarkMap, optional
@@ -134,7 +134,7 @@ def draw_map(
     reference : Path2D, optional
         The true path, or another to compare with; dashed.
     title : str
-        Stands above.
+        Drawn above the picture.
     overwrite : bool
         Whether an existing file may be replaced.
     interactive : bool
@@ -203,7 +203,7 @@ def draw_errors(
     reference : (N, 3) array_like
         True poses in the same map.
     title : str
-        Stands above.
+        Drawn above the picture.
     overwrite, interactive : bool
         As for `draw_map`.
 
@@ -259,7 +259,7 @@ def _draw_nees(axes: Axes, step: NDArray[np.int64], nees: FloatArray) -> None:
             fontsize=9,
             loc="right",
         )
-        # Room above for the legend.
+        # Space above for the legend.
         highest = max(100.0, 5.0 * float(np.max(nees[known])))
         lowest = min(0.05, max(1e-3, float(np.min(nees[known])) / 1.5))
         axes.set_ylim(lowest, highest)
@@ -354,7 +354,7 @@ def _draw_landmarks(
     shown = _inside(some.xy, low, high)
     outside = int(np.sum(~shown))
     label = f"{name} ({len(some)}{f', {outside} of them outside' if outside else ''})"
-    # Many landmarks stand close together: small dots leave their ellipses to be seen.
+    # Many landmarks are close together: with small dots their ellipses remain visible.
     size = 4.0 if len(some) <= 100 else 2.0
     axes.plot(
         some.xy[shown, 0], some.xy[shown, 1], ls="", marker=marker, ms=size, color=colour,
@@ -363,7 +363,7 @@ def _draw_landmarks(
     known = shown & np.any(some.covariance != 0.0, axis=(1, 2))
     if known.any():
         outlines = ellipse_outlines(some.xy[known], some.covariance[known])
-        # Of hundreds that lie over each other the fillings would hide all else.
+        # The fillings of hundreds of overlapping ellipses would hide everything else.
         filling, edge, width = (0.15, 1.0, 0.7) if len(some) <= 100 else (0.05, 0.55, 0.5)
         ellipses = PolyCollection(
             list(outlines),

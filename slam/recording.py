@@ -1,4 +1,4 @@
-"""A run's odometry and landmark rows as arrays, checked for what an estimator cannot use."""
+"""A run's odometry and landmark rows as arrays, checked for values that estimators cannot use."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class LineRows:
     sigma_rad : (n,) float64
         Its standard deviation, above 0.
     ids : tuple of n tuples of int
-        All lines that a row stands for (joined rows have several); empty where unknown.
+        All lines that a row shows (joined rows have several); empty where unknown.
     """
 
     frame: IntArray
@@ -87,7 +87,7 @@ class LineRows:
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """A run: N steps of odometry and what was seen after each.
+    """A run: N steps of odometry and the measurements after each.
 
     Attributes
     ----------
@@ -99,7 +99,7 @@ class Recording:
         Of `steps`, positive definite.
     circles : CircleRows
     lines : LineRows
-        Without rows where they were not asked for.
+        Without rows if they were not requested.
     unstated_steps : int
         Steps whose covariance their source does not state: it is an assumed one.
     """
@@ -246,7 +246,7 @@ def recording_of_frames(
     frames : sequence of Frame
         The run in order.
     name : str
-        What stands for the file in messages.
+        What messages call the file.
     noise : OdometryNoise
         Of the steps that state no covariance: zeros.
 
@@ -274,7 +274,7 @@ def recording_of_frames(
     for bad in _not_positive_definite(covariance):
         raise SlamError(
             f"{name}: step {bad + 1} ({steps[bad].prefix}): its covariance is not positive "
-            "definite: expected one that weighs all of dx, dy and dphi"
+            "definite: expected a covariance of dx, dy and dphi of full rank"
         )
     return Recording(
         prefixes=tuple(step.prefix for step in steps),

@@ -1,6 +1,6 @@
-"""How a result gets onto the disk: whole or not at all, and never over what the user has.
+"""Writes results to disk: completely or not at all, and never over a user's files.
 
-Every room writes its files through `write_whole`.
+All packages write their files with `write_whole`.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def write_whole(path: str | os.PathLike[str], *, overwrite: bool) -> Iterator[Bi
     OutputExistsError
         If `path` exists and `overwrite` is false.
     OSError
-        If the folder cannot be written to, or has no room; names `path`.
+        If the folder cannot be written to, or the disk is full; names `path`.
     """
     path = Path(path)
     if not overwrite and os.path.lexists(path):

@@ -1,4 +1,4 @@
-"""Reading a file from strangers: of bounded size, and nothing but a file."""
+"""Reads untrusted files: regular files of bounded size only."""
 
 from __future__ import annotations
 
@@ -39,8 +39,8 @@ def read_bounded(path: str | os.PathLike[str], largest_bytes: int) -> bytes:
             raise OSError(errno.EINVAL, "is a pipe, socket or device: expected a file")
         if state.st_size > largest_bytes:
             raise OSError(errno.EFBIG, f"larger than {largest_bytes} bytes")
-        # Memory is taken for as much as is asked for, whatever there is; and some file systems give
-        # no more than so much at once.
+        # `read` allocates what is asked for, even if the file is shorter; and some file systems
+        # return only part of it in one call.
         content = os.read(handle, state.st_size + 1)
         while more := os.read(handle, state.st_size + 1 - len(content)):
             content += more

@@ -1,8 +1,8 @@
-"""What numbers a setting may have; others are refused by name, with value and what was expected.
+"""Bounds of settings; other values are refused with the name, the value and what was expected.
 
     demand(self, DetectError, radius_m=ABOVE_0, samples=whole(3, 128))
 
-NaN is refused everywhere, and infinity wherever it is not said to stand for "no limit".
+NaN is always refused; infinity is refused unless it means "no limit".
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def whole(least: int, most: int | None = None) -> Bounds:
 FINITE = Bounds("a finite number", above=True, below=True)
 ABOVE_0 = Bounds("above 0", 0.0, above=True, below=True)
 NOT_NEGATIVE = Bounds("0 or more", 0.0, below=True)
-#: Infinity stands for "no limit".
+#: Infinity means "no limit".
 LIMIT = Bounds("above 0", 0.0, above=True)
 LIMIT_OR_0 = Bounds("0 or more", 0.0)
 SHARE = from_to(0.0, 1.0)
@@ -84,9 +84,9 @@ def demand(settings: object, error: type[Exception], /, **bounds: Bounds) -> Non
     Parameters
     ----------
     settings : object
-        What has the numbers as attributes; of tuples each number is looked at.
+        Has the numbers as attributes; each number of a tuple is checked.
     error : type of exception
-        What is raised.
+        The exception to raise.
     bounds : Bounds
         By the attributes' names.
 

@@ -51,7 +51,7 @@ class Program:
     def parsed(
         self, arguments: Sequence[str], defaults: Mapping[type, object] | None = None
     ) -> Any:
-        """What a command line says; exits, as `--help` does, where nothing can be done about it.
+        """Parse a command line; exits after `--help` and on errors.
 
         Parameters
         ----------

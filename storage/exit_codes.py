@@ -15,15 +15,15 @@ from storage.messages import one_line
 EXIT_ERROR = 1
 #: It was interrupted from the keyboard.
 EXIT_INTERRUPTED = 130
-#: Nobody reads on what it prints (``| head``): what the system's own tools end with then.
+#: The reader of its output has gone (``| head``); the code that system tools exit with then.
 EXIT_UNREAD = 141
 
 
 def exit_code_of(work: Callable[[], int]) -> int:
-    """Do what a command is for; say what is wrong on one line.
+    """Run a command and report its errors on one line.
 
-    Typed errors of all rooms are ValueErrors, and those of the system OSErrors: anything else is a
-    fault of the program and shows its traceback.
+    All packages raise subclasses of ValueError, the system raises OSErrors. Anything else is a bug
+    and shows its traceback.
 
     Parameters
     ----------
@@ -39,7 +39,7 @@ def exit_code_of(work: Callable[[], int]) -> int:
         try:
             return work()
         finally:
-            # What is still to be printed is part of the work: nobody may be reading it.
+            # Flushing can fail, too, if the output is a closed pipe.
             sys.stdout.flush()
     except KeyboardInterrupt:
         return say_interrupted()
@@ -48,9 +48,9 @@ def exit_code_of(work: Callable[[], int]) -> int:
 
 
 def say_error(error: BaseException | str) -> int:
-    """Say what was wrong; returns the exit code.
+    """Print an error on one line and return the exit code.
 
-    That nobody reads on what is printed is nothing to speak of.
+    Nothing is printed if the reader of the output has gone.
     """
     if isinstance(error, BrokenPipeError) and _is_unread():
         return EXIT_UNREAD
@@ -65,7 +65,7 @@ def say_interrupted() -> int:
 
 
 def _is_unread() -> bool:
-    """Whether standard output is a pipe that nobody reads; if so, it is led nowhere."""
+    """Whether standard output is a pipe without a reader; if so, redirect it to the null device."""
     try:
         descriptor = sys.stdout.fileno()
     except (AttributeError, OSError):
@@ -82,15 +82,15 @@ def _is_unread() -> bool:
 
 
 def _said(error: BaseException | str) -> str:
-    """The error in words; and what to do where a folder is not there, or kernels find no room."""
+    """The error's message, with advice if a folder is missing or kernels cannot be cached."""
     if isinstance(error, FileNotFoundError) and isinstance(error.filename, str | os.PathLike):
         folder = Path(error.filename).parent
         if not folder.is_dir():
             return f"{error.filename}: no such folder: {folder}: make it first, or name another"
     if isinstance(error, OSError) and _while_kernels_were_kept(error):
         return (
-            f"compiled kernels cannot be kept: {error}: make room for them, or name another folder "
-            "by the environment variable NUMBA_CACHE_DIR"
+            f"compiled kernels cannot be kept: {error}: free some disk space, or set the "
+            "environment variable NUMBA_CACHE_DIR to another folder"
         )
     return str(error)
 

@@ -1,8 +1,8 @@
-"""What the header of an image file claims, without decoding it, and which way up it is shown.
+"""Size and orientation of an image from its file's header, without decoding it.
 
-A file of some hundred bytes can claim an image of gigabytes; a decoder takes the memory before it
-notices. So the size is read from the header by itself, for the formats that runs are made of:
-JPEG (ISO/IEC 10918-1), PNG, PNM (P1 to P6), BMP, and TIFF (6.0 and BigTIFF).
+A file of a few hundred bytes can claim an image of gigabytes, and decoders allocate the memory
+first. So the size is read from the header, for the formats that are supported as input: JPEG
+(ISO/IEC 10918-1), PNG, PNM (P1 to P6), BMP, and TIFF (6.0 and BigTIFF).
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from collections.abc import Iterator
 #: The largest image that there can be: it fills as many bytes as grey values.
 MOST_PIXELS = 1 << 27
 
-#: The start-of-frame markers of a JPEG: C0 to CF but for tables (C4), extensions (C8, CC).
+#: The start-of-frame markers of a JPEG: C0 to CF except tables (C4), extensions (C8, CC).
 _JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _JPEG_WITHOUT_LENGTH = frozenset({0x01, *range(0xD0, 0xD9)})
 _PNG = b"\x89PNG\r\n\x1a\n"
@@ -25,7 +25,7 @@ _TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 _TIFF_SIZES = (256, 257, 322, 323)  # width, height, and those of a tile
 _TIFF_ORIENTATION = 274
 _TIFF_NUMBERS = {3: "H", 4: "I", 16: "Q"}
-# Tiles are padded: those of small images may be larger than these, and up to here are no fault.
+# Tiles are padded and may be larger than a small image; up to this many pixels that is valid.
 _ORDINARY_TILE = 1 << 22
 
 
@@ -61,7 +61,7 @@ def claimed_size(content: bytes) -> tuple[int, int] | None:
 def _png_size(content: bytes) -> tuple[int, int] | None:
     """That of the first chunk, if every chunk ends within the file.
 
-    OpenCV takes as much memory for a chunk as it claims to have, up to 4 GiB, before it looks.
+    OpenCV takes as much memory for a chunk as it claims to have, up to 4 GiB, before it reads it.
     """
     if content[12:16] != b"IHDR":
         return None
@@ -119,8 +119,8 @@ def _tiff_size(content: bytes) -> tuple[int, int] | None:
 
 
 def _tiff_numbers(content: bytes) -> Iterator[tuple[int, str | None, int]]:
-    """The tags of the first directory: each with how its number is packed, None for others, and
-    where it stands.
+    """The tags of the first directory, each with the `struct` format of its number (None if it is
+    no number) and its offset.
     """
     order = "<" if content.startswith(b"II") else ">"
     big = content[2:4] in (b"+\0", b"\0+")
@@ -137,10 +137,9 @@ def _tiff_numbers(content: bytes) -> Iterator[tuple[int, str | None, int]]:
 
 
 def without_orientation(content: bytes) -> bytes:
-    """An image file that decoders do not turn, whichever way up its camera was held.
+    """An image file's content with orientation metadata that makes decoders rotate it removed.
 
-    OpenCV leaves the pixels of JPEG and PNG as they are if it is told to, those of TIFF it turns
-    nevertheless.
+    On request, OpenCV ignores the orientation of JPEG and PNG, but not that of TIFF.
 
     Parameters
     ----------
@@ -150,7 +149,7 @@ def without_orientation(content: bytes) -> bytes:
     Returns
     -------
     bytes
-        The same; of a TIFF that says that it is to be turned, one that does not.
+        The same content, with a TIFF's orientation tag set to "not rotated".
     """
     if not content.startswith(_TIFF):
         return content
@@ -162,6 +161,6 @@ def without_orientation(content: bytes) -> bytes:
                 if turn != 1:
                     changed = changed if changed is not None else bytearray(content)
                     struct.pack_into(number, changed, place, 1)
-    except (struct.error, OverflowError):  # damaged: the decoder will tell
+    except (struct.error, OverflowError):  # damaged: the decoder reports it
         pass
     return content if changed is None else bytes(changed)

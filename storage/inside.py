@@ -1,4 +1,4 @@
-"""Names of files that other files give: they must not lead out of the folder they are given for."""
+"""Checks names of files that other files give: they must not lead out of a given folder."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _DRIVE = re.compile(r"[A-Za-z]:")
 # What Windows takes for a device in any folder, whatever the ending.
 _DEVICES = "(?:con|prn|aux|nul|com[0-9]|lpt[0-9])"
 _DEVICE = re.compile(rf"(?:\A|/){_DEVICES}(?: *\.[^/]*)?(?:/|\Z)", re.IGNORECASE)
-# Most names: one look is enough.
+# Most names: one match is enough.
 _PLAIN = re.compile(
     rf"(?!{_DEVICES}(?:\.|\Z))[0-9a-z_-]++(?:\.[0-9a-z_-]++)*+", re.IGNORECASE | re.ASCII
 )
@@ -31,7 +31,7 @@ def leads_out(name: str, *folders: str) -> str | None:
     Returns
     -------
     str or None
-        What it does, to stand after the name; None if it may.
+        What is wrong with the name, as the end of a message that starts with it; None if nothing.
     """
     if _PLAIN.fullmatch(name):
         return None
@@ -52,7 +52,7 @@ def _within(name: str, home: str) -> bool:
 
 
 def link_out(path: Path, *folders: Path) -> bool:
-    """Whether a path, links followed, lies in none of the folders, theirs followed too."""
+    """Whether a path is in none of the folders, after all links are resolved."""
     real = os.path.realpath(path)
     return not any(
         real == home or real.startswith(home.rstrip("/") + "/")
@@ -61,12 +61,12 @@ def link_out(path: Path, *folders: Path) -> bool:
 
 
 def path_inside(folder: Path, name: str) -> Path:
-    """The file of a name that stands in a file, in that file's folder.
+    """Path of a file that another file names, in the other file's folder.
 
     Raises
     ------
     ValueError
-        If it would lie elsewhere; the message says why, to stand after the name.
+        If it would be elsewhere; the message says why, as the end of one that starts with the name.
     """
     why = leads_out(name)
     if why is None and link_out(folder / name, folder):

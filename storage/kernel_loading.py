@@ -1,15 +1,15 @@
 """Compiled kernels loaded from Numba's cache without what only a compiler needs.
 
-Before it looks into its cache, Numba gets ready to compile: it imports what it can compile of
+Before it reads its cache, Numba prepares to compile: it imports what it can compile of
 Python, NumPy and SciPy, and registers all of it, which takes a third of the time that a command
-has before its first landmark. Machine code needs none of that. So the cache is looked into first,
-and Numba gets ready where there is something to compile.
+has before its first landmark. Machine code needs none of that. So the cache is read first, and
+Numba is initialised only if there is something to compile.
 
-What is compiled is kept as Numba keeps it, but for one thing: it names machine code in the index of
-a kernel before it writes it. A process that is killed in between, or finds no room, would leave an
-index that vouches for what an earlier version of the kernel left under that name, and another one
-that looks at that moment would take it. So such files are removed first. And an index that cannot
-be read, because it names classes of another version of the program, counts as empty.
+Compiled kernels are cached as Numba caches them, with one exception. Numba adds a file of machine
+code to a kernel's index before it writes the file. If the process is killed in between, or the disk
+is full, the index refers to a file of that name that an earlier version of the kernel left; another
+process that reads the cache at that moment would load it. So such files are removed first. An index
+that cannot be read, because it names classes of another version of the program, counts as empty.
 
 Attributes of Numba that are not public are used for it; where they have changed, everything is done
 as Numba does it.
@@ -25,13 +25,13 @@ from functools import cache
 from importlib import import_module
 from typing import Any
 
-#: What is done before a kernel is compiled, if anything: it may be in the cache afterwards.
+#: Called before a kernel is compiled, if set: the kernel may be in the cache afterwards.
 _before_compiling: Callable[[], object] | None = None
 
 
 @contextmanager
 def waiting_before_compiling(wait: Callable[[], object]) -> Iterator[bool]:
-    """Have `wait` called, during a block, before a kernel is compiled, and the cache asked again.
+    """Have `wait` called, during a block, before a kernel is compiled; then read the cache again.
 
     Gives whether that can be done: else the caller waits before anything is loaded.
     """
@@ -84,7 +84,7 @@ def load_kernels_alone() -> bool:
             with _environments_alone(environment), self._guard_against_spurious_io_errors():
                 return self._load_overload(signature, target_context)
         except Exception:
-            return None  # whatever it is: Numba itself will tell
+            return None  # Numba itself reports the error
 
     def save_index(self: Any, overloads: dict[Any, str]) -> None:
         for name in {*overloads.values()} - {*self._load_index().values()}:

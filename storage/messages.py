@@ -1,6 +1,6 @@
-"""What is shown of files whose content nobody vouches for: escaped, bounded, on one line.
+"""Quotes the content of untrusted files in messages: escaped, bounded, on one line.
 
-A terminal acts upon control characters, so none of a file's own may reach it; and a file may hold
+A terminal acts upon control characters, so those of a file must not reach it; and a file may hold
 a word of a gigabyte. Every typed error of the project passes its message through `one_line`.
 """
 
@@ -26,7 +26,7 @@ def one_line(text: str, longest: int = LONGEST_MESSAGE) -> str:
     Returns
     -------
     str
-        What is printable already comes back as it is.
+        Printable text is returned unchanged.
     """
     if len(text) > longest:
         # Escapes make a text longer, never shorter: no more than this can be shown.

@@ -1,10 +1,9 @@
-"""Files that grow beside the place where they will be.
+"""Partial files, renamed when they are complete.
 
-A result is written to ``.NAME.part`` in the folder of ``NAME``, and takes its place in one step
-when it is complete. Whoever writes it holds a lock on it, which the operating system takes back
-however the process ends: a part that nobody has locked is what a killed process left behind. The
-next one that writes the same result removes it; beside one that is being written, the next part is
-``.NAME.1.part``.
+A result is written to ``.NAME.part`` in the folder of ``NAME``, and renamed in one step when it is
+complete. The writing process holds a lock on the partial file, which the operating system releases
+however the process ends: an unlocked one was left by a killed process. The next process that writes
+the same result removes it. While one is being written, the next partial file is ``.NAME.1.part``.
 """
 
 from __future__ import annotations
@@ -18,23 +17,23 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-#: So many places for parts are looked at for what killed processes left.
+#: Number of names of partial files that are checked for leftovers of killed processes.
 _PLACES_LOOKED_AT = 8
 
 _NEW = os.O_RDWR | os.O_CREAT | os.O_EXCL | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
-# What stands in the place of a part may be anything: no link is followed, no pipe waited for.
+# The path of a part may be anything: follow no link and wait for no pipe.
 _OLD = os.O_RDWR | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
 
 
 class OutputExistsError(FileExistsError):
-    """A file that would be overwritten stands where a result should go."""
+    """A result's file exists already and must not be overwritten."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(f"{path}: exists already: give --force to overwrite it")
 
 
 class NotAFileError(OSError):
-    """What stands where a result should go is a device, a pipe or a socket."""
+    """The path of a result is a device, a pipe or a socket."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(f"{path}: is a device, pipe or socket: expected the name of a file")
@@ -60,7 +59,7 @@ class PartFile:
         self._handle = handle
 
     def fileno(self) -> int:
-        """The descriptor, for reading what is there and for cutting it off."""
+        """The descriptor, for reading and truncating the file."""
         return self._handle
 
     def write(self, content: bytes) -> None:
@@ -77,7 +76,7 @@ class PartFile:
             raise named(error, self.path) from None
 
     def read(self, place: int, length: int) -> bytes:
-        """What stands at a place; less than asked for where the part ends."""
+        """The bytes from an offset; fewer than `length` at the end of the part."""
         left = max(0, os.fstat(self._handle).st_size - place)
         os.lseek(self._handle, place, os.SEEK_SET)
         wanted = min(length, left)
@@ -108,12 +107,12 @@ class PartFile:
             raise named(error, self.path) from None
 
     def place(self, *, overwrite: bool) -> None:
-        """Take the place of the result; where a link stands, of what it leads to.
+        """Move the part to the result's path; if that is a link, to the link's target.
 
         Raises
         ------
         OutputExistsError
-            If something stands there that must not be overwritten.
+            If there is a file that must not be overwritten.
         """
         if sys.platform == "win32":
             self.close()  # a file that is open keeps its name there
@@ -154,7 +153,7 @@ def new_part(path: Path) -> PartFile:
     Raises
     ------
     NotAFileError
-        If what stands there is no regular file.
+        If the path exists and is no regular file.
     OSError
         If the folder cannot be written to; names the result.
     """
@@ -202,7 +201,7 @@ def named(error: OSError, path: Path) -> OSError:
 
 @contextmanager
 def folder_locked(folder: Path) -> Iterator[None]:
-    """Wait until nobody else has the folder locked, and lock it for the time of a block."""
+    """Lock a folder for the duration of a block; waits for other processes that hold the lock."""
     if sys.platform == "win32":
         yield
         return
@@ -219,7 +218,7 @@ def folder_locked(folder: Path) -> Iterator[None]:
 
 
 def new_locked(place: Path) -> int | None:
-    """A new file, locked; None if another process writes there, or what is there is no part."""
+    """A new file, locked; None if another process writes it, or the existing file is no part."""
     while True:
         try:
             handle = os.open(place, _NEW, 0o666)
@@ -234,7 +233,7 @@ def new_locked(place: Path) -> int | None:
             continue
         if _lock(handle) is not False and _is_at(handle, place):
             return handle
-        os.close(handle)  # taken for something left behind before it was locked
+        os.close(handle)  # mistaken for a leftover file before it was locked
 
 
 def old_locked(place: Path) -> int | None:
@@ -244,13 +243,13 @@ def old_locked(place: Path) -> int | None:
     except OSError:
         return None
     if stat.S_ISREG(os.fstat(handle).st_mode) and _lock(handle) and _is_at(handle, place):
-        return handle  # nobody writes it any more
+        return handle  # no process writes it any more
     os.close(handle)
     return None
 
 
 def _lock(handle: int) -> bool | None:
-    """Lock a file; False if somebody else has, None where there are no locks: nobody knows then."""
+    """Lock a file: False if another process holds the lock, None if locks are not supported."""
     if sys.platform == "win32":
         return None
     import fcntl
@@ -272,7 +271,7 @@ def _is_at(handle: int, place: Path) -> bool:
 
 
 def _place_new(temporary: Path, path: Path) -> None:
-    """Give the file its name unless somebody took it meanwhile."""
+    """Give the file its name unless the name was taken meanwhile."""
     try:
         os.link(temporary, path)
     except FileExistsError:
@@ -296,12 +295,12 @@ def _rename_new(temporary: Path, path: Path) -> None:
     failed = _rename_without_replacing(temporary, path)
     if failed == errno.EEXIST or (failed and os.path.lexists(path)):
         raise OutputExistsError(path) from None
-    if failed:  # here somebody can still come between
+    if failed:  # another process can still create the file here
         temporary.replace(path)
 
 
 def _rename_without_replacing(old: Path, new: Path) -> int:
-    """Linux's renameat2: 0, or why it failed, be it that the system has no such thing."""
+    """Linux's renameat2: 0, or the error number, also where the system does not have it."""
     import ctypes
 
     rename = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)

@@ -1,4 +1,4 @@
-"""NumPy's ``.npy`` format from strangers: no objects, and no size believed before it is checked."""
+"""Reads untrusted files in NumPy's ``.npy`` format: no objects, and sizes are checked first."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def read_plain_array(
     Raises
     ------
     ValueError
-        If there is no such array; the message says what stands there, on one line.
+        If there is no such array; the message says what was found, on one line.
     """
     expected = f"expected {dimensions}-dimensional {dtype}, row by row"
     try:
@@ -53,7 +53,7 @@ def read_plain_array(
         if min(shape, default=0) < 0 or size > largest_bytes:
             raise ValueError(f"its shape {shape} does not fit in {largest_bytes} bytes")
         data = stream.read(size)
-    # What a damaged header raises is as manifold as Python's own grammar.
+    # A damaged header can raise almost any exception.
     except (
         ValueError, SyntaxError, TypeError, OverflowError, EOFError, MemoryError, RecursionError,
         tokenize.TokenError, Warning,

@@ -1,3 +1,3 @@
-"""The version of this project: the one place where it stands."""
+"""The version of this project, defined only here."""
 
 __version__ = "0.1.0"

@@ -1,4 +1,4 @@
-"""Boards for calibration: what is printed on them, in metres.
+"""Calibration boards and their dimensions in metres.
 
 A board's frame: origin in the middle of its points, x right, y up, z out of the print, held so that
 
@@ -98,7 +98,7 @@ class Board:
 
     @property
     def looks_turned(self) -> bool:
-        """Whether the board looks the same turned by 180 degrees, so that it shows no direction."""
+        """Whether the board is symmetric under rotation by 180 deg: its direction is ambiguous."""
         if self.kind == "checkerboard":
             return (self.columns + self.rows) % 2 == 0
         if self.kind == "asymmetric-circles":

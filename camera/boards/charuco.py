@@ -1,9 +1,9 @@
 """Corners of a ChArUco board: OpenCV reads the markers, and each corner is measured on its edges.
 
-The markers fill most of the white squares, so that a window round a corner holds their edges, too,
-which draw it away. What is measured here are two strips along the corner's own two edges, as wide
-as the white between edge and marker. Corners whose markers were not read, for they are small,
-oblique or cut off by the image's border, are looked for where their neighbours say.
+The markers fill most of the white squares. A window round a corner therefore contains marker edges,
+which bias the corner. Instead, two strips along the corner's own edges are measured, as wide as the
+white margin between edge and marker. Corners whose markers were not read (small, oblique or cut off
+by the image's border) are searched at positions predicted from their neighbours.
 """
 
 from __future__ import annotations
@@ -24,21 +24,21 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 GreyImage = NDArray[np.uint8]
 
-# How far the strips follow the edges, in squares: farther, the lens bends them.
+# Length of the strips along the edges, in squares; farther out, the lens bends the edges.
 _ALONG = 0.4
-# An edge is no wider than this to either side (px), nor can it be measured in less.
+# Largest and smallest half-width of a strip (px).
 _WIDEST_PX = 3.0
 _NARROWEST_PX = 1.2
-# Blur and the gradient's own width carry the marker's edge so far towards the corner's.
+# By blur and the width of the gradient filter, the marker's edge reaches this far into the margin.
 _REACH_PX = 1.5
-# Away from where it is expected, in squares; and agreement with black and white as printed.
+# Largest distance from the predicted position, in squares; correlation with the printed pattern.
 _FARTHEST = 0.25
 _LEAST_AGREEMENT = 0.85
 _ITERATIONS = 40
 _STILL_PX = 1e-4
-# Corners that tell where their neighbour is.
+# Number of neighbours from which a missing corner is predicted.
 _NEIGHBOURS = 12
-# Fewer tell no plane.
+# Fewest corners that determine a plane.
 _FEWEST_FOUND = 4
 
 
@@ -128,7 +128,7 @@ def _interpolated(image: GreyImage, board: Board) -> tuple[IntArray, FloatArray]
 
 
 def measured_corners(image: GreyImage, grid: FloatArray, marker_share: float) -> FloatArray:
-    """Measure a grid of corners on their edges, and look for those that are missing.
+    """Measure a grid of corners on their edges, and search those that are missing.
 
     Parameters
     ----------
@@ -151,7 +151,7 @@ def measured_corners(image: GreyImage, grid: FloatArray, marker_share: float) ->
     rough, result = grid, np.full(grid.shape, np.nan)
     tried = np.zeros(grid.shape[:2], dtype=bool)
     while True:
-        # First those that were given, then, ring by ring, what borders on what was found.
+        # First the given corners, then, ring by ring, the neighbours of those found.
         known = rough if not tried.any() else result
         present = np.isfinite(known[..., 0])
         wanted = (present if not tried.any() else _bordering(present)) & ~tried
@@ -194,7 +194,7 @@ def _expected(
 ) -> tuple[FloatArray, FloatArray]:
     """Where a corner is expected, (2,), and the pixels of a square to the right and down, (2, 2).
 
-    The homography of all, plus what the nearest corners differ from it: that is the lens.
+    The homography of all corners, plus the deviation of the nearest ones, due to the lens.
     """
     places = np.argwhere(present)[:, ::-1].astype(np.float64)
     here = np.array([column, row], dtype=np.float64)
@@ -250,7 +250,7 @@ def _measured(
     across = area / np.linalg.norm(axes, axis=0)
     half_px = np.clip(white * across - _REACH_PX, _NARROWEST_PX, _WIDEST_PX)
     to_squares = np.linalg.inv(axes)
-    # Room for the whole window wherever it may go.
+    # Large enough for the window at any position within the search range.
     extent = (_ALONG + _FARTHEST) * np.abs(axes).sum(axis=1) + 1.0
     low = np.maximum(np.floor(start - extent), 1.0).astype(int)
     high = np.minimum(np.ceil(start + extent), np.array(grey.shape[::-1]) - 2.0).astype(int)

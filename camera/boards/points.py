@@ -21,9 +21,9 @@ _WINDOW = 0.3
 _SMALLEST_HALF_WINDOW = 2
 _LARGEST_HALF_WINDOW = 9
 _FEWEST_POINTS = 8
-# A checkerboard is looked for in pictures reduced to so many pixels along their longer side, one
-# after the other: what OpenCV's search takes grows faster than the picture, most where there is no
-# board, and squares of a few pixels are enough for it.
+# Lengths of the longer side (px) to which an image is reduced, in turn, to search a checkerboard.
+# The time of OpenCV's search grows faster than the image, most of all in images without a board,
+# and squares of a few pixels suffice.
 _SEARCHED_PX = (1280, 2048)
 
 
@@ -190,7 +190,7 @@ def _circles(image: GreyImage, board: Board) -> FloatArray:
         else cv2.CALIB_CB_SYMMETRIC_GRID
     )
     size = (board.columns, board.rows)
-    # Clustering bears more perspective, the plain search more clutter; light circles on a dark
+    # Clustering tolerates more perspective, the plain search more clutter; light circles on a dark
     # ground are dark ones in the negative; and half-height images flatten circle and grid.
     for taller in (False, True):
         for negative in (False, True):
@@ -235,7 +235,7 @@ def circle_centroids(image: GreyImage, grid: FloatArray) -> FloatArray:
     Returns
     -------
     (rows, columns, 2) array
-        The area centroid of each; a place where there is no circle to measure stays as it is.
+        The area centroid of each; places without a measurable circle are unchanged.
     """
     spacing = _least_spacing(grid.astype(np.float32))
     result = grid.copy()

@@ -104,13 +104,13 @@ class Adjusted:
     ----------
     estimate : Estimate
     sigma_px : float
-        Noise of a coordinate that the residuals show (robust, degrees of freedom taken off).
+        Noise of a coordinate that the residuals show (robust, by degrees of freedom).
     residuals : (N, 2) float64
         Seen less projected, pixels.
     weights : (N, 2) float64
         Robust weights, 1 where a residual counts in full.
     covariance : (14, 14) float64
-        Of the intrinsics; zero for what was held fixed.
+        Of the intrinsics; zero for those held fixed.
     pose_covariances : (V, 6, 6) float64
         Of each view's rotation (perturbed from the left, in the camera frame, rad) and translation
         (m), the intrinsics' uncertainty included.

@@ -21,7 +21,7 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 _OUTLIER_FACTOR = 3.0
-# A point is wrong when it is so many standard deviations off.
+# Residual, in standard deviations, beyond which a point is an outlier.
 _WRONG_POINT = 8.0
 _FEWEST_POINTS = 8
 
@@ -53,7 +53,7 @@ class Calibration:
     ----------
     adjusted : Adjusted
     points : Points
-        What it was fitted to; circles' shifts are taken off.
+        The points that it was fitted to, corrected for the circles' shifts.
     names : tuple of str
         The views' names.
     outliers : tuple of (str, float)
@@ -130,12 +130,12 @@ def calibrate(
     start = _staged(start, measured, settings, radius)
 
     outliers: tuple[tuple[str, float], ...] = ()
-    # What a model lacks is no picture's fault, so outliers are told by the fullest one.
+    # Outliers are detected with the fullest model: residuals of a simpler one are partly its own.
     most = settings.most
     for count in range(min(2, most), most + 1):
         first = fit_points(start, measured, settings, settings.lens(count), radius)
         start = first[0].estimate
-    # Before more is asked of views that can't tell.
+    # Checked before terms are fitted that such views do not determine.
     demand_different_views(first[0], normals_spread_deg(start.rotations))
     if settings.tangential is not False:
         full = settings.lens(most, tangential=True)
@@ -203,7 +203,7 @@ def _without_wrong_points(
     residuals = seen - project_estimate(estimate, points)[0]
     right = np.all(np.abs(residuals) < _WRONG_POINT * sigma_px, axis=1)
     counts = np.add.reduceat(right.astype(np.int64), points.starts)
-    # A picture of which too little is left stays as it is: the robust loss deals with it.
+    # A picture with too few points left is unchanged: the robust loss deals with it.
     right |= np.repeat(counts < _FEWEST_POINTS, points.counts)
     counts = np.add.reduceat(right.astype(np.int64), points.starts)
     trimmed = replace(

@@ -1,4 +1,4 @@
-"""What is demanded of views of a board before a calibration is believed, and what is warned of."""
+"""Requirements on the views of a board, and warnings about a calibration."""
 
 from __future__ import annotations
 
@@ -31,22 +31,22 @@ def demand_enough(count: int, without: str = "") -> None:
 
 
 def demand_different_views(fit: Adjusted, spread_deg: float) -> None:
-    """Refuse views from which focal length and distance can't be told apart."""
+    """Refuse views that do not separate focal length and distance."""
     variance = float(fit.covariance[0, 0])
-    # Where nothing is known, rounding can make the variance anything.
+    # In a singular problem rounding can make the variance zero or negative.
     sigma = np.sqrt(variance) if variance > 0.0 else np.inf
     relative = float(sigma / fit.estimate.intrinsics[0])
     if spread_deg < _SMALLEST_SPREAD_DEG or not relative < _LARGEST_SCALE_SIGMA:
         raise CalibrationError(
-            f"the boards stand too much alike: their normals differ by at most {spread_deg:.1f} "
-            f"deg and leave the focal length {100.0 * relative:.2g} % uncertain, for it can't be "
-            "told from the distance; tilt the board by 20 to 45 deg in different directions "
-            "between pictures"
+            f"the boards have almost the same orientation: their normals differ by at most "
+            f"{spread_deg:.1f} deg and leave the focal length {100.0 * relative:.2g} % uncertain, "
+            "because it is not separable from the distance; tilt the board by 20 to 45 deg in "
+            "different directions between pictures"
         )
 
 
 def warnings_of(fit: Adjusted, points: Points, spread_deg: float) -> list[str]:
-    """What would make a calibration firmer."""
+    """Warnings about weaknesses of a calibration."""
     warnings = []
     if fit.rms_px > max(_LARGEST_RMS_PX, _LARGEST_RMS_WIDTHS * points.width):
         warnings.append(
@@ -76,7 +76,7 @@ def coverage(points: Points, columns: int = 8, rows: int = 6) -> IntArray:
 
 
 def coverage_warnings(intrinsics: FloatArray, points: Points) -> list[str]:
-    """What of the image no point was seen in."""
+    """Parts of the image in which no point was seen."""
     warnings = []
     thirds = coverage(points, 3, 3)
     across, down = ("left", "middle", "right"), ("top", "middle", "bottom")

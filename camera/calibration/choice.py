@@ -17,13 +17,14 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 _FOLDS = 8
-# A coefficient more has to lower the sum of the squared hold-out errors by so many variances.
+# An additional coefficient must lower the sum of squared hold-out errors by this many variances.
 _WORTH = 4.0
-# The two tangential terms by so many, and they have to differ from 0 by so many variances: where a
-# board's points are found a little wrong, always in the same way, that can look like decentering.
+# The two tangential terms must lower it by `_TANGENTIAL_WORTH` variances and differ from 0 by
+# `_TANGENTIAL_SIGNIFICANCE` variances: small systematic errors of a board's points can look like
+# decentering.
 _TANGENTIAL_WORTH = 20.0
 _TANGENTIAL_SIGNIFICANCE = 50.0
-# The polynomial instead of a rational function of as few coefficients, by so many.
+# The same for the polynomial, compared with a rational function with as many coefficients.
 _POLYNOMIAL_WORTH = 20.0
 
 
@@ -35,7 +36,7 @@ class Candidate:
     ----------
     adjusted : Adjusted
     points : Points
-        What it was fitted to; circles' shifts are taken off.
+        The points that it was fitted to, corrected for the circles' shifts.
     holdout_px : float
         `holdout_error`.
     """
@@ -53,12 +54,12 @@ def choose_lens(
 ) -> tuple[FreeLens, Candidates]:
     """Fit with more and more coefficients free, and choose.
 
-    The fewest radial coefficients whose hold-out error is not worse than the best. Tangential terms
-    if they lower it, beside those, by more than they would by chance, and are significant; then the
-    radial ones are chosen anew. The polynomial instead of the rational function if, beside the same
-    tangential terms, it needs fewer coefficients for an error that is not worse, or lowers the
-    error by more than it would by chance; what it has then not been asked yet is whether it needs
-    tangential terms.
+    Chosen are the fewest radial coefficients whose hold-out error is not worse than the best.
+    Tangential terms are added if they lower that error by more than they would by chance and are
+    significant; then the radial coefficients are chosen again. The polynomial replaces the rational
+    function if, with the same tangential terms, it needs fewer coefficients for an error that is
+    not worse, or lowers the error by more than it would by chance. Whether it needs tangential
+    terms is then tested as well.
 
     Parameters
     ----------
@@ -149,13 +150,13 @@ def _fewest_needed(tried: Candidates) -> FreeLens:
 
 
 def _is_worth_it(radial: Candidate, decentred: Candidate) -> bool:
-    """Whether tangential terms explain what was held out, and are more than noise."""
+    """Whether tangential terms explain the held-out points and are more than noise."""
     lower = _is_lower(decentred, radial, _TANGENTIAL_WORTH)
     return lower and tangential_significance(decentred.adjusted) >= _TANGENTIAL_SIGNIFICANCE
 
 
 def _is_lower(candidate: Candidate, other: Candidate, variances: float) -> bool:
-    """Whether a candidate's sum of squared hold-out errors is lower by so many variances."""
+    """Whether a candidate's sum of squared hold-out errors is lower by at least `variances`."""
     slack = variances * candidate.adjusted.sigma_px**2 / len(candidate.points.board)
     return candidate.holdout_px**2 + slack <= other.holdout_px**2
 
@@ -182,7 +183,7 @@ def holdout_error(
 ) -> float:
     """RMS reprojection error in views that the intrinsics were not fitted to, pixels.
 
-    Of what is held out only the poses are fitted.
+    For held-out points only the poses are fitted.
 
     Parameters
     ----------

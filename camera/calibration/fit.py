@@ -37,7 +37,7 @@ def fit_points(
     -------
     fit : Adjusted
     points : Points
-        With the circles' shifts taken off (`circle_shifts`).
+        Corrected for the circles' shifts (`circle_shifts`).
     """
     span = lens.span(settings.aspect)
     start = replace(start, intrinsics=_within(start.intrinsics, points, span, settings.aspect))
@@ -54,7 +54,7 @@ def fit_to_centres(
     points: Points,
     radius_m: float,
 ) -> tuple[Adjusted, Points]:
-    """Fit to points; of circles, again and again less the shifts that the fit before shows.
+    """Fit to points; with circles, repeatedly, corrected for the shifts by the previous fit.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ def fit_to_centres(
     -------
     fit : Adjusted
     points : Points
-        With the circles' shifts taken off (`circle_shifts`).
+        Corrected for the circles' shifts (`circle_shifts`).
     """
     fit = adjusted(start, points)
     corrected = points
@@ -86,7 +86,7 @@ def fit_to_centres(
 def _within(
     intrinsics: FloatArray, points: Points, span: FloatArray, aspect: float | None
 ) -> FloatArray:
-    """The start with what is not free at its fixed value: no coefficient, the known aspect."""
+    """The start with fixed parameters at their values: no coefficient, the known aspect."""
     free = np.any(span != 0.0, axis=1)
     inside = np.where(free, intrinsics, 0.0)
     if aspect is not None:

@@ -115,7 +115,7 @@ def place_on_floor(
     start = Estimate(intrinsics, *board_poses(intrinsics, points))
 
     def adjusted(start: Estimate, points: Points) -> Adjusted:
-        # Not robust with few: four points have no residuals to tell outliers by.
+        # Not robust with few points: four, for example, leave too few residuals to find outliers.
         return adjust(start, points, np.zeros((COUNT, 0)), robust=len(floor) > 8)
 
     try:
@@ -227,5 +227,5 @@ def _check(pixels: FloatArray, floor: FloatArray) -> None:
         if np.any(spreads[:, 0] < 1e-6 * spreads[:, 1]):
             raise CalibrationError(
                 f"all but one of the points lie in a line {what}: add another beside it, or poses "
-                "can't be told apart"
+                "are ambiguous"
             )

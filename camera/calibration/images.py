@@ -26,17 +26,16 @@ VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpe
 def calibration_images(
     inputs: Sequence[Path], every: int, most: int
 ) -> Iterator[tuple[str, GreyImage]]:
-    """Names and pictures, grey, one after the other.
+    """Names and grey images, one after the other.
 
     Parameters
     ----------
     inputs : sequence of Path
-        Images, folders of images, videos. A file that is named twice is taken once: the same
-        picture again tells nothing more.
+        Images, folders of images, videos. A file that is named twice is used once.
     every : int
-        Of a video every so many-th frame is taken.
+        Only every `every`-th frame of a video is used.
     most : int
-        At most so many images are taken, evenly over all, and so many frames of each video.
+        At most this many images are used, evenly spaced, and at most this many frames per video.
 
     Raises
     ------
@@ -93,9 +92,9 @@ def read_grey(path: Path) -> GreyImage:
 
 
 def grey_of_content(content: bytes, name: object) -> GreyImage:
-    """What `read_grey` reads, of a file's content; `name` is what messages call it.
+    """Decode the content of an image file as `read_grey` does; messages name it `name`.
 
-    How much memory the image takes is not looked at: `storage.image_header` says it beforehand.
+    The memory that the image takes is not checked here: see `storage.image_header`.
 
     Raises
     ------
@@ -126,7 +125,7 @@ def _not_an_image(name: object) -> CalibrationError:
 
 
 def _is_image(path: Path) -> bool:
-    # Hidden files are none: some systems keep notes, named ._ and the picture's name, beside it.
+    # Hidden files are skipped: some systems keep metadata in files named ._ and the image's name.
     return path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".")
 
 
@@ -145,10 +144,10 @@ def _frames(path: Path, every: int, most: int) -> Iterator[tuple[str, GreyImage]
     try:
         if not video.isOpened():
             raise CalibrationError(f"{path}: not a video that OpenCV can read")
-        # The sensor's pixels, as of photographs: a telephone's note of how it was held turns none.
+        # The sensor's pixels, as with photographs: orientation metadata is ignored.
         video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
         count = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
-        # A long video is thinned, so that the frames taken are from all of it.
+        # The frames are spread over the whole video.
         step = max(every, -(-count // most)) if count > 0 else every
         number = taken = 0
         while taken < most and video.grab():
@@ -163,7 +162,6 @@ def _frames(path: Path, every: int, most: int) -> Iterator[tuple[str, GreyImage]
         if taken == 0:
             raise CalibrationError(f"{path}: a video without frames")
         if taken < most and number < count:
-            told = f"{path}: {number} of the {count} frames it speaks of are there"
-            print(told, file=sys.stderr)
+            print(f"{path}: only {number} of {count} frames can be read", file=sys.stderr)
     finally:
         video.release()

@@ -1,4 +1,4 @@
-"""What a calibration adjusts: the projection with its derivatives, rigid poses, and the parameters.
+"""Model of the calibration: the projection with its derivatives, rigid poses, and the parameters.
 
 Intrinsics are always the vector ``(scaleX, scaleY, offsetX, offsetY, a2, a3, b1, b2, b3, p1, p2,
 k1, k2, k3)``, the order of the ``.cam`` file. What is free of them is a matrix `span`, so that
@@ -47,8 +47,8 @@ FREE_COEFFICIENTS: tuple[tuple[str, ...], ...] = (
 
 # The image's corner must be seen at a radius that stays below the fold by this share.
 _FOLD_MARGIN = 0.01
-# Directions in which it is looked how far such a lens sees, and places on each of the border's
-# sides.
+# Number of directions in which the limit of such a lens is searched, and of places on each side
+# of the border.
 _DIRECTIONS = 128
 _BORDER_PLACES = 9
 

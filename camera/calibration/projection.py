@@ -1,7 +1,7 @@
-"""How sure a calibration is of where it projects, and how far two cameras' projections differ.
+"""Uncertainty of a calibration's projections, and differences between those of two cameras.
 
-A small rotation of the camera looks the same as a shift of the principal point, and the pose takes
-it up; so what is common with a rotation is taken off, as mrcal does.
+A small rotation of the camera has the same effect as a shift of the principal point, and the pose
+absorbs it; so the component common with a rotation is removed, as in mrcal.
 """
 
 from __future__ import annotations

@@ -91,7 +91,7 @@ class CalibrationSettings:
         return self._all if self.coefficients is None else self.coefficients
 
     def lens(self, count: int, *, tangential: bool = False) -> FreeLens:
-        """The lens with so many free radial coefficients."""
+        """The lens with `count` free radial coefficients."""
         if self.polynomial:
             return FreeLens(0, tangential, count)
         return FreeLens(count, tangential)

@@ -23,7 +23,7 @@ FloatArray = NDArray[np.float64]
 
 # Focal lengths that are tried, in widths of the image: from 130 to 6 degrees across.
 _FOCAL_WIDTHS = (0.25, 0.4, 0.6, 0.9, 1.4, 2.2, 4.0, 8.0)
-# Views that are enough to tell a good start from a bad one.
+# Number of views used to compare starts.
 _FEW_VIEWS = 10
 _LOOSE = 1e-4
 
@@ -112,8 +112,8 @@ def _pose_from_homography(board: FloatArray, xy: FloatArray) -> tuple[FloatArray
 def best_poses(estimate: Estimate, points: Points, sigma_px: float | None = None) -> Estimate:
     """Each pose refined, from its start and from the same board tilted the other way.
 
-    Seen from afar a board and its mirror image in depth look almost alike, so that a start can lie
-    in the wrong valley (Schweighofer and Pinz 2006).
+    From afar a board and its mirror image in depth look almost alike, so that a start can be
+    in the wrong minimum (Schweighofer and Pinz 2006).
     """
     candidates = [estimate, Estimate(estimate.intrinsics, *_mirrored(estimate, points))]
     fits = [_poses_alone(candidate, points, sigma_px) for candidate in candidates]

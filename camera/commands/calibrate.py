@@ -54,7 +54,7 @@ def perform(options: Calibrate) -> int:
     for path in (options.output, report, *names.values()):
         if path.exists() and not options.force:
             raise OutputExistsError(path)
-    # What would be told only after minutes of work.
+    # Checked first, not after minutes of work.
     if report == options.output:
         raise CalibrationError(f"{report}: the report is written there: expected a name in .cam")
     if not options.output.parent.exists():
@@ -119,7 +119,7 @@ def _beside(output: Path, name: str) -> Path:
 def find_views(
     images: Iterable[tuple[str, GreyImage]], board: Board
 ) -> tuple[list[BoardView], tuple[int, int]]:
-    """Find the board in pictures; those without it are told on standard error.
+    """Find the board in images; those without it are listed on standard error.
 
     Raises
     ------
@@ -209,7 +209,7 @@ def radius_on_floor(path: Path, board: Board) -> float:
 
 
 def describe(calibration: Calibration, camera: Camera) -> str:
-    """What was found, for people."""
+    """Human-readable summary of the result."""
     sigma = np.sqrt(np.diag(calibration.adjusted.covariance))
     lines = [
         f"  {name:8s} {value:12.6g}" + (f" +- {s:.2g}" if s > 0.0 else "  (fixed)")

@@ -91,7 +91,7 @@ def read_text(path: Path) -> str:
 
 
 def _label(camera: Camera) -> str:
-    """What a camera's distortion is made of."""
+    """Name of a camera's distortion model, with its terms."""
     if not any(camera.brown):
         return "rational radial"
     parts = {
@@ -103,7 +103,7 @@ def _label(camera: Camera) -> str:
 
 
 def format_of_name(path: Path) -> Format:
-    """The format that a file's name asks for.
+    """The format that a file's name implies.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Converting a camera to another model: taken over where that contains it, else fitted."""
+"""Converts a camera to another model: exactly if the model contains it, else by a fit."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Rows = Literal["same", "halve", "double"]
 
 _IDENTITY = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
 
-# Grids of pixels: to fit on, and to look for the largest deviation on.
+# Grids of pixels: for the fit, and for the largest deviation.
 _FIT_GRID = (41, 31)
 _CHECK_GRID = (129, 97)
 _MANY_STEPS = 200
@@ -145,16 +145,16 @@ def convert_to_foreign(
 
 
 def contains(model: Model, source: AnyCamera, *, free: int = -1) -> bool:
-    """Whether a model holds a camera as it is; parameters as of `convert_to_foreign`."""
+    """Whether a model represents a camera exactly; parameters as of `convert_to_foreign`."""
     return _contained(source, model, COEFFICIENTS[model] if free < 0 else free) is not None
 
 
 def convert_to_camera(
     source: AnyCamera, rows: Rows = "same", pose: Camera | None = None
 ) -> Converted:
-    """Take over, or fit, the project's model.
+    """Convert to the project's model, exactly or by a fit.
 
-    A polynomial and tangential terms without a denominator are taken over as they are. Else the
+    A polynomial and tangential terms without a denominator are copied. Else the
     rational part is fitted beside the source's tangential terms and, where it comes not near, all
     of them and a polynomial together.
 
@@ -223,7 +223,7 @@ def convert_to_camera(
         raise ConversionError("the source's focal lengths or principal point are not possible here")
     spans = [free_span(count, None) for count in range(6)]
     if any(_tangential(source)):
-        # Last, the terms taken over may make up for what the radial part can't follow.
+        # Finally, the copied terms may compensate for what the radial part cannot follow.
         spans.append(free_span(5, None, tangential=True))
     together = free_span(5, None, tangential=any(_tangential(source)), polynomial=3)
     radius = np.hypot(rays[:, 0], rays[:, 1])
@@ -343,9 +343,9 @@ def _contained(source: AnyCamera, model: Model, number: int) -> ForeignCamera | 
         return ForeignCamera(model, source.width, source.height, fx, fy, cx, cy, found)
     if (source.model == "fisheye") != (model == "fisheye"):
         return None
-    room = COEFFICIENTS[model]
-    padded = (*source.distortion, *(0.0,) * room)[:room]
-    if any(source.distortion[room:]) or any(padded[number:]):
+    count = COEFFICIENTS[model]
+    padded = (*source.distortion, *(0.0,) * count)[:count]
+    if any(source.distortion[count:]) or any(padded[number:]):
         return None
     return replace(source, model=model, distortion=padded)
 
@@ -383,7 +383,7 @@ def _rays(source: AnyCamera, pixels: FloatArray) -> FloatArray:
 
 
 def _check(source: AnyCamera, rows: Rows) -> tuple[FloatArray, FloatArray]:
-    """The target's pixels that the deviation is looked for at, and their rays."""
+    """The target's pixels at which the deviation is evaluated, and their rays."""
     pixels = _grid(*target_size(source, rows), _CHECK_GRID)
     return pixels, _rays(source, source_pixels(pixels, rows))
 

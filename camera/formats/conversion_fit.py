@@ -1,4 +1,4 @@
-"""Fitting a camera to where another sees rays: least squares, the smallest largest error."""
+"""Fits one camera model to the projections of another: least squares and minimax."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
 
-#: A deviation that only rounding is left of.
+#: Deviation (px) up to which a conversion counts as exact: rounding only.
 EXACT_PX = 1e-6
 
-# Lawson's reweighting: so many rounds towards the smallest largest deviation.
+# Number of rounds of Lawson's reweighting, which minimises the largest deviation.
 _LAWSON_ROUNDS = 25
 _STEPS = 60
 _LAWSON_STEPS = 5

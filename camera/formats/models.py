@@ -1,6 +1,6 @@
 """The distortion models of other programs: OpenCV, ROS, Kalibr and COLMAP.
 
-All of them are pinhole cameras with pixel centres at integers (COLMAP's half a pixel is taken off
+All of them are pinhole cameras with pixel centres at integers (COLMAP's half a pixel is subtracted
 where its files are read) and a distortion of normalised coordinates x = X/Z, y = Y/Z:
 
 radtan
@@ -38,7 +38,7 @@ COEFFICIENTS: dict[Model, int] = {"radtan": 5, "rational": 12, "fisheye": 4}
 P1 = 2
 
 _LARGEST_SIDE_PX = 65536
-# An inverse is walked to from the image's centre in so many steps.
+# Number of steps from the image's centre in which the inverse is found.
 _WALK = 24
 _NEWTON_STEPS = 20
 _CONVERGED_PX = 1e-7
@@ -109,7 +109,7 @@ class ForeignCamera:
     def undistort(self, pixels: FloatArray) -> FloatArray:
         """(N, 2) undistorted normalised coordinates of (N, 2) pixels.
 
-        Newton's method, walking out from the centre so that no branch past a fold is taken.
+        Newton's method, continued outwards from the centre to avoid branches past a fold.
 
         Raises
         ------

@@ -1,6 +1,6 @@
 """OpenCV's YAML of a calibration, as its FileStorage and its calibration sample write it.
 
-A fisheye camera is told by ``fisheye_model: 1``, as the sample does. An image's size stands in
+A fisheye camera has ``fisheye_model: 1``, as in the sample. The size of the image is given by
 ``image_width`` and ``image_height``.
 """
 
@@ -35,7 +35,7 @@ def parse_opencv(text: str, name: str = "<text>") -> ForeignCamera:
     sides = []
     for key, other in (("image_width", "image_Width"), ("image_height", "image_Height")):
         if key not in content and other not in content:
-            # OpenCV itself does not ask for the size; its stereo sample writes none.
+            # OpenCV itself does not require the size; its stereo sample writes none.
             raise ConversionError(
                 f"{name}: lacks {key}: add the images' size, a line such as '{key}: 640'"
             )
@@ -50,7 +50,7 @@ def parse_opencv(text: str, name: str = "<text>") -> ForeignCamera:
 
 
 def opencv_model(coefficients: list[float], *, fisheye: bool, name: str) -> Model:
-    """The model that OpenCV takes so many coefficients for.
+    """The model that OpenCV uses for this number of coefficients.
 
     Raises
     ------
@@ -83,16 +83,17 @@ def foreign(
     pinhole: tuple[float, float, float, float],
     coefficients: list[float],
 ) -> ForeignCamera:
-    """A camera; coefficients that the model has and the file has not are 0.
+    """Make a camera; coefficients of the model that the file does not give are 0.
 
     Raises
     ------
     ConversionError
         If there can be no such camera; the message names the file.
     """
-    room = COEFFICIENTS[model]
+    count = COEFFICIENTS[model]
+    padded = (*coefficients, *(0.0,) * count)[:count]
     try:
-        return ForeignCamera(model, width, height, *pinhole, (*coefficients, *(0.0,) * room)[:room])
+        return ForeignCamera(model, width, height, *pinhole, padded)
     except ConversionError as error:
         raise ConversionError(f"{name}: {error}") from None
 

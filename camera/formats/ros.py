@@ -11,7 +11,7 @@ from camera.formats.opencv import foreign
 from camera.formats.plain_yaml import first_of, numbers, parse_yaml, pinhole_matrix, shortest, whole
 from storage.messages import excerpt
 
-#: What ROS calls the models (sensor_msgs/distortion_models.h).
+#: Names of the models in ROS (sensor_msgs/distortion_models.h).
 ROS_NAMES: dict[Model, str] = {
     "radtan": "plumb_bob",
     "rational": "rational_polynomial",
@@ -45,7 +45,7 @@ def camera_from_message(
     k : 9 floats
         The camera matrix of the raw image, row by row.
     name : str
-        Stands for the message in errors.
+        What errors call the message.
 
     Raises
     ------

@@ -1,1 +1,1 @@
-"""Detected rows held against reference rows of the same run."""
+"""Compares detected rows with reference rows of the same run."""

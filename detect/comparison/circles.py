@@ -1,4 +1,4 @@
-"""Detected discs held against reference rows of the same run.
+"""Compares detected discs with reference rows of the same run.
 
 Frames are matched by the names of their images; in each, detected rows are paired with reference
 rows one to one within a gate: in the image, each where it was seen, or on the floor. What is left
@@ -187,7 +187,7 @@ def compare_frames(
     reference_name: str = "reference",
     detected_name: str = "detected",
 ) -> Comparison:
-    """Compare the discs of two sets of frames; the names stand for them in errors and reports.
+    """Compare the discs of two sets of frames; errors and reports use their names.
 
     See `compare_runs`.
     """

@@ -1,4 +1,4 @@
-"""The command ``detect compare``: detected rows held against reference rows."""
+"""The command ``detect compare``: compares detected rows with reference rows."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ def perform(command: Compare) -> int:
 
 
 def _demand_rows(command: Compare) -> None:
-    """Refuse to compare what is not there, and say where it comes from."""
+    """Refuse missing files, with a message that says how to make them."""
     kind = "lines" if command.lines else "circles"
     reference = command.reference or command.run / f"map.{kind}"
     detected = command.detected or command.run / f"detected.{kind}"
     if not reference.exists():
         raise DetectError(
-            f"{reference}: no such landmark file: name the reference rows by --reference"
+            f"{reference}: no such landmark file: give the reference rows with --reference"
         )
     if not detected.exists():
         raise DetectError(

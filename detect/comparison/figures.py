@@ -26,7 +26,7 @@ def quantile(values: FloatArray, q: float) -> float | None:
 def normalised_error(
     squared: FloatArray, *, dof_per_row: int, left_out: int = 0
 ) -> NormalisedError:
-    """Mean of squared normalised errors and where it should lie.
+    """Mean of squared normalised errors and the interval where it should be.
 
     Parameters
     ----------

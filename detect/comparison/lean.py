@@ -16,7 +16,7 @@ FloatArray = NDArray[np.float64]
 #: Huber's constant: 95 % efficient where errors are normal.
 _HUBER = 1.345
 _LEAST_PAIRS = 4
-#: With fewer frames, their scatter does not tell how sure the lean is.
+#: With fewer frames, their scatter does not determine the uncertainty of the lean.
 _LEAST_FRAMES = 10
 _LARGEST_CONDITION = 1e10
 
@@ -68,7 +68,7 @@ def common_lean(
     Returns
     -------
     Lean or None
-        None where the rows are too few, or lie so that they cannot tell.
+        None if the rows are too few or do not determine it.
     """
     seen = image_positions(camera, reference_xy)
     usable = np.isfinite(seen).all(axis=1) & np.isfinite(image_positions(camera, detected_xy)).all(

@@ -1,9 +1,9 @@
-"""Detected lines held against reference rows of the same run.
+"""Compares detected lines with reference rows of the same run.
 
 Frames are matched by the names of their images; in each, detected rows are paired with reference
-rows one to one by bearing. A detected row can stand for several lines that were joined: its sigma
-then reaches them all, and reference rows left over within it are found too. What is still left over
-on either side is missed or extra.
+rows one to one by bearing. A detected row can represent several lines that were joined; unpaired
+reference rows within its sigma count as found, too. The remaining rows on either side are missed or
+extra.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ def compare_line_frames(
     reference_name: str = "reference",
     detected_name: str = "detected",
 ) -> LineComparison:
-    """Compare the lines of two sets of frames; the names stand for them in errors and reports.
+    """Compare the lines of two sets of frames; errors and reports use their names.
 
     See `compare_line_runs`.
     """
@@ -143,7 +143,7 @@ def pair_lines(
     reference, detected : sequence of LineLandmark
         Rows of one frame.
     options : LineCompareOptions
-        The gate: the larger of the tolerance and of so many of the detected row's sigmas.
+        The gate: the larger of the tolerance and a multiple of the detected row's sigma.
 
     Returns
     -------
@@ -175,7 +175,7 @@ def _count_joined(match: LineMatch, options: LineCompareOptions) -> int:
 def joined_lines(
     left: Sequence[LineLandmark], paired: Sequence[LineLandmark], options: LineCompareOptions
 ) -> NDArray[np.bool_]:
-    """Tell which reference rows are found with another's match.
+    """Which reference rows count as found through another row's match.
 
     Parameters
     ----------

@@ -25,7 +25,7 @@ _WORST_FRAMES = 10
 
 
 def line_comparison_tables(comparison: LineComparison) -> Group:
-    """Lay a comparison out for a rich console, which leaves colour out where there is no terminal.
+    """Format a comparison for a rich console, which omits colour if there is no terminal.
 
     Parameters
     ----------
@@ -43,7 +43,7 @@ def line_comparison_tables(comparison: LineComparison) -> Group:
 
 
 def format_line_text(comparison: LineComparison, *, width: int = 100) -> str:
-    """Lay a comparison out as plain text of at most `width` columns, without colour."""
+    """Format a comparison as plain text of at most `width` columns, without colour."""
     return plain_text(line_comparison_tables(comparison), width)
 
 

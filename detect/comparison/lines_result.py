@@ -1,4 +1,4 @@
-"""What a comparison of the lines of two runs is asked for, and what it answers."""
+"""Options and result of a comparison of the lines of two runs."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class LineCompareOptions:
 
 @dataclass(frozen=True, slots=True)
 class LineFrameScore:
-    """What became of one frame's rows; `joined` ones were found with another row's match."""
+    """Result for one frame's rows; `joined` ones were found with another row's match."""
 
     name: str
     matched: int
@@ -67,8 +67,8 @@ class LineComparison:
     matched : int
         Pairs of a reference and a detected row; no row is in two of them.
     joined : int
-        Further reference rows that lie within the deviation of a matched detected row: that row
-        stands for several lines.
+        Further reference rows within the deviation of a matched detected row, which represents
+        several lines.
     set_aside : int
         Detected rows on reference rows that do not count.
     recall, precision : float or None
@@ -109,12 +109,12 @@ class LineComparison:
 
     @property
     def found(self) -> int:
-        """Reference rows that a detected row stands for, alone or with others."""
+        """Reference rows that a detected row represents, alone or with others."""
         return self.matched + self.joined
 
     @property
     def missed(self) -> int:
-        """Reference rows that no detected row stands for."""
+        """Reference rows that no detected row represents."""
         return self.reference - self.found
 
     @property

@@ -1,4 +1,4 @@
-"""Which rows of two runs can be held against each other: frames by image, rows one to one."""
+"""Pairs rows of two runs: frames by image, rows one to one."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def pair_frames(
     all_frames : bool
         Keep frames that only one run has: with no rows on the other side.
     reference_name, detected_name : str
-        Stand for the runs in errors.
+        What errors call the runs.
 
     Returns
     -------

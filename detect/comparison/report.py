@@ -32,7 +32,7 @@ _WORST_FRAMES = 10
 
 
 def comparison_tables(comparison: Comparison) -> Group:
-    """Lay a comparison out for a rich console, which leaves colour out where there is no terminal.
+    """Format a comparison for a rich console, which omits colour if there is no terminal.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ def comparison_tables(comparison: Comparison) -> Group:
 
 
 def format_text(comparison: Comparison, *, width: int = 100) -> str:
-    """Lay a comparison out as plain text of at most `width` columns, without colour."""
+    """Format a comparison as plain text of at most `width` columns, without colour."""
     return plain_text(comparison_tables(comparison), width)
 
 
@@ -168,7 +168,7 @@ def _any_levelled(c: Comparison) -> bool:
 
 
 def lean_text(lean: CommonLean) -> str:
-    """What would explain the differences on the floor, and what is left."""
+    """Tilt and height that would explain the differences on the floor, and the residuals."""
     left = _median_and_most(lean.left.median_m, lean.left.most_m, 4, "m")
     return (
         f"pitch {lean.pitch_deg:.3f} +- {lean.pitch_sigma_deg:.3f} deg, "

@@ -1,4 +1,4 @@
-"""What a comparison of two runs is asked for, and what it answers."""
+"""Options and result of a comparison of two runs."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class CompareOptions:
 
 @dataclass(frozen=True, slots=True)
 class FrameScore:
-    """What became of one frame's rows."""
+    """Result for one frame's rows."""
 
     name: str
     matched: int
@@ -106,11 +106,11 @@ class NormalisedError:
     Attributes
     ----------
     per_dof : float or None
-        Mean per degree of freedom: 1 if the covariance is right, more if it promises too much.
+        Mean per degree of freedom: 1 if the covariance is right, more if it is too small.
     dof : int
         Degrees of freedom: two for each matched disc, one for each matched line.
     band : (float, float) or None
-        Where `per_dof` lies with 95 % probability if errors are normal, independent and have that
+        Interval of `per_dof` with 95 % probability if errors are normal, independent and have that
         covariance.
     left_out : int
         Matched rows whose covariance is not positive definite, or whose sigma is not positive.
@@ -168,7 +168,7 @@ class FloorBin:
 
 @dataclass(frozen=True, slots=True)
 class CommonLean:
-    """What constant tilt and height of the camera explain the differences, and what is left.
+    """Constant tilt and height of the camera that explain the differences, and the residuals.
 
     Each figure with its standard deviation; positive pitch and roll as in a ``.tilt`` file.
     """
@@ -268,7 +268,7 @@ class Comparison:
 
 
 class Rates(Protocol):
-    """What demands are made on: a comparison of discs or of lines."""
+    """A comparison of discs or of lines, for which limits can be demanded."""
 
     @property
     def recall(self) -> float | None:

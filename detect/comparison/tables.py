@@ -1,4 +1,4 @@
-"""The pieces that the reports of comparisons are laid out of."""
+"""The parts of the reports of comparisons."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ NONE = "-"
 
 
 def summary_table(rows: Iterable[tuple[str, str]]) -> Table:
-    """Lay out names and their values, which may wrap."""
+    """A table of names and values, which may wrap."""
     table = Table(box=None, show_header=False, pad_edge=False)
     table.add_column(style="bold", no_wrap=True)
     table.add_column(overflow="fold")
@@ -75,5 +75,5 @@ def number(value: float | None, decimals: int) -> str:
 
 
 def printable(name: str) -> str:
-    """A name from a file, with what a terminal would choke on or obey escaped."""
+    """A name from a file, with control characters escaped."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in name)

@@ -75,7 +75,7 @@ def outline_disc(
     settings : CircleSettings
         The radii.
     text : str
-        Stands above.
+        Written above.
     edge_colour : Colour
         Of the edge.
     """

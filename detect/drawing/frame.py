@@ -1,6 +1,6 @@
 """Rows of one frame drawn into its image: discs, verticals, markers, tilt, and their residuals.
 
-What is drawn comes from files alone; nothing is detected again. Outlines of discs go through the
+Everything drawn comes from files; nothing is detected again. Outlines of discs go through the
 tilt of the frame, where the rows are corrected for it, and through the lens; verticals through the
 lens, with a bar of one standard deviation to each side where they cross the horizon (the report's
 figures 5, 6 and 8). Where there are reference rows, those that are missing are drawn as well, and
@@ -63,13 +63,13 @@ def draw_rows(
     camera : Camera or None
         The calibrated camera; without one, only markers are drawn.
     rows : SeenRows
-        What the files say.
+        The rows of the files.
     settings : CircleSettings
         The radii of the discs' outlines.
     gate, line_gate : CompareOptions, LineCompareOptions
         What counts as the same disc or vertical as one of the reference.
     title : str
-        Stands first in the line below.
+        Beginning of the line below the picture.
 
     Returns
     -------
@@ -122,7 +122,7 @@ def sigma_bars(camera: Camera, ends: FloatArray, sigma_rad: FloatArray) -> Float
     Parameters
     ----------
     camera : Camera
-        Its own horizon is meant, that of the level robot.
+        Gives the horizon, that of the level robot.
     ends : (N, 4) float64
         As for `line_curves`; a line that ends before the horizon is made longer.
     sigma_rad : (N,) float64

@@ -1,4 +1,4 @@
-"""What stands at the head of a file of rows: how they were made."""
+"""Reads the head of a file of rows: how they were made."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from detect.settings import CircleSettings
 from detect.tune.grid import parameter_value
 from storage.messages import excerpt
 
-# The head is what stands before the first row; nobody writes so much.
+# The head is what precedes the first row; real ones are much shorter.
 _LONGEST_BYTES = 1 << 16
 #: Settings that are several numbers.
 _PAIRS, _LIST = "refine_steps_px", "blurred_widths"
@@ -46,7 +46,7 @@ class FileHead:
 
     @property
     def circle_settings(self) -> CircleSettings:
-        """The settings of discs, the defaults where the head does not tell them.
+        """The settings of discs, the defaults where the head does not give them.
 
         Raises
         ------
@@ -125,6 +125,6 @@ def _line_values(settings: Iterable[tuple[str, str]]) -> dict[str, Any]:
 
 
 def _values(kind: type, settings: Iterable[tuple[str, str]]) -> dict[str, Any]:
-    """The settings that a detector knows, as what they are."""
+    """The settings that a detector has, converted to their types."""
     known = {field.name for field in fields(kind)}
     return {name: parameter_value(kind, name, text) for name, text in settings if name in known}

@@ -1,4 +1,4 @@
-"""Rows of a run from files, image by image: what was detected, and what it is held against."""
+"""Rows of a run from files, image by image: detections and reference rows."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ KINDS = ("circles", "lines", "markers", "tilt")
 
 @dataclass(frozen=True, slots=True)
 class SeenRows:
-    """What files say of one image; None where there is no file.
+    """The files' rows of one image; None where there is no file.
 
     Attributes
     ----------
@@ -33,7 +33,7 @@ class SeenRows:
     reference_by : (float, float) or None
         The same of the reference rows.
     reference_circles, reference_lines : tuple of rows or None
-        What they are held against; None also where that file does not know the image.
+        What they are compared with; None also if that file does not have the image.
     """
 
     circles: tuple[CircleLandmark, ...] | None = None
@@ -57,7 +57,7 @@ class SeenFiles:
     heads : dict
         Their heads, by kind.
     reference_circles, reference_lines : path or None
-        What they are held against.
+        The reference rows.
     """
 
     detected: dict[str, Path]
@@ -78,7 +78,7 @@ class SeenFiles:
 
 @dataclass(frozen=True)
 class RowSource:
-    """Rows of a run, looked up by image; of the files, only where frames stand is in memory."""
+    """Rows of a run by image; of the files, only the offsets of frames are in memory."""
 
     files: SeenFiles
     _frames: dict[str, FramesByImage] = field(default_factory=dict)
@@ -113,7 +113,7 @@ def find_files(run: ImageRun, options: RowFiles) -> SeenFiles:
     run : ImageRun
         The run.
     options : RowFiles
-        What a command line says of them.
+        The options of a command line.
 
     Returns
     -------
@@ -148,7 +148,7 @@ def find_files(run: ImageRun, options: RowFiles) -> SeenFiles:
 
 
 def open_rows(files: SeenFiles) -> RowSource:
-    """Look through the files.
+    """Find and index the files.
 
     Raises
     ------

@@ -44,8 +44,9 @@ def draw_lines(
 ) -> NDArray[np.uint8]:
     """Draw lines through the distortion, with bars of their standard deviations on the horizon.
 
-    Lines made of several edges are drawn in another colour. A bar reaches one standard deviation to
-    each side of the column where the line's own edge crosses the horizon (the report's figure 6).
+    Lines joined from several edges are drawn in another colour. A bar reaches one standard
+    deviation to each side of the column where the line's own edge crosses the horizon (the report's
+    figure 6).
 
     Parameters
     ----------
@@ -93,7 +94,7 @@ def draw_tracks(
     rejected: bool = True,
     reasons: bool = True,
 ) -> NDArray[np.uint8]:
-    """Draw the points of tracks, coloured by what became of them, with a legend.
+    """Draw the points of tracks, coloured by their fates, with a legend.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Which frames of a run are looked at."""
+"""Selection of frames of a run."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class FrameSelection:
     names: frozenset[str] = frozenset()
 
     def expected(self, frames: Frames) -> int | None:
-        """About how many frames that will be; None if nobody knows."""
+        """Approximate number of these frames; None if unknown."""
         if self.ranges or self.names or frames.expected is None:
             return None
         return -(-frames.expected // self.every)
@@ -55,7 +55,7 @@ class FrameSelection:
 
 
 def select_frames(frames: Frames, wanted: Sequence[str], every: int) -> FrameSelection:
-    """Read what a command line says about frames.
+    """Parse the selection of frames of a command line.
 
     Parameters
     ----------

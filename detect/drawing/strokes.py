@@ -15,9 +15,9 @@ FloatArray = NDArray[np.float64]
 Colour = tuple[int, int, int]
 
 _SUBPIXEL_BITS = 4
-# OpenCV's fixed-point coordinates are 32 bits; far beyond any picture, less is as good.
+# OpenCV's fixed-point coordinates have 32 bits; curves that go far outside are not drawn.
 _FARTHEST_PX = 1e6
-# Pictures of so many columns are drawn into by strokes of one pixel; those of telephones have more.
+# Up to this many columns strokes are one pixel wide; wider pictures (of phones) get wider strokes.
 _COLUMNS = 1500
 
 

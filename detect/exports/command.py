@@ -1,4 +1,4 @@
-"""What ``detect export`` does."""
+"""The command ``detect export``."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def perform(command: Export) -> int:
     places = {tables[0]: output} if command.to == "mcap" else table_files(output, tables)
     for path in places.values():
         if path.exists() and path.samefile(command.file):
-            raise DetectError(f"{path}: is what is exported: expected another place for the rows")
+            raise DetectError(f"{path}: is the file to export: expected another output")
     if command.to == "mcap":
         with write_whole(output, overwrite=command.force) as stream:
             count = write_mcap(stream, tables, rows, str(command.file))
@@ -74,7 +74,7 @@ def perform(command: Export) -> int:
 
 
 def table_files(output: Path, tables: list[TableName]) -> dict[TableName, Path]:
-    """Which file each table goes to: the first one to `output`, others beside it.
+    """The file of each table: the first one to `output`, others beside it.
 
     Steps are never first where there is anything else.
     """

@@ -1,7 +1,7 @@
 """Tables as CSV: comma separated, a line of names at the top, numbers as Python prints them.
 
-A number is the shortest text that gives the same float64; what is not known is empty; several
-identifiers stand between blanks.
+A number is the shortest text that gives the same float64; unknown values are empty; several
+identifiers are separated by blanks.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Rows as messages of ROS 2 in an MCAP file, by the package ``rosbags``: no ROS is needed.
 
-A message for each frame and table. The messages' definitions are made of the tables' columns
-(`message_definitions`) and stand in the file, so that whoever reads it needs no package of ours.
+There is a message for each frame and table. The messages' definitions follow from the tables'
+columns (`message_definitions`) and are in the file, so that readers need none of this project's.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def write_mcap(
     tables : iterable of str
         The tables that there are.
     rows : iterable of TableRow
-        With times; those of a frame stand together.
+        With times; those of a frame are consecutive.
     source : str
         What messages call the file.
 

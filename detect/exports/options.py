@@ -36,7 +36,7 @@ class Export:
         Times of the frames, rows `prefix seconds`; by default <file>.times, or that of what was
         detected together (detected.times).
     rate_hz : float
-        Without times: so many frames in a second, the first at 0 s. MCAP needs one or the other.
+        Frame rate to use without times, the first frame at 0 s. MCAP needs one or the other.
     force : bool
         Replace existing files.
     """

@@ -1,4 +1,4 @@
-"""Tables as Parquet, by the package ``pyarrow``: units and meanings stand with the columns."""
+"""Tables as Parquet, by the package ``pyarrow``: columns have units and descriptions."""
 
 from __future__ import annotations
 

@@ -53,7 +53,7 @@ class TableRow:
 
 
 class ExportedRows:
-    """The rows of a landmark or tilt file; iterating again begins anew.
+    """The rows of a landmark or tilt file; iterating again starts over.
 
     Parameters
     ----------

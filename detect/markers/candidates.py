@@ -3,7 +3,7 @@
 The grayscale closing I2 of the image I1 with a disc fills everything dark that the disc does not
 fit into; where I1 is much darker than I2 is a candidate for (a part of) a marker. RAWSEEDS
 deliverable D2.1 part 2. The disc is an octagon here, which two squares and some crosses make up at
-a cost that grows little with its size, and large markers are looked for in reduced images.
+a cost that grows little with its size, and large markers are searched in reduced images.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ def closing(grey: GreyImage, radius: int) -> GreyImage:
 
 
 def candidate_layers(image: GreyImage, settings: MarkerSettings) -> tuple[Layer, ...]:
-    """The image at the scales to be looked at, with its closings.
+    """The image at the scales to be searched, with its closings.
 
     Parameters
     ----------

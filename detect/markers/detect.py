@@ -1,8 +1,8 @@
 """The detector of square markers: one image in, markers with their corners out.
 
-The way of one image, top to bottom, is `detect_markers`: the three phases of RAWSEEDS deliverable
-D2.1 part 2 (candidates, filtering, refinement and identification), and after them, by default, the
-fit of the whole marker, which makes the corners more exact and tells false markers from true ones.
+`detect_markers` processes one image from top to bottom: the three phases of RAWSEEDS deliverable
+D2.1 part 2 (candidates, filtering, refinement and identification) and then, by default, the fit of
+the whole marker, which makes the corners more exact and rejects false markers.
 """
 
 from __future__ import annotations
@@ -59,11 +59,11 @@ _CAPTURE_PX = 0.7
 _CAPTURE_WIDTHS = 0.02
 #: Where edges and whole marker disagree by more than this (mean normalised squared difference; the
 #: edges' systematic error included), the marker is not what the fit takes it for: not flat, or
-#: bent by a lens that nobody calibrated. Its edges are then where they are seen.
+#: bent by an uncalibrated lens. Its edges are then where they are seen.
 _MOST_DISAGREEMENT = 6.0
 _EDGE_SYSTEMATIC_PX = 0.02
 #: What is white within the border, or round the quiet zone, shines into edges that are softer than
-#: this part of the border: nothing is to be learnt from those.
+#: this part of the border: these are not used.
 _SHARP_BLURS = 0.14
 #: Steps from or to grey levels beyond these are clipped, and seem to be where they are not.
 _UNCLIPPED = (3.0, 250.0)
@@ -102,12 +102,12 @@ def detect_markers(
     image : (H, W) uint8
         Grey image.
     settings : MarkerSettings
-        What to look for.
+        The settings.
     camera : Camera, optional
         The calibration, whose distortion bends the markers' edges; without one they are taken to
         be straight in the image.
     keep_masks : bool
-        Whether the result holds the dark pixels of phase 1, for looking at.
+        Whether the result holds the dark pixels of phase 1, for display.
 
     Returns
     -------

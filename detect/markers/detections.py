@@ -1,4 +1,4 @@
-"""What the detector of markers returns: the markers of one image, and what became of the rest."""
+"""Result of the detector of markers: the markers of one image, and the rejected candidates."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class Candidate:
 
 @dataclass(frozen=True)
 class MarkerDetections:
-    """The markers found in one image, by ID and place, and what was not taken for one.
+    """The markers found in one image, by ID and place, and the rejected candidates.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""What is printed on square markers: the patterns of each set, and where their cells are.
+"""Dictionaries of square markers: the patterns of each set, and where their cells are.
 
 - ``rawseeds``: RAWSEEDS deliverable D2.1 part 2. A black square of 24 units with a matrix of 6x6
   cells of 2 units, moved half a cell up and to the right, so that it lies on the right six columns
@@ -45,7 +45,7 @@ class MarkerDictionary:
     ids : (N,) int64
         The markers' numbers.
     patterns : (N, G, G) bool
-        What the cells of the sampled grid show, True for white; row 0 is the marker's top.
+        The cells of the sampled grid, True for white; row 0 is the marker's top.
     centres : (G,) float64
         Where the grid's columns (and rows) have their centres, in widths of the marker from its
         left (upper) edge.
@@ -84,7 +84,7 @@ class MarkerDictionary:
 
 
 def dictionary_names() -> tuple[str, ...]:
-    """Names that `marker_dictionary` knows."""
+    """Names that `marker_dictionary` accepts."""
     return (RAWSEEDS, ARTOOLKITPLUS_12, ARTOOLKITPLUS_8, *sorted(_opencv_constants()))
 
 

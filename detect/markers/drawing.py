@@ -1,4 +1,4 @@
-"""Detected markers, and what was not taken for one, drawn for people."""
+"""Draws detected markers and rejected candidates."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _EDGE_COLOUR: Colour = (60, 220, 60)
 _TOP_LEFT_COLOUR: Colour = (0, 0, 255)
 _TEXT_COLOUR: Colour = (0, 230, 255)
 _CANDIDATE_COLOUR: Colour = (255, 150, 40)
-#: Ellipses of the corners show so many standard deviations.
+#: Size of the ellipses of the corners, in standard deviations.
 _SIGMAS = 20.0
 
 
@@ -41,7 +41,7 @@ def draw_markers(
     image : (H, W) uint8
         The grey image.
     found : MarkerDetections
-        What was found in it.
+        The markers found in it.
     rejected : bool
         Whether to draw candidates that are no markers.
 

@@ -25,7 +25,7 @@ _LARGEST_REST = 0.6
 _ROOT_HALF = math.sqrt(0.5)
 _ROOT_2PI = math.sqrt(2.0 * math.pi)
 _SEGMENTS = 8
-#: Places across an edge at which it may begin to be looked for.
+#: Number of places across an edge at which its search may begin.
 _SPLITS = 14
 #: Standard deviation of the light's change across an edge, in contrasts per pixel.
 _LIGHT_SLOPE = 0.004
@@ -267,7 +267,7 @@ def _fit_step(pixels: _EdgePixels, reach: float, search: EdgeSearch, out: EdgeFi
         for i in range(_PARAMETERS):
             for j in range(i):
                 normal[i, j] = normal[j, i]
-        # Weak knowledge: light changes little along an edge; the blur is about what was guessed.
+        # Weak prior: light changes little along an edge; the blur is about what was guessed.
         variance = scale * scale
         contrast = max(abs(p[3] - p[2]), scale)
         light = variance / (0.3 * contrast) ** 2

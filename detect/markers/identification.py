@@ -1,9 +1,9 @@
-"""Phase 3, second part: which marker it is.
+"""Phase 3, second part: identifies the marker.
 
-The homography of the refined corners tells where the cells have their middles; the grey values
-there, rescaled to 0 to 1, are compared with all patterns in all four turns. The nearest one wins if
-it is near enough (RAWSEEDS deliverable D2.1 part 2), and here also only if the second nearest is
-clearly farther away.
+The homography of the refined corners gives the centres of the cells. The grey values there,
+rescaled to 0 to 1, are compared with all patterns in all four rotations. The nearest one is chosen
+if it is near enough (RAWSEEDS deliverable D2.1 part 2) and the second nearest is clearly farther
+away.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ NO_WHITE = "edges without contrast"
 
 #: Samples of a cell are this far apart, in cells.
 _SPREAD_CELLS = 0.25
-#: Patterns whose correlation is this near the best one's are tried too, at most so many.
+#: Patterns whose correlation is this near the best one's are tried, too, at most `_MOST_TRIED`.
 _CLOSE_CORRELATION = 0.06
 _MOST_TRIED = 3
 #: Where cells are blurred by less than this (in cells), only a quarter as near.
@@ -42,11 +42,11 @@ _CLEAR_BLUR_CELLS = 0.3
 _LEAST_CORRELATION = 0.6
 #: Natural logarithm of how much less likely the second best pattern must be.
 _LEAST_LOG_ODDS = 15.0
-#: Whiteness of cells is trusted to no better than this.
+#: Least standard deviation of the whiteness of cells.
 _LEAST_CELL_SIGMA = 0.08
-#: Cells that are blurred by more than this (in cells) tell nothing for certain. Of each pair the
-#: first number is for dictionaries whose patterns are next to never met by chance, the second for
-#: those whose are (see `Templates.weakness`).
+#: Cells that are blurred by more than this (in cells) are not used for a decision. The first number
+#: of each pair is for dictionaries whose patterns hardly ever occur by chance, the second for the
+#: others (see `Templates.weakness`).
 _LARGEST_BLUR_CELLS = (0.62, 0.6)
 #: From the first blur (in cells) to the second what is demanded of a fit grows: many patterns can
 #: be bent to blurred cells, but none fits them to the noise unless it is the right one.
@@ -56,7 +56,7 @@ _STRICT_FROM, _STRICT_AT = 0.35, 0.6
 _CLEAR_MISFIT, _CLEAR_AGREEMENT = 0.12, 0.85
 _BLURRED_MISFIT = (0.06, 0.03)
 _BLURRED_AGREEMENT = (0.92, 0.95)
-#: Patterns that other things show as well have to be seen this clearly.
+#: Patterns that other objects show as well must have at most this misfit.
 _PLAIN_LARGEST_MISFIT = 0.04
 _PLAIN_LEAST_AGREEMENT = 0.95
 _PLAIN_LARGEST_CELL_ERROR = 0.25
@@ -157,7 +157,7 @@ def likely_patterns(
 def verified_identity(
     fit: PatternFit, template: int, templates: Templates, settings: MarkerSettings
 ) -> Identity | str:
-    """What a fitted marker's cells say about its identity, or the cause of rejecting it.
+    """The identity of a fitted marker by its cells, or the cause of its rejection.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Straight pixels: the image's positions with the lens's distortion taken off.
+"""Straight pixels: the image's positions with the lens's distortion removed.
 
 Edges of markers are straight in a pinhole image only. Everything that is fitted to edges is
 therefore fitted at *straight* positions, ``(scale x + offset)`` of the undistorted normalised
@@ -19,7 +19,7 @@ from detect.markers.lens_kernels import bend_points, straighten_points, straight
 
 FloatArray = NDArray[np.float64]
 
-#: Bilinear interpolation over so many pixels: off by an eighth of its square times the curvature.
+#: Spacing for bilinear interpolation; the error is an eighth of its square times the curvature.
 _STEP_PX = 2
 
 

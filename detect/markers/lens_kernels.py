@@ -1,8 +1,8 @@
 """Between pixels and straight pixels, compiled: bilinear interpolation in a grid, and its inverse.
 
-Straight pixels are where an image without the lens's distortion would have things: lines are
-straight in them. `grid[j, i]` holds the straight position of pixel (step * i, step * j); an empty
-grid stands for no distortion.
+Straight pixels are those of an image without the lens's distortion: lines are straight in them.
+`grid[j, i]` holds the straight position of pixel (step * i, step * j); an empty grid means no
+distortion.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Phase 3, last part: the whole marker fitted to the grey values.
 
-Four edges know little about a small marker: its cells have edges too. Once it is known which
-marker it may be, all of it is fitted at once (`detect.markers.pattern_fit_kernels`): corners,
-light, blur. What each cell then shows on its own says whether it is that marker indeed.
+The four edges of a small marker give little information, but its cells have edges, too. Given a
+candidate pattern, the whole marker is fitted at once (`detect.markers.pattern_fit_kernels`):
+corners, light, blur. Each cell by itself then confirms or refutes the pattern.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Compiled measures of what a marker's fit leaves over: each cell's own whiteness, correlation."""
+"""Compiled measures of the residuals of a marker's fit: each cell's own whiteness, correlation."""
 
 from __future__ import annotations
 
@@ -132,7 +132,7 @@ def inflation_of(pixels: NDArray[np.int32], left: Residuals) -> float:
 
     A pixel's residual that is correlated with its neighbours' by rho along a row (geometrically
     falling off) counts as (1 - rho) / (1 + rho) of an independent one; rows and columns alike. Only
-    what stands out of chance counts.
+    significant correlation is considered.
     """
     first_u = pixels[0, 0]
     last_u = pixels[0, 0]

@@ -76,7 +76,7 @@ def is_inside(x: float, y: float, corners: NDArray[np.float64]) -> bool:
 def pixel_area(polygon: NDArray[np.int32]) -> float:
     """Pixels inside a polygon through pixel centres, those on it included (Pick's theorem).
 
-    Sides that run between the grid's directions count as the digital lines that they stand for.
+    Sides between the grid's directions count as the digital lines that they represent.
     """
     total = 0.0
     boundary = 0

@@ -36,7 +36,7 @@ _QUICK_PASSES = 2
 #: Steps that end a fit's iteration, in these passes and in the last.
 _ROUGHLY_PX = 0.02
 _EXACTLY_PX = 0.002
-#: In the last passes an edge is looked for within this many of its blurs, and this many pixels.
+#: In the last passes an edge is searched within this many of its blurs, and this many pixels.
 _REACH_BLURS = 2.5
 _REACH_PX = 0.8
 #: With fewer rows of pixels on each side than that there would be more unknowns than rows.

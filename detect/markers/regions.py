@@ -1,4 +1,4 @@
-"""Phase 2, first part: which dark regions may be markers, by what is cheap to measure.
+"""Phase 2, first part: selects dark regions that may be markers, by inexpensive measures.
 
 RAWSEEDS deliverable D2.1 part 2: area, number of holes, solidity, share of the holes; the cheapest
 first. OpenCV labels and outlines the regions.
@@ -32,8 +32,8 @@ WHITE_SHARE = "share of holes"
 _LEAST_FORESHORTENING = 0.3
 #: Narrowest bounding box, pixels of the layer.
 _LEAST_SIDE_PX = 4
-#: Where larger markers are looked for in the next level, a region this wide (in radii of the disc)
-#: is left to that.
+#: If the next level searches larger markers, a region this wide (in radii of the disc) is left to
+#: that level.
 _WIDEST_RADII = 12.0
 #: Holes of fewer pixels are noise.
 _LEAST_HOLE_PX = 1
@@ -161,7 +161,7 @@ def _area_limits(settings: MarkerSettings, scale: int) -> tuple[float, float]:
         expected = (settings.width_px / scale) ** 2
         return expected / settings.area_factor, expected * settings.area_factor
     least = settings.least_width_px**2
-    # What is small in a reduced image was looked for in the finer ones.
+    # Markers that are small in a reduced image are found in the finer ones.
     return (least if scale == 1 else max(least, 100.0) * _LEAST_FORESHORTENING), math.inf
 
 

@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-#: Residuals beyond so many standard deviations lose weight.
+#: Residuals beyond this many standard deviations lose weight.
 OUTLIER = 3.0
 #: Grey values are rounded: noise is never below this, grey levels.
 LEAST_NOISE = 0.3
@@ -25,7 +25,7 @@ def robust_sigma(residual: NDArray[np.float64], count: int, sampled: int, least:
     count : int
         How many of them, from the first on.
     sampled : int
-        About how many are looked at: every second, third, ... of more.
+        Approximate number to use: every second, third, ... of more.
     least : float
         The result is at least that.
 

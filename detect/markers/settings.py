@@ -1,4 +1,4 @@
-"""What the detector of square markers can be told."""
+"""Settings of the detector of square markers."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ def _expect(condition: bool, name: str, value: object, expected: str) -> None:
 
 @dataclass(frozen=True)
 class MarkerSettings:
-    """Everything that decides what the marker detector finds. The defaults are the best known.
+    """All settings of the marker detector. The defaults are the best known.
 
     Parameters
     ----------
     dictionary : str
-        What is printed on the markers: rawseeds, artoolkitplus12, artoolkitplus8, or an OpenCV
+        Dictionary of the markers: rawseeds, artoolkitplus12, artoolkitplus8, or an OpenCV
         dictionary (4x4_50 ... 7x7_1000, aruco_original, aruco_mip_36h12, apriltag_16h5 ...).
     ids : tuple of int
         The markers to expect; none: all of the dictionary.
@@ -41,12 +41,12 @@ class MarkerSettings:
     disc_widths : float
         Radius of the closing's disc in widths of the marker.
     pyramid : bool
-        Look for large markers in reduced images.
+        Search large markers in reduced images.
     dark_noise : float
         Dark pixels are darker than the closing by at least this many standard deviations of the
         image's noise.
     least_width_px : float
-        Narrowest marker looked for (square root of its area), pixels, where no width is given.
+        Narrowest marker to search (square root of its area), pixels, where no width is given.
     area_factor : float
         A candidate's area is within this factor of the expected width squared.
     least_holes, most_holes : int
@@ -63,7 +63,7 @@ class MarkerSettings:
         Area of the rough quadrangle over that of the convex hull.
     joint : bool
         Fit the whole marker, cells included, to the grey values; its corners are more exact than
-        those of four separate edges, and what it leaves over tells false markers from true ones.
+        those of four separate edges, and its residuals reveal false markers.
     least_contrast : float
         Least contrast of each edge, in standard deviations of the image's noise.
     edge_balance : float

@@ -22,7 +22,7 @@ _BLURS_CELLS = (0.2, 0.35, 0.5, 0.7, 1.0)
 
 @dataclass(frozen=True, eq=False)
 class Templates:
-    """What the cells of the expected markers show, for each marker turned by 0, 90, 180, 270 deg.
+    """Templates of the expected markers' cells, for each marker turned by 0, 90, 180, 270 deg.
 
     Attributes
     ----------
@@ -31,11 +31,11 @@ class Templates:
     cells : (T, G * G) float32
         1 for white; T is four times the number of markers.
     weakness : float
-        How easily a pattern is met by chance, from 0 (next to never) to 1.
+        How likely a pattern occurs by chance, from 0 (hardly ever) to 1.
     decoys : (D, G * G) float32
-        What other things show that are framed in black: nothing, or a bar, or a half.
+        Content of other black frames: nothing, a bar, or a half.
     plain : (T,) bool
-        Which of the templates are like such things themselves.
+        Which of the templates are similar to these.
     marker : (T,) int64
         Index of the marker in the dictionary.
     turns : (T,) int64

@@ -1,1 +1,1 @@
-"""The page that tells what was found in a run, and how good it is."""
+"""The report of a run: a page with its results and their quality."""

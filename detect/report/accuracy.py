@@ -207,7 +207,7 @@ def _honesty(residuals: Residuals, error: NormalisedError, what: str) -> list[Pa
         figure_part(
             whitened_figure(residuals),
             f"Residuals in units of the covariance that the rows state, {what}: standard normal if "
-            "the covariances are right, wider if they promise too much.",
+            "the covariances are right, wider if they are too small.",
         ),
         Part("figures", entries=tuple(entries)),
     ]

@@ -19,7 +19,7 @@ _HALF_PX = (48, 32)
 _TIMES = 3
 _SHOWN = 0.5
 _GAP_PX = 4
-#: Outlines are drawn so much larger than the disc that they do not hide its edge.
+#: Outlines are drawn larger than the disc by this factor, so that they do not hide its edge.
 _WIDER = 1.6
 _COLOUR: dict[str, Colour] = {"missed": (60, 60, 255), "extra": (255, 60, 255)}
 

@@ -1,4 +1,4 @@
-"""What a report is made of: all rows of a run, frame by frame, and what they are held against."""
+"""Inputs of a report: all rows of a run, frame by frame, and the reference rows."""
 
 from __future__ import annotations
 
@@ -139,7 +139,7 @@ def gather(run: ImageRun, options: RowFiles, gates: Gates, time_frames: int) -> 
     gates : Gates
         What counts as the same landmark.
     time_frames : int
-        So many frames are detected again to see how long that takes.
+        Number of frames that are detected again to measure the time.
 
     Returns
     -------

@@ -86,7 +86,7 @@ def report_page(
 
 
 def _clean(value: Any) -> Any:
-    """Text without characters that no page may hold; everything else as it is."""
+    """Text without characters that are not allowed in a page."""
     if type(value) is not str:
         return value
     return "".join(
@@ -130,7 +130,7 @@ def _summary(inputs: ReportInputs) -> list[Part]:
 def _frames(
     inputs: ReportInputs, worst: int, picture_of: Callable[[str], Picture]
 ) -> tuple[str, list[Part]]:
-    """Heading and parts: the worst frames, or some where nothing tells which are."""
+    """Heading and parts: the worst frames, or some frames if there is no reference to rank them."""
     named = {picture_name(prefix): prefix for prefix in inputs.names}
     parts: list[Part] = []
     shown: dict[str, str] = {}

@@ -1,4 +1,4 @@
-"""The pieces that a report is laid out of."""
+"""The parts of a report."""
 
 from __future__ import annotations
 

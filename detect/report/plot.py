@@ -40,7 +40,7 @@ def plotted(
     """
     with mpl.rc_context():
         mpl.rcdefaults()
-        # Names of parts are made of a hash; text stays text, and is set in a font of the reader's.
+        # Names of parts are hashes with a fixed salt; text remains text, in the viewer's own font.
         mpl.rcParams.update({"svg.hashsalt": "redetect", "svg.fonttype": "none"})
         mpl.rcParams.update({"axes.spines.top": False, "axes.spines.right": False})
         figure = Figure(figsize=size, dpi=_DPI, layout="constrained")

@@ -33,15 +33,15 @@ from detect.settings import CircleSettings
 from detect.sources.opening import open_calibrated, open_source
 from storage.kernel_loading import load_kernels_alone
 
-#: The radius of the discs is found in about so many images.
+#: Approximate number of images from which the radius of the discs is estimated.
 _RADIUS_IMAGES = 12
-#: Of runs of at least so many frames it is said when there are hardly any discs in them, and that
-#: the radius is another where it differs by this (its logarithm).
+#: Runs of at least `_FEWEST_FRAMES` frames get a warning if there are hardly any discs in them, and
+#: if the logarithm of the radius differs by `_OTHER_RADIUS`.
 _FEWEST_FRAMES, _OTHER_RADIUS = 10, 0.15
 
 
 class _Job(NamedTuple):
-    """What a command asks for: see `detect.runs.stream.detect_run`."""
+    """Parameters of a run: see `detect.runs.stream.detect_run`."""
 
     label: str
     run: ImageRun
@@ -182,7 +182,7 @@ def _with_radius(settings: CircleSettings, run: Run) -> CircleSettings:
 
 
 def _some_images(run: Run) -> Iterator[NDArray[np.uint8]]:
-    """Images that are spread over a run, as far as its length is known beforehand."""
+    """Images that are spread over a run, if its length is known in advance."""
     if run.frames.expected is None:
         raise DetectError("--find-radius: expected recorded images, which can be read twice")
     step = max(1, run.frames.expected // _RADIUS_IMAGES)
@@ -202,7 +202,7 @@ def _output(command: DetectorFlags, run: ImageRun, kind: str) -> Path:
 def _known(
     discs: DiscIdOptions | None = None, *, lines: Path | None = None, tilts: Path | None = None
 ) -> Known:
-    """What files say of the frames beforehand."""
+    """Prior data on the frames from files."""
     discs = DiscIdOptions() if discs is None else discs
     if (discs.ids_from_map is None) != (discs.path is None):
         raise DetectError("--ids-from-map and --path: expected both or neither")
@@ -220,7 +220,7 @@ def _known(
 
 
 def _workers(command: DetectorFlags, job: _Job) -> Workers:
-    """Who does the work of a command."""
+    """The workers of a command."""
     frames = job.run.frames
     large = job.pictures is not None or frames.ships_images
     if command.cluster is not None:

@@ -1,4 +1,4 @@
-"""How a run is carried out, besides what is looked for."""
+"""How a run is carried out, apart from what is detected."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class ConductOptions:
-    """How faults are met.
+    """How failures are handled.
 
     Parameters
     ----------

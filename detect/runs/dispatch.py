@@ -1,13 +1,13 @@
-"""Frames worked on by any number of workers, their rows in the order of the run.
+"""Processes frames with any number of workers, and gives their rows in the order of the run.
 
 Workers are a standard `concurrent.futures.Executor`: this process, others on this machine, or a
 cluster (`detect.runs.workers`). Frames travel in chunks. Only a window of them is under way at any
 time, so that neither what waits nor what is finished grows with the run, and a slow frame holds the
 others up only when they are a window ahead of it.
 
-A worker that dies, killed or out of memory, costs no frame of its neighbours: whatever was under
-way is worked on again, one chunk at a time and then one frame at a time, until the frame that kills
-its worker is alone; that one is reported like an image that cannot be read.
+A worker that dies, killed or out of memory, loses no other frame: all frames under way are
+processed again, one chunk at a time and then one frame at a time, until the frame that kills its
+worker is alone; that one is reported like an image that cannot be read.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from detect.runs.rows import FrameRows, rows_of_failure, rows_of_frames
 
 Chunk = tuple[FrameTask, ...]
 
-#: After so many frames that killed their workers, and none between that did not, it is not them.
+#: After this many consecutive frames that killed their workers, the frames are not the cause.
 _DEADLY_FRAMES = 10
 
 
 @dataclass(frozen=True)
 class Workers:
-    """Who does the work.
+    """Workers that process the frames.
 
     Attributes
     ----------
@@ -42,12 +42,12 @@ class Workers:
     chunk : int
         How many frames a task has.
     window : callable
-        How many tasks may be under way; asked again and again, as clusters grow.
+        How many tasks may be under way; called repeatedly, as clusters grow.
     died : tuple of exception types
         What a task raises, besides `BrokenExecutor`, when its worker has died.
     tell_of_tables : bool
-        Whether the first task tells what is wrong with the tables of a plan: this process need not
-        make them then, and gets ready sooner.
+        Whether the first task reports errors in the tables of a plan: this process then need not
+        compute them and starts sooner.
     """
 
     start: Callable[[FramePlan], AbstractContextManager[Executor]]
@@ -67,7 +67,7 @@ def detect_chunks(
     tasks : iterable of FrameTask
         The frames; taken from as they are needed.
     plan : FramePlan
-        What is done with each.
+        The plan for each.
     workers : Workers
         By whom.
 
@@ -75,22 +75,22 @@ def detect_chunks(
     ------
     list of (FrameTask, FrameRows)
         In the order of the tasks, as many at a time as a worker gives back. Close the generator
-        (`contextlib.closing`) when it is not asked for all of them: that ends the workers.
+        (`contextlib.closing`) if not all of them are consumed: that ends the workers.
 
     Raises
     ------
     WorkerError
-        If workers die whatever they are given, go away, or have not got this program.
+        If workers die with any frame, disappear, or do not have this program.
     """
     source = iter(tasks)
     chunks = iter(lambda: tuple(islice(source, workers.chunk)), ())
     with _Crew(workers, plan) as crew:
-        # A chunk without a future is under suspicion: to be worked on alone.
+        # A chunk without a future is suspect: to be processed alone.
         under_way: deque[tuple[Chunk, Future[list[FrameRows]] | None]] = deque()
         while True:
             suspects = any(future is None for _, future in under_way)
-            room = 0 if suspects else max(0, workers.window() - len(under_way))
-            under_way.extend((chunk, crew.submit(chunk)) for chunk in islice(chunks, room))
+            more = 0 if suspects else max(0, workers.window() - len(under_way))
+            under_way.extend((chunk, crew.submit(chunk)) for chunk in islice(chunks, more))
             if not under_way:
                 return
             chunk, future = under_way.popleft()
@@ -105,14 +105,14 @@ def detect_chunks(
 
 
 def work_on_chunk(plan: FramePlan, chunk: Chunk) -> list[FrameRows]:
-    """What a worker does with a task; all it needs, and all that it gives back, is small."""
+    """Process a task in a worker; its input and output are small."""
     plan = _known(plan)
     return rows_of_frames(chunk, plan, tables_of(plan))
 
 
 @lru_cache(maxsize=4)
 def _known(plan: FramePlan) -> FramePlan:
-    """The first of equal plans, which come with every task: what is made of it is kept."""
+    """The first of equal plans, which come with every task, so that results for it are cached."""
     return plan
 
 
@@ -157,7 +157,7 @@ class _Crew:
         return rows
 
     def bury(self, error: BaseException) -> None:
-        """End what is left of broken workers; the next chunk gets new ones."""
+        """End the remaining broken workers; the next chunk gets new ones."""
         if isinstance(error, BrokenExecutor):
             self._executor = None
             self._started.close()

@@ -1,7 +1,7 @@
 """Frames of a run: their images in, their verticals, tilts, discs and markers out.
 
-The way of a frame, top to bottom, is `STAGES`; `detect_batch` goes it with any number of frames,
-one by one or many together.
+`STAGES` are the stages that a frame passes, in order; `detect_batch` runs them for any number of
+frames, one by one or many together.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from detect.run import RunFrame, read_image
 from detect.runs.known import NOTHING, KnownOfFrame
 from landmarks import FrameTilt, Step, tilt_as_written
 
-# Detectors and tables are imported when they are asked for: loading them all takes a tenth of a
-# second each, and a process that has others do the work needs neither them nor a compiler.
+# Detectors and tables are imported on demand: loading them takes a tenth of a second each, and a
+# process that delegates the work needs neither them nor a compiler.
 if TYPE_CHECKING:
     from detect.circles import CircleDetections
     from detect.line_settings import LineSettings
@@ -35,24 +35,24 @@ if TYPE_CHECKING:
 
 Drawing = Literal["discs", "lines", "tracks", "markers"]
 
-#: What is wrong with one frame, not with the run.
+#: Errors of one frame, not of the run.
 COSTS_THE_FRAME = (FrameError, ArithmeticError, np.linalg.LinAlgError, MemoryError)
 
 
 @dataclass(frozen=True)
 class FramePlan:
-    """What is done with every frame of a run. Small: it travels with every task.
+    """The plan for every frame of a run. Small: it is sent with every task.
 
     Attributes
     ----------
     camera : Camera or None
-        The calibrated camera; only markers can be looked for without one.
+        The calibrated camera; without one, only markers can be detected.
     lines : LineSettings or None
-        Which verticals are looked for, if any.
+        Which verticals are detected, if any.
     circles : CircleSettings or None
-        Which discs are looked for, if any.
+        Which discs are detected, if any.
     markers : MarkerSettings or None
-        Which square markers are looked for, if any.
+        Which square markers are detected, if any.
     json : bool
         Whether the discs are wanted as JSON as well: `detect_run` sees to it.
     drawing : {"discs", "lines", "tracks", "markers"} or None
@@ -79,7 +79,7 @@ class FramePlan:
 
 
 class FrameTask(NamedTuple):
-    """A frame to be worked on, and what is known of it beforehand. Small."""
+    """A frame to be processed, with prior data on it. Small."""
 
     frame: RunFrame
     known: KnownOfFrame = NOTHING
@@ -92,7 +92,7 @@ class FrameTask(NamedTuple):
 
 @dataclass
 class FrameDetections:
-    """What was found in one image; None is what was not looked for.
+    """Detections in one image; None for kinds that were not searched.
 
     Attributes
     ----------
@@ -100,13 +100,13 @@ class FrameDetections:
         None where it cannot be read.
     lines : LineDetections or None
     tilt : FrameTilt or None
-        None also where too few lines tell.
+        None also if too few lines determine it.
     seen : CircleDetections or None
         The discs where they would be on a level robot.
     discs : CircleDetections or None
         The same, corrected for the tilt where there is one and the plan says so.
     outline_tilt : FrameTilt or None
-        What the outlines of the discs show of the tilt, where a run is levelled by all frames.
+        The tilt by the outlines of the discs, if a run is levelled by all frames.
     markers : MarkerDetections or None
     error : str or None
         Why the frame cannot be worked on.
@@ -130,7 +130,7 @@ class FrameDetections:
 
 @dataclass(frozen=True)
 class Tables:
-    """What the calibration decides before the first image, as far as a plan needs it."""
+    """The tables by the calibration that a plan needs."""
 
     verticals: VerticalTable | None
     discs: DiscTable | None
@@ -139,7 +139,7 @@ class Tables:
 def detect_batch(
     tasks: Sequence[FrameTask], plan: FramePlan, tables: Tables
 ) -> list[FrameDetections]:
-    """Find what a plan asks for in the images of some frames.
+    """Detect the landmarks of a plan in the images of some frames.
 
     Every stage is done with all frames before the next one: a decoder, the detectors and Python
     drive each other's instructions and tables out of the processor's caches. A frame that cannot be
@@ -150,7 +150,7 @@ def detect_batch(
     tasks : sequence of FrameTask
         The frames; as many images are in memory at once.
     plan : FramePlan
-        What to look for.
+        The landmarks to detect.
     tables : Tables
         See `tables_of`.
 
@@ -237,7 +237,7 @@ def _find_markers(_: FrameTask, found: FrameDetections, plan: FramePlan, __: Tab
         found.markers = detect_markers(found.pixels, plan.markers, plan.camera)
 
 
-#: The way of a frame: what each of them finds is there for those that follow.
+#: The stages that a frame passes: each can use the results of those before it.
 STAGES: tuple[Callable[[FrameTask, FrameDetections, FramePlan, Tables], None], ...] = (
     _decode,
     _find_lines,
@@ -295,7 +295,7 @@ def _tables(camera: Camera | None, verticals: bool, shape: DiscShape | None) -> 
 
 
 def import_detectors(plan: FramePlan) -> None:
-    """Import what a plan needs: what can be done while others make its tables."""
+    """Import the modules that a plan needs, while other processes compute its tables."""
     if plan.lines is not None:
         import detect.lines
     if plan.circles is not None:

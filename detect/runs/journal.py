@@ -1,9 +1,10 @@
-"""The journal of a run: which frames are complete, so that a run that ended early can go on.
+"""The journal of a run: which frames are complete, so that an interrupted run can be resumed.
 
 An append-only text file beside the results, locked while the run lasts. Each line has a digest, of
 the line itself and of all before it, and a record in JSON: the run's (`JournalHead`), then one for
-each frame (`JournalFrame`: how many bytes of each file are its, and their digest), at last one that
-says that the files are complete. What does not fit its digest, and what follows it, does not count.
+each frame (`JournalFrame`: how many bytes of each file are its, and their digest), and finally one
+that marks the files as complete. Lines that do not fit their digest, and all that follow, are
+ignored.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from detect.runs.frame import FramePlan, FrameTask
 from detect.runs.outputs import Output
 from storage.parts import named, new_locked, old_locked, write_all
 
-#: Raised with every change of what a journal or the rows that it stands for look like.
+#: Incremented with every change of the format of a journal or of the rows that it records.
 _JOURNAL_VERSION = 4
 
 _DIGITS = 16
@@ -36,7 +37,7 @@ _LONGEST_LINE = 1 << 20
 
 
 class JournalHead(NamedTuple):
-    """What the first line says."""
+    """Content of the first line."""
 
     made_by: str  #: Digest of whatever decides the rows: program, settings, camera, heads of files.
     parts: Sequence[int]  #: Which parts the files of the run grow in (see `storage.parts`).
@@ -44,11 +45,11 @@ class JournalHead(NamedTuple):
 
 
 class JournalFrame(NamedTuple):
-    """What a line says of a frame."""
+    """Record of a frame."""
 
     lengths: Sequence[int]  #: How many bytes the frame has in each of the files.
     content: str  #: Digest of them.
-    task: str  #: Digest of what was to be done.
+    task: str  #: Digest of the task.
     found: Mapping[str, int]  #: This and what follows: see `detect.runs.rows.FrameRows`.
     rejected: Mapping[str, int]
     error: str | None
@@ -86,14 +87,14 @@ class Journal:
         return os.read(self._handle, len(end)) == end
 
     def head(self) -> JournalHead | None:
-        """What the first line says, if it counts."""
+        """Content of the first line, if it is valid."""
         first = next(self._records(), None)
         return JournalHead(*first) if isinstance(first, list) else None
 
     def frames(self) -> Iterator[JournalFrame]:
-        """What counts of the lines behind the head.
+        """The valid lines behind the head.
 
-        Who asks for the next one takes it over; `cut` forgets the last one and all behind it.
+        Requesting the next one takes it over; `cut` discards the last one and all that follow.
         """
         records = self._records()
         next(records, None)
@@ -102,7 +103,7 @@ class Journal:
                 yield JournalFrame(*record)
 
     def cut(self) -> None:
-        """Forget what was not taken over; the next line is written there."""
+        """Discard the lines that were not taken over; the next line is written there."""
         os.ftruncate(self._handle, self._end)
         os.lseek(self._handle, self._end, os.SEEK_SET)
 
@@ -178,7 +179,7 @@ def made_by(outputs: Sequence[Output], plan: FramePlan, conduct: Conduct) -> str
 
 
 def task_digest(task: FrameTask) -> str:
-    """A digest of what is to be done with a frame: its step, image, and what is known of it.
+    """A digest of the work on a frame: its step, its image and the prior data on it.
 
     Of an image file, name, size and time of change count.
     """
@@ -189,7 +190,7 @@ def task_digest(task: FrameTask) -> str:
 
 
 def _file_of(frame: RunFrame) -> object:
-    """What tells a frame's image file, as it is now, from others."""
+    """What identifies the current state of a frame's image file."""
     if frame.image is None:
         return None
     if frame.stamp is not None:

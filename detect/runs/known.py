@@ -1,6 +1,6 @@
-"""What is known of each frame of a run beforehand: tilts, and landmarks with IDs.
+"""Prior data on each frame of a run: tilts, and landmarks with IDs.
 
-Files are looked into while the run goes by: little of them is in memory.
+Files are read during the run: little of them is in memory.
 """
 
 from __future__ import annotations
@@ -33,18 +33,18 @@ from storage.bounds import NOT_NEGATIVE, demand
 
 T_co = TypeVar("T_co", covariant=True)
 
-#: Discs of a map that are farther from a frame than this are not looked for in it, metres.
+#: Discs of a map that are farther from a frame than this are not matched in it, metres.
 _REACH_M = 20.0
 
 
 class ByPrefix(Protocol[T_co]):
-    """Something of each frame, by its image's prefix: a dict, or a file that is looked into."""
+    """Data on each frame by its image's prefix: a dict, or a file that is read on demand."""
 
     def get(self, prefix: str, /) -> T_co | None: ...
 
 
 class KnownOfFrame(NamedTuple):
-    """What is known of a frame: see `Known`."""
+    """Prior data on a frame: see `Known`."""
 
     tilt: FrameTilt | None = None
     lines: tuple[LineLandmark, ...] = ()
@@ -59,12 +59,12 @@ NOTHING = KnownOfFrame()
 
 @dataclass(frozen=True)
 class Known:
-    """What is known of the frames of a run.
+    """Prior data on the frames of a run.
 
     Attributes
     ----------
     tilts : mapping, optional
-        Tilts by image prefix, for frames whose verticals are not looked for.
+        Tilts by image prefix, for frames whose verticals are not detected.
     lines : mapping, optional
         Frames by image prefix whose lines have IDs: carried over where the match is unambiguous.
     discs : mapping, optional
@@ -72,8 +72,8 @@ class Known:
     discs_level : bool
         Whether these are corrected for the tilt.
     mapped : mapping, optional
-        Discs of a map by image prefix: rows that `discs` knows nothing of get the ID of the one
-        that they fall on.
+        Discs of a map by image prefix: rows without an ID by `discs` get the ID of the one that
+        they fall on.
     slack_m : float
         Standard deviation of where these are, besides their covariances, metres.
     """
@@ -89,7 +89,7 @@ class Known:
         demand(self, DetectError, slack_m=NOT_NEGATIVE)
 
     def of(self, prefix: str) -> KnownOfFrame:
-        """What is known of a frame."""
+        """Prior data on a frame."""
         if all(source is None for source in (self.tilts, self.lines, self.discs, self.mapped)):
             return NOTHING
         lines = None if self.lines is None else self.lines.get(prefix)
@@ -142,7 +142,7 @@ class TiltsByImage:
 class FramesByImage:
     """The frames of a landmark file, by the name of their image; 12 bytes each, and the name.
 
-    The file is read once to learn where each frame stands, and there again when it is asked for.
+    The file is read once for the offset of each frame, and again there when a frame is requested.
 
     Parameters
     ----------
@@ -170,7 +170,7 @@ class FramesByImage:
         self._index = NameIndex(names())
 
     def get(self, prefix: str) -> Frame | None:
-        """A frame; None if the file does not know it."""
+        """A frame; None if the file does not have it."""
         place = self._index.find(_bytes(image_name(prefix)))
         if place is None:
             return None
@@ -201,7 +201,7 @@ class MapByImage:
         }
 
     def get(self, prefix: str) -> Sequence[MappedDisc] | None:
-        """The discs within reach of a frame's pose; None if the path does not know it."""
+        """The discs within reach of a frame's pose; None if the path does not have the frame."""
         pose = self._poses.get(image_name(prefix))
         if pose is None:
             return None

@@ -14,7 +14,7 @@ from detect.runs.outputs import LEVEL_CIRCLES, LEVEL_TILT
 from detect.runs.rows import RunSummary, disc_numbers, encoded, landmark_rows
 from landmarks import FrameTilt, format_levelling, format_no_tilt, format_tilt, tilt_as_written
 
-#: So many bytes of rows are gathered before they are written.
+#: Number of bytes of rows that are collected before they are written.
 _AT_ONCE = 1 << 18
 
 #: Prefix, lines and tilt of a frame.
@@ -33,7 +33,7 @@ def level_run(
     ----------
     camera : Camera
     tilt_sigma_rad : float
-        Standard deviation of pitch and roll of frames whose tilt nothing tells.
+        Standard deviation of pitch and roll of frames whose tilt is unknown.
     summary : RunSummary
         Is given the tilt of the run, if there is one.
     files : mapping of str to binary stream
@@ -108,7 +108,7 @@ def _counts(row: bytes) -> bool:
 
 
 def _tilts_of_rows(rows: BinaryIO) -> tuple[list[_Tilted], list[FrameTilt | None]]:
-    """Prefix, lines and tilt of each frame, and what the outlines of its discs show."""
+    """Prefix, lines and tilt of each frame, and the tilt by the outlines of its discs."""
     frames: list[_Tilted] = []
     outlines: list[FrameTilt | None] = []
     for row in filter(_counts, rows):

@@ -18,13 +18,13 @@ from landmarks import format_head
 #: Endings of files of landmarks.
 LANDMARK_SUFFIXES = frozenset({".circles", ".lines", ".markers"})
 
-#: Stand in the head of files whose positions are true level ones, or corrected for the tilt.
+#: In the head of files whose positions are levelled, or corrected for the tilt.
 LEVEL = "level robot frame"
 LEVELLED = "corrected for the tilt of the frames that have one"
 
 #: The kind of the log (`detect.runs.run_log`).
 LOG = "log"
-#: What a second pass makes of the files of a first one (`detect.runs.level_run`).
+#: Files that a second pass makes from those of the first one (`detect.runs.level_run`).
 LATE_KINDS = LEVEL_TILT, LEVEL_CIRCLES = "level tilt", "level circles"
 
 _ROBOT = "Robot frame: origin on the floor, X left, Y backward (forward is -Y), metres, radians."
@@ -46,13 +46,13 @@ class Output:
     kind : str
         Which of `FrameRows.rows` go into it: of a kind that they do not have, none do.
     head, tail : bytes
-        What stands before and after the rows of all frames.
+        Text before and after the rows of all frames.
     between : bytes
-        What stands between those of two frames.
+        Text between the rows of two frames.
     crlf : bool
         Whether rows end with CR and LF, as in the data set's own files.
     placed : bool
-        Whether it is a result; else others are made of it, and it goes when they are there.
+        Whether it is a result; else it is temporary and removed when others were made from it.
     """
 
     path: Path
@@ -78,7 +78,7 @@ def outputs_of(
     run : ImageRun
         The run.
     plan : FramePlan
-        What is looked for in it.
+        What is detected in it.
     places : mapping
         Where files of each kind go: "circles", "lines", "tilt", "markers", "json".
     conduct : Conduct
@@ -121,7 +121,7 @@ def frames_tilt_place(tilt: Path) -> Path:
 
 
 def _times_place(results: list[Path]) -> Path:
-    """The file of the frames' times that stands beside results.
+    """The file of the frames' times beside results.
 
     It is called like the file of landmarks, with ``.times`` behind; where there are several, like
     what they have in common: ``detected.circles.times``, but ``detected.times``.
@@ -167,7 +167,7 @@ def _markers_text(run: ImageRun, plan: FramePlan, version: str) -> list[str]:
         *(_STEP, _odometry(run)),
         "LANDMARK_M <dictionary> <ID> <quality>, and for each corner <u> <v> <cUU> <cUV> <cVV>",
         "  corners top left, top right, bottom right, bottom left of the marker as printed;",
-        "  pixels of the image as it is, the top left pixel's centre is 0 0; quality: 1 is perfect",
+        "  pixels of the original image, the top left pixel's centre is 0 0; quality: 1 is perfect",
         *_made_with(plan, plan.markers),
     ]
 
@@ -186,7 +186,7 @@ def _tilt_text(version: str, *, by_run: bool) -> list[str]:
 def _level_tilt_text(version: str) -> list[str]:
     return [
         f"Pitch and roll that the discs of each frame were levelled by, by redetect {version}:",
-        "  the constant lean of the run and what the frame is believed to deviate from it",
+        "  the constant lean of the run and the frame's estimated deviation from it",
         *_TILT_ROWS,
         "  and the number of verticals that agree with the tilt of the frame by itself",
         "NOTILT <image> <lines>: its discs are as they were seen",
@@ -194,7 +194,7 @@ def _level_tilt_text(version: str) -> list[str]:
 
 
 def _json_file(path: Path, plan: FramePlan, version: str) -> Output:
-    """What `json.dumps` with an indent of 1 gives."""
+    """The text that `json.dumps` with an indent of 1 gives."""
     assert plan.circles is not None
     assert plan.camera is not None
     document = {

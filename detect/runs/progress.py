@@ -1,4 +1,4 @@
-"""What a long run shows on a terminal."""
+"""Progress of a long run on a terminal."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _SHOWN_FAILURES = 10
 def progress_bar(label: str, total: int | None) -> Iterator[Callable[[], None]]:
     """A progress bar with the rate, on a terminal; yields what to call after every frame.
 
-    Calling it raises an interrupt that got lost (see `detect.interrupts`).
+    Calling it raises an interrupt that was lost (see `detect.interrupts`).
 
     Without a total, it shows how many there were.
 
@@ -59,7 +59,7 @@ def progress_bar(label: str, total: int | None) -> Iterator[Callable[[], None]]:
 
 
 def print_failures(count: int, first: Sequence[str]) -> None:
-    """Tell which frames could not be worked on, as far as they fit on a screen."""
+    """Print which frames could not be processed, as many as fit on a screen."""
     if not count:
         return
     print(f"{count} frames could not be worked on:", file=sys.stderr)

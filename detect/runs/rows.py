@@ -1,4 +1,4 @@
-"""What is written of one frame: rows, JSON and pictures, as bytes.
+"""Output of one frame: rows, JSON and pictures, as bytes.
 
 This is all that a worker sends back, whichever process or machine it runs on: some kilobytes.
 """
@@ -44,17 +44,17 @@ if TYPE_CHECKING:
     from detect.lines import LineDetections
     from detect.run_tilt import RunTilt
 
-#: So many pixels are decoded before any of them is looked at.
+#: Largest number of pixels that are decoded at once.
 PIXELS_AT_ONCE = 1 << 25
 
-#: So many failures are kept word for word.
+#: Number of failures whose messages are kept.
 KEPT_FAILURES = 100
 
 _NONE: Mapping[str, int] = {}
 
 
 class FrameRows(NamedTuple):
-    """What came of a frame.
+    """Result of a frame.
 
     Attributes
     ----------
@@ -79,12 +79,12 @@ class FrameRows(NamedTuple):
 
 @dataclass
 class RunSummary:
-    """What came of a run.
+    """Summary of a run.
 
     Attributes
     ----------
     frames : int
-        Frames looked at.
+        Frames processed.
     found : Counter
         How many "discs", "lines" and "markers" were found in them, and "tilts".
     rejected : Counter
@@ -94,9 +94,9 @@ class RunSummary:
     failures : list of str
         A line for each of the first `KEPT_FAILURES` of them.
     images_without_step : int
-        Images that are no part of the run: the odometry knows nothing of them.
+        Images that are no part of the run: the odometry does not have them.
     tilt : RunTilt or None
-        What discs were levelled by, if it was the tilt of the run.
+        The tilt of the run, if discs were levelled by it.
     """
 
     frames: int = 0
@@ -126,7 +126,7 @@ def rows_of_frames(tasks: Sequence[FrameTask], plan: FramePlan, tables: Tables) 
     tasks : sequence of FrameTask
         The frames.
     plan : FramePlan
-        What is done with each.
+        The plan for each.
     tables : Tables
         See `detect.runs.frame.tables_of`.
 
@@ -191,7 +191,7 @@ def _rows_by_kind(task: FrameTask, found: FrameDetections, plan: FramePlan) -> d
 
 
 def rows_of_failure(task: FrameTask, reason: str) -> FrameRows:
-    """What is written of a frame that could not be worked on."""
+    """Output of a frame that could not be processed."""
     step = task.frame.step
     rows = dict.fromkeys(("circles", "lines", "markers"), encoded(format_record(step)))
     rows["tilt"] = encoded(format_no_tilt(step.prefix, 0))
@@ -203,15 +203,15 @@ def rows_of_failure(task: FrameTask, reason: str) -> FrameRows:
 def landmark_rows(
     keyword: str, numbers: NDArray[np.float64], ids: Sequence[tuple[int, ...]]
 ) -> bytes:
-    """Rows of landmarks, as `landmarks.format_record` lays them out.
+    """Rows of landmarks, as `landmarks.format_record` formats them.
 
     Parameters
     ----------
     keyword : str
     numbers : (N, K) float64
-        What stands behind it.
+        The numbers after the keyword.
     ids : sequence of N tuples of int
-        Stand at the end.
+        The IDs at the end.
 
     Raises
     ------
@@ -281,12 +281,12 @@ def _time_row(task: FrameTask) -> bytes:
 
 
 def encoded(row: str) -> bytes:
-    """A row as it stands in a file, its end included."""
+    """A row as bytes of a file, with its line end."""
     return f"{row}\n".encode("utf-8", "surrogateescape")
 
 
 def _json(record: dict[str, object]) -> bytes:
-    """A record as it stands in the list of frames of an indented document."""
+    """A record as bytes in the list of frames of an indented document."""
     return b"\n" + indent(json.dumps(record, indent=1), "  ").encode()
 
 
@@ -309,7 +309,7 @@ def _disc_records(found: CircleDetections) -> list[dict[str, object]]:
 def _drawn(
     name: str, found: FrameDetections, plan: FramePlan, tables: Tables
 ) -> Iterator[tuple[str, bytes]]:
-    """The pictures that a plan asks for, by name."""
+    """The pictures of a plan, by name."""
     if plan.drawing is None and not plan.draw_response:
         return
     from detect.drawing.detections import draw_circles

@@ -1,4 +1,4 @@
-"""The files of a run while they grow, so that a run that ends early keeps what is done.
+"""The files of a run while they grow, so that an interrupted run keeps its completed frames.
 
 The rows of the frames that a worker gives back together are written at once to the parts of the
 files (`storage.parts`), then noted in the journal (`detect.runs.journal`). However a run ends, by a
@@ -54,12 +54,12 @@ from storage.parts import PartFile, folder_locked, left_part, new_part, remove_l
 
 _log = logging.getLogger("redetect")
 
-# Rows for the files that are made of others, from those (by their kinds): kind and rows.
+# Makes the rows of files that follow from others, given those by kind: yields kind and rows.
 SecondPass = Callable[[Mapping[str, BinaryIO]], Iterable[tuple[str, bytes]]]
 
 
 class _GrowingFile:
-    """A file of a run, its part, and what is in it so far."""
+    """A file of a run, its part, and its size."""
 
     def __init__(self, output: Output, part: PartFile) -> None:
         self.output, self.part = output, part
@@ -68,7 +68,7 @@ class _GrowingFile:
         self.has_rows = False
 
     def next_rows(self, rows: bytes) -> bytes:
-        """What a frame adds, from its rows."""
+        """The bytes that a frame adds, from its rows."""
         between = self.output.between if self.has_rows and rows else b""
         self.has_rows = self.has_rows or bool(rows)
         return between + self.output.ended(rows)
@@ -80,20 +80,20 @@ class _GrowingFile:
             self.count(content)
 
     def count(self, content: bytes) -> None:
-        """Count what is there already."""
+        """Count the existing content."""
         self.size += len(content)
         self.digest.update(content)
 
 
 class RunFiles:
-    """The files of a run: a context manager that opens them, and keeps or removes what there is.
+    """The files of a run: a context manager that opens them, and keeps or removes partial files.
 
     Parameters
     ----------
     outputs : sequence of Output
         The files.
     plan : FramePlan
-        What is done with every frame.
+        The plan for every frame.
     conduct : Conduct
         Whether there are a log and a journal, and a run to be resumed.
 
@@ -118,7 +118,7 @@ class RunFiles:
         for output, place in zip(self._outputs, places):
             if places.count(place) > 1:  # the last one would be all there is
                 raise DetectError(f"{output.path}: named for two results: expected a file for each")
-        # Else they may be half of those of a run that was killed: told when that is over.
+        # If there is a journal, existing files may be those of a killed run: checked later.
         if conduct.log is None or not journal_place(conduct.log).exists():
             self._demand_new()
 
@@ -171,11 +171,11 @@ class RunFiles:
             demand_log_place(self._conduct.log, overwrite=self._conduct.overwrite)
 
     def _may_replace(self, path: Path) -> bool:
-        """Whether what stands in a file's place may go: a log always, if it is one."""
+        """Whether an existing file may be replaced: the log always, if it is one."""
         return self._conduct.overwrite or path == self._conduct.log
 
     def _look_at(self, left: Journal) -> None:
-        """Complete, take over, or remove what a run that ended early left."""
+        """Complete, take over, or remove the files of an interrupted run."""
         try:
             head = left.head()
             numbers = () if head is None else head.parts
@@ -284,7 +284,7 @@ class RunFiles:
         return chain(beyond, tasks)
 
     def _content_of(self, frame: JournalFrame) -> list[bytes] | None:
-        """The rows that a line of the journal stands for; None if they are not there."""
+        """The rows that a line of the journal records; None if they are not there."""
         content = [
             file.part.read(file.size, length) for file, length in zip(self._files, frame.lengths)
         ]
@@ -339,7 +339,7 @@ class RunFiles:
     # -- ending -----------------------------------------------------------------------------
 
     def finish(self, found: RunSummary, second_pass: SecondPass | None = None) -> None:
-        """Write what stands after the frames, and have the files take their places.
+        """Write the files' ends, and move the files to their final paths.
 
         Raises
         ------
@@ -364,7 +364,7 @@ class RunFiles:
             for path, _ in results:
                 if not self._may_replace(path) and os.path.lexists(path):
                     raise OutputExistsError(path)
-                # What a replaced file has on the disk is given back when nobody has it open any
+                # The disk space of a replaced file is freed when no process has it open any
                 # more. That takes much longer than to replace it, and so happens behind the last
                 # one: hardly any kill falls between the calls that replace them.
                 if path.is_file():
@@ -377,7 +377,7 @@ class RunFiles:
         self._done = True
 
     def _write_late(self, second_pass: SecondPass) -> None:
-        """Fill the files that are made of the others."""
+        """Fill the files that are made from the others."""
         files = {file.output.kind: file for file in self._files}
         first = {kind: file for kind, file in files.items() if kind not in LATE_KINDS}
         with ExitStack() as stack:
@@ -406,7 +406,7 @@ class RunFiles:
     def _is_worth_keeping(self, journal: Journal, error: BaseException | None) -> bool:
         """Whether there is something, of this run or the one resumed, that can be gone on with."""
         if isinstance(error, OutputExistsError):
-            return False  # somebody else was faster
+            return False  # another process was faster
         if not os.path.lexists(journal.place):
             return False  # it went with its folder
         return self._noted > 0 or self._resumes

@@ -1,8 +1,8 @@
-"""What a run says of itself for machines to read: ``<output>.log.json``.
+"""Machine-readable log of a run: ``<output>.log.json``.
 
-Which program ran with which settings, which frames could not be worked on and why, how much was
-found, and what the other files are, by size and hash. Nothing in it depends on the time of day or
-on who did the work: the same run writes the same bytes.
+It states the program and its settings, the frames that could not be processed and why, how much was
+found, and the size and hash of the other files. Nothing in it depends on the time of day or on the
+workers: the same run writes the same bytes.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class FailedFrameError(DetectError):
 
 
 def log_place(output: Path) -> Path:
-    """Where the log of a result goes."""
+    """Path of the log of a result."""
     return output.with_name(f"{output.name}.log.json")
 
 
@@ -41,7 +41,7 @@ def demand_log_place(place: Path, *, overwrite: bool) -> None:
     Raises
     ------
     storage.OutputExistsError
-        If something else than a log stands there, and must not be overwritten.
+        If there is a file that is no log and must not be overwritten.
     """
     if overwrite or not os.path.lexists(place):
         return
@@ -53,7 +53,7 @@ def demand_log_place(place: Path, *, overwrite: bool) -> None:
 
 
 def log_head(plan: FramePlan, conduct: Conduct) -> bytes:
-    """What stands before the failures."""
+    """The text before the failures."""
     settings = {"circles": plan.circles, "lines": plan.lines, "markers": plan.markers}
     document: dict[str, Any] = {
         "program": "redetect",
@@ -77,7 +77,7 @@ def log_failure(place: int, prefix: str, reason: str) -> bytes:
 
 
 def log_tail(found: RunSummary, outputs: Sequence[Mapping[str, object]]) -> bytes:
-    """What stands after the failures; of each output the name, the size and the hash."""
+    """The text after the failures; of each output the name, the size and the hash."""
     document = {
         "frames": found.frames,
         "failed": found.failed,

@@ -1,9 +1,9 @@
-"""The way of a run: frames in, files out, neither ever in memory as a whole.
+"""Processes a run: frames in, files out, neither ever in memory as a whole.
 
     frames of the run  ->  tasks  ->  workers (`detect.runs.dispatch`)  ->  rows in order  ->  files
 
-The files are the same bytes whoever worked on the frames; they appear together at the end, or not
-at all.
+The files have the same bytes with any number of workers; they appear together at the end, or not at
+all.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def detect_run(
     on_progress: Callable[[], None] | None = None,
     conduct: Conduct | None = None,
 ) -> RunSummary:
-    """Do with every frame of a run what a plan says, and write what comes of it.
+    """Process every frame of a run by a plan, and write the results.
 
     Each image is decoded once. Levelled by frames, discs and lines together give the files that
     they give one after the other, with the tilts that were written. Levelled by the run, the tilt
@@ -50,18 +50,18 @@ def detect_run(
     Parameters
     ----------
     run : ImageRun
-        The run; without a calibration, only markers can be looked for.
+        The run; without a calibration, only markers can be detected.
     plan : FramePlan
-        What to look for.
+        The landmarks to detect.
     places : mapping
         The files to write, by kind: "circles", "lines", "tilt", "markers", "json" (the discs once
         more). Where the frames' times are known, they go beside them.
     known : Known, optional
-        What is known of the frames beforehand.
+        Prior data on the frames.
     pictures : path, optional
-        Folder for what the plan has drawn.
+        Folder for the plan's pictures.
     workers : Workers, optional
-        Who does the work; by default this process (see `detect.runs.workers`).
+        The workers; by default this process (see `detect.runs.workers`).
     on_progress : callable, optional
         Called once after every frame.
     conduct : Conduct, optional
@@ -79,7 +79,7 @@ def detect_run(
     storage.OutputExistsError
         If an output exists and must not be replaced.
     WorkerError
-        If there is nobody to do the work.
+        If there are no workers.
     DetectError
         If another run is writing the same files, a frame fails where every frame is demanded, or
         there is no such dictionary of markers.
@@ -130,7 +130,7 @@ def make_folder(folder: Path) -> None:
 
 
 def _demand_possible(plan: FramePlan, workers: Workers) -> None:
-    """Refuse what would be wrong with every frame, as far as this process can tell soon."""
+    """Refuse what would fail for every frame, as far as this process can check quickly."""
     if plan.markers is not None:
         templates_of(plan.markers.dictionary, plan.markers.ids)
     if not workers.tell_of_tables:
@@ -138,7 +138,7 @@ def _demand_possible(plan: FramePlan, workers: Workers) -> None:
 
 
 def _second_pass(plan: FramePlan, summary: RunSummary) -> SecondPass | None:
-    """What makes files of those of the frames, if anything."""
+    """The second pass over the files of the frames, if there is one."""
     if plan.levelling != "run" or not (plan.camera and plan.lines and plan.circles):
         return None
     from detect.runs.level_run import level_run

@@ -1,4 +1,4 @@
-"""Who works on the frames of a run: this process, processes of this machine, or a cluster.
+"""Workers for the frames of a run: this process, processes of this machine, or a cluster.
 
 Each is a standard executor with its number of frames per task, put together as
 `detect.runs.dispatch.Workers`.
@@ -38,8 +38,8 @@ R = TypeVar("R")
 #: Fewer frames than this are not worth another process's start.
 FRAMES_PER_PROCESS = 500
 
-#: A task has so many frames at most; one of a process so many at least, and more where each
-#: process has so many tasks nevertheless.
+#: A task has at most `_MOST_TOGETHER` frames. One for a process has at least `_PROCESS_CHUNK`, and
+#: more if each process still gets `_TASKS_PER_PROCESS` tasks.
 _MOST_TOGETHER = 128
 _PROCESS_CHUNK = 16
 _TASKS_PER_PROCESS = 32
@@ -48,7 +48,7 @@ _WINDOW_PER_WORKER = 3
 _CLUSTER_ANSWER_S = 10.0
 _CLUSTER_PATIENCE_S = 60.0
 _CLUSTER_LOOK_S = 5.0
-#: Processes have so long to end by themselves.
+#: Time that processes have to end by themselves.
 _GRACE_S = 1.0
 
 
@@ -110,8 +110,7 @@ def cluster_workers(address: str, *, large: bool = False) -> Workers:
     Raises
     ------
     WorkerError
-        If there can be no scheduler of that address, or the package that speaks to clusters is not
-        installed.
+        If the address of the scheduler is invalid, or the package for clusters is not installed.
     """
     if not re.fullmatch(r"[a-z]+://\S+:[0-9]+", address):
         raise WorkerError(f"cluster is {address!r}: expected the scheduler's tcp://host:port")
@@ -134,7 +133,7 @@ def cluster_workers(address: str, *, large: bool = False) -> Workers:
 
 
 class _InProcess(Executor):
-    """Does what it is given at once, before it gives the future back."""
+    """Runs each task immediately, before it returns the future."""
 
     def submit(self, fn: Callable[P, R], /, *args: P.args, **kwargs: P.kwargs) -> Future[R]:
         future: Future[R] = Future()
@@ -184,9 +183,8 @@ class _ProcessPool(ProcessPoolExecutor):
     def end(self) -> None:
         """End them, whatever they are doing; a further interrupt waits for that.
 
-        The thread that looks after them is waited for: an interrupted program leaves threads
-        behind, and this one would be stopped between the removal of a semaphore and the note of
-        that.
+        The thread that manages them is joined: an interrupted program leaves threads behind, and
+        this one could be stopped after it has removed a semaphore and before it has recorded that.
         """
         with interrupts_deferred():
             processes = list((self._processes or {}).values())
@@ -207,7 +205,7 @@ class _ProcessPool(ProcessPoolExecutor):
 
 
 class _Beginning(NamedTuple):
-    """What new worker processes share: one of them makes what is not in the caches yet, for all.
+    """What new worker processes share: one of them fills the caches for all.
 
     Attributes
     ----------
@@ -232,7 +230,7 @@ def _begin(plan: FramePlan, beginning: _Beginning, show: bool) -> None:
 
     cv2.setNumThreads(1)
     announce_compiling()
-    with suppress(Exception):  # whatever it is: the first task will tell
+    with suppress(Exception):  # any error recurs, and is reported, with the first task
         _rehearse_together(plan, beginning)
 
 
@@ -243,7 +241,7 @@ def _rehearse_together(plan: FramePlan, beginning: _Beginning) -> None:
             tables_of(plan)
             beginning.tables.set()
             rehearse(plan)
-        finally:  # the others see for themselves what is wrong
+        finally:  # the other processes find the error themselves
             beginning.tables.set()
             beginning.kernels.set()
         return
@@ -264,7 +262,7 @@ def _end_with_parent() -> None:
 
 
 class _ClusterSize:
-    """How many tasks a cluster may have under way; looked at now and then."""
+    """How many tasks a cluster may have under way; updated from time to time."""
 
     def __init__(self) -> None:
         self._client: Client | None = None

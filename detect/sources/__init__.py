@@ -2,13 +2,13 @@
 
 ::
 
-    source             module       what it is named by
+    source             module       how it is named
     run folder         detect.run   the folder
     images             pictures     a folder, one image, or a pattern such as 'drive/*.png'
     video file         video        the file
     ROS bag, MCAP      bag          the .bag or .mcap file, or the folder of a ROS 2 bag
     live camera        live         camera:0
 
-A source gives images in order, with their times where it knows them. Odometry is laid over it
+A source gives images in order, with their times if it has them. Odometry is added to it
 (`odometry`), so that any source may be combined with any odometry; `opening` puts both together.
 """

@@ -97,7 +97,7 @@ class Bag:
         return self._count
 
     def images(self) -> Generator[SourceImage, None, None]:
-        """The images of the topic: raw ones as grey values, compressed ones as they are."""
+        """The images of the topic: raw ones as grey values, compressed ones unchanged."""
         bits = self._bits
         with opened_bag(self.path) as reader:
             for number, (kind, recorded_s, message) in enumerate(

@@ -3,7 +3,7 @@
 The intrinsics are converted to the project's model, and refused where that cannot follow them. The
 pose is the chain of static transforms from the robot's base *on the floor* to the camera's optical
 frame (x right, y down, z forward), brought to the data set's axes. Without one, only what needs no
-floor can be looked for.
+floor can be detected.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 #: What ROS calls the robot's base on the floor (REP 105, REP 120).
 BASE_FRAME = "base_footprint"
 
-#: A conversion may differ by so much from the camera_info, anywhere in the image.
+#: Largest deviation of a conversion from the camera_info, anywhere in the image.
 LIMIT_PX = 0.05
 
 _INFO, _TRANSFORMS = "sensor_msgs/msg/CameraInfo", "tf2_msgs/msg/TFMessage"
@@ -70,7 +70,7 @@ def calibration_of_info(message: Any, name: str, pose: Matrix | None, why_not: s
     Raises
     ------
     DetectError
-        If only part of the image is meant, or the model cannot follow the lens.
+        If it is for part of the image only, or the model cannot approximate the lens.
     camera.CameraError
         If there can be no such camera.
     """
@@ -154,7 +154,7 @@ def rotation_of(qx: float, qy: float, qz: float, qw: float) -> Matrix:
     largest = np.abs(q).max()
     if not 0.0 < largest < np.inf:
         raise ValueError(f"a rotation of {qx:g}, {qy:g}, {qz:g}, {qw:g}")
-    q = q / largest  # squares of what is very large or small are no numbers
+    q = q / largest  # squares of very large or small numbers overflow or underflow
     x, y, z, w = q / np.linalg.norm(q)
     return np.array(
         [

@@ -17,12 +17,12 @@ _CHANNELS = {
     "bgr16": 3, "rgb16": 3, "bgra16": 4, "rgba16": 4,
 }  # fmt: skip
 _BAYER = ("bayer_rggb", "bayer_bggr", "bayer_gbrg", "bayer_grbg")
-# Where in each pair of bytes the brightness stands.
+# Offset of the brightness in each pair of bytes.
 _LUMA = {"yuv422": 1, "uyvy": 1, "yuv422_yuy2": 0, "yuyv": 0}
 
 
 class ImageMessage(Protocol):
-    """What is read of a `sensor_msgs/Image`."""
+    """The fields of a `sensor_msgs/Image` that are used."""
 
     height: int
     width: int
@@ -51,7 +51,7 @@ def pixels_of_message(message: ImageMessage, name: object) -> NDArray[Any]:
     Raises
     ------
     FrameError
-        If the encoding is another, or there is less data than the message speaks of.
+        If the encoding is another, or there is less data than the message states.
     """
     encoding = message.encoding
     bayer = encoding.rstrip("0123456789").rstrip("_") if encoding.startswith("bayer_") else None

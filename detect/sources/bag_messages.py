@@ -1,4 +1,4 @@
-"""The messages of a bag, read by the package ``rosbags``; what is wrong with them in one line."""
+"""The messages of a bag, read by the package ``rosbags``; errors are reported on one line."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ def opened_bag(path: Path) -> Iterator[AnyReader]:
             f"{path}: bags are read by the package rosbags: install it by "
             "pip install 'redetect[bags]'"
         ) from None
-    # Bags of older ROS 2 do not say what their messages look like.
+    # Bags of older ROS 2 do not contain the definitions of their messages.
     defaults = get_typestore(Stores.LATEST)
     try:
         reader = AnyReader([path], default_typestore=defaults)
         reader.open()
-    except Exception as error:  # what a damaged file raises is as manifold as its bytes
+    except Exception as error:  # a damaged file can raise anything
         raise DetectError(
             f"{path}: cannot be read as a bag: {_one_line(error)}: expected a whole ROS 1 or 2 bag "
             "or an MCAP file of ROS messages"
@@ -51,7 +51,7 @@ def opened_bag(path: Path) -> Iterator[AnyReader]:
 
 
 def messages(reader: AnyReader, path: Path, topic: str) -> Iterator[tuple[str, float, Any]]:
-    """The messages of a topic: type, time of recording (s), and what they say.
+    """The messages of a topic: type, time of recording (s), and content.
 
     Raises
     ------
@@ -64,7 +64,7 @@ def messages(reader: AnyReader, path: Path, topic: str) -> Iterator[tuple[str, f
     while True:
         try:
             connection, recorded_ns, content = next(stream)
-            recorded_s = recorded_ns / 1e9  # whatever stands in a database's column
+            recorded_s = recorded_ns / 1e9  # a database's column may hold anything
             message = reader.deserialize(content, connection.msgtype)
         except StopIteration:
             return

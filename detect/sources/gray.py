@@ -1,8 +1,8 @@
-"""Images of any kind as the 8-bit grey images that the detectors look at.
+"""Converts images of any kind to the 8-bit grey images of the detectors.
 
 Colour becomes 0.299 R + 0.587 G + 0.114 B, as OpenCV has it (of a JPEG, the brightness that it
 stores). Of images with more than 8 bits, the 8 highest of their *significant* bits are kept: a
-12-bit camera's values stand in 16-bit files, and would be nearly black if all 16 were taken.
+12-bit camera's values are stored in 16-bit files, and would be nearly black if all 16 were used.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from detect.errors import FrameError
 from detect.sources.image_bounds import bounded_content, demand_bounded
 from storage.image_header import without_orientation
 
-#: What an image of 16 bits may hold.
+#: Significant bits of a 16-bit image.
 BIT_DEPTHS = (8, 10, 12, 14, 16)
 
 #: Only files of these kinds can hold more than 8 bits.
@@ -122,7 +122,7 @@ def significant_bits_of_file(path: Path) -> int | None:
         content = bounded_content(path, path, None)
         demand_bounded(content, path, None)
     except FrameError:
-        return None  # told when it is the file's turn
+        return None  # reported when the file is processed
     image = _decoded(content, deep=True)
     return None if image is None or image.dtype != np.uint16 else significant_bits(image)
 

@@ -8,8 +8,8 @@ from detect.errors import FrameError
 from storage.bounded import read_bounded
 from storage.image_header import MOST_PIXELS, claimed_size
 
-# A file has at most what its pixels have uncompressed, 16 bits in four channels, twice over for
-# formats that grow, and room for thumbnails and whatever else cameras write.
+# A file is at most as large as its uncompressed pixels, 16 bits in four channels, twice over for
+# formats that grow, plus thumbnails and other metadata that cameras write.
 _BYTES_PER_PIXEL = 16
 _BYTES_BESIDE = 1 << 23
 

@@ -1,6 +1,6 @@
 """The images of a folder, and which of them belongs to a step: never one outside the run.
 
-A run may have a million frames: what is kept of one is the name of its image, twice, and 4 bytes.
+A run may have a million frames: the memory per frame is the name of its image, twice, and 4 bytes.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from storage.messages import excerpt
 
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".pgm", ".ppm", ".tif", ".tiff", ".bmp"})
 
-#: Size in bytes and time of change in nanoseconds: what tells one state of a file from another.
+#: Size in bytes and time of change in nanoseconds: they identify a state of a file.
 FileStamp = tuple[int, int]
 
 _DIGITS = re.compile(r"[0-9]+")
@@ -87,7 +87,7 @@ class ImageNames:
         """The place of the image of a name, with or without its ending; the first of several."""
         stem = name.encode("utf-8", "surrogateescape")
         names = [stem + suffix for suffix in self._suffixes]
-        if stem.endswith(self._suffixes):  # else there is nothing of that name as it stands
+        if stem.endswith(self._suffixes):  # else there is no file of exactly that name
             names.append(stem)
         if len(names) == 1:
             return self._index.find(names[0])
@@ -100,8 +100,8 @@ class ImageNames:
         Raises
         ------
         FrameError
-            If the step's prefix leads out of the run: whoever made the file of steps does not
-            decide which other files are read.
+            If the step's prefix leads out of the run: a file of steps must not decide which other
+            files are read.
         """
         name = prefix.strip('"')
         why = leads_out(name, *self._homes)
@@ -150,7 +150,7 @@ def images_of_folder(folder: Path) -> ImageNames:
 
 
 def _natural_order(name: str) -> str:
-    """What sorts names with numbers by value, then by the name itself, which follows the last /.
+    """Sort key of names, with numbers by value, then by the name itself, which follows the last /.
 
     A number becomes NUL, how many digits it has, and the digits: longer numbers are larger ones.
     """

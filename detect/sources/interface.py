@@ -1,4 +1,4 @@
-"""What a source of images is, and what the detectors see of it."""
+"""Interface of sources of images."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from camera import Camera, read_camera
 from detect.errors import DetectError
 
-#: No robot is as far from where it began (m): products of such numbers are still numbers.
+#: Limit of distances from the start (m), such that products of two remain finite.
 FARTHEST = 1e12
 
 
@@ -29,7 +29,7 @@ class SourceImage:
     time_s : float or None
         When it was taken; what zero is, is the source's.
     path : path or None
-        Its file, read by whoever works on it; or
+        Its file, read by the process that works on it; or
     content : bytes or (H, W) uint8 array or None
         the encoded image, or its grey values.
     bits : int
@@ -62,7 +62,7 @@ class Calibration:
 
 
 class PoseStream(Protocol):
-    """Poses of the robot over time, as recorded; iterating again begins anew."""
+    """Poses of the robot over time, as recorded; iterating again starts over."""
 
     #: What messages call it.
     name: str
@@ -84,7 +84,7 @@ class Source(Protocol):
 
     @property
     def expected(self) -> int | None:
-        """About how many images there will be; None if nobody knows."""
+        """Approximate number of images; None if unknown."""
         ...
 
     def images(self) -> Generator[SourceImage, None, None]:
@@ -92,7 +92,7 @@ class Source(Protocol):
         ...
 
     def calibration(self) -> Calibration | None:
-        """The calibration that lies beside it, or that it holds; None if there is none.
+        """The calibration beside it, or that it holds; None if there is none.
 
         Raises
         ------
@@ -137,7 +137,7 @@ class TimedPose:
 
 
 def frame_prefix(name: str) -> str:
-    """A name as it may stand in a STEP row and a ``.times`` file: without what would part it."""
+    """A name as allowed in a STEP row and a ``.times`` file: without characters that split it."""
     return re.sub(r'[\s,#"\\]', "_", name) or "_"
 
 

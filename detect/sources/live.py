@@ -1,8 +1,8 @@
-"""A camera of this machine as a source: what it shows now, until somebody says stop.
+"""A live camera of this machine as a source, until it is stopped.
 
-The camera is read all the time, so that an image's time is that of its arrival; images that nobody
-had time for are passed over. The first Ctrl-C ends the stream: what was seen is worked on to the
-end and written. A second one ends the program, which then writes nothing.
+The camera is read all the time, so that an image's time is that of its arrival; images that could
+not be processed in time are dropped. The first Ctrl-C ends the stream: the images so far are
+processed and the results written. A second one ends the program, which then writes nothing.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _LOOK_S = 0.1
 
 
 class Capture(Protocol):
-    """What is asked of an OpenCV capture."""
+    """The interface of an OpenCV capture that is used."""
 
     def read(self) -> tuple[bool, NDArray[Any] | None]: ...
 
@@ -60,7 +60,7 @@ class LiveCamera:
 
     @property
     def expected(self) -> int | None:
-        """Nobody knows."""
+        """Unknown."""
         return None
 
     def images(self) -> Generator[SourceImage, None, None]:
@@ -105,11 +105,11 @@ class _Newest:
                     image, self._image = self._image, None
                     return image
                 if self._ended:
-                    _log.info("the camera gives no more images: what was seen is written")
+                    _log.info("the camera gives no more images: the results so far are written")
                     return None
                 self._changed.wait(_LOOK_S)  # an interrupt is noticed in between
         if not stop.is_set():
-            _log.info(f"no image came within {PATIENCE_S:g} s: what was seen is written")
+            _log.info(f"no image came within {PATIENCE_S:g} s: the results so far are written")
         return None
 
     def end(self) -> None:
@@ -151,7 +151,7 @@ def _stoppable() -> Iterator[threading.Event]:
 
     def note(_: int, __: FrameType | None) -> None:
         stop.set()
-        signal.signal(signal.SIGINT, before)  # the next one is meant
+        signal.signal(signal.SIGINT, before)  # the next one interrupts the program
 
     signal.signal(signal.SIGINT, note)
     try:

@@ -1,4 +1,4 @@
-"""Names and where they stand, for runs of a million frames."""
+"""Index of names and their positions, for runs of a million frames."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Steps laid over images: from poses over time, from a file of STEP rows, or none."""
+"""Combines images with steps: from poses over time, from a file of STEP rows, or none."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class SourceFrames:
 
     @property
     def expected(self) -> int | None:
-        """About how many frames there will be; None if nobody knows."""
+        """Approximate number of frames; None if unknown."""
         return self._source.expected
 
     def __iter__(self) -> Generator[RunFrame, None, None]:
@@ -81,7 +81,7 @@ class FramesAlongPoses(SourceFrames):
 
 
 class FramesAlongRows(SourceFrames):
-    """The frames of a source whose STEP rows stand in a file, in the same order.
+    """The frames of a source whose STEP rows are in a file, in the same order.
 
     A row belongs to the image whose name is the last part of its prefix. Images without a row are
     no part of the run; rows without an image are frames that cannot be worked on.
@@ -112,7 +112,7 @@ class FramesAlongRows(SourceFrames):
                 yield RunFrame(step, None)
             else:
                 raise DetectError(
-                    f"{self._path}: the row of {image.prefix} stands too early: "
+                    f"{self._path}: the row of {image.prefix} comes too early: "
                     "expected the STEP rows in the order of the images"
                 )
         for step in steps:
@@ -147,7 +147,7 @@ class FirstFrames:
 
     @property
     def why_left_out(self) -> str:
-        """What is told of them, after their number."""
+        """Why frames were left out; printed after their number."""
         return self._frames.why_left_out
 
     def __len__(self) -> int:
@@ -162,7 +162,7 @@ class FirstFrames:
 
 
 class _Track:
-    """Poses in order, walked along once."""
+    """Poses in order, read once."""
 
     def __init__(self, poses: Iterator[TimedPose], name: str) -> None:
         self._poses = poses
@@ -173,7 +173,7 @@ class _Track:
             raise DetectError(f"{name}: no pose in it: expected odometry, or --odometry none")
 
     def at(self, time_s: float) -> TimedPose | None:
-        """The pose at a time; None where nothing is known of it, or after a later one was asked."""
+        """The pose at a time; None if unknown, or if a later one was requested before."""
         while self._after is not None and self._after.time_s < time_s:
             self._advance(self._after)
         before, after = self._before, self._after
@@ -192,7 +192,7 @@ class _Track:
         self._before, self._after = passed, next(self._poses, None)
         if self._after is not None and self._after.time_s < passed.time_s:
             raise DetectError(
-                f"{self._name}: the pose of {self._after.time_s:.6f} s stands after that of "
+                f"{self._name}: the pose of {self._after.time_s:.6f} s comes after that of "
                 f"{passed.time_s:.6f} s: expected times in order"
             )
 

@@ -1,6 +1,6 @@
 """A run from the name of whatever holds its images.
 
-What reads other sources than folders is imported when there is one.
+Readers of sources other than folders are imported on demand.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def open_calibrated(
     camera_path : path, optional
         The calibration; by default the one beside the images.
     options : SourceOptions, optional
-        What else is to be known.
+        Further options.
 
     Returns
     -------
@@ -90,7 +90,7 @@ def open_source(
     Raises
     ------
     DetectError, camera.CameraError, landmarks.LandmarkFileError
-        As `open_calibrated` does, but for a missing calibration.
+        As `open_calibrated`, except for a missing calibration.
     """
     options = SourceOptions() if options is None else options
     if _is_plain_folder(name, options):
@@ -100,7 +100,7 @@ def open_source(
 
 
 def demand_recording(name: Path) -> None:
-    """Refuse a live camera where rows are looked at: it shows other images than theirs.
+    """Refuse a live camera where existing rows are used: its images are not theirs.
 
     Raises
     ------

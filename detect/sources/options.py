@@ -14,7 +14,7 @@ Axes = Literal["robotics", "dataset"]
 
 @dataclass(frozen=True)
 class SourceOptions:
-    """What is to be known of a source beyond its name.
+    """Options of a source besides its name.
 
     Parameters
     ----------
@@ -33,7 +33,7 @@ class SourceOptions:
         The frame of the robot's base, on the floor, in a bag that holds the calibration itself
         (camera_info and tf_static); by default base_footprint.
     frames : int
-        Stop after so many frames; 0 for all of them (of a live camera: until Ctrl-C).
+        Stop after this many frames; 0 for all of them (of a live camera: until Ctrl-C).
     bits : int
         Significant bits of 16-bit images, 8 to 16; 0: the fewest of 8, 10, 12, 14 or 16 that hold
         the values of the first images.

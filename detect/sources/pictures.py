@@ -19,7 +19,7 @@ from detect.sources.times import TimesByImage
 
 WILDCARDS = frozenset("*?[")
 
-# From so many images, spread over all, the significant bits are taken.
+# Number of images, spread over all, that determine the significant bits.
 _LOOKED_AT = 5
 
 
@@ -33,7 +33,7 @@ class ImageFiles:
     name : str
         What messages call them.
     home : path
-        The run's folder: calibration and times lie there, and results go there.
+        The run's folder: calibration and times are there, and results are written there.
     times : TimesByImage or None
         When they were taken.
     bits : int or None
@@ -109,7 +109,7 @@ def home_of(folder: Path) -> Path:
 
 
 def own_times(home: Path) -> Path | None:
-    """The file of times that lies in a run folder."""
+    """The file of times in a run folder."""
     path = home / f"{home.resolve().name}.times"
     return path if path.is_file() else None
 

@@ -34,7 +34,7 @@ class Movement:
 def movement_between(before: TimedPose, after: TimedPose) -> Movement:
     """How a robot moved from one pose to another.
 
-    The covariances of poses are taken to have grown with the path: that of the later pose is that
+    The covariances of poses are assumed to grow with the path: that of the later pose is that
     of the earlier, carried along, plus that of the movement, independent of it. Where they have
     not (a driver that publishes the same covariance all the time), nothing is known of the
     movement's.
@@ -55,7 +55,7 @@ def movement_between(before: TimedPose, after: TimedPose) -> Movement:
     if before.covariance is None or after.covariance is None:
         return Movement(pose, None)
     carried = np.eye(3)
-    carried[:2, 2] = (-moved[1], moved[0])  # what an error of theta does to where it arrives
+    carried[:2, 2] = (-moved[1], moved[0])  # effect of an error of theta on the position
     grown = after.covariance - carried @ before.covariance @ carried.T
     scale = float(np.abs(after.covariance).max())
     if float(np.linalg.eigvalsh(grown).min()) < -_INDEFINITE * scale:
@@ -93,7 +93,7 @@ def pose_between(before: TimedPose, after: TimedPose, time_s: float) -> TimedPos
 
 
 def step_of(prefix: str, movement: Movement | None) -> Step:
-    """A STEP row; what is not known (the movement, its covariance) is zero."""
+    """A STEP row; unknown values (the movement, its covariance) are zero."""
     if movement is None:
         return Step(prefix, *[0.0] * 9)
     c = np.zeros((3, 3)) if movement.covariance is None else movement.covariance

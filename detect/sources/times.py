@@ -10,7 +10,7 @@ from pathlib import Path
 from detect.errors import DetectError
 from detect.sources.name_index import NameIndex
 
-#: Stands at the head of a file of times.
+#: The head of a file of times.
 TIMES_HEAD = "Times of the frames: <image> <seconds>, as their source gives them."
 
 _LARGEST_ROW = 65536

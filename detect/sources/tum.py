@@ -19,7 +19,7 @@ _LARGEST_ROW = 65536
 
 
 class TumTrajectory:
-    """A TUM trajectory, read as it is gone through.
+    """A TUM trajectory, read on demand.
 
     Parameters
     ----------

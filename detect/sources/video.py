@@ -1,4 +1,4 @@
-"""A video file as a source: its frames in order, decoded by OpenCV as they are asked for."""
+"""A video file as a source: its frames in order, decoded by OpenCV on demand."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ class VideoFile:
                 yield SourceImage(prefix, time_s, content=gray)
                 number, last_s = number + 1, time_s
         if self._count is not None and number < self._count:
-            _log.info(f"{self.name}: {number} of the {self._count} frames it speaks of are there")
+            _log.info(f"{self.name}: only {number} of {self._count} frames can be read")
 
     def calibration(self) -> Calibration | None:
         """The ``.cam`` file beside it: of its name, or the only one."""
@@ -112,7 +112,7 @@ def _opened(path: Path) -> Iterator[cv2.VideoCapture]:
 
 @contextmanager
 def quiet_opencv() -> Iterator[None]:
-    """Keep OpenCV, and FFmpeg in it, from telling in their own words what is told in ours."""
+    """Suppress messages of OpenCV, and of FFmpeg in it, for errors that are reported here."""
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     levels: Any = getattr(cv2.utils, "logging", cv2)  # where OpenCV 4 has them
     before = levels.getLogLevel()

@@ -1,4 +1,4 @@
-"""The command ``detect tune``: parameters over a grid, held against reference rows."""
+"""The command ``detect tune``: parameters over a grid, compared with reference rows."""
 
 from __future__ import annotations
 
@@ -118,12 +118,12 @@ def perform(options: Tune) -> int:
 
 def _reference(path: Path) -> FramesByImage:
     if not path.is_file():
-        raise LandmarkFileError(path, None, "no such reference rows: name some by --reference")
+        raise LandmarkFileError(path, None, "no such reference rows: give some with --reference")
     return FramesByImage(path)
 
 
 def _jsonable(settings: CircleSettings | LineSettings) -> dict[str, Any]:
-    """Settings by name; what is no number of JSON's (infinity) as a word."""
+    """Settings by name; numbers that JSON does not have (infinity) as words."""
     return {
         name: value if isinstance(value, bool | int | str) else _finite_or_word(value)
         for name, value in dataclasses.asdict(settings).items()

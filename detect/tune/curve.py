@@ -30,7 +30,7 @@ def pareto_front(recall: ArrayLike, precision: ArrayLike) -> NDArray[np.intp]:
     """
     r, p = np.asarray(recall, np.float64), np.asarray(precision, np.float64)
     known = np.flatnonzero(np.isfinite(r) & np.isfinite(p))
-    # By falling recall, then falling precision: what is no better than before is beaten.
+    # By falling recall, then falling precision: points no better than before are dominated.
     order = known[np.lexsort((known, -p[known], -r[known]))]
     front = []
     best = -np.inf
@@ -46,7 +46,7 @@ def knee(recall: ArrayLike, precision: ArrayLike) -> int | None:
 
     That is the point of the front farthest beyond the chord between the front's ends, both axes
     scaled to the front's extent. Where no point is beyond it, there is no knee, and the point with
-    the greatest harmonic mean of recall and precision stands for it.
+    the greatest harmonic mean of recall and precision is used instead.
 
     Parameters
     ----------

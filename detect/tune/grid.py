@@ -1,4 +1,4 @@
-"""Grids of parameters: what a command line says, as settings to be tried."""
+"""Grids of parameters: converts a command line to settings to be tried."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Combination = tuple[tuple[str, Any], ...]
 
 
 def parameter_value(kind: type, name: str, text: str) -> Any:
-    """The value of a parameter that a word stands for.
+    """Convert a word to the value of a parameter.
 
     Parameters
     ----------
@@ -113,7 +113,7 @@ def combinations(kind: type, varied: Mapping[str, str], most: int) -> tuple[Comb
     varied : mapping of str
         The values of each parameter, as for `parameter_values`.
     most : int
-        More than so many are refused.
+        Largest number of combinations; more are refused.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Settings tried on the same frames, each held against the same reference rows."""
+"""Tries settings on the same frames, and compares each with the same reference rows."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ Settings = CircleSettings | LineSettings
 
 @dataclass(frozen=True)
 class Trial:
-    """What came of one setting.
+    """Result of one setting.
 
     Attributes
     ----------
     reference, detected, matched : int
         Rows that count, and pairs of them; for verticals, `matched` are the reference rows that a
-        detected row stands for, alone or with others.
+        detected row represents, alone or with others.
     recall, precision : float or None
         None where there are no rows to compute them from.
     error_median : float or None
@@ -80,8 +80,7 @@ def tune_run(
     gate : CompareOptions for discs, LineCompareOptions for verticals
         What counts as the same landmark.
     workers : Workers
-        Who does the work. They are started once for all settings,
-        and again where some of them have died.
+        Workers. They are started once for all settings, and again where some of them have died.
     tilts : mapping, optional
         Tilts by image prefix: positions of discs are corrected for them.
     on_progress : callable, optional
@@ -97,7 +96,7 @@ def tune_run(
     lut.TableError
         If there can be no table for the camera and a setting.
     WorkerError
-        If there is nobody to do the work.
+        If there are no workers.
     """
     plans = [_plan(run, each) for each in settings]
     known = Known(tilts=tilts)
@@ -119,10 +118,9 @@ def tune_run(
 
 @contextmanager
 def _kept(workers: Workers, plan: FramePlan) -> Iterator[Callable[[], Workers]]:
-    """Workers that stay from setting to setting; gives what tells those of the next setting.
+    """Keep workers for all settings; yields a function that returns those of the next setting.
 
-    Where some of them have died, they are asked for once more during a setting: then they are
-    replaced.
+    If some of them have died, they are requested again during a setting, and then replaced.
     """
     crew: Executor | None = None
 

@@ -18,7 +18,7 @@ from detect.tune.run import Trial
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# So many points can be told apart by words beside them.
+# Largest number of points that are labelled.
 _MOST_NAMED = 12
 
 
@@ -32,7 +32,7 @@ def trial_records(
     combinations : sequence of combinations
         See `detect.tune.grid.combinations`.
     trials : sequence of Trial
-        What came of each.
+        Their results.
     unit : str
         Of the errors: ends the name of their column.
     """
@@ -104,7 +104,7 @@ def curve_picture(
                 words = _words(combinations[k])
                 if len(combinations[k]) == 1:
                     words = f"{combinations[k][0][1]}"
-                # Towards the middle, where there is room.
+                # Towards the middle, where there is space.
                 left = recall[k] > sum(axes.get_xlim()) / 2.0
                 axes.annotate(
                     words, (recall[k], precision[k]), xytext=(-7 if left else 7, 5),

@@ -1,6 +1,6 @@
-"""What the filter needs on rows parallel to the horizon, many neighbouring columns at a time.
+"""Moments for the filter on rows parallel to the horizon, many neighbouring columns at a time.
 
-As loops over the columns, one for each weight, these would go through memory once for each.
+Plain loops over the columns, one for each weight, would read memory once per weight.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ BLOCK = 32
 #: Columns whose grey values, in all rows of the band, fit into the innermost cache.
 TILE = 2 * BLOCK
 
-#: Neighbouring places between pixels that are looked at together.
+#: Number of neighbouring places between pixels that are processed together.
 RUN = 16
 
 _BLOCK_FLOATS = ir.VectorType(FLOAT, BLOCK)
@@ -69,7 +69,7 @@ def interpolate(
     where : int32, contiguous
         The pixel on the left of each place; -1 for none: both results are 0.
     part : float32, contiguous
-        How far to the right of it each lies, 0 to 1.
+        How far to the right of it each is, 0 to 1.
     at : int64
         Index of the first place in both.
     between : float32, contiguous
@@ -124,14 +124,14 @@ def interpolate_runs(
         The image in scan order.
     runs : (N, 3) int32, contiguous
         The pixel on the left of the first of `RUN` places, for each run as if all were of it; the
-        image goes on for so many pixels behind these.
+        image continues for `RUN` pixels behind these.
     lengths : (N, 2) uint8, contiguous
         The number of the first place that is not of the first run, and not of the second.
     part : float32, contiguous
         See `interpolate`.
     block : int64
         Index in `runs` and `lengths` of the first `RUN` places, of which there are ``TILE / RUN``;
-        pixels as far on again are fetched beforehand.
+        pixels as far on again are prefetched.
     between, plane, to
         As for `interpolate`.
     """
@@ -211,11 +211,11 @@ def sums_along(
     taps : int64
         How many rows.
     scale : float32, contiguous
-        What the sums of each column are multiplied with.
+        The factor of each column's sums.
     at_scale : int64
         Index there of the first column.
     sums, sums_plane, to
-        Results, as `between`, `plane` and `first` tell.
+        Results, addressed like `between`, `plane` and `first`.
     """
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:

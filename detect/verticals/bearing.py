@@ -39,13 +39,13 @@ def turned_bearings(
     fits : LineFits
         The lines.
     rotation : (3, 3) float64
-        What turns the normals of their planes.
+        The rotation of the normals of their planes.
     pitch, roll : float
         The tilt under which the lines are seen (rad).
     building : float
         Standard deviation of real verticals about the vertical (rad): the measured lean b is
         replaced by its best estimate, given that it should be that of a vertical up to this, and a,
-        which is correlated with it, follows. Infinite to take lines as they are.
+        which is correlated with it, follows. Infinite: lines are not changed.
 
     Returns
     -------

@@ -1,8 +1,8 @@
-"""Images whose edges are all blurred: how much, and the settings that suit them.
+"""Images whose edges are all blurred: the amount of blur, and settings for it.
 
-Turning robots and soft optics blur all edges of an image alike. Where the blur is wider than the
-filter, an edge has no one steepest place: what turning makes of a step is a ramp, the same all
-over, and tracks wander in it. A filter as wide as the blur finds the middle of it again.
+Turning robots and soft optics blur all edges of an image alike. If the blur is wider than the
+filter, an edge has no unique steepest place: rotation turns a step into a ramp of constant slope,
+in which tracks drift. A filter as wide as the blur finds the middle of the ramp.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from detect.verticals.tilt_error import descending
 _WIDE_ENOUGH = 0.68
 #: Refinement has no steps wider than this, pixels.
 _WIDEST_STEP_PX = 19.0
-#: Fewer edges than this tell nothing of the image.
+#: Least number of edges from which the blur of an image is estimated.
 _LEAST_EDGES = 3
-#: What grows with the width of the filter: pixels across an edge. A line's standard deviation is
-#: among it: what stands beside an edge within the blur draws it by some part of that.
+#: Settings that grow with the width of the filter: pixels across an edge. They include a line's
+#: standard deviation: other edges within the blur displace it by a part of that.
 _ACROSS = (
     "sigma_across_px", "guided_reach_px", "fine_scale_px", "coarse_scale_px",
     "largest_scatter_px", "largest_shift_px", "largest_noise_px", "bend_px", "largest_lean_px",
@@ -58,7 +58,7 @@ def blur_of_sharpness(sharpness: float, fine_px: float, coarse_px: float) -> flo
 
 
 def width_for(sharpness: float, settings: LineSettings) -> float:
-    """How many times as wide as it is set the filter has to be for an image's edges.
+    """Factor by which the filter must be widened for an image's edges.
 
     Parameters
     ----------
@@ -83,7 +83,7 @@ def width_for(sharpness: float, settings: LineSettings) -> float:
 
 @lru_cache(maxsize=32)
 def widened(settings: LineSettings, width: float) -> LineSettings:
-    """The same settings for edges so many times as wide, and what is wider still."""
+    """The settings for edges `width` times as wide; of `blurred_widths`, larger ones remain."""
     across = {name: width * getattr(settings, name) for name in _ACROSS}
     steps = tuple(
         (min(width * scale, _WIDEST_STEP_PX), width * most)

@@ -1,4 +1,4 @@
-"""What was found in one image: lines, their tilt, and all that they were made from."""
+"""Detections in one image: lines, their tilt, and the tracks behind them."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ FloatArray = NDArray[np.float64]
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class LineDetections:
-    """What was found in one image.
+    """Detections in one image.
 
     Parameters
     ----------
@@ -30,7 +30,7 @@ class LineDetections:
     tracks : LineTracks
         All tracks.
     judged : Judgement
-        Lines through all of them, and what they are.
+        Lines through all of them, and their fates.
     sharpness : float
         Median sharpness of the edges (`detect.verticals.blur.median_sharpness`).
     """
@@ -45,7 +45,7 @@ class LineDetections:
 
     @property
     def line_numbers(self) -> FloatArray:
-        """(8, N) ends, bearings, inclinations, deviations and noise, as told below, in rows."""
+        """(8, N) ends, bearings, inclinations, deviations and noise, as described below, by row."""
         own = self.lines
         return np.stack([*own.ends.T, own.alpha_rad, own.beta_rad, own.sigma_rad, own.noise_rad])
 
@@ -76,7 +76,7 @@ class LineDetections:
 
     @cached_property
     def members(self) -> tuple[tuple[int, ...], ...]:
-        """The tracks that each line was made of, the strongest first; its ends are that one's."""
+        """The tracks that each line consists of, the strongest first; its ends are that one's."""
         own = self.lines.members.tolist()
         return tuple(tuple(own[a:b]) for a, b in pairwise(self.lines.bounds.tolist()))
 

@@ -110,7 +110,7 @@ def moments_across(
     at : int64
         Index in `strip` of the group's first.
     left, right : float32
-        Columns from and below which windows lie inside the image; elsewhere moments are 0.
+        Columns from and below which windows are inside the image; elsewhere moments are 0.
     weights : (4, T) float32, contiguous
         See `detect.verticals.response.LineFilter.weights_between`.
     words : int64

@@ -34,7 +34,7 @@ FloatArray = NDArray[np.float64]
 
 
 class JoiningLimits(NamedTuple):
-    """What lines are gathered by; see `detect.line_settings.LineSettings`.
+    """Limits for joining lines; see `detect.line_settings.LineSettings`.
 
     `equal` is whether joined lines count the same, `turn` 1 to undo the tilt and -1 to apply it
     once more, `building_rad` see `detect.verticals.bearing.turned_bearings`.
@@ -79,7 +79,7 @@ class Lines(NamedTuple):
 
 @lru_cache(maxsize=16)
 def joining_of(settings: LineSettings) -> JoiningLimits:
-    """What lines are gathered by."""
+    """Limits for joining lines."""
     level = settings.alpha == "level"
     return JoiningLimits(
         same_edge_px=float(settings.same_edge_px),
@@ -243,7 +243,7 @@ def join_tracks(
     members, bounds
         See `group_tracks`.
     sigma_px : float
-        Standard deviation of an edge about the line of the building that it stands for, pixels.
+        Standard deviation of an edge about the line of the building that it shows, pixels.
 
     Returns
     -------

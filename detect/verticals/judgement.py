@@ -1,9 +1,9 @@
-"""Judgement: which tracks can be verticals, by themselves and by the tilt on which most agree.
+"""Selects the tracks that can be verticals, by themselves and by the tilt on which most agree.
 
 A track's evidence is its response summed over its length in pixel widths, weakened by the square of
-its sharpness: soft edges are shadows and glare more often than the building's. A line of angle b
-about the vertical is one if b^2 is at most the sum of the squares of the largest lean, of so many
-standard deviations of its noise, and of some pixels over its length
+its sharpness: soft edges are shadows and glare more often than the building's. A line at an angle b
+to the vertical is accepted if b^2 is at most the sum of the squares of the largest lean, of a
+number of standard deviations of its noise, and of some pixels over its length
 (`detect.line_settings.LineSettings`).
 
 An edge that crosses the band round the horizon has a maximum of the response on each of its rows.
@@ -59,8 +59,7 @@ NOT_VERTICAL = 10
 SAME_EDGE = 11
 BESIDE_A_STRONGER_EDGE = 12
 
-#: What can become of a track: a line of its own, joined to a stronger one, or the reason why it is
-#: none.
+#: Fates of a track: accepted as a line, joined to a stronger one, or the reason for its rejection.
 FATES = (
     "accepted",
     "joined",
@@ -77,17 +76,17 @@ FATES = (
     "beside a stronger edge",
 )
 
-#: Maxima on neighbouring rows of the band that belong together are not as far apart, columns.
+#: Maxima of a chain on neighbouring rows of the band are closer than this, columns.
 _CHAIN_APART = 1.5
-#: Least number of maxima of a chain, of which noise alone has few so long.
+#: Least number of maxima of a chain; noise alone gives few as long.
 _CHAIN_LEAST = 6
 #: Largest root-mean-square distance of them from a straight line, pixels.
 _CHAIN_SCATTER_PX = 0.3
 #: How far a chain may lean from the vertical over its length, pixels (see
 #: `detect.line_settings.LineSettings.largest_lean_px`).
 _CHAIN_LEAN_PX = 0.5
-#: Standard deviation of its lean over its length due to all but noise, pixels: more than that of
-#: lines, which are refined on the grey values.
+#: Standard deviation of its lean over its length due to causes other than noise, pixels: more than
+#: that of lines, which are refined on the grey values.
 _CHAIN_BEND_PX = 0.125
 
 
@@ -103,7 +102,7 @@ class Leaning(NamedTuple):
 
 
 class JudgementLimits(NamedTuple):
-    """What tracks are judged by; see `detect.line_settings.LineSettings`.
+    """Limits for the selection of tracks; see `detect.line_settings.LineSettings`.
 
     `least_score` is the least evidence in responses, not in pixel widths.
     """
@@ -124,7 +123,7 @@ class JudgementLimits(NamedTuple):
 
 
 class Judgement(NamedTuple):
-    """Lines through tracks, and what they are.
+    """Lines through tracks, and their fates.
 
     Attributes
     ----------
@@ -147,7 +146,7 @@ class Judgement(NamedTuple):
 
 @lru_cache(maxsize=16)
 def limits_of(settings: LineSettings, row_aspect: float) -> JudgementLimits:
-    """What tracks are judged by."""
+    """Limits for the selection of tracks."""
     return JudgementLimits(
         least_points=settings.least_points(row_aspect),
         least_score=float(settings.least_evidence / row_aspect),
@@ -180,7 +179,7 @@ def judge_tracks(
     *,
     steps: int | None = None,
 ) -> Judgement:
-    """Fit lines to tracks, judge them one by one, and let them agree on a tilt.
+    """Fit lines to tracks, select them one by one, and estimate the tilt on which most agree.
 
     Parameters
     ----------
@@ -193,7 +192,7 @@ def judge_tracks(
     settings : LineSettings
         See there.
     steps : int, optional
-        Only so many of the settings' steps refine lines on the grey values.
+        Number of the settings' steps that refine lines on the grey values.
     """
     limits = limits_of(settings, table.row_aspect)
     filters = refinement_of(settings, steps)
@@ -206,7 +205,7 @@ def fit_and_judge(
     image: NDArray[np.uint8], strip: Strip, tracks: LineTracks, filters: StepFilters,
     limits: JudgementLimits,
 ) -> tuple[Judgement, Verticals, NDArray[np.int64]]:  # fmt: skip
-    """As `judge_tracks`, but for the tilt's covariance, which is that of least squares.
+    """As `judge_tracks`, except that the tilt's covariance is that of least squares.
 
     Also returned is what `detect.verticals.tilt.with_error` needs for another one: what the
     accepted tracks say about the tilt, and one of them for each, the same for all of an edge.
@@ -251,7 +250,7 @@ def _quantile(values: NDArray[np.float64], share: float) -> float:
 def judge_each(
     strip: Strip, tracks: LineTracks, fits: LineFits, limits: JudgementLimits
 ) -> tuple[FloatArray, NDArray[np.int8]]:
-    """Tell for each track what speaks for it, and whether it can be a vertical, by itself.
+    """Evidence of each track, and whether it can be a vertical, by itself.
 
     Returns
     -------
@@ -307,7 +306,7 @@ def weigh_verticals(
     fits: LineFits, evidence: FloatArray, accepted: NDArray[np.int64], leaning: Leaning,
     weight_limit: float,
 ) -> Verticals:  # fmt: skip
-    """What accepted lines say about the tilt."""
+    """The tilt's constraints by accepted lines."""
     count = len(accepted)
     normal = np.empty((count, 3))
     variance = np.empty(count)

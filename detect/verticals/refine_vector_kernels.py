@@ -1,4 +1,4 @@
-"""What the refinement of lines sums up over the rows that they cross, `ROWS` rows at a time.
+"""Sums of the refinement of lines over the rows that they cross, `ROWS` rows at a time.
 
 Each row has its own place in the image and its own weights: what is alike in all of them is done
 in vectors of one number for each row, and the rest, weighted sums of eight grey values at a time,
@@ -31,7 +31,7 @@ __all__ = ["ROWS", "SUBPIXELS", "heights", "move_crossings", "newton_sums"]
 #: Positions in a pixel for which weights are tabulated; between them the derivative helps out.
 SUBPIXELS = 64
 
-#: Rows that are looked at together.
+#: Number of rows that are processed together.
 ROWS = LANES
 # How many numbers `newton_sums` returns.
 _SUMS = 9
@@ -102,7 +102,7 @@ def newton_sums(
     left: Any,
     right: Any,
 ) -> Any:
-    """What a step of Newton's method needs of a line's rows.
+    """Sums over a line's rows for a step of Newton's method.
 
     Parameters
     ----------

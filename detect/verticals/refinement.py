@@ -35,7 +35,7 @@ from detect.verticals.tracking import LineTracks
 
 FloatArray = NDArray[np.float64]
 
-#: Beyond so many standard deviations there is nothing left of the Gaussian.
+#: Standard deviations beyond which the Gaussian is negligible.
 _REACH = 4.4
 #: Up to here series of tangents and arc tangents are as good as these.
 _SMALL = 0.1
@@ -126,8 +126,8 @@ class StepFilters(NamedTuple):
         Those of its derivatives times sigma^2: `WORD` (`detect.vector_code`) of the
         first, then as many of the second, and so on.
     farthest : (K,) float64
-        How far a step may take the middle of a line, pixels; one that would go farther is not made,
-        nor any after it. With no step the lines stay as tracked.
+        Largest displacement of the middle of a line by a step, pixels; a larger step is not made,
+        nor any after it. Without steps the lines stay as tracked.
     """
 
     half: NDArray[np.int64]
@@ -160,7 +160,7 @@ def step_filters(sigmas_px: tuple[float, ...], farthest_px: tuple[float, ...]) -
         weights = np.stack(
             [d / sigma**2 * gaussian, (q - 1.0) * gaussian, (q - 3.0) * d / sigma**2 * gaussian]
         )
-        # What is cut off must not see the image's brightness.
+        # Windows that are cut off must not depend on the image's brightness.
         weights -= weights.mean(axis=-1, keepdims=True)
         weights = np.pad(weights, [(0, 0), (0, 1), (0, 0)])
         tables.append(weights.reshape(3, -1))
@@ -266,7 +266,7 @@ def fit_eigenlines(
     for t in range(len(bounds) - 1):
         begin, end = bounds[t], bounds[t + 1]
         n = end - begin
-        # Views: that no index of theirs is negative the compiler knows.
+        # Views, so that the compiler knows that indices are not negative.
         own_row = row[begin:end]
         own_column = column[begin:end]
         own_score = score[begin:end]
@@ -400,7 +400,7 @@ def refine_lines(
             continue
         phi = reference[t]
         n = end - begin
-        # Views: that no index of theirs is negative the compiler knows.
+        # Views, so that the compiler knows that indices are not negative.
         own_row = row[begin:end]
         own_column = column[begin:end]
         own_rise = rise[begin:end]
@@ -423,7 +423,7 @@ def refine_lines(
         columns_about = 2.0 / (bearing[j + 1] - bearing[j - 1])
         rightmost = np.float64(width - 1)
         for i in range(n):
-            # To a hundredth of a column; it decides which of them it lies between.
+            # To a hundredth of a column; it decides between which columns it is.
             at = own_column[i] + (turn[i] - own_off[i]) * columns_about
             inside = (at >= 0.0) & (at <= rightmost)
             near[i] = np.int32(at if inside else -1.0)
@@ -473,7 +473,7 @@ def refine_lines(
             meat_bb = sums[7]
             used = int(sums[8])
             determinant = hessian_aa * hessian_bb - hessian_ab * hessian_ab
-            # No maximum here at this scale: what the coarser ones found stands.
+            # No maximum here at this scale: the result of the coarser ones is kept.
             if used < 5 or not (hessian_aa < 0.0 and determinant > 1e-12 * hessian_aa * hessian_bb):
                 break
             inverse_aa = hessian_bb / determinant

@@ -34,7 +34,7 @@ from lut.verticals import VerticalTable
 FloatArray = NDArray[np.float64]
 T = TypeVar("T", bound=np.generic)
 
-#: So many rows of the band are crossed by each line if starts need company on them.
+#: Each line crosses at least this many rows of the band if starts need support on other rows.
 _CROSSED = 3
 
 
@@ -63,11 +63,11 @@ class LineFilter(NamedTuple):
 
 
 class StartBand(NamedTuple):
-    """The rows parallel to the anchor on which tracks start, and what the filter needs there.
+    """The rows parallel to the anchor on which tracks start, and the filter's tables for them.
 
-    The anchor is the horizon, or what stands for it (`lut.verticals`). Rows of the band are counted
-    from there; the filter is evaluated on its row s (half the filter's length) and every `spacing`
-    from there.
+    The anchor is the horizon or its replacement (`lut.verticals`). Rows of the band are counted
+    from its upper end; the filter is evaluated on row s (half the filter's length) and every
+    `spacing` rows after it.
 
     Attributes
     ----------
@@ -87,19 +87,19 @@ class StartBand(NamedTuple):
     odd_bounds : (P // T + 1,) int32
         Those of tile t are ``odd[odd_bounds[t] : odd_bounds[t + 1]]``.
     part : (P // T, R, T) float32
-        How far the pixel of the band lies to the right of it.
+        How far the pixel of the band is to the right of it.
     scale : (K, P) float32
-        One over the sum of the weights that lie on the vertical; 0 where there are none.
+        One over the sum of the weights that are on the vertical; 0 where there are none.
     visible : (K, W) bool
-        Whether the filter's window lies inside the image.
+        Whether the filter's window is inside the image.
     weights : (K, 2, 2r + 1) float32
         The filter's weights across the vertical, for the strip's columns, which are a pixel apart
         on the horizon only.
     spacing : int
         See above.
     supported : bool
-        Whether there are so many of these rows that each line crosses several of them: a start that
-        has no company on them is none of a line.
+        Whether there are enough of these rows for each line to cross several of them: a start
+        without others next to it on these rows belongs to no line.
     """
 
     row: NDArray[np.int32]
@@ -154,7 +154,7 @@ class Strip(NamedTuple):
 
 
 class ResponseOnDemand(NamedTuple):
-    """The response of one image, evaluated where it is asked for (`response_kernels.respond`).
+    """The response of one image, evaluated on demand (`response_kernels.respond`).
 
     Attributes
     ----------
@@ -219,7 +219,7 @@ def _weights_across(sigma_px: float, spacing_px: float) -> FloatArray:
 
 @lru_cache(maxsize=16)
 def line_filter(settings: LineSettings) -> LineFilter:
-    """The filter that settings ask for."""
+    """The filter of some settings."""
 
     weights = _weights_across(settings.sigma_across_px, 1.0)
     # Moments between two pixels are those of both, interpolated; so are the weights.
@@ -280,7 +280,7 @@ def start_band(table: VerticalTable, settings: LineSettings) -> StartBand:
     spacing_px = [_typical_spacing(x[i], on_vertical[i]) for i in range(*evaluated.indices(len(x)))]
     weights = [_weights_across(settings.sigma_across_px, px) for px in spacing_px]
     beyond = [(0, 0), (0, -width % TILE)]
-    # What is there counts nowhere; that it goes on like this makes it fast.
+    # These values are not used; continuing the run makes it fast.
     further = np.minimum(pixel[:, -1:] + np.arange(1, beyond[1][1] + 1), height * width - 2)
     pixel = _in_tiles(np.concatenate([pixel, further], axis=1).astype(np.int32))
     runs, lengths, odd, odd_bounds = _runs_of_neighbours(pixel, height * width)
@@ -315,7 +315,7 @@ def _runs_of_neighbours(
     block = pixel.reshape(-1, RUN)
     breaks = np.diff(block, axis=1) != 1
     number = np.concatenate([np.zeros((len(block), 1), np.intp), np.cumsum(breaks, axis=1)], axis=1)
-    # Which place is the first behind so many breaks.
+    # The first place behind 1, and behind 2 breaks.
     lengths = np.stack([(number <= 0).sum(axis=1), (number <= 1).sum(axis=1)], axis=1)
     own = np.arange(len(block))
     begins = [np.zeros_like(own), *np.minimum(lengths, RUN - 1).T]
@@ -412,7 +412,7 @@ def start_response(
 
 
 def padded_pixels(image: NDArray[np.uint8], window: LineFilter) -> NDArray[np.uint8]:
-    """The image in scan order, and behind it what the filter's weights of zero need."""
+    """The image in scan order, followed by padding for the filter's weights of zero."""
     flat = image.reshape(-1)
     missing = window.weights_between.shape[1] - window.weights.shape[1] - 1
     return np.pad(flat, (0, missing)) if missing else flat

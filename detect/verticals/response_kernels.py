@@ -1,8 +1,8 @@
 """Compiled: the filter everywhere, on the rows near the horizon, and where tracks go.
 
-Groups of `LANES` neighbouring verticals begin `STEP` columns apart and overlap: whoever follows an
-edge finds the columns round it in one of them. What the vectors do not reach, windows that are cut
-off, is done number by number.
+Groups of `LANES` neighbouring verticals begin `STEP` columns apart and overlap, so that the columns
+round an edge are all in one of them. Windows that are cut off, which the vectors do not reach, are
+computed number by number.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ from detect.verticals.filter_vector_kernels import (
 if TYPE_CHECKING:
     from detect.verticals.response import LineFilter, ResponseOnDemand, StartBand, Strip
 
-#: Groups of verticals begin so many columns apart, and so many before the first that is theirs:
-#: whoever asks for a column may ask for two more on either side.
+#: Groups of verticals begin `STEP` columns apart, and `MARGIN` columns before the first of their
+#: own, so that a column's two neighbours on either side are in the same group.
 STEP = 4
 MARGIN = 2
 
@@ -173,7 +173,7 @@ def _from_cache_line(numbers: NDArray[np.float32]) -> NDArray[np.float32]:
 def band_response(
     image: NDArray[np.uint8], band: StartBand, window: LineFilter
 ) -> NDArray[np.float32]:
-    """Responses on rows parallel to the horizon, with the window laid over the strip itself.
+    """Responses on rows parallel to the horizon, with the window applied to the strip itself.
 
     Near the horizon the strip's columns are a pixel wide. There it hardly matters whether the
     moments across the vertical are taken in the image and interpolated, or the grey values and
@@ -209,7 +209,7 @@ def band_response(
     flat_scale = band.scale.reshape(-1)
     flat_weights = band.weights.reshape(-1)
     runs, lengths, odd = band.runs, band.lengths, band.odd
-    # Some columns at a time: what is between the pixels stays in the innermost cache.
+    # Some columns at a time, so that interpolated values stay in the innermost cache.
     plane = rows * TILE
     between = _from_cache_line(np.empty(2 * plane + 16, np.float32))
     length = padded + (BLOCK + taps + 15) // 16 * 16
@@ -231,7 +231,7 @@ def band_response(
                     flat_scale, k * padded + left + own, sums, sums_plane, k * length + left + own,
                 )  # fmt: skip
     for row in range(2 * levels):
-        # What is computed of it is not looked at, but may take long.
+        # Results for the padding are not used, but arbitrary values in it may take long.
         sums[row * length + padded : (row + 1) * length] = _ZERO
     values = np.empty(length, np.float32)
     for k in range(levels):

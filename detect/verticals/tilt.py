@@ -1,16 +1,16 @@
 """Tilt consensus: the camera's tilt from the verticals that it sees.
 
-A calibration knows how the camera is mounted on the robot, not how the robot stands: it pitches and
-rolls on its springs, and the mounting itself drifts. Real verticals tell. The plane through the
-camera's centre and a vertical line contains the vertical, so its normal n, turned by the tilt, is
-level:
+A calibration gives the mounting of the camera on the robot, not the robot's tilt: the robot pitches
+and rolls on its springs, and the mounting itself drifts. Real verticals show the tilt. The plane
+through the camera's centre and a vertical line contains the vertical, so its normal n, rotated by
+the tilt, is level:
 
     (R n)_z = 0,    R = exp([pitch, roll, 0]x)    (robot frame: X left, Y backward, Z up)
 
 R takes directions measured with the calibrated mounting to level ones. (DLR Spatial Cognition data
 set report, line detection; the data set's own rows apply the inverse of this rotation.) The tilt is
-the one on which most lines agree, refined by least squares with Cauchy's weights; how far it may be
-off, `detect.verticals.tilt_error` tells.
+the one on which most lines agree, refined by least squares with Cauchy's weights; its error is
+estimated in `detect.verticals.tilt_error`.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from detect.verticals.tilt_error import descending, error_of_tilt
 
 FloatArray = NDArray[np.float64]
 
-#: How often the tilt is estimated anew over the lines that agree with it.
+#: How often the tilt is estimated again from the lines that agree with it.
 REFINEMENTS = 6
 #: Standard deviations from which on a line's pull no longer grows.
 SOFTENING = 2.0
@@ -71,7 +71,7 @@ class ConsensusSettings(NamedTuple):
     prior_rad : float
         Standard deviation of the tilt; decides only between tilts that the lines support alike.
     proposers : int
-        The tilt is looked for among those that pairs of this many lines, the strongest, agree with.
+        Candidates for the tilt come from pairs of this many lines, the strongest.
     least_lines : int
         With fewer lines that agree there is no estimate.
     stray_share : float
@@ -87,7 +87,7 @@ class ConsensusSettings(NamedTuple):
 
 
 class Verticals(NamedTuple):
-    """What lines that may be verticals say about the tilt.
+    """Constraints of the tilt by lines that may be verticals.
 
     Attributes
     ----------
@@ -110,7 +110,7 @@ class Verticals(NamedTuple):
 def consensus(
     lines: Verticals, settings: ConsensusSettings
 ) -> tuple[TiltEstimate | None, NDArray[np.bool_]]:
-    """Estimate the tilt from the largest consistent set of lines, and tell which belong to it.
+    """Estimate the tilt from the largest consistent set of lines; returns the set as well.
 
     Parameters
     ----------
@@ -143,7 +143,7 @@ def level_rotation(pitch_rad: float, roll_rad: float) -> FloatArray:
 
 @njit(cache=True, error_model="numpy")
 def no_tilt() -> TiltEstimate:
-    """What compiled code has where there is no estimate."""
+    """The value in compiled code for no estimate."""
     return TiltEstimate(np.nan, np.nan, np.full((2, 2), np.nan), 0, np.nan, np.nan)
 
 

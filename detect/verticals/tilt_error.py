@@ -1,16 +1,17 @@
-"""How far a tilt that verticals agree on may be from the true one.
+"""Mean square error of a tilt on which verticals agree.
 
-Least squares believe that each line errs by itself. Lines of a real building err together: both
-edges of a board that leans, the folds of a curtain, a row of trees. And some frames show carpentry,
-others clutter. The mean square error of a tilt t is therefore taken over a posterior
+Least squares assume that errors of lines are independent. Lines of a real building have common
+errors: both edges of a board that leans, the folds of a curtain, a row of trees. And some frames
+show carpentry, others clutter. The mean square error of a tilt t is therefore taken over a
+posterior
 
     p(t, s) ~ p(t) p(s) prod_k [(1 - q) T3(z_k(t); v_k + s^2) + q Cauchy(z_k(t); c)]
 
 of the tilt and of the scatter s of verticals about the vertical, where z_k(t) is the inclination
 of line k levelled by t, v_k the variance of its measurement, T3 Student's density of three degrees
-of freedom, and q the share of lines that are no verticals. How large s is, the edges tell one by
-one; given s, all lines within `TOGETHER_RAD` of bearing count as a single one, for they lean
-together. The sums run over a polar grid round the tilt, stretched as the information is.
+of freedom, and q the share of lines that are no verticals. For s each edge counts by itself; given
+s, all lines within `TOGETHER_RAD` of bearing count as a single one, since they lean together. The
+sums are over a polar grid round the tilt, stretched according to the information.
 
 Student's density for errors whose scale is not known: K. L. Lange, R. J. A. Little and J. M. G.
 Taylor, Robust Statistical Modeling Using the t Distribution, JASA 84 (1989).

@@ -35,9 +35,9 @@ FloatArray = NDArray[np.float64]
 
 #: A line's starts on neighbouring rows of the band are no more columns apart.
 SUPPORT = 2
-#: Maxima are told by vectors of bytes, and looked through so many at a time.
+#: Maxima are flagged in vectors of bytes, of which this many are scanned at a time.
 _WORD = 8
-#: Scores are put in order by so many classes first, then within each.
+#: Number of classes into which scores are sorted first, before they are sorted within each.
 _CLASSES = 512
 #: Rows that are filtered ahead of a track.
 _AHEAD = 12
@@ -139,9 +139,9 @@ class Following(NamedTuple):
     reach : float
         Largest offset of a point from its expected position, columns.
     enough : int
-        No more edges are followed once there are so many tracks
+        No more edges are followed once there are this many tracks
     least_points, least_score : int, float
-        of at least so many points and such a sum of scores.
+        with at least this number of points and this sum of scores.
     """
 
     threshold: float
@@ -170,7 +170,7 @@ ALL_EDGES = 2**31
 def following_of(
     settings: LineSettings, row_aspect: float, guided: bool, enough: int = ALL_EDGES
 ) -> Following:
-    """How settings ask edges to be followed: along the verticals of a tilt, or wherever they go."""
+    """How edges are followed with some settings: along the verticals of a tilt, or without one."""
     return Following(
         threshold=float(settings.threshold),
         max_gap=settings.gap_rows,
@@ -228,10 +228,10 @@ def line_tracks(
     settings : LineSettings
         Threshold, gaps, border.
     tilt : TiltEstimate, optional
-        If given, edges are only followed along the verticals that it predicts; else wherever they
-        go.
+        If given, edges are only followed along the verticals that it predicts; else in any
+        direction.
     enough : int, optional
-        No more edges are followed once so many could be lines by their length and response.
+        No more edges are followed once this many could be lines by their length and response.
 
     Returns
     -------
@@ -553,7 +553,7 @@ def follow_edges(
             else:
                 end = height + count
         if begin == end:
-            # Starts were looked for with less care.
+            # Starts were searched less thoroughly.
             continue
         if n + height > capacity:
             capacity *= 2
@@ -566,7 +566,7 @@ def follow_edges(
             grown_score = np.empty(capacity, np.float32)
             grown_score[:n] = score[:n]
             score = grown_score
-        # Views: that no index of theirs is negative the compiler knows.
+        # Views, so that the compiler knows that indices are not negative.
         points = end - begin
         seen_row = own_row[begin:end]
         seen_column = own_column[begin:end]

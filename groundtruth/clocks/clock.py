@@ -1,8 +1,8 @@
-"""How the robot's clock goes against the ground truth's: a straight line per segment, and its file.
+"""Model of the robot's clock relative to the ground truth's: a straight line per segment.
 
 Within a segment ``robot_time = time + offset + (rate - 1) (time - reference)``, `time` being the
 ground truth's; between segments the offset is interpolated, before the first and after the last
-their lines go on.
+their lines are extrapolated.
 """
 
 from __future__ import annotations
@@ -46,15 +46,15 @@ class ClockSegment:
     angle_rad : float
         Heading of the ground truth minus heading of the odometry.
     sigma_offset_s, sigma_rate, sigma_angle_rad : float
-        Standard deviations; infinite where nothing in the segment tells.
+        Standard deviations; infinite where the segment does not determine the value.
     turned_rad : float
-        How far the robot turned, all turns taken positive.
+        Sum of the absolute values of the robot's turns.
     status : str
-        `ok`; `no turns`: the segment cannot be synchronised, its numbers are what the others say;
-        `jump`: its two halves disagree, as where a clock was set; `at a bound`: the best is at the
-        limit of what was searched.
+        `ok`; `no turns`: the segment cannot be synchronised, its numbers follow from the others;
+        `jump`: its two halves disagree, as where a clock was set; `at a bound`: the optimum is at
+        the limit of the search range.
     note : str
-        What is known beyond the status.
+        Details of the status.
     """
 
     from_s: float
@@ -78,7 +78,7 @@ class ClockModel:
     Attributes
     ----------
     segments : tuple of ClockSegment
-        In order; at least one that tells something.
+        In order; at least one whose offset is determined.
     """
 
     segments: tuple[ClockSegment, ...]
@@ -121,8 +121,8 @@ class ClockModel:
         Raises
         ------
         GroundTruthError
-            If the clock stands still or runs backward between two segments (it was set back): then
-            a robot time has no single time.
+            If the clock stops or runs backward between two segments (it was set back): then a robot
+            time has no unique ground truth time.
         """
         knots, offsets = self._knots()
         robot = knots + offsets
@@ -154,7 +154,7 @@ class ClockModel:
 
 
 def clock_document(segments: Sequence[ClockSegment]) -> list[dict[str, Any]]:
-    """Segments as they stand in a clock file: infinite deviations are null."""
+    """Segments as written in a clock file: infinite deviations are null."""
     return [
         {
             name: None if isinstance(value, float) and math.isinf(value) else value

@@ -26,7 +26,7 @@ _FEWEST_PER_WINDOW = 5
 _SHORT_WINDOW_S = 0.1
 _LARGEST_STREAM_GAP_S = 0.5
 _STRIDE_S = 0.5
-# What a robot's odometry may be off by, systematically: a share of each turn, and a bend.
+# Systematic errors of a robot's odometry: a share of each turn, and a curvature.
 _TURN_SCALE_SIGMA = 0.03
 _TURN_PER_METRE_SIGMA = 0.01
 
@@ -95,7 +95,7 @@ def pair_headings(
     largest_drift: float,
     fewest: int,
 ) -> HeadingPair | None:
-    """What of two streams can be compared, fixed for a whole search of offset and drift.
+    """The comparable part of two streams, fixed for a whole search of offset and drift.
 
     Parameters
     ----------
@@ -111,7 +111,7 @@ def pair_headings(
     Returns
     -------
     HeadingPair or None
-        None where too few samples are covered by the other stream wherever the search looks.
+        None if the other stream covers too few samples in the whole search range.
     """
     if len(segment) < fewest:
         return None
@@ -140,7 +140,7 @@ def pair_headings(
     pair = HeadingPair(times, headings, window, other, reference, sign, systematic)
     if len(times) == 0:
         return None
-    # Wherever the search looks, the other stream must have a say.
+    # The other stream must cover the samples in the whole search range.
     corners = [
         pair.warped(times + end * window, offset, drift)
         for end in (-0.5, 0.5)
@@ -179,7 +179,7 @@ def without_turns(differences: FloatArray, *, keep_mean: bool = False) -> FloatA
     ----------
     differences : (N,) array
     keep_mean : bool
-        Whether their mean angle stays in; else it is taken off, which eliminates the angle between
+        Whether their mean angle stays in; else it is subtracted, which eliminates the angle between
         the streams' axes.
 
     Returns

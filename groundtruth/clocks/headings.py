@@ -108,7 +108,7 @@ class HeadingIntegral:
         return np.asarray((self._integral(to_s) - self._integral(from_s)) / (to_s - from_s))
 
     def covers(self, from_s: FloatArray, to_s: FloatArray, largest_gap_s: float) -> BoolArray:
-        """Which of M spans of time lie among the samples and touch no longer gap."""
+        """Which of M spans of time are within the samples and overlap no longer gap."""
         covered = (from_s >= self.times_s[0]) & (to_s <= self.times_s[-1])
         for gap in np.flatnonzero(np.diff(self.times_s) > largest_gap_s):
             covered &= (to_s <= self.times_s[gap]) | (from_s >= self.times_s[gap + 1])

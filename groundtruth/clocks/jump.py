@@ -14,12 +14,12 @@ from groundtruth.clocks.wandering import Wandering, estimate_wandering
 FloatArray = NDArray[np.float64]
 
 _PLACES = 60
-# By how much a step must explain more than chance would at the best of so many places: beside the
-# drift, and in its stead (100 draws without a jump reached 13 and 11).
+# By how much a step must reduce the squared error, more than the best of `_PLACES` would by chance:
+# in addition to the drift, and instead of it (100 draws without a jump reached 13 and 11).
 _BEYOND_DRIFT = 20.0
 _INSTEAD_OF_DRIFT = 15.0
 _LEAST_JUMP_S = 0.004
-# What a jump makes of the differences changes slowly and must not pass for wandering.
+# A jump changes the differences slowly and must not be mistaken for a random walk.
 _SHORT_LAGS = (1, 2, 3, 4)
 _RELOCATIONS = 4
 _FEWEST_PER_SIDE = 5
@@ -29,7 +29,7 @@ _SEARCH_S = 1.0
 def find_jump(pair: HeadingPair, offset_s: float, drift: float) -> float | None:
     """When the clock was set, if it was.
 
-    A step of the offset at each of many places is held against the drift: there was a jump if a
+    A step of the offset at each of many places is compared with the drift: there was a jump if a
     step explains the headings better than the drift does, or much that the drift leaves over.
 
     Parameters
@@ -55,7 +55,7 @@ def find_jump(pair: HeadingPair, offset_s: float, drift: float) -> float | None:
         pair.times_s[-_FEWEST_PER_SIDE],
     )
     steps = np.where(pair.times_s[:, None] >= places, jacobian[:, :1], 0.0)
-    # To first order, what the differences were with the offset alone.
+    # To first order, the differences with the offset alone.
     without_drift = differences - jacobian[:, 1] * drift
     instead, _ = _gains(without_drift, steps, jacobian[:, :1], wandering)
     beside, size = _gains(without_drift, steps, jacobian, wandering)
@@ -96,7 +96,7 @@ class _Split:
 def _relocate(
     pair: HeadingPair, wandering: Wandering, places: FloatArray, best: int, near_s: float
 ) -> _Split:
-    """The place that fits best once each side has an offset of its own, without drift."""
+    """The place that fits best if each side has its own offset, without drift."""
     split = None
     for _ in range(_RELOCATIONS):
         before = pair.times_s < places[best]

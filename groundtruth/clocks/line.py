@@ -1,4 +1,4 @@
-"""Whether the robot's clock ran evenly over a whole session: one straight line for all segments."""
+"""Fits one straight line to all segments of a session, if the robot's clock ran evenly."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ _AGREEMENT = 0.999
 def on_one_line(segments: Sequence[ClockSegment]) -> list[ClockSegment]:
     """Put segments on the straight line through all of them, if that agrees with each.
 
-    A clock that nobody disciplines or sets runs evenly over minutes; then the segments, minutes
-    apart, tell its rate far better than each does alone, and its offset somewhat better.
+    A clock that is neither disciplined nor set runs evenly over minutes. Segments that are minutes
+    apart then determine its rate much better than each alone, and its offset somewhat better.
 
     Parameters
     ----------
@@ -29,16 +29,16 @@ def on_one_line(segments: Sequence[ClockSegment]) -> list[ClockSegment]:
     -------
     list of ClockSegment
         With the line's offsets, rates and deviations, and a note; unchanged where fewer than two
-        segments tell something, a clock was set, or one line does not explain them: its squared
-        error is above what one session in a thousand has by chance.
+        segments are determined, a clock was set, or one line does not explain them: its squared
+        error is larger than one session in a thousand has by chance.
     """
-    told = [segment for segment in segments if segment.status == "ok"]
+    determined = [segment for segment in segments if segment.status == "ok"]
     others = {segment.status for segment in segments} - {"ok", "no turns"}
-    if len(told) < 2 or others:
+    if len(determined) < 2 or others:
         return list(segments)
-    middle = float(np.mean([segment.reference_s for segment in told]))
+    middle = float(np.mean([segment.reference_s for segment in determined]))
     rows, values, sigmas = [], [], []
-    for segment in told:
+    for segment in determined:
         rows += [(1.0, segment.reference_s - middle), (0.0, 1.0)]
         values += [segment.offset_s, segment.rate - 1.0]
         sigmas += [segment.sigma_offset_s, segment.sigma_rate]
@@ -51,7 +51,7 @@ def on_one_line(segments: Sequence[ClockSegment]) -> list[ClockSegment]:
     freedom = len(values) - 2
     if squared > chdtri(freedom, 1.0 - _AGREEMENT):
         return list(segments)
-    note = f"one line through {len(told)} segments: chi2 {squared:.1f} of {freedom}"
+    note = f"one line through {len(determined)} segments: chi2 {squared:.1f} of {freedom}"
     result = []
     for segment in segments:
         at = np.array([1.0, segment.reference_s - middle])

@@ -42,7 +42,7 @@ _OFFSET = "offset from master"
 
 @dataclass(frozen=True, eq=False)
 class PtpdLog:
-    """What ptpd reported.
+    """Reports of ptpd.
 
     Attributes
     ----------

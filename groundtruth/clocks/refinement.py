@@ -1,9 +1,9 @@
-"""The robot's clock from its whole movement, once headings have told it roughly.
+"""Refines the robot's clock with its whole movement, starting from the estimate by headings.
 
-Headings alone tell the time by turns, and no better than odometry's heading wanders. Where the
-ground truth has positions and covariances, the clock is moved, near what the headings said, to
-where odometry's movements make all measured poses likeliest; bends of the way and changes of speed
-tell the time then, too.
+Headings determine the time only through turns, and only as well as odometry's heading drift allows.
+Where the ground truth has positions and covariances, the clock is refined, near the estimate by
+headings, to maximise the likelihood of all measured poses given odometry's movements. Curves of the
+path and changes of speed then contribute as well.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ _MARGIN_S = 2.0
 _LEAST_WAY_M = 1.0
 _FEWEST_POSES = 20
 _ROUNDS = 2
-# Deviations of simulated sessions from the truth were so many times what the curvature of the
-# likelihood says: wheels do not err quite as the model has it.
+# Ratio of the errors in simulated sessions to the deviations by the likelihood's curvature: errors
+# of wheels do not follow the model exactly.
 _SIGMA_FACTOR = 2.0
 
 
@@ -44,7 +44,7 @@ def refine_by_movement(
     Parameters
     ----------
     segments : sequence of ClockSegment
-        What the headings told.
+        The estimate by headings.
     odometry : PlanarPoses
         The robot's own poses on its own clock.
     groundtruth : PlanarPoses
@@ -53,8 +53,8 @@ def refine_by_movement(
     Returns
     -------
     list of ClockSegment
-        Refined where their status is `ok` or `jump`, the robot drove a metre or more, and the
-        headings' result was near; the others unchanged.
+        Refined if their status is `ok` or `jump`, the robot drove a metre or more, and the result
+        is near the estimate by headings; the others unchanged.
     """
     if groundtruth.covariances is None:
         return list(segments)
@@ -137,7 +137,7 @@ def _refined(
 
 
 _SIMPLEX = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
-# Farther from what the headings told than so many of their deviations, something else is wrong.
+# Largest distance from the estimate by headings, in its deviations; beyond it is rejected.
 _FARTHEST = 8.0
 
 

@@ -1,11 +1,11 @@
 """The robot's clock from headings: time offset, drift and angle offset, segment by segment.
 
 The headings of odometry and ground truth are those of one robot; the offset and the rate between
-their clocks make the squared difference least, the angle between their axes being eliminated in
-closed form (RAWSEEDS D2.1 part 2). The search is global and derivative-free, and has no start that
-it could depend on. Odometry's heading wanders, so that a plain sum of squares would trade wandering
-for time; a second search, round the first one's result, whitens it: the noise of the samples and
-the rate of wandering are taken from the residuals themselves.
+their clocks minimise the squared difference, with the angle between their axes eliminated in closed
+form (RAWSEEDS D2.1 part 2). The search is global and derivative-free and depends on no initial
+value. Odometry's heading drifts, so that a plain sum of squares would explain drift by a time
+offset. A second search around the first result therefore whitens the residuals, from which the
+noise of the samples and the rate of the random walk are estimated.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ FloatArray = NDArray[np.float64]
 _MOST_COARSE_SAMPLES = 400
 _OUTLIER_SIGMAS = 6.0
 _COARSE_SIGMA_RAD = 0.02
-# A segment tells the offset if its deviation is below this share of the search's bound, and the
-# drift likewise: the deviation of what is merely between the bounds is .58 of them.
+# A segment determines the offset, or the drift, if its deviation is below this share of the search
+# bound: the deviation of a uniform distribution between the bounds is .58 of the bound.
 _LEAST_DETERMINED = 0.1
 _MOST_JUMPS = 3
 _JUMP_SIGMAS = 3.5
@@ -57,7 +57,7 @@ class SyncSettings:
     segment_gap_s : float
         A longer pause in the ground truth begins a new segment (s).
     use_movement : bool
-        Refine what the headings tell by the whole movement, where the ground truth has covariances.
+        Refine the estimate by headings with the whole movement if the ground truth has covariances.
 
     Raises
     ------
@@ -96,9 +96,9 @@ def synchronise(
     -------
     tuple of ClockSegment
         In order. Segments without enough turns have the status `no turns`, infinite deviations and
-        the offset that the others lead to (0 where no segment tells). A segment in which the clock
-        was set is cut there: its parts have the status `jump`. Where one straight line through the
-        session agrees with all segments, theirs are that line's.
+        an offset interpolated from the others (0 if no segment determines one). A segment in which
+        the clock was set is split there: its parts have the status `jump`. If one straight line
+        through the session agrees with all segments, they get that line's values.
 
     Raises
     ------
@@ -120,13 +120,15 @@ def synchronise(
             groundtruth.poses[part],
             covariances[part] if covariances is not None and bounds.use_movement else None,
         )
-        told = refine_by_movement(
+        determined = refine_by_movement(
             _segment(odometry, segment, bounds, _MOST_JUMPS), odometry, segment
         )
-        if len(told) > 1 and not _differ(told):
-            # What looked like a jump of the clock to the headings is none to the whole movement.
-            told = refine_by_movement(_segment(odometry, segment, bounds, 0), odometry, segment)
-        found.extend(told)
+        if len(determined) > 1 and not _differ(determined):
+            # Headings suggested a jump of the clock that the whole movement does not confirm.
+            determined = refine_by_movement(
+                _segment(odometry, segment, bounds, 0), odometry, segment
+            )
+        found.extend(determined)
     if all(segment.turned_rad == 0.0 and segment.note == "no odometry" for segment in found):
         raise GroundTruthError(
             f"odometry from {odometry.times_s[0]:.3f} s to {odometry.times_s[-1]:.3f} s and ground "
@@ -164,13 +166,13 @@ def _segment(
     if not math.sqrt(covariance[0, 0]) < _LEAST_DETERMINED * bounds.largest_offset_s:
         alone = _covariance(pair, wandering, offset, drift, with_drift=False)
         if not math.sqrt(alone[0, 0]) < _LEAST_DETERMINED * bounds.largest_offset_s:
-            return [_untold(segment, turned, "turns too little to tell the offset")]
+            return [_untold(segment, turned, "turns too little to determine the offset")]
     if not math.sqrt(covariance[1, 1]) < _LEAST_DETERMINED * bounds.largest_drift:
-        note = "too short to tell the drift: taken as none"
+        note = "too short to determine the drift: assumed to be 0"
         drift = 0.0
         offset, drift = _refine(pair, wandering, (offset, drift), bounds, with_drift=False)
         covariance = _covariance(pair, wandering, offset, drift, with_drift=False)
-        # What is unknown of the drift moves the offset by nothing at the reference only.
+        # Only at the reference time is the offset independent of the unknown drift.
         covariance[1, 1] = bounds.largest_drift**2 / 3.0
     elif jumps_left > 0:
         place = find_jump(pair, offset, drift)
@@ -212,15 +214,15 @@ def _segment(
 
 
 def _differ(parts: list[ClockSegment]) -> bool:
-    """Whether the clock before a jump and after it are told, and are not the same there."""
-    told = [part for part in parts if part.status != "no turns"]
-    for before, after in pairwise(told):
+    """Whether the clock is determined before and after a jump, and differs there."""
+    determined = [part for part in parts if part.status != "no turns"]
+    for before, after in pairwise(determined):
         place = 0.5 * (before.to_s + after.from_s)
         offsets, variances = [], []
         for part in (before, after):
             away = place - part.reference_s
             offsets.append(part.offset_s + (part.rate - 1.0) * away)
-            # A clock's drift is far smaller than the bounds that stand for not knowing it.
+            # A clock's drift is far smaller than the search bounds, which are used if it is open.
             rate_sigma = min(part.sigma_rate, _LARGEST_DRIFT_OF_A_QUARTZ)
             variances.append(part.sigma_offset_s**2 + (rate_sigma * away) ** 2)
         jump = abs(offsets[1] - offsets[0])
@@ -240,7 +242,7 @@ def _sum_of_squares(pair: HeadingPair, offset_s: float, drift: float) -> float:
     level = without_turns(pair.differences(offset_s, drift))
     level -= level.mean()
     shapes = pair.systematic
-    # The systematic errors' deviations stand against a coarse guess of the noise.
+    # The systematic errors are weighted against a coarse guess of the noise.
     information = shapes.T @ shapes + _COARSE_SIGMA_RAD**2 * np.eye(shapes.shape[1])
     along = shapes.T @ level
     return float((level @ level - along @ np.linalg.solve(information, along)) / len(level))
@@ -350,13 +352,13 @@ def _untold(segment: PlanarPoses, turned_rad: float, note: str) -> ClockSegment:
 
 
 def _told_by_the_others(segments: list[ClockSegment]) -> list[ClockSegment]:
-    """Segments in which the offset of those that tell nothing lies between the others'."""
-    telling = [segment for segment in segments if segment.status != "no turns"]
-    if not telling:
+    """Interpolate the offsets of undetermined segments from the others."""
+    determined = [segment for segment in segments if segment.status != "no turns"]
+    if not determined:
         return segments
     ends = [
         (time, segment.offset_s + (segment.rate - 1.0) * (time - segment.reference_s))
-        for segment in telling
+        for segment in determined
         for time in (segment.from_s, segment.to_s)
     ]
     times, offsets = np.array(ends).T

@@ -1,4 +1,4 @@
-"""Differences that wander: white noise of each sample on top of a random walk, and least squares.
+"""Least squares for differences with a random walk plus white noise of each sample.
 
 The model of a difference between two headings: odometry's error adds up (a random walk, variance
 `rate` per second), the other's does not (white, `sigma`). Systematic errors may come on top, such
@@ -105,7 +105,7 @@ def estimate_wandering(
     systematic: FloatArray | None = None,
     lags: tuple[int, ...] = LAGS,
 ) -> Wandering:
-    """Tell noise and wandering apart by how far samples differ after more and more time.
+    """Separate noise from random walk by the differences of samples over increasing time lags.
 
     Parameters
     ----------
@@ -158,5 +158,5 @@ def estimate_wandering(
     (variance, rate), _ = nnls(design * weight[:, None], target * weight)
     sigma = max(float(np.sqrt(variance)), 0.1 * float(np.sqrt(squares[0] / 2.0)), _LEAST_SIGMA_RAD)
     duration = float(times_s[-1] - times_s[0])
-    # A walk of a hundredth of the noise over the whole segment is none.
+    # A random walk of a hundredth of the noise over the whole segment is negligible.
     return Wandering(times_s, sigma, max(float(rate), (0.01 * sigma) ** 2 / duration), shapes)

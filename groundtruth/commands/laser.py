@@ -30,7 +30,7 @@ from storage import write_whole
 
 FloatArray = NDArray[np.float64]
 
-#: So many readings that hide the robot, or of things beside it, mark a set as disturbed.
+#: A set is disturbed by this many readings that hide the robot or are of objects beside it.
 _DISTURBED = 3
 
 
@@ -68,7 +68,7 @@ def perform(options: Laser) -> int:
         if scanner["suspect"]:
             shift = scanner["correction"]
             print(
-                f"warning: scanner {scanner['name']} does not fit the others: its readings ask for "
+                f"warning: scanner {scanner['name']} does not fit the others: its readings suggest "
                 f"a shift of {1e3 * shift[0]:.1f}, {1e3 * shift[1]:.1f} mm and "
                 f"{np.degrees(shift[2]):.2f} deg; "
                 + ("it was left out" if scanner["left_out"] else "it was used all the same"),

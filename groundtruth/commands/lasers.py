@@ -17,7 +17,7 @@ from groundtruth.lasers.scans import find_scans, read_scans
 from landmarks import wrap_angle
 from storage import write_whole
 
-#: A scanner so many standard deviations from where it was measured is named.
+#: Scanners this many standard deviations from their measured pose are reported.
 _FAR_OFF_SIGMA = 5.0
 
 

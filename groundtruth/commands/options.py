@@ -75,7 +75,7 @@ class Network:
     Parameters
     ----------
     boards : Path
-        A boards.json, or the folder in which it stands.
+        A boards.json, or its folder.
     estimate_offset : bool
         Estimate how the double board's halves lie to each other, whatever the file says.
     output : Path
@@ -151,7 +151,7 @@ class Score:
         Relations between two times (t_i, t_j, x, y, z, roll, pitch, yaw): the poses are held
         against these too.
     rpe_step : int
-        Relative errors from each of the compared poses to the one so many later.
+        Relative errors are between poses this many compared poses apart.
     rpe_longest_s : float
         Such steps that take longer, as across a gap, do not count (s).
     json : Path
@@ -260,7 +260,7 @@ class Sync:
     segment_gap_s : float
         A longer pause in the ground truth begins a new segment (s).
     use_movement : bool
-        Refine what the headings tell by the whole movement, where the ground truth has covariances.
+        Refine the estimate by headings with the whole movement if the ground truth has covariances.
     ptpd : Path
         Log of ptpd, to compare with.
     apply : Path
@@ -298,7 +298,7 @@ class Fuse:
     camera : Path
         Ground truth from the markers, in the same columns.
     clock : Path
-        What `groundtruth sync` wrote; without it all clocks are one.
+        Output of `groundtruth sync`; without it all clocks are assumed to be one.
     distance_sigma : float
         Standard deviation of odometry's distance per square root of a metre driven (m).
     lateral_sigma : float
@@ -308,7 +308,7 @@ class Fuse:
     turn_per_metre_sigma : float
         The same per square root of a metre driven (rad).
     learn_noise : bool
-        Scale these by what makes the measurements likeliest.
+        Scale these to maximise the likelihood of the measurements.
     gate_probability : float
         Share of right poses that pass the gate.
     covariance_scale : two floats
@@ -349,7 +349,7 @@ class Validate:
     poses : Path
         The ground truth (t, x, y, theta, and perhaps 9 of covariance).
     clock : Path
-        What `groundtruth sync` wrote, for the on-board scans.
+        Output of `groundtruth sync`, for the on-board scans.
     refine : str
         `scans`: refine the reference poses by ICP of the on-board scans to the building; `none`:
         distances alone.

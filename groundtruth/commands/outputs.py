@@ -1,4 +1,4 @@
-"""What every command does: looks after its outputs, says what they rest on, shows progress."""
+"""Common parts of the commands: checks of outputs, metadata, progress."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def check_outputs(paths: Sequence[Path | None], force: bool) -> None:
 
 
 def provenance(settings: Any, files: Sequence[Path] = ()) -> dict[str, Any]:
-    """What stands beside a result: version, settings, and the files that it depends on."""
+    """Metadata of a result: version, settings, and the files that it depends on."""
     return {
         "version": __version__,
         "settings": asdict(settings),
@@ -53,15 +53,15 @@ def provenance(settings: Any, files: Sequence[Path] = ()) -> dict[str, Any]:
 
 
 def write_account(path: Path, content: dict[str, Any], *, overwrite: bool) -> None:
-    """Write what stands beside a result, as JSON."""
+    """Write the metadata of a result as JSON."""
     with write_whole(path, overwrite=overwrite) as stream:
         stream.write((json.dumps(content, indent=1) + "\n").encode())
 
 
 @contextmanager
 def progress(label: str) -> Iterator[tuple[Callable[[int], None], Callable[[], None]]]:
-    """A progress bar on a terminal; yields what to tell the total to, and what to call on."""
-    # Asked of the file: variables of the environment have rich take a log for a terminal, and of a
+    """A progress bar on a terminal; yields a function to set the total and one to advance."""
+    # The file is checked: environment variables can make rich take a log for a terminal, and of a
     # disabled bar, older versions of it print the line's end.
     if not sys.stderr.isatty():
         yield lambda total: None, lambda: None

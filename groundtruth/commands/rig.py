@@ -1,4 +1,4 @@
-"""What ``groundtruth rig`` does: reads runs, estimates the rig, puts it into the robot's frame."""
+"""The command ``groundtruth rig``: reads runs, estimates a rig, puts it into the robot's frame."""
 
 from __future__ import annotations
 

@@ -30,10 +30,10 @@ def perform(options: Sync) -> int:
     truth = read_planar_poses(options.groundtruth)
     log = None if options.ptpd is None else read_ptpd(options.ptpd)
     segments = synchronise(odometry, truth, settings)
-    told = [segment for segment in segments if segment.status != "no turns"]
+    determined = [segment for segment in segments if segment.status != "no turns"]
     for segment in segments:
         print(_line(segment))
-    if not told:
+    if not determined:
         print("no segment turns enough: the clocks cannot be aligned by headings")
         return 1
     model = ClockModel(segments)
@@ -42,7 +42,7 @@ def perform(options: Sync) -> int:
         "segments": clock_document(segments),
     }
     if log is not None:
-        document["ptpd"] = compare_with_ptpd(model, told, log)
+        document["ptpd"] = compare_with_ptpd(model, determined, log)
         print(_ptpd_line(document["ptpd"]))
     write_account(options.output, document, overwrite=options.force)
     if options.apply is not None:
@@ -54,15 +54,15 @@ def perform(options: Sync) -> int:
 
 
 def compare_with_ptpd(
-    model: ClockModel, told: list[ClockSegment], log: PtpdLog
+    model: ClockModel, determined: list[ClockSegment], log: PtpdLog
 ) -> dict[str, float | int | None]:
-    """Hold what headings say of the clocks against what ptpd reported.
+    """Compare the clocks estimated from headings with ptpd's reports.
 
     Parameters
     ----------
     model : ClockModel
-    told : list of ClockSegment
-        Those that tell something.
+    determined : list of ClockSegment
+        Those whose offset is determined.
     log : PtpdLog
         Its times are those of the robot's clock; an offset is the robot's minus the master's.
 
@@ -79,7 +79,7 @@ def compare_with_ptpd(
     groundtruth = times - offsets
     inside = np.zeros(len(times), dtype=np.bool_)
     bends = []
-    for segment in told:
+    for segment in determined:
         here = (groundtruth >= segment.from_s) & (groundtruth <= segment.to_s)
         inside |= here
         if np.count_nonzero(here) >= 3:
@@ -94,7 +94,7 @@ def compare_with_ptpd(
         "reports_in_segments": int(np.count_nonzero(inside)),
         "rms_difference_s": _rms(difference),
         "mean_drift_ptpd": float(np.mean(drift)) if drift.size else None,
-        "mean_drift_headings": float(np.mean([segment.rate - 1.0 for segment in told])),
+        "mean_drift_headings": float(np.mean([segment.rate - 1.0 for segment in determined])),
         "rms_from_line_s": _rms(np.concatenate(bends)) if bends else None,
     }
 

@@ -33,7 +33,7 @@ def print_table(rows: Sequence[dict[str, Any]]) -> None:
 
 
 def print_sigmas(kind: str, names: Sequence[str], covariance: Any) -> None:
-    """Print how sure each pose is, of (6 N, 6 N) covariance."""
+    """Print the standard deviations of each pose, from a (6 N, 6 N) covariance."""
     sigmas = np.sqrt(np.diagonal(covariance)).reshape(-1, 6)
     for name, row in zip(names, sigmas):
         print(

@@ -38,7 +38,7 @@ from groundtruth.validation.validate import (
 )
 from storage import write_whole
 
-#: What stands in the folder.
+#: Files written to the folder.
 OUTPUTS = ("table.csv", "reference.csv", "errors.png", "validation.json")
 
 _FARTHEST_S = 0.5
@@ -74,7 +74,7 @@ def perform(options: Validate) -> int:
         clock_path = _clock_path(session, options.clock)
         if onboard and clock_path is None:
             print(
-                "warning: no clock.json: the times of the scans on board are taken as they are",
+                "warning: no clock.json: the times of the on-board scans are not corrected",
                 file=sys.stderr,
             )
         clock = None if clock_path is None else read_clock(clock_path)
@@ -148,7 +148,7 @@ def account(
     figures: Figures,
     distances: dict[str, Any],
 ) -> list[str]:
-    """What is printed: the figures, with RAWSEEDS' beside them."""
+    """The printed figures, with RAWSEEDS' beside them."""
     refined = sum(reference.scans == "used" for reference in references)
     lines = [
         f"reference poses    {len(references)} ({len(refused)} refused), {refined} refined by scans"

@@ -13,8 +13,7 @@ from groundtruth.trajectories.streams import PlanarPoses
 
 FloatArray = NDArray[np.float64]
 
-# A robot that stands still may yet be moved a little; without it, standing would make covariances
-# that cannot be inverted.
+# A robot at rest may still move a little; without this noise, rest would give singular covariances.
 _CREEP_M2_PER_S = (1e-4) ** 2
 _CREEP_RAD2_PER_S = (1e-4) ** 2
 # A turn is distinct if, from a second before to a second after, odometry turned by more than so
@@ -24,13 +23,13 @@ _DISTINCT_SIGMAS = 4.0
 # Odometry pauses where samples are farther apart than both, in seconds and in usual intervals.
 _PAUSE_S = 1.0
 _PAUSE_INTERVALS = 10.0
-# What may have been driven in a pause: as much as at this quantile of the rates over a second.
+# Motion that is possible in a pause: at this quantile of the rates over a second.
 _USUAL_RATES_OVER_S = 1.0
 _USUAL_RATES_QUANTILE = 0.9
 
 
 def pauses_of(odometry: PlanarPoses) -> list[tuple[float, float]]:
-    """Where odometry tells only what it came to, but not by which way.
+    """Pauses of odometry: only the resulting movement is known, not the path.
 
     Parameters
     ----------
@@ -71,8 +70,8 @@ def movements(
     controls : (N, 4) float64
         As in `groundtruth.fusion.movement.MovementProblem`.
     unseen : (N, 2) float64
-        Way (m) and turn (rad) that the robot may have made besides, where odometry pauses: as much
-        as at the rates at which it usually goes.
+        Additional distance (m) and turn (rad) that the robot may have made where odometry pauses,
+        at its usual rates.
     """
     arcs = log_motion(between(odometry.poses[:-1], odometry.poses[1:]))
     way, turn = np.hypot(arcs[:, 0], arcs[:, 1]), arcs[:, 2]
@@ -99,9 +98,9 @@ def _distinct(
 ) -> NDArray[np.bool_]:
     """Between which samples the robot turned by more than odometry's random errors explain.
 
-    Only there its turns tell by what share they are too long. Elsewhere, what looks like turns are
-    those errors; and since they are just what measured headings contradict, the share would be
-    drawn towards -1, whatever it is (regression dilution).
+    Only there can the scale error of its turns be estimated. Elsewhere, apparent turns are random
+    errors, which measured headings contradict, so that the estimate would be biased towards -1
+    (regression dilution).
     """
     turned, passed = _within(times_s, turn, _DISTINCT_OVER_S)
     driven, _ = _within(times_s, way, _DISTINCT_OVER_S)
@@ -126,7 +125,7 @@ def _unseen(times_s: FloatArray, way: FloatArray, turn: FloatArray) -> FloatArra
     passed = np.diff(times_s)[paused]
     for column, (rate, steps) in enumerate(zip(usual, (way, turn))):
         hidden[paused, column] = np.maximum(rate * passed - np.abs(steps[paused]), 0.0)
-    # Some odometry is written on change only: what is the same to the last digit stood still.
+    # Some odometry is written on change only: with all digits equal, the robot was at rest.
     hidden[(way == 0.0) & (turn == 0.0)] = 0.0
     return hidden
 

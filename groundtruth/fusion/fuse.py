@@ -32,10 +32,10 @@ class Rejected:
     Attributes
     ----------
     stream : str
-        Whose it was.
+        Its stream.
     time_s : float
     squared_innovation : float
-        Squared normalised distance from what was expected.
+        Squared normalised innovation.
     """
 
     stream: str
@@ -45,7 +45,7 @@ class Rejected:
 
 @dataclass(frozen=True)
 class OdometryErrors:
-    """What the measurements say of odometry.
+    """Odometry's errors estimated from the measurements.
 
     Attributes
     ----------
@@ -76,7 +76,7 @@ class OdometryErrors:
 
 @dataclass(frozen=True, eq=False)
 class Fusion:
-    """The robot's path out of all streams.
+    """The robot's path from all streams.
 
     Attributes
     ----------
@@ -86,11 +86,11 @@ class Fusion:
     rejected : tuple of Rejected
         In order of time.
     restarts_s : tuple of float
-        When the filter began anew, since nothing of what was measured fitted any more.
+        When the filter was restarted because no measurement fitted any more.
     used : dict of str to int
         Measurements that went in, by stream.
     odometry : OdometryErrors
-        What was learnt of it.
+        The estimated errors of odometry.
     repaired : dict of str to int
         Covariances that were not positive definite as written, by stream; they were raised by their
         file's rounding.
@@ -153,7 +153,7 @@ def fuse(
     at = np.searchsorted(problem.times_s, inside)
     poses = smoothed[at, :3]
     poses[:, 2] = wrap_angle(poses[:, 2])
-    # Odometry's errors are constants: all that is known of them is known at the end.
+    # Odometry's errors are constants: their final estimate uses all measurements.
     last_spread = np.sqrt(np.maximum(np.diagonal(spread[-1]), 0.0))
     return Fusion(
         poses=PlanarPoses(inside, poses, spread[at][:, :3, :3].copy()),

@@ -1,12 +1,12 @@
-"""Gaps at whose ends the filter is lost: bridged anew from both ends, or cut in their middle.
+"""Bridges gaps at whose ends the filter is lost, from both ends, or cuts them in the middle.
 
-Over a long way without measurements the heading that odometry tells goes astray so far that
-derivatives along the filter's own path say nothing of the true one. So such gaps are taken by
-themselves: the path before and the path after are known from their own measurements, odometry is
-laid between them, bent evenly, and from there Gauss-Newton steps (a filter forward and a smoother
-backward, linearised along the path so far) lead to the likeliest path. Headings are told but for
-whole turns; each number of turns that may be is tried, and the gap is bridged only if one of them
-explains the other end much better than all others. Otherwise both sides are left to themselves.
+Over a long path without measurements odometry's heading drifts so far that derivatives along the
+filter's own path do not hold for the true one. Such gaps are treated separately. The paths before
+and after are known from their own measurements. Odometry is placed between them, bent evenly, and
+refined to the likeliest path by Gauss-Newton steps (a forward filter and a backward smoother,
+linearised along the current path). Headings are known up to whole turns: each possible number of
+turns is tried, and the gap is bridged only if one of them explains the other end much better than
+all others. Otherwise the two sides are not connected.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from landmarks import wrap_angle
 
 FloatArray = NDArray[np.float64]
 
-#: So long without measurements is a gap: rejections that begin after it are laid to it.
+#: Least time without measurements that is a gap: rejections after it are attributed to it.
 UNMEASURED_S = 1.0
 _MOST_TURNS = 2
 _MOST_STEPS = 15
@@ -51,7 +51,7 @@ class Bridge:
     Attributes
     ----------
     path : (N, 6) float64 or None
-        States from the gap's begin to its end; headings go on without jumps. None if more than one
+        States from the gap's begin to its end; headings have no jumps. None if more than one
         number of whole turns may be, or if none explains the end.
     looser : float
         By what factor odometry's variances had to be raised to explain it, 1 or more.
@@ -78,7 +78,7 @@ def ends_that_did_not_fit(
     accepted: NDArray[np.bool_],
     restarted: NDArray[np.int8],
 ) -> list[int]:
-    """Nodes after gaps where rejections began that made the filter begin anew in the end."""
+    """Nodes after gaps where those rejections began that made the filter restart."""
     found = []
     for node in np.flatnonzero(restarted == AFTER_REJECTIONS):
         first = int(np.searchsorted(nodes, node))
@@ -189,7 +189,7 @@ def _step(
     measured: FloatArray,
     measured_covariances: FloatArray,
 ) -> tuple[float, float, FloatArray]:
-    """Filter and smooth over a gap with what is measured at its end (nothing, or one pose)."""
+    """Filter and smooth over a gap with the measurement at its end (none, or one pose)."""
     count = len(controls)
     history = empty_history(count)
     end = np.full(len(measured), count - 1, dtype=np.int64)
@@ -214,7 +214,7 @@ def _no_gate(nodes: int) -> Gating:
 def back_from(
     controls: FloatArray, variances: FloatArray, end: FloatArray, end_spread: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """States and covariances that odometry tells backward from a gap's end.
+    """States and covariances predicted backward by odometry from a gap's end.
 
     Parameters
     ----------

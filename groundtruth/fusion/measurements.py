@@ -29,7 +29,7 @@ def gather(
     Returns
     -------
     names : list of M str
-        Whose each measurement is.
+        The stream of each measurement.
     times_s, poses, covariances : (M,), (M, 3), (M, 3, 3) arrays
     repaired : dict of str to int
         Covariances that had to be raised, by stream.

@@ -2,7 +2,7 @@
 
 Between two nodes the robot is taken to go forward, sideways and round at constant rates, which is
 an arc. All along it, white noise is added to the three rates: along the way, across it, and to the
-turn. What becomes of it until the arc's end is integrated in closed form: a heading that errs early
+turn. Its effect at the arc's end is integrated in closed form: a heading that errs early
 leads aside for the rest of the way. So an arc that is cut in two, and its halves one after the
 other, come to the same. In complex numbers, with the arc's length s, its turn w and the directions
 of its chord and across it as axes, a wrong heading at the share t - 1/2 of the way moves the end by
@@ -32,7 +32,7 @@ _SERIES_BELOW = 0.1
 
 @njit(cache=True, error_model="numpy")
 def arc_integrals(half_turn: float) -> tuple[float, float, float, float, float]:
-    """What an arc of length 1 makes of errors along it.
+    """Effect of errors along an arc of length 1.
 
     Parameters
     ----------

@@ -46,7 +46,7 @@ _RELINEARISATIONS_WHERE_LOST = 3
 
 @dataclass(frozen=True, eq=False)
 class MeasurementAccount:
-    """What became of the measurements.
+    """How the measurements were used.
 
     Attributes
     ----------
@@ -54,7 +54,7 @@ class MeasurementAccount:
         Squared normalised innovations.
     accepted : (M,) bool
     restarted : (N,) int8
-        Whether the filter began anew at a node, and why (see `smoother_kernels`).
+        Whether the filter was restarted at a node, and why (see `smoother_kernels`).
     surprise : float
         Minus twice the logarithm of their likelihood.
     """
@@ -91,7 +91,7 @@ class MovementProblem:
     measured, covariances : (M, 3), (M, 3, 3) float64
         The measured poses.
     streams : tuple of M str
-        Whose they are.
+        Their streams.
     repaired : dict of str to int
         Covariances that had to be raised, by stream.
     repeated : dict of str to int
@@ -111,7 +111,7 @@ class MovementProblem:
     settings: FuseSettings
 
     def shortened(self, count: int) -> MovementProblem:
-        """The run of nodes with most measurements among them, of at most so many."""
+        """The contiguous nodes, at most `count`, that have the most measurements."""
         if len(self.times_s) <= count:
             return self
         begins = self.nodes[self.nodes + count <= len(self.times_s)]
@@ -150,7 +150,7 @@ class MovementProblem:
         return self.account(noise).surprise
 
     def account(self, noise: FloatArray) -> MeasurementAccount:
-        """What becomes of the measurements in a filter that goes forward only."""
+        """How a forward-only filter uses the measurements."""
         return self._forward(
             self._variances(noise),
             np.empty((1, STATE)),
@@ -234,9 +234,9 @@ class MovementProblem:
     def _bridge(
         self, begin: int, end: int, variances: FloatArray, points: FloatArray, smoothed: Smoothed
     ) -> Bridge:
-        """Lay points over a gap that was cut, if it can be bridged.
+        """Bridge a gap that was cut with points, if possible.
 
-        The least noise that explains the other end tells by how many whole turns headings differ.
+        The number of whole turns by which headings differ is that with the least noise.
         """
         gap = slice(begin, end + 1)
         found = bridge(
@@ -251,7 +251,7 @@ class MovementProblem:
         if found.path is None:
             return found
         points[begin:end] = found.path[:-1]
-        # Whole turns, so that headings go on without a jump.
+        # Whole turns, so that headings continue without a jump.
         turns = np.round((found.path[-1, 2] - points[end, 2]) / (2.0 * math.pi))
         points[end:, 2] += 2.0 * math.pi * turns
         return found

@@ -1,4 +1,4 @@
-"""How odometry is taken to err, and how far a measured pose may be off."""
+"""Assumed errors of odometry, and limits of measured poses."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class FuseSettings:
         Standard deviation of odometry's distance after a metre (m); it grows with the root.
     lateral_sigma : float
         How far the robot slips sideways within a metre (m), its standard deviation; it grows with
-        the root. What a wrong heading leads aside is not part of it.
+        the root. The lateral error by a wrong heading is not part of it.
     turn_sigma : float
         Standard deviation of its heading after turning a radian (rad).
     turn_per_metre_sigma : float

@@ -22,7 +22,7 @@ IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 KindArray = NDArray[np.int8]
 
-#: How the filter began anew at a node: not at all, after many rejections, where it was lost.
+#: Restart of the filter at a node: none, after many rejections, where it was lost.
 NOT_ANEW, AFTER_REJECTIONS, WHERE_LOST = 0, 1, 2
 
 
@@ -197,7 +197,7 @@ def filter_forward(
     gating : Gating
     points : (N, 6) float64
         States at which each movement away from a node is linearised, with headings that go on
-        without jumps; measured headings are taken to lie within half a turn of them. Of length 1:
+        without jumps; measured headings are assumed to be within half a turn of them. Of length 1:
         at the filter's own.
     history : FilterHistory
         Filled, unless it is of no nodes.

@@ -39,7 +39,7 @@ _LARGEST_CHI2 = 4.0
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """What the kernels know of the robot.
+    """The robot's data for the kernels.
 
     Attributes
     ----------
@@ -60,7 +60,7 @@ class Body:
 
 
 class Refined(NamedTuple):
-    """What `groundtruth.lasers.tracking_kernels.refine_outline` returns."""
+    """Result of `groundtruth.lasers.tracking_kernels.refine_outline`."""
 
     pose: FloatArray
     covariance: FloatArray
@@ -79,7 +79,7 @@ def refine(
     settings: LaserSettings,
     prior_m: float,
 ) -> Refined:
-    """Most likely pose near a start; what the readings leave open holds on to it with `prior_m`."""
+    """Most likely pose near a start; undetermined directions are held by a prior `prior_m`."""
     s = settings
     fit = OutlineFit(
         s.floor_m, s.least_slope, s.gate_sigma, s.gate_m, prior_m, s.weak_sigma_m, body.radius_m,
@@ -147,7 +147,7 @@ def acquire(
 def _places(points: FloatArray, body: Body, settings: LaserSettings) -> list[FloatArray]:
     """Where the robot's middle might be: the middles of heaps, those of parts of large ones."""
     pairs = cKDTree(points).query_pairs(settings.link_m, output_type="ndarray")
-    # SciPy before 1.12 knows no graphs with indices of 64 bits.
+    # SciPy before 1.12 does not support graphs with 64-bit indices.
     ends = (pairs[:, 0].astype(np.int32), pairs[:, 1].astype(np.int32))
     graph = coo_array((np.ones(len(pairs), dtype=np.int8), ends), (len(points),) * 2)
     count, label = connected_components(graph, directed=False)
@@ -213,7 +213,7 @@ def _close(a: FloatArray, b: FloatArray) -> bool:
 
 
 def _same(a: FloatArray, b: FloatArray, body: Body) -> bool:
-    """Whether two poses are one, but for noise and the outline's symmetries."""
+    """Whether two poses are equal up to noise and the outline's symmetries."""
     for other in (b, *(compose(b, symmetry) for symmetry in body.symmetries)):
         near = math.hypot(a[0] - other[0], a[1] - other[1]) < 0.1
         if near and abs(float(wrap_angle(a[2] - other[2]))) < math.radians(8.0):

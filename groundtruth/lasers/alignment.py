@@ -1,4 +1,4 @@
-"""Where fixed scanners stand: aligned with each other and with the building, in steps.
+"""Poses of fixed scanners, aligned with each other and with the building, in steps.
 
 The order is that of RAWSEEDS' deliverable D2.1, part 2: pairs of scanners by ICP; the scans merged
 one after the other; each scanner aligned again with the others' merged scans; all together until
@@ -81,7 +81,7 @@ class AlignmentSettings:
 
 @dataclass(frozen=True, eq=False)
 class StillScan:
-    """What a scanner sees of the empty area, averaged over its scans.
+    """Points of a scanner in the empty area, averaged over its scans.
 
     Attributes
     ----------
@@ -116,9 +116,9 @@ class Alignment:
     steps : dict of str to (scanners, 3) float64
         Poses after each of `STEPS`; those before the map are in the frame of the measured poses.
     pairs : dict of (int, int) to float
-        How much of two scans lies on the other scan after the pairwise ICP, 0 to 1.
+        Share of two scans that coincides with the other scan after the pairwise ICP, 0 to 1.
     matched : (scanners,) int64
-        Beams that lie on the map.
+        Number of beams that hit the map.
     rms_m : (scanners,) float64
         Their root mean square distance from it.
     undetermined : tuple of str
@@ -354,8 +354,8 @@ def _to_map(
     """Pose of one scanner on the map, its covariance, and the fit's summary.
 
     The kernel moves faces to points: here the map to the scanner's frame. Walls are seen from both
-    sides. What stands before a wall is far off the wall that the beam would meet, and falls out as
-    the fit narrows.
+    sides. Readings of objects in front of a wall are far from the wall that the beam would hit, and
+    are excluded as the gate narrows.
     """
     faces = np.vstack([building, building[:, [2, 3, 0, 1]]])
     lone = np.zeros(len(scan.points), dtype=np.int64)

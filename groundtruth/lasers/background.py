@@ -1,4 +1,4 @@
-"""What a fixed scanner sees when nobody is there, learned from scans of the empty area."""
+"""Background of a fixed scanner, learned from scans of the empty area."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def learn_background(
     margin_sigma: float = 5.0,
     passing: float = 0.02,
 ) -> Background:
-    """Learn what the beams see from scans of the empty area.
+    """Learn the background of the beams from scans of the empty area.
 
     Parameters
     ----------
@@ -60,11 +60,11 @@ def learn_background(
     least_sigma_m : float
         Standard deviation that a beam has at least (m).
     margin_sigma : float
-        A reading is new if it is this many standard deviations nearer than the nearest thing that
+        A reading is new if it is this many standard deviations nearer than the nearest object that
         the beam saw.
     passing : float
-        The nearest thing is this quantile of the beam's readings: beams along an edge see near and
-        far in turn, and nearer readings than that are taken for something that passed.
+        The nearest object is at this quantile of the beam's readings: beams along an edge see near
+        and far in turn, and nearer readings than that are treated as passing objects.
 
     Returns
     -------
@@ -88,7 +88,7 @@ def learn_background(
         return np.asarray(values[row, beams])
 
     median = quantile(ordered, 0.5)
-    # Two readings in a hundred scans tell nothing of what stands there.
+    # Two readings in a hundred scans say nothing about the background.
     seen = count >= max(1, round(0.02 * len(ranges_mm)))
     deviation = np.full_like(metres, np.inf)
     np.subtract(metres, median, out=deviation, where=hit)

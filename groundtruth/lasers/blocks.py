@@ -17,7 +17,7 @@ LARGEST_GAP_S = 0.05
 
 
 def combined_poses(track: LaserTrack, sets_per_pose: int = 1) -> PlanarPoses:
-    """Poses of a track, each from so many sets that follow each other.
+    """Poses of a track, each from `sets_per_pose` consecutive sets.
 
     The sets' poses are moved to their mean time with the robot's motion and averaged. Every set
     is in one pose only, so that the readings' errors in different poses are independent; those of

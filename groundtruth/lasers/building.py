@@ -188,7 +188,7 @@ def _read_drawing(
             unit = InsertUnits(drawing.header.get("$INSUNITS", 0))
             unit_m = units.conversion_factor(unit, InsertUnits.Meters) if unit else 1.0
         for curve in _curves(path, drawing.modelspace(), wanted, CURVE_TOLERANCE_M / unit_m):
-            # Equal neighbours occur where curves meet, and where a line stands upright.
+            # Equal neighbours occur where curves meet, and where a line is vertical.
             far = np.hypot(*np.diff(curve, axis=0).T) * unit_m > _SHORTEST_M
             pieces += [(*a, *b) for a, b, wide in zip(curve, curve[1:], far) if wide]
             if len(pieces) > MOST_SEGMENTS:

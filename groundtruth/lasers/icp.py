@@ -42,7 +42,7 @@ class IcpSettings:
     threshold_m : float
         The ICP ends when the root mean square error changes by less than this (m).
     most_steps : int
-        It ends unconverged after so many steps.
+        Largest number of steps; after these the ICP has not converged.
     weak_sigma_m : float
         A direction is undetermined if the pose's standard deviation along it is larger than this
         (m; a rotation counts by what it does to the points, root mean square).
@@ -150,7 +150,7 @@ def icp_to_segments(
 
 
 def trimmed_variance(kept: float) -> tuple[float, float]:
-    """What keeping the best share of Gaussian residuals does to variances.
+    """Factor of variances due to keeping only the best share of Gaussian residuals.
 
     Returns
     -------
@@ -246,7 +246,7 @@ def _uncertainty(
     variance = float(residual @ residual) / freedom / shrinkage
     # Exactly fitting points do not make a pose exact to less than rounding.
     information = rows.T @ rows / max(variance * inflation, 1e-18)
-    # About the middle of the points, where turning and moving are told apart best.
+    # About the middle of the points, where rotation and translation are least correlated.
     middle = lever.mean(axis=0)
     scale_m = math.sqrt(float(np.mean(np.sum((lever - middle) ** 2, axis=1))))
     shift = np.array([[1.0, 0.0, middle[1]], [0.0, 1.0, -middle[0]], [0.0, 0.0, 1.0]])

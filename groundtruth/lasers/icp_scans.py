@@ -1,8 +1,8 @@
-"""Matching two scans without odometry: point-to-line ICP from many headings, the best explained.
+"""Matches two scans without odometry, by point-to-line ICP from many headings.
 
 ICP finds the nearest minimum, which for two scans of a turning robot is often a wrong one. So a
-coarse ICP is begun from every heading; what it finds is judged by how much of *both* scans lies on
-the other, and the best few are refined and judged again.
+coarse ICP is started from headings all round. Its results are scored by the share of *both* scans
+that coincides with the other, and the best few are refined and scored again.
 
 References
 ----------
@@ -41,18 +41,19 @@ class ScanMatchSettings:
     coarse_gates_m, fine_gates_m : tuple of float
         Gates of the steps of the coarse and of the fine ICP; the last one is repeated (m).
     coarse_thinning : int
-        The coarse ICP moves every so many-th point.
+        The coarse ICP uses every `coarse_thinning`-th point.
     refined : int
-        So many of the coarse poses are refined.
+        Number of coarse poses that are refined.
     kept : float
-        Share of the pairs within the gate that counts: the best.
+        Share of the pairs within the gate that is used: the best ones.
     largest_shift_m : float
-        A pose farther than this from its start is none: the robot cannot have moved so far (m).
+        Poses farther than this from the start are rejected: the robot cannot have moved so far (m).
     normal_radius_m, normal_reach, normal_spread : float, int, float
-        A point's line comes from the points up to so many beams to either side, without a step
-        longer than the radius, if they extend across it by no more than this share of along it.
+        A point's line is fitted to the points up to `normal_reach` beams to either side, without a
+        step longer than `normal_radius_m`, if their extent across the line is at most
+        `normal_spread` times that along it.
     coarse_sigma_m, fine_sigma_m : float
-        Distance at which a point no longer counts as explained, in judging (m).
+        Distance at which a point no longer counts as explained in the score (m).
     weak_sigma_m : float
         A direction is undetermined if the standard deviation along it is larger (m).
     """
@@ -96,7 +97,7 @@ class ScanMatchSettings:
 
 @dataclass(frozen=True, eq=False)
 class ScanMatch:
-    """How a scan lies to another one.
+    """The pose of a scan relative to another one.
 
     Attributes
     ----------
@@ -106,7 +107,7 @@ class ScanMatch:
         From the residuals' size and the geometry; infinite on the diagonal where nothing is
         determined.
     explained : float
-        Share of both scans' points that lie on the other scan, 0 to 1.
+        Share of both scans' points that coincide with the other scan, 0 to 1.
     rival : float
         The same of the best other pose found, 0 without one.
     undetermined : (k, 3) float64

@@ -63,7 +63,7 @@ def outline_radius_m(faces: FloatArray) -> tuple[FloatArray, float]:
 def outline_symmetries(faces: FloatArray, tolerance_m: float = 0.015) -> FloatArray:
     """Motions other than none that map the outline onto itself.
 
-    A robot seen only by its outline may stand at `pose` as well as at `compose(pose, symmetry)`.
+    A robot of which only the outline is seen may be at `pose` or at `compose(pose, symmetry)`.
 
     Parameters
     ----------

@@ -119,7 +119,7 @@ class Scanner:
 
 @dataclass(frozen=True, eq=False)
 class Robot:
-    """What laser tracking knows of a robot.
+    """A robot as laser tracking needs it.
 
     Attributes
     ----------
@@ -235,7 +235,7 @@ def _scanners(path: str | os.PathLike[str], content: dict[str, Any]) -> tuple[Sc
     names = [scanner.name for scanner in scanners]
     for name in names:
         if names.count(name) > 1:
-            raise GroundTruthError(f"{path}: scanner {excerpt(name)} stands there more than once")
+            raise GroundTruthError(f"{path}: scanner {excerpt(name)} is listed more than once")
     return scanners
 
 
@@ -284,7 +284,7 @@ def _number(place: str, value: Any) -> float:
 
 
 def _numbers(place: str, value: Any, rows: int | None, columns: int) -> FloatArray:
-    """A list of lists as an array; a message that shows what stood there if it is none."""
+    """A list of lists as an array; raises an error that shows the value if it is none."""
     expected = f"{'rows' if rows is None else rows} x {columns} finite numbers"
     good = isinstance(value, list) and (rows is None or len(value) == rows)
     for row in value if good else ():

@@ -1,4 +1,4 @@
-"""What laser scanners measured over time, and its files.
+"""Readings of laser scanners over time, and their files.
 
 ``<name>.scans.npz``
     `times_s` (N,) float64 and `ranges_mm` (N, readings) uint16, nothing pickled.
@@ -151,7 +151,7 @@ def write_scans(path: str | os.PathLike[str], scans: Scans, *, overwrite: bool =
 
 
 def _read_npz(path: str | os.PathLike[str]) -> Scans:
-    """Read the two arrays without trusting a size that the file claims, nor unpickling."""
+    """Read the two arrays, checking sizes that the file claims and without unpickling."""
     try:
         with zipfile.ZipFile(path) as archive:
             times = _member(path, archive, "times_s", np.dtype(np.float64), 1)
@@ -162,7 +162,7 @@ def _read_npz(path: str | os.PathLike[str]) -> Scans:
         raise GroundTruthError(f"{path}: no such file") from None
     except OSError as error:
         raise GroundTruthError(f"{path}: cannot be read: {error.strerror}") from None
-    # What a damaged archive raises: names that are no UTF-8, offsets beyond any file, ...
+    # Errors of damaged archives: names that are no UTF-8, offsets beyond any file, ...
     except (
         zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, ValueError, OverflowError,
         struct.error,

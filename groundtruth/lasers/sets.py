@@ -84,7 +84,7 @@ def scanner_tables(
     backgrounds: Sequence[Background],
     joint_covariance: FloatArray | None = None,
 ) -> ScannerTables:
-    """Lay scanners and what they have learned out for the kernels.
+    """Arrange scanners and their backgrounds for the kernels.
 
     Parameters
     ----------
@@ -138,7 +138,7 @@ def sets_of_scans(scans: Sequence[Scans], window_s: float | None = None) -> Scan
 
     Going through all scans in the order of time, a set ends where a scanner would come a second
     time, or where its first scan is more than the window ago. So each scan is in one set, and
-    scanners that run slightly faster than others now and then make a set of their own.
+    scanners that run slightly faster than others occasionally have a set of their own.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""How the robot is tracked by lasers: what the command line and library callers can choose."""
+"""Settings of laser tracking, for the command line and library callers."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class LaserSettings:
     threshold_m : float
         The ICP ends when its root mean square error changes by less than this (m).
     most_steps : int
-        It ends after so many steps at the latest.
+        Largest number of steps of the ICP.
     floor_m : float
         Standard deviation of a reading's distance from the outline that does not depend on the
         scanner's noise: the outline is drawn to millimetres (m).
@@ -30,31 +30,32 @@ class LaserSettings:
         Readings along a face, whose beam and normal have a smaller cosine, count as if it were
         this: their distances from the face are small whatever the pose.
     gate_sigma : float
-        In the final pose count readings up to so many standard deviations off.
+        The final pose uses readings up to this many standard deviations off.
     weak_sigma_m : float
         A direction is undetermined if the pose's standard deviation along it is larger (m;
         a turn counts by what it does to the farthest corner).
     least_readings : int
         A pose needs as many.
     acquire_readings : int
-        A robot that is found anew needs as many.
+        A robot that is found again needs as many.
     coast_s : float
         The robot is lost after so long without a pose (s).
     acquire_s : float
-        Lost, it is looked for this often (s).
+        When the robot is lost, it is searched this often (s).
     headings : int
         Headings that the search begins from.
     link_m : float
-        New readings nearer to each other than this may be of one thing (m).
+        New readings nearer to each other than this may be of one object (m).
     least_agreement : float
         Share of the beams that should see the robot, or see something beside it, that must agree
         with a pose found.
     symmetry_m : float
-        The outline may be mistaken for itself turned round if it is nowhere farther from it (m).
+        The outline counts as symmetric if it is nowhere farther from itself when rotated (m).
     front_sigma : float
-        The outline shows which of these it is if the residuals differ by so many standard errors.
+        The readings identify the front if the residuals differ by this many standard errors.
     forward_m : float
-        Otherwise a robot has shown its front after driving so far forward more than backward (m).
+        Otherwise the front is known after the robot has driven this much farther forward than
+        backward (m).
 
     Raises
     ------

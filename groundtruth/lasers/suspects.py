@@ -44,7 +44,7 @@ def track_without_suspects(
     -------
     track : LaserTrack
     left_out : dict of str to (2, 3) float64
-        By scanner, the shift its readings asked for and its standard deviations.
+        By scanner, the shift that its readings suggest and its standard deviations.
     """
     left_out: dict[str, FloatArray] = {}
     track = track_robot(sets, tables, robot, settings)

@@ -1,8 +1,8 @@
 """Tracking the robot by fixed scanners, one set of scans after the other.
 
-Per set: what is new against the background and where the robot can have got to; trimmed ICP of the
-outline from where it should be by now; the most likely pose from there; whether the beams agree.
-Nothing of one set's errors goes into the next one's pose but where to start.
+Per set: select the readings that are new against the background and within the robot's reach; run a
+trimmed ICP of the outline from the predicted pose; refine the result to the most likely pose; check
+that the beams agree. Errors of one set affect the next one's pose only through its start.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _FRONT_SAMPLE = 60
 
 @dataclass(frozen=True, eq=False)
 class LaserTrack:
-    """What came of every set of scans.
+    """Result for every set of scans.
 
     Attributes
     ----------
@@ -68,7 +68,7 @@ class LaserTrack:
     reasons : dict of int to str
         Why a set has no pose, where the robot was expected.
     corrections : (scanners, 3) float64
-        Poses of the scanners that their residuals ask for, as against those given.
+        Corrections of the scanners' given poses that their residuals suggest.
     correction_sigma : (scanners, 3) float64
     """
 
@@ -160,7 +160,7 @@ class Tracker:
             before = t
             predicted = pose + motion * step
             self.segment[i] = segment
-            # What the readings leave open is as uncertain as the motion since they last did not.
+            # Undetermined directions: as uncertain as the motion since they were last determined.
             self.prior_m[i] = 0.02 + 0.5 * self.speed * (t - sure)
             fitted = self._fit(i, predicted, motion, t - last)
             if fitted is None:
@@ -277,16 +277,16 @@ class Tracker:
             self.status[i], self.poses[i] = COASTING, np.nan
             return
         self._store(i, refined, summary, self._explain(i, refined))
-        # What was known of the whole visit, or of its first set, stays known.
+        # Keeps what the whole visit, or its first set, has determined.
         if status == UNRESOLVED or (status == REACQUIRED and self.status[i] == OK):
             self.status[i] = status
         self.information += self._evidence[0]
         self.gradient += self._evidence[1]
 
     def _front(self, rows: IntArray, velocity: FloatArray) -> str:
-        """Choose among the poses that the outline hardly tells apart, and say by what.
+        """Choose among the poses that the outline hardly distinguishes; returns the criterion.
 
-        First by the readings themselves, in a sample of the sets; if they do not tell, by the
+        First by the readings themselves, in a sample of the sets; if they are ambiguous, by the
         motion: robots drive forward.
         """
         if len(self.body.symmetries) == 0:

@@ -1,4 +1,4 @@
-"""Kernels of laser tracking: what is new in a set of scans, and how the robot explains it.
+"""Kernels of laser tracking: new readings in a set of scans, and their fit to the robot.
 
 A set of scans is a row of `ranges` per scanner (-1: none). Poses are (x, y, theta) of the robot in
 the world; its faces (k, 4) run counter-clockwise in its own frame, so that outward normals are to
@@ -244,7 +244,7 @@ def refine_outline(
     weak : (3,)
         The least determined direction of (x, y, theta), theta times `scale_m`.
     information, gradient : (scanners, 3, 3), (scanners, 3)
-        What the residuals say of each scanner's own pose.
+        Correction of each scanner's own pose by the residuals.
     """
     points, scanner, direction, range_m = seen
     many = sigmas_m.size
@@ -345,7 +345,7 @@ def refine_outline(
         if used < 3:
             return pose, covariance, calibration, summary, weak, information, gradient
         summary[3] = math.sqrt(squares / used)
-        # Open directions are looked for about the middle of the points, theta in metres there.
+        # Undetermined directions are evaluated about the middle of the points, theta in metres.
         mx, my = sx / used, sy / used
         scale = fit.scale_m
         for a in range(3):
@@ -406,7 +406,7 @@ def explain_set(
     (6,) float64
         Beams that should see the robot before the background; of these: as far as they should,
         farther (through it), nearer (hidden by something), without a reading; and new readings
-        in the outline's circle where the robot is not: things that stand there beside it.
+        in the outline's circle where the robot is not: objects beside it.
     """
     out = np.zeros(6)
     c, s = math.cos(pose[2]), math.sin(pose[2])

@@ -57,7 +57,7 @@ class AdjustedBundle:
     degrees_of_freedom : int
     camera_covariance : (6 C, 6 C) float64
     part_covariance : (6 P, 6 P) float64
-        Of right perturbations, all other poses marginalised; zeros for what was not free. They are
+        Of right perturbations, all other poses marginalised; zeros for fixed ones. They are
         those of the corners' covariances, not scaled by the residuals.
     """
 
@@ -186,7 +186,7 @@ def _damped_step(
 ) -> tuple[FloatArray, FloatArray, float]:
     """The step for a damping relative to the diagonal, and by how much it should lower the cost."""
     of_shared, of_bodies = (
-        # What no residual depends on is held where it is.
+        # Parameters on which no residual depends are kept fixed.
         damping * np.where(diagonal > 0.0, diagonal, 1.0)
         for diagonal in equations.diagonals
     )

@@ -1,4 +1,4 @@
-"""``boards.json``: which checkerboard is in which image of which camera, and what is known of them.
+"""``boards.json``: which checkerboard is in which image of which camera, and the boards' data.
 
 ::
 
@@ -45,7 +45,7 @@ FIRST, SECOND, WORLD = "first", "second", "world"
 
 @dataclass(frozen=True, eq=False)
 class BoardImage:
-    """A board in an image that was not looked at yet."""
+    """A board in an image that has not been read yet."""
 
     camera: str
     board: str
@@ -56,7 +56,7 @@ class BoardImage:
 
 @dataclass(frozen=True, eq=False)
 class BoardsFile:
-    """What a ``boards.json`` says.
+    """Content of a ``boards.json``.
 
     Attributes
     ----------
@@ -83,7 +83,7 @@ def read_boards(path: Path) -> BoardsFile:
     Parameters
     ----------
     path : path
-        The file, or the folder in which it stands.
+        The file, or its folder.
 
     Returns
     -------
@@ -151,7 +151,7 @@ def find_boards(image: BoardImage, board: Checkerboard, camera: Camera) -> Board
     except OSError as error:
         raise GroundTruthError(f"{image.image}: cannot be read: {error.strerror}") from None
     size = claimed_size(content)
-    # What claims more is not decoded: memory is taken only for what there should be.
+    # Larger claims are not decoded: memory is allocated for the expected size only.
     if size is not None and size != (camera.width, camera.height):
         raise _other_size(image.image, size, camera)
     if size is None:

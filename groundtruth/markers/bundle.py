@@ -1,8 +1,8 @@
-"""Points seen through chains of poses: what is known, what is free, residuals and derivatives.
+"""Points seen through chains of poses: fixed and free poses, priors, residuals and derivatives.
 
-What is unknown here are poses, not points: a marker's four corners and a board's are rigid and of
-known size, which is what gives the result its scale. Bundle adjusters for reconstruction (as
-pycolmap's) move each point by itself and cannot hold a square square.
+The unknowns are poses, not points: a marker's four corners and a board's are rigid and of
+known size, which gives the result its scale. Bundle adjusters for reconstruction (as
+pycolmap's) move each point independently and cannot keep a square rigid.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ PoseKind = Literal["camera", "body", "part"]
 
 @dataclass(frozen=True, eq=False)
 class PosePrior:
-    """What is known of a pose beforehand: its value, and the covariance of right perturbations."""
+    """Prior of a pose: its value, and the covariance of right perturbations."""
 
     kind: PoseKind
     index: int
@@ -95,7 +95,7 @@ class Bundle:
 
 @dataclass(frozen=True, eq=False)
 class Whiteners:
-    """What makes residuals independent, each of variance 1.
+    """Whitening of residuals: independent, each of variance 1.
 
     Attributes
     ----------

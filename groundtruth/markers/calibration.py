@@ -192,7 +192,7 @@ def write_rig(
     *,
     overwrite: bool = False,
 ) -> None:
-    """Write a ``rig.json``; `extra` stands beside the markers (settings, residuals)."""
+    """Write a ``rig.json``; `extra` is written beside the markers (settings, residuals)."""
     entries = {
         str(marker): {"width_m": float(width), **_pose_entries(pose)}
         for marker, width, pose in zip(rig.ids, rig.widths_m, rig.robot_from_marker)
@@ -213,7 +213,7 @@ def write_network(
     *,
     overwrite: bool = False,
 ) -> None:
-    """Write a ``network.json``; `extra` stands beside the cameras (settings, residuals)."""
+    """Write a ``network.json``; `extra` is written beside the cameras (settings, residuals)."""
     entries = {
         name: {"calibration": calibration, **_pose_entries(pose)}
         for name, calibration, pose in zip(
@@ -277,7 +277,7 @@ def parse_pose(place: str, entry: Any) -> FloatArray:
     Raises
     ------
     GroundTruthError
-        If it is none; `place` says where it stands.
+        If it is none; the message names `place`.
     """
     if not isinstance(entry, dict):
         raise GroundTruthError(f"{place}: expected translation_m and quaternion_xyzw")
@@ -293,7 +293,7 @@ def parse_covariance(place: str, entry: dict[str, Any]) -> FloatArray:
     Raises
     ------
     GroundTruthError
-        If it has both, or one that cannot be; `place` says where it stands.
+        If it has both, or an invalid one; the message names `place`.
     """
     matrix, sigmas = entry.get("covariance"), entry.get("sigmas")
     if matrix is not None and sigmas is not None:

@@ -94,7 +94,7 @@ def project_chain(
         Their lenses; the mounting that a `Camera` holds is not used.
     world_from_camera, world_from_body, body_from_part : (C | B | P, 4, 4) arrays
     seen : ChainPoints
-        Its pixels are not looked at.
+        Its pixels are not used.
     """
     in_body = apply(body_from_part[seen.part], seen.points)
     in_world = apply(world_from_body[seen.body], in_body)

@@ -1,4 +1,4 @@
-"""Checkerboards of which only one way to hold them is right; they are found by the camera room.
+"""Checkerboards with a unique orientation; `camera.boards` finds them in images.
 
 A board's frame is that of `camera.boards.board`: origin at the middle of its inner corners, x
 right, y up, z out of the print, held so that the square in its top left corner is black. With one
@@ -20,7 +20,7 @@ from groundtruth.errors import GeometryError, GroundTruthError
 FloatArray = NDArray[np.float64]
 
 #: Half the side of the window in which a corner is refined, as a share of its squares: calibrated
-#: cameras look from afar here, and what blur and noise cost is more than the lens's bending.
+#: cameras look from afar here, and blur and noise cause larger errors than the lens's distortion.
 _WINDOW = 0.4
 
 
@@ -38,7 +38,7 @@ class Checkerboard:
     Raises
     ------
     GroundTruthError
-        If the board looks the same turned by 180 degrees, or is too small.
+        If the board is symmetric under rotation by 180 degrees, or is too small.
     """
 
     columns: int
@@ -58,7 +58,7 @@ class Checkerboard:
 
     @property
     def board(self) -> Board:
-        """The board, as the camera room knows it."""
+        """The board as used in the package `camera`."""
         return Board("checkerboard", self.columns, self.rows, self.square_m)
 
     @property

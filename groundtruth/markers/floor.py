@@ -1,4 +1,4 @@
-"""What the floor says of the pose of a robot that stands on it."""
+"""Constraint of the floor on the pose of a robot."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Floor:
-    """Where a robot that stands on the floor has its z, roll and pitch, and how surely."""
+    """z, roll and pitch of a robot on the floor, with standard deviations."""
 
     z_m: float
     sigma_z_m: float
@@ -22,7 +22,7 @@ class Floor:
 
 
 def floor_residuals(pose: FloatArray, floor: Floor) -> tuple[FloatArray, FloatArray]:
-    """What a pose misses of the floor's z, roll, pitch: (3,) normalised, and its (3, 6) Jacobian.
+    """Deviation of a pose from the floor's z, roll, pitch: (3,) normalised, and (3, 6) Jacobian.
 
     The Jacobian is that of the normalised z, roll and pitch by the pose's right perturbation.
     """

@@ -1,9 +1,9 @@
-"""What one time cannot decide, the times before and after can.
+"""Resolves ambiguous poses of a frame with the frames before and after it.
 
-A robot that stands on the floor and drives keeps its height, roll and pitch and moves no faster
-than it can; the mirror image of a marker rarely does. Among all sequences of candidates, with
-frames left out at a price, the cheapest through each candidate is found (min-sum, forwards and
-backwards), and the difference between a frame's candidates is how surely its neighbours decide.
+A robot on the floor keeps its height, roll and pitch and its speed is limited; the mirror image of
+a marker rarely moves like that. Among all sequences of candidates, in which frames may be left out
+at a cost, the cheapest through each candidate is found (min-sum, forwards and backwards). The
+difference of cost between a frame's candidates is the certainty of the decision.
 
 The candidates' own odds count for their own frame only: errors of frames of a standing robot go
 together, and many weak reasons are not a strong one.

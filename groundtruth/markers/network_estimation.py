@@ -106,7 +106,7 @@ def estimate_network(
     double : DoubleBoard or None
         None if all cameras see boards of the world.
     shots : sequence of sequences of BoardView
-        What was seen at one time.
+        Markers seen at one time.
     settings : NetworkSettings
 
     Returns
@@ -298,7 +298,7 @@ def _bundle(
         free = double.offset is None or bool(np.any(double.covariance))
         free_part[order.index(double.second)] = free
         if free and double.offset is not None:
-            # What is exactly known beside what is not is held to a micrometre.
+            # Exactly known poses beside uncertain ones are held to a micrometre.
             covariance = double.covariance + 1e-12 * np.eye(6)
             priors = (PosePrior("part", order.index(double.second), double.offset, covariance),)
     free_body = np.ones(1 + len(bodies), dtype=np.bool_)

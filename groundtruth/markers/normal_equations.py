@@ -83,7 +83,7 @@ class NormalEquations:
         return self.shared - self._eliminated(coupling)
 
     def _eliminated(self, solved: FloatArray) -> FloatArray:
-        """What the bodies take from the shared part, given inverse blocks times coupling."""
+        """The Schur complement's term of the bodies, given inverse blocks times coupling."""
         width = self.shared.shape[0]
         rows = 6 * len(self.bodies)
         return np.asarray(self.coupling.reshape(rows, width).T @ solved.reshape(rows, width))

@@ -1,4 +1,4 @@
-"""How two markers lie to each other: an estimate from each time that shows both, and a consensus.
+"""Relative poses of two markers: an estimate from each time that shows both, and a consensus.
 
 A square has two solutions, so each time gives four estimates of a pair. The right one is the same
 at all times; wrong ones depend on where the camera stood. The consensus is the estimate that the
@@ -48,7 +48,7 @@ class MarkerPose:
 
 @dataclass(frozen=True, eq=False)
 class PairConsensus:
-    """How one marker lies to another.
+    """The pose of one marker relative to another.
 
     Attributes
     ----------
@@ -146,7 +146,7 @@ def spanning_tree(pairs: Mapping[tuple[int, int], int], count: int, root: int) -
     Returns
     -------
     list of int
-        Parents; the root's is itself, -1 for what is not connected.
+        Parents; the root's is itself, -1 for unconnected ones.
     """
     parents = [-1] * count
     parents[root] = root

@@ -52,7 +52,7 @@ def solve_camera(
         In the object's frame (m). For `ippe` they are the corners of one square marker in its own
         frame, as `groundtruth.markers.calibration.marker_corners` gives them.
     pixels : (N, 2) array
-        In the image as it is; the lens' distortion is taken off here.
+        In the original image; the lens' distortion is removed here.
     solver : str
         `sqpnp` (Terzakis & Lourakis 2020), `epnp` (Lepetit et al. 2009; of points in one plane it
         may give the mirror image), `iterative` (DLT or homography, then least squares), `ippe`
@@ -102,7 +102,7 @@ def solve_robot(problem: PoseProblem, solver: Solver = "sqpnp") -> list[PnpSolut
     -------
     list of PnpSolution
         `world_from_robot`, with residuals over all cameras; the best first. Solutions in which a
-        corner lies behind its camera are left out.
+        corner is behind its camera are left out.
 
     Raises
     ------

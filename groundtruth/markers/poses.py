@@ -1,9 +1,9 @@
 """The robot's pose at one time: solutions, wrong markers, and the planar ambiguity.
 
-The solver chosen gives starts, least squares over everything refine them. If all markers agree, the
-rest is a look at whether the mirror image of what was seen explains the corners as well. If not,
-each marker's own two solutions are hypotheses, and the one that most others agree with decides
-which markers are wrong.
+The chosen solver gives initial poses, which are refined by least squares over all corners. If all
+markers agree, it remains to check whether the mirror image of the markers explains the corners as
+well. If not, each marker's own two solutions are hypotheses, and the one that most others agree
+with decides which markers are wrong.
 """
 
 from __future__ import annotations
@@ -61,12 +61,12 @@ class PoseCandidate:
 
 @dataclass(frozen=True, eq=False)
 class PoseEstimate:
-    """What one time's corners say.
+    """Pose estimate from the corners of one time.
 
     Attributes
     ----------
     candidates : tuple of PoseCandidate
-        The best first; several where what was seen is ambiguous, or contradicts itself.
+        The best first; several if the markers are ambiguous or contradict each other.
     log_odds : tuple of float
         Natural logarithm of how much likelier the first is than each candidate: 0 for the first.
     contradiction : bool
@@ -119,7 +119,7 @@ def estimate_pose(problem: PoseProblem, settings: PoseSettings) -> PoseEstimate:
         minima = _distinct(refined + _refined(alone, starts, settings))
         candidates += [PoseCandidate(pose, views) for pose in _likely(minima, settings)]
     if contradiction:
-        # Different views were explained: their costs cannot be held against each other.
+        # Different views were explained: their costs are not comparable.
         return PoseEstimate(tuple(candidates), (0.0,) * len(candidates), True)
     best = candidates[0].refined
     inflation = _inflation(best)
@@ -145,7 +145,7 @@ def _starts(problem: PoseProblem, settings: PoseSettings) -> list[FloatArray]:
 
 
 def _own_poses(problem: PoseProblem) -> list[FloatArray]:
-    """What single views say alone: those that explain all of them best."""
+    """Poses by single views: those that explain all views best."""
     poses = [pose for view in range(problem.views) for pose in view_poses(problem, view)]
     return sorted(poses, key=lambda pose: robot_rms_px(problem, pose))[:_OWN_STARTS]
 
@@ -233,7 +233,7 @@ def _consensus(
         other = found.get(views.tobytes())
         if other is None or refined.cost < other[1].cost:
             found[views.tobytes()] = explained
-        if 3 * int(views.sum()) > 2 * count:  # nobody else can have as many
+        if 3 * int(views.sum()) > 2 * count:  # no other candidate can have as many
             break
     if not found:
         raise GeometryError("no pose explains any of the markers")

@@ -39,7 +39,7 @@ _LARGEST_DAMPING = 1e10
 
 @dataclass(frozen=True, eq=False)
 class PoseProblem:
-    """What is known about a robot at one time.
+    """The data on a robot's pose at one time.
 
     Attributes
     ----------

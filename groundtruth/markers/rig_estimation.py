@@ -100,7 +100,7 @@ def estimate_rig(
     reference : int, optional
         The marker whose frame is the rig's; by default the one with the most support.
     camera_covariance : (6 C, 6 C) array, optional
-        How well the cameras are calibrated to each other: they are adjusted with it as a prior.
+        Covariance of the cameras' relative poses, a prior of their adjustment.
 
     Returns
     -------

@@ -1,7 +1,7 @@
 """A rig in the robot's frame: by markers whose place on the robot is known, or by known poses.
 
-What is known becomes a prior of one more adjustment in which all markers are free. So the
-covariance is that of the robot's frame: markers far from what defines it are less sure.
+These become priors of a further adjustment in which all markers are free. So the covariance is that
+in the robot's frame: markers far from those that define it are less certain.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from groundtruth.trajectories.streams import PlanarPoses
 
 FloatArray = NDArray[np.float64]
 
-# What is exactly known is held to a micrometre and a microradian.
+# Exactly known poses are held to a micrometre and a microradian.
 _EXACT = 1e-12
-# A reference pose without covariance is taken to be this good (m, rad), and any to be this level.
+# Assumed deviations of a reference pose without covariance (m, rad), and of any one's level.
 _REFERENCE_SIGMA_M, _REFERENCE_SIGMA_RAD = 0.005, 0.005
 
 

@@ -45,7 +45,7 @@ def draw_rig(estimate: RigEstimate) -> bytes:
     middle = 0.5 * (centre.min(axis=0) + centre.max(axis=0))
     reach = 0.5 * float(np.ptp(centre, axis=0).max()) + float(rig.widths_m.max())
     for axes, (across, up, title) in zip(figure.subplots(1, 3), _PLANES):
-        # Wrong estimates lie far away: they are drawn as far as the picture goes.
+        # Wrong estimates are far away: only those inside the picture are drawn.
         axes.scatter(
             differing[:, across], differing[:, up], s=14, marker="x", color=_DIFFERS, lw=0.8,
             label=f"pairwise, differs ({len(differing)})", zorder=1,

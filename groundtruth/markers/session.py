@@ -212,7 +212,7 @@ def chain_points(
 def pose_problem(
     views: Sequence[View], rig: Rig, network: Network, settings: PoseSettings
 ) -> PoseProblem:
-    """What is to be solved for the robot's pose at one time."""
+    """The problem of the robot's pose at one time."""
     floor = None
     if settings.floor:
         floor = Floor(

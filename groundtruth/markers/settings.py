@@ -1,4 +1,4 @@
-"""How poses are worked out: what the command line and library callers can choose."""
+"""Settings of the estimation of poses, for the command line and library callers."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class PoseSettings:
     Parameters
     ----------
     solver : str
-        What finds the pose that least squares start from.
+        The solver for the initial pose of least squares.
     loss : str
         How markers that fit badly are weighted in the least squares.
     loss_scale : float
@@ -30,12 +30,12 @@ class PoseSettings:
     outlier_px : float
         and its root mean square residual is larger than this (px).
     corner_floor_px : float
-        Standard deviation added to each corner's own covariance, for what a fit to the image
-        cannot know: the lens' calibration, the print (px).
+        Standard deviation added to each corner's own covariance, for errors that a fit to the image
+        does not include: the lens' calibration, the print (px).
     ambiguity_odds : float
-        A second solution is taken for impossible only if the first is this many times likelier.
+        A second solution is ruled out only if the first is this many times likelier.
     floor : bool
-        Take it that the robot stands on the floor: z, roll and pitch are known.
+        Assume that the robot is on the floor: z, roll and pitch are known.
     floor_z_m : float
         Height of the robot's origin there (m).
     floor_sigma_z_m : float

@@ -34,7 +34,7 @@ STATUSES: tuple[Status, ...] = (
 
 @dataclass(frozen=True, eq=False)
 class TrackedTime:
-    """What became of one time.
+    """Result for one time.
 
     Attributes
     ----------
@@ -50,7 +50,7 @@ class TrackedTime:
     estimate : PoseEstimate or None
     choice : Choice or None
     reason : str
-        Why there is no pose, or what to know about it.
+        Why there is no pose, or a remark on it.
     """
 
     time_s: float
@@ -63,7 +63,7 @@ class TrackedTime:
 
     @property
     def pose(self) -> PoseCandidate | None:
-        """The robot's pose; None where there is none to be trusted."""
+        """The robot's pose; None if there is no reliable one."""
         if self.status in ("clear", "resolved") and self.estimate is not None:
             assert self.choice is not None
             assert self.choice.candidate is not None
@@ -165,7 +165,7 @@ def track_robot(
 
 
 def report_entry(tracked: TrackedTime, network: Network) -> dict[str, Any]:
-    """One time's account, for a line of JSON: what was seen, used and decided."""
+    """Record of one time for a line of JSON: markers seen and used, and decisions."""
     entry: dict[str, Any] = {
         "time_s": round(tracked.time_s, 6),
         "status": tracked.status,

@@ -1,1 +1,1 @@
-"""What a session holds, on one page."""
+"""The content of a session on one page."""

@@ -1,4 +1,4 @@
-"""What a session holds for the report; what is missing or cannot be read is noted, not raised."""
+"""The report's inputs from a session; files missing or unreadable are noted, not raised."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class Inputs:
     documents : dict of str to dict
         Contents of `laser.json`, `fused.json`, `clock.json`, `validation.json`, `aligned.json`.
     sets : dict of str to int
-        Sets of scans by what became of them.
+        Numbers of sets of scans by status.
     intervals : list of Interval
         Where the laser's track was not determined within visits.
     picture : bytes or None
@@ -70,9 +70,9 @@ class Inputs:
     visits : list of (float, float)
         Times between which the robot was in the covered area.
     missing : list of str
-        What is not there.
+        Missing files.
     problems : list of str
-        What is there but cannot be read.
+        Files that cannot be read.
     """
 
     name: str
@@ -91,7 +91,7 @@ class Inputs:
 
 
 def gather(session: Path, truth: Path | None = None) -> Inputs:
-    """Read what there is in a session.
+    """Read the files of a session.
 
     Parameters
     ----------
@@ -106,7 +106,7 @@ def gather(session: Path, truth: Path | None = None) -> Inputs:
     Raises
     ------
     GroundTruthError
-        If there is no such folder, or the truth asked for cannot be read.
+        If there is no such folder, or the requested truth cannot be read.
     """
     if not session.is_dir():
         raise GroundTruthError(f"{session}: no such folder: expected a session")
@@ -158,7 +158,7 @@ def in_visits(poses: PlanarPoses, visits: list[tuple[float, float]]) -> PlanarPo
 def _read(
     inputs: Inputs, path: Path, reader: Callable[[Path], T], *, quiet: bool = False
 ) -> T | None:
-    """What a reader makes of a file, or None and a note."""
+    """The result of a reader for a file, or None and a note."""
     place = path.name if path.parent.name != "validation" else f"validation/{path.name}"
     try:
         if path.is_file():

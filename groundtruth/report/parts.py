@@ -1,4 +1,4 @@
-"""What stands on the report's page, before it is HTML; and how it becomes that."""
+"""Content of the report's page and its conversion to HTML."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class Part:
 
 @dataclass(frozen=True)
 class Section:
-    """A section of the page: its anchor, its heading, and what stands in it."""
+    """A section of the page: its anchor, its heading and its content."""
 
     key: str
     name: str
@@ -74,7 +74,7 @@ def figure(caption: str, *drawings: Element) -> Part:
 
 
 def picture(caption: str, address: str, instead: str) -> Part:
-    """A picture (a ``data:`` address) over its caption; `instead` is for who cannot see it."""
+    """A picture (a ``data:`` address) over its caption; `instead` is its alternative text."""
     return Part("picture", caption, address=address, instead=instead)
 
 

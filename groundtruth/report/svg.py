@@ -66,7 +66,7 @@ def draw_map(
     width: float = _WIDTH,
     ellipses: int = 0,
 ) -> tuple[Element, float]:
-    """Walls, paths, and for each track so many 3 sigma ellipses.
+    """Walls, paths, and `ellipses` 3 sigma ellipses for each track.
 
     Returns
     -------
@@ -137,7 +137,7 @@ def draw_series(
 
     total = sum(max(b - a, 1e-3) for a, b in visits)
     pause = min(14.0, 0.3 * (width - left) / len(visits))
-    room = width - left - 6.0 - pause * (len(visits) - 1)
+    available = width - left - 6.0 - pause * (len(visits) - 1)
     for power in range(least, most + 1):
         y = float(level(np.array([10.0**power]))[0])
         _line(drawing, np.array([[left, y], [width - 6.0, y]]), "#dddad5", 0.8)
@@ -145,7 +145,7 @@ def draw_series(
     x = left
     for number, (first, last) in enumerate(visits, 1):
         span = max(last - first, 1e-3)
-        wide = room * span / total
+        wide = available * span / total
         edges = np.array([[x, top], [x, height - bottom], [x + wide, height - bottom]])
         _line(drawing, edges, "#888", 0.8)
         if wide > 60.0:
@@ -234,7 +234,7 @@ def _largest(
 
 
 def _bounds(tracks: Sequence[Track], building: FloatArray | None) -> tuple[FloatArray, FloatArray]:
-    """Corners of what is shown: the paths with some room, or the whole building without any."""
+    """Corners of the drawn area: the paths with a margin, or the whole building without one."""
     places = [track.poses.poses[:, :2] for track in tracks if len(track.poses)]
     if not places and building is not None:
         places = [building.reshape(-1, 2)]
@@ -242,8 +242,8 @@ def _bounds(tracks: Sequence[Track], building: FloatArray | None) -> tuple[Float
         return np.zeros(2), np.ones(2)
     everything = np.concatenate(places)
     low, high = everything.min(axis=0), everything.max(axis=0)
-    room = max(1.0, 0.08 * float((high - low).max()))
-    return low - room, high + room
+    margin = max(1.0, 0.08 * float((high - low).max()))
+    return low - margin, high + margin
 
 
 def _drawing(title: str, width: float, height: float) -> Element:
@@ -288,6 +288,6 @@ def _number(value: float) -> str:
 
 
 def _round_step(wanted: float) -> float:
-    """The smallest of ..., 0.5, 1, 2, 5, 10, ... that is not below what is wanted."""
+    """The smallest of ..., 0.5, 1, 2, 5, 10, ... that is at least `wanted`."""
     power = 10.0 ** math.floor(math.log10(max(wanted, 1e-9)))
     return power * min(step for step in (1.0, 2.0, 5.0, 10.0) if step * power >= wanted * 0.999)

@@ -1,7 +1,7 @@
 """Files of poses and times: RAWSEEDS' comma-separated streams, TUM trajectories, ``.times``.
 
 A RAWSEEDS stream has a row per pose: time (s), x, y (m), heading theta (rad), and for ground truth
-the 3x3 covariance of (x, y, theta) row by row. It knows no comments and no header.
+the 3x3 covariance of (x, y, theta) row by row. It has no comments and no header.
 """
 
 from __future__ import annotations
@@ -85,10 +85,10 @@ class PlanarPoses:
 
 
 def last_of_each_time(poses: PlanarPoses) -> PlanarPoses:
-    """The last of all poses of one time, which is where those before it lead to.
+    """Keep only the last of all poses with the same time.
 
-    Where stamps are coarser than samples, as those of buffers that are read now and then, several
-    poses have one time. No speed can be told between them, yet the robot moved on.
+    Where stamps are coarser than samples, as with buffers that are read from time to time, several
+    poses have the same time. The robot moved between them, but at no computable speed.
     """
     last = np.append(np.diff(poses.times_s) > 0.0, True)[: len(poses)]
     if np.all(last):
@@ -166,7 +166,7 @@ def read_planar_poses(path: str | os.PathLike[str]) -> PlanarPoses:
 
 
 def format_planar_poses(poses: PlanarPoses, covariance_decimals: int = 12) -> str:
-    """Lay poses out as a RAWSEEDS stream.
+    """Format poses as a RAWSEEDS stream.
 
     Parameters
     ----------
@@ -201,7 +201,7 @@ def write_planar_poses(
 
 
 def format_tum(times_s: FloatArray, world_from_robot: FloatArray) -> str:
-    """Lay (N,) times and (N, 4, 4) poses out as a TUM trajectory: t x y z qx qy qz qw."""
+    """Format (N,) times and (N, 4, 4) poses as a TUM trajectory: t x y z qx qy qz qw."""
     quaternions = quaternion_xyzw(world_from_robot) if len(times_s) else np.zeros((0, 4))
     return "".join(
         " ".join([f"{t:.6f}", *(f"{v:.6f}" for v in pose[:3, 3]), *(f"{v:.9f}" for v in q)]) + "\n"
@@ -224,7 +224,7 @@ def read_times(path: str | os.PathLike[str]) -> dict[str, float]:
     Raises
     ------
     StreamError
-        If the file cannot be read, a row is malformed or a prefix stands twice.
+        If the file cannot be read, a row is malformed or a prefix is listed twice.
     """
     times: dict[str, float] = {}
     for line, words in _rows(path):
@@ -232,7 +232,7 @@ def read_times(path: str | os.PathLike[str]) -> dict[str, float]:
             raise StreamError(path, line, f"{len(words)} words: expected a prefix and seconds")
         prefix = words[0]
         if prefix in times:
-            raise StreamError(path, line, f"prefix {excerpt(prefix)} stands here a second time")
+            raise StreamError(path, line, f"prefix {excerpt(prefix)} is listed a second time")
         times[prefix] = _numbers(path, line, words[1:])[0]
     return times
 

@@ -55,7 +55,7 @@ class Distance:
     Attributes
     ----------
     pose : int
-        Which of the reference poses the robot stood in.
+        Number of the reference pose.
     time_s : float
         When, on the ground truth's clock.
     point, fiducial : str
@@ -113,7 +113,7 @@ def read_distances(path: str | os.PathLike[str], survey: Survey) -> list[Distanc
     ----------
     path : path
     survey : Survey
-        Its points are the only ones that may stand in the file.
+        The file may contain only its points.
 
     Returns
     -------

@@ -24,7 +24,7 @@ def draw_errors(
     figures: Figures,
     building: FloatArray | None = None,
 ) -> bytes:
-    """Draw errors with what their covariances allow; a PNG's bytes.
+    """Draw errors with bounds by their covariances; returns a PNG's bytes.
 
     The same input gives the same bytes.
 
@@ -84,7 +84,7 @@ def draw_errors(
         axes.set_xlim(-0.7, len(at) - 0.3)
         axes.grid(axis="y", alpha=0.25)
         low, high = axes.get_ylim()
-        axes.set_ylim(low, high + 0.22 * (high - low))  # room for the legend
+        axes.set_ylim(low, high + 0.22 * (high - low))  # space for the legend
         axes.legend(loc="upper center", ncols=4, fontsize=8, framealpha=0.9)
 
     where = figure.add_subplot(grid[:, 1])
@@ -121,6 +121,6 @@ def draw_errors(
 
 
 def _round_factor(wanted: float) -> float:
-    """The largest of 1, 2, 5, 10, ... that is not above what is wanted."""
+    """The largest of 1, 2, 5, 10, ... that is at most `wanted`; 1 if that is below 1."""
     power = 10.0 ** math.floor(math.log10(max(wanted, 1.0)))
     return power * max(step for step in (1.0, 2.0, 5.0) if step * power <= max(wanted, 1.0))

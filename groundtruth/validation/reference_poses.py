@@ -1,8 +1,8 @@
-"""Reference poses of a standing robot from distances of points on it to surveyed points.
+"""Reference poses of a robot at rest from distances of points on it to surveyed points.
 
-All minima are sought, from starts all round: distances to two points, or to points in a line, fit
-mirrored poses as well. A pose counts only if it is determined, no other fits nearly as well, and
-its distances agree within their noise, but for gross errors that can be told apart.
+All minima are searched, from starts all round: distances to two points, or to points on a line, fit
+mirrored poses as well. A pose is accepted only if it is determined, no other fits nearly as well,
+and its distances agree within their noise, except for gross errors that can be identified.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class DistanceSettings:
     gross_probability : float
         Distances that fit less well than this share of right ones hold a gross error.
     most_gross : int
-        At most so many of a pose's distances are left out as gross errors.
+        At most this many of a pose's distances are left out as gross errors.
     ambiguity_chi2 : float
         Another pose within this squared normalised misfit of the best makes it ambiguous.
     largest_sigma_m, largest_sigma_deg : float
@@ -72,7 +72,7 @@ class DistanceSettings:
 
 @dataclass(frozen=True, eq=False)
 class DistancePose:
-    """What a pose's distances say of it.
+    """A reference pose from its distances.
 
     Attributes
     ----------
@@ -84,7 +84,7 @@ class DistancePose:
         `ok`; `ambiguous`: several poses fit; `undetermined`: a direction is open; `inconsistent`:
         no pose fits.
     reason : str
-        What is at fault, if anything.
+        What is wrong, if anything.
     candidates : (C, 3) float64
         Poses x, y (m), theta (rad) that fit, the best first; one if the status is `ok`.
     covariances : (C, 3, 3) float64

@@ -1,8 +1,8 @@
 """Reference poses refined by ICP of the on-board scanners' readings to the building.
 
-The robot stands still, so that its readings are averaged first. What distances say is the prior:
-ICP begins there and the two are combined by their covariances, unless the walls leave a direction
-open or the two disagree. Where distances leave several poses, the walls decide among them.
+The robot is at rest, so its readings are averaged first. The pose from distances is the prior: ICP
+starts there, and the two results are combined by their covariances, unless the walls leave a
+direction undetermined or the results disagree. If distances leave several poses, the walls decide.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from storage.bounds import ABOVE_0, PROBABILITY, SHARE_ABOVE_0, demand
 FloatArray = NDArray[np.float64]
 ScanStatus = Literal["used", "undetermined", "disagrees", "moved", "no scans", "not asked"]
 
-# Beams whose readings jump about, as at edges, say where nothing is.
+# Beams with fewer readings than this share near their median, as at edges, give no point.
 _FEWEST_READINGS = 0.5
 # Along a corridor only the beams to its ends change; a passer-by hides fewer than these.
 _MOVED_SHARE = 0.25
@@ -43,9 +43,9 @@ class RefineSettings:
     Parameters
     ----------
     still_s : float
-        The robot stands still for so long before and after the distances' time (s).
+        The robot is at rest for this long before and after the distances' time (s).
     moved_m : float
-        It does not if a quarter of the beams change by more than this within that time (m).
+        It has moved if a quarter of the beams change by more than this within that time (m).
     gates_m : tuple of float
         Gates of successive ICPs (m).
     kept : float
@@ -55,8 +55,8 @@ class RefineSettings:
     disagreement_probability : float
         Distances and walls disagree if right ones would by as much in less than this share.
     least_share : float
-        The walls decide among several poses if at least so many of the points lie on a wall, and at
-        least so much larger a share than at the next one.
+        The walls decide among several poses if at least this share of the points is on a wall, and
+        the share at the next pose is smaller by at least this fraction.
 
     Raises
     ------
@@ -105,7 +105,7 @@ class Onboard:
 
 @dataclass(frozen=True, eq=False)
 class StillPoints:
-    """What the scanners on board saw while the robot stood.
+    """Readings of the on-board scanners while the robot was at rest.
 
     Attributes
     ----------
@@ -125,7 +125,7 @@ class StillPoints:
 
 @dataclass(frozen=True, eq=False)
 class RefinedPose:
-    """A reference pose after the scans were asked.
+    """A reference pose after refinement by scans.
 
     Attributes
     ----------
@@ -133,7 +133,7 @@ class RefinedPose:
     covariance : (3, 3) float64
     scans : str
         `used`; `undetermined`: the walls leave a direction open; `disagrees`: with the distances;
-        `moved`: the robot did not stand still; `no scans`: too few readings lie on walls;
+        `moved`: the robot was not at rest; `no scans`: too few readings are on walls;
         `not asked`.
     reason : str
     points : int
@@ -153,7 +153,7 @@ class RefinedPose:
 def still_points(
     onboard: Sequence[Onboard], time_s: float, settings: RefineSettings | None = None
 ) -> StillPoints:
-    """Average what the scanners on board saw about a time.
+    """Average the readings of the on-board scanners about a time.
 
     Parameters
     ----------
@@ -183,7 +183,7 @@ def still_points(
         half = len(metres) // 2
         if half >= 2:
             changes.append(np.abs(_median(metres[half:]) - _median(metres[:half])))
-        # A passer-by and the edge of a thing are far from the beam's median.
+        # Readings of passers-by and at edges of objects are far from the beam's median.
         near = np.abs(metres - middle) <= 4.0 * board.scanner.sigma_m + _QUANTUM_M
         steady = np.mean(near, axis=0) >= _FEWEST_READINGS
         mean = np.where(near, metres, 0.0).sum(axis=0)[steady] / near.sum(axis=0)[steady]
@@ -194,7 +194,7 @@ def still_points(
     if len(change) and (typical := float(np.quantile(change, 1.0 - _MOVED_SHARE))) > s.moved_m:
         raise GeometryError(
             f"moved: a quarter of the beams change by more than {typical:.3f} m: expected a robot "
-            f"that stands still for {2.0 * s.still_s:g} s"
+            f"at rest for {2.0 * s.still_s:g} s"
         )
     return StillPoints(tuple(clouds), tuple(board.scanner for board in onboard))
 
@@ -248,7 +248,7 @@ def refine_pose(
         return unrefined(
             "disagrees",
             f"{1e3 * math.hypot(apart[0], apart[1]):.0f} mm and {math.degrees(apart[2]):.2f} deg "
-            "from what the distances say, more than both allow",
+            "from the pose by distances, more than both allow",
         )
     gain = np.linalg.solve(own + covariance, covariance).T
     pose = prior + gain @ apart
@@ -300,7 +300,7 @@ def _mount_covariance(
 def _decided(
     distances: DistancePose, cloud: FloatArray, segments: FloatArray, s: RefineSettings
 ) -> int | None:
-    """Which candidate's points lie on walls, if one's do and no other's."""
+    """Which candidate's points are on walls, if those of one only are."""
     shares = []
     for pose in distances.candidates:
         try:

@@ -27,7 +27,7 @@ _COLUMNS = 8
 
 @dataclass(frozen=True, eq=False)
 class Relations:
-    """How the robot lay at one time to where it was at another.
+    """Poses of the robot at one time relative to another.
 
     Attributes
     ----------
@@ -52,7 +52,7 @@ class RelativeScore:
     Attributes
     ----------
     pairs : int
-        Pairs of times held against the truth.
+        Pairs of times compared with the truth.
     unmatched : int
         Pairs that one side has no pose for, or that are too far apart.
     position_mean_m, position_sigma_m, position_median_m, position_rmse_m, position_max_m : float
@@ -126,7 +126,7 @@ def score_steps(
     poses, truth : PlanarPoses
         With the same times.
     step : int
-        From each pose to the one so many poses later.
+        From each pose to the one `step` poses later.
     longest_s : float
         Steps that take longer, as across a gap, do not count (s).
 

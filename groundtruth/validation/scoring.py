@@ -1,4 +1,4 @@
-"""Poses held against the truth: errors, and whether their covariances are right."""
+"""Compares poses with the truth: errors, and whether their covariances are right."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class PoseScore:
     Attributes
     ----------
     poses : int
-        Poses held against the truth.
+        Poses compared with the truth.
     unmatched : int
         Poses without truth at their time.
     position_mean_m, position_sigma_m, position_rmse_m, position_max_m : float

@@ -1,4 +1,4 @@
-"""A ground truth held against reference poses: errors at each, their figures, and NEES."""
+"""Compares a ground truth with reference poses: errors at each, statistics, and NEES."""
 
 from __future__ import annotations
 
@@ -65,9 +65,9 @@ class ReferencePose:
     covariance : (3, 3) float64
     distances : DistancePose
     scans : str
-        What the scans on board did (`groundtruth.validation.reference_poses_scans.RefinedPose`).
+        Use of the on-board scans (`groundtruth.validation.reference_poses_scans.RefinedPose`).
     note : str
-        What there is to say of it.
+        Remarks.
     points : int
         Points of the scans on walls.
     rms_m : float
@@ -144,7 +144,7 @@ class Figures:
     nees : float
         Its mean over 3, the degrees of freedom: 1 if the covariances are right. NaN without.
     nees_low, nees_high : float
-        95 % of means over so many independent poses lie between these. NaN without.
+        95 % of means over as many independent poses are between these. NaN without.
     """
 
     poses: int
@@ -167,7 +167,7 @@ def reference_poses(
     clock: ClockModel | None = None,
     settings: RefineSettings | None = None,
 ) -> tuple[list[ReferencePose], list[Refused]]:
-    """Poses out of distances, refined by scans where these help.
+    """Poses from distances, refined by scans where these help.
 
     Parameters
     ----------
@@ -178,7 +178,7 @@ def reference_poses(
     segments : (S, 4) array, optional
         The building's walls, needed with scanners.
     clock : ClockModel, optional
-        Without it the robot's clock is taken for the ground truth's.
+        Without it the robot's clock is assumed to be the ground truth's.
     settings : RefineSettings, optional
 
     Returns
@@ -256,8 +256,8 @@ def pose_errors(
     references : sequence of ReferencePose
         In order of time.
     poses : PlanarPoses
-        The ground truth. The one nearest in time counts, as the robot stands: between two poses
-        the covariance would depend on how their errors go together, which is not known.
+        The ground truth. The pose nearest in time is used, as the robot is at rest: the covariance
+        of an interpolated pose would depend on the unknown correlation of their errors.
     farthest_s : float
         But not one farther away in time (s).
 
@@ -385,7 +385,7 @@ def table_rows(
 
 
 def document(figures: Figures, refused: Sequence[Refused]) -> dict[str, Any]:
-    """Figures and refused poses as they stand in a JSON file: null for what there is not."""
+    """Figures and refused poses as written to a JSON file: null for missing values."""
     return {
         "figures": {k: _finite(v) for k, v in asdict(figures).items()},
         "published": [asdict(published) for published in PUBLISHED],

@@ -1,7 +1,7 @@
 """Which rows show which known landmarks: individual gate, or joint compatibility (JCBB).
 
 A frame's innovations are not independent: all of them carry the error of the one pose. Joint
-compatibility asks whether a set of pairs is likely *together*; branch and bound finds the largest
+compatibility tests whether a set of pairs is likely *together*; branch and bound finds the largest
 such set (J. Neira, J. D. Tardos, "Data association in stochastic mapping using the joint
 compatibility test", IEEE Transactions on Robotics and Automation 17(6), 2001).
 
@@ -146,7 +146,7 @@ def chi_squared_gates(probability: float, width: int, most_pairs: int) -> FloatA
     width : int
         Degrees of freedom of a pair.
     most_pairs : int
-        Largest number of pairs asked for.
+        Largest number of pairs to return.
 
     Returns
     -------

@@ -49,16 +49,16 @@ class LocalSettings:
         Factor on the discs' standard deviations: tilt and calibration move a frame's discs
         together by more than the file says. Bearings are compensated for tilt.
     tilt_sigma_rad : float
-        Standard deviation of the robot's sway about both axes of the floor, which moves all discs
+        Standard deviation of the robot's tilt about both axes of the floor, which moves all discs
         of a frame together.
     camera_height_m : float
-        Above the floor; with the sway it says by how much.
+        Height of the camera above the floor, which scales the displacement by tilt.
     forget_frames : int
         A landmark unseen for longer is forgotten.
     forget_sigma_m : float
-        So is a disc whose place relative to the robot has become less certain than this.
+        So is a disc whose position relative to the robot has become less certain than this.
     most_landmarks : int
-        Of each kind only so many are kept, those seen last.
+        At most this many landmarks of each kind are kept, those seen last.
     most_nodes : int
         Bound of the joint search; see `slam.association.compatibility.joint_compatible`.
     """
@@ -90,15 +90,15 @@ class LocalSettings:
 
 @dataclass(frozen=True, eq=False)
 class LocalAssociation:
-    """What was found from frame to frame.
+    """Result of the association from frame to frame.
 
     Attributes
     ----------
     circle_labels, line_labels : (n,) int64
         The landmark of each row, numbered from 0 in order of first sight.
     line_places : (L, 2) float64
-        Of each line where it was last known to stand in the frame of the robot (m); NaN if that
-        was behind the camera or beyond 50 m.
+        The last estimate of each line's position in the robot frame (m); NaN if that was behind the
+        camera or beyond 50 m.
     line_frames : (L,) int64
         After which step.
     incomplete : int
@@ -119,7 +119,7 @@ def associate_locally(
     camera_xy: tuple[float, float] = (0.0, 0.0),
     progress: Callable[[int], None] | None = None,
 ) -> LocalAssociation:
-    """Give the rows of a run labels, frame by frame; IDs in the file are not looked at.
+    """Label the rows of a run, frame by frame, ignoring IDs in the file.
 
     Parameters
     ----------
@@ -130,7 +130,7 @@ def associate_locally(
     camera_xy : (2,)
         The camera's centre in the robot frame (m): bearings of lines are from there.
     progress : callable, optional
-        Told how many frames are done.
+        Called with the number of frames done.
 
     Returns
     -------
@@ -185,7 +185,7 @@ def associate_locally(
 def _measured(
     circles: CircleRows, lines: LineRows, rows: slice, is_line: bool, setting: LocalSettings
 ) -> tuple[FloatArray, FloatArray]:
-    """What rows of a frame measure (n, d), and their covariances (n, d, d)."""
+    """Measurements of a frame's rows (n, d), and their covariances (n, d, d)."""
     if is_line:
         variance = lines.sigma_rad[rows] ** 2
         return lines.bearing_rad[rows][:, None], variance[:, None, None]
@@ -208,7 +208,7 @@ def _observed(
     innovations = seen[:, None] - local.mean[candidates, :width][None]
     if is_line:
         innovations = wrap_angle(innovations)
-    # A sway is the same for all rows of the frame: it correlates what they measure.
+    # A tilt is the same for all rows of the frame: it correlates their measurements.
     sway = np.zeros((len(index), 2))
     sway_of_rows = np.zeros((len(seen), width, 2))
     if not is_line:

@@ -1,18 +1,18 @@
-"""Which rows show the same vertical, where the path is known: points in which rays meet.
+"""Associates rows of verticals along a known path, by points where rays intersect.
 
-A row of a vertical is a ray in the map. Frame to frame it does not say much: neighbouring edges
-stand closer than a bearing is certain, and a new edge may be at any distance. Over many frames it
-does: rays of one vertical meet in one point, and with each frame it is less likely that they do by
-chance. So wherever rays of frames a few steps apart cross, the frames round about are asked how
-much likelier they are with a vertical there; the best point takes its rows, one of a frame, then
-the next best of those that are left (the greedy way to solve what multiple hypothesis tracking
-solves by trees: D. B. Reid, "An algorithm for tracking multiple targets", IEEE Transactions on
-Automatic Control 24(6), 1979).
+A row of a vertical is a ray in the map. From frame to frame it is ambiguous: neighbouring edges are
+closer together than the uncertainty of a bearing, and a new edge may be at any distance. Over many
+frames the rays of one vertical intersect in one point, which becomes less likely by chance with
+each frame. So at each intersection of rays of frames a few steps apart, the likelihood of the
+surrounding frames with a vertical there is compared with that without. The best point is assigned
+its rows, at most one per frame; then the next best point among the remaining rows. This is a greedy
+solution of what multiple hypothesis tracking solves with trees (D. B. Reid, "An algorithm for
+tracking multiple targets", IEEE Transactions on Automatic Control 24(6), 1979).
 
-The path comes from the discs; the heading of a single frame is less certain by it than a bearing
-is. So the verticals as they were found frame to frame are put into the least squares of the path
-first, robustly; then the search begins with wide gates, what it finds takes their place there, and
-it begins anew with narrower ones.
+The path comes from the discs; it gives the heading of a single frame less precisely than a bearing
+is measured. So the verticals associated from frame to frame are added to the least-squares problem
+of the path first, with a robust loss. The search then starts with wide gates; its result replaces
+those verticals in the problem, and the search is repeated with narrower gates.
 """
 
 from __future__ import annotations
@@ -34,40 +34,40 @@ from storage.bounds import ABOVE_0, PROBABILITY, demand, whole
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-# The most of a field of view that a bearing at its end may lie beyond it.
+# How far beyond the field of view a bearing may be.
 _WIDER_RAD = 0.005
 _FEWEST_ROWS = 3
-# What was found frame to frame corrects the path so many times.
+# Number of times that the frame-to-frame association corrects the path.
 _FIRST_ROUNDS = 2
 
 
 @dataclass(frozen=True)
 class PointSettings:
-    """How points are looked for.
+    """Settings of the search for points.
 
     Attributes
     ----------
     heading_sigma_deg : tuple of float
-        What the path's heading in a single frame is trusted to, round by round (degrees).
+        Standard deviation of the path's heading in a single frame, for each round (degrees).
     sigma_scale : float
-        Factor on the rows' standard deviations, which leave out what a detector does with edges
-        that stand close together.
+        Factor on the rows' standard deviations, which do not include the detector's errors at edges
+        that are close together.
     path_sigma_scale : float
-        The same where rows correct the path.
+        The same factor for rows that correct the path.
     detected : float
         Probability that a vertical in view gives a row.
     gate_sigmas : float
-        A ray that passes farther from a point does not speak for it.
+        A ray that passes farther from a point does not support it.
     least_score : float
-        Logarithm of how much likelier the rows must be with a point than without.
+        Least log likelihood ratio of the rows with a point to those without.
     gaps : tuple of int
-        Rays of frames so many steps apart are crossed.
+        Numbers of steps between frames whose rays are intersected.
     least_parallax_sigmas : float
-        Least angle between two rays that are crossed.
+        Least angle between two rays that are intersected.
     farthest_m : float
-        Crossings farther away do not count.
+        Intersections farther away are ignored.
     window_frames : int
-        So far before and after a crossing frames are asked.
+        Number of frames before and after an intersection that are scored.
     path_rows : int
         Points of fewer rows do not correct the path.
     """
@@ -235,7 +235,7 @@ def find_points(rays: Rays, setting: PointSettings) -> tuple[IntArray, FloatArra
     rows = np.empty(len(rays.heading), dtype=np.int64)
     labels = np.full(len(free), -1, dtype=np.int64)
     found: list[FloatArray] = []
-    # Scores only fall as rows are taken: whoever is first still, with what is left, is the best.
+    # Scores only fall as rows are assigned: a point still first when rescored is the best.
     waiting = [(-scores[k], int(k)) for k in np.flatnonzero(scores >= setting.least_score)]
     heapq.heapify(waiting)
 

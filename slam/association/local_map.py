@@ -36,7 +36,7 @@ class LocalMap:
     covariance : (2 m, 2 m) float64
     is_line : (m,) bool
     number : (m,) int64
-        What the landmark is called; discs and lines are counted separately.
+        Number of the landmark; discs and lines are counted separately.
     last_frame : (m,) int64
         When it was seen last.
     """
@@ -147,7 +147,7 @@ def tilt_jacobian(disc_xy: FloatArray, height_m: float) -> FloatArray:
 def kept(
     local: LocalMap, frame: int, *, forget_frames: int, forget_sigma_m: float, most_landmarks: int
 ) -> LocalMap:
-    """The map without what was not seen for long, or is no longer certain enough.
+    """The map without landmarks that were not seen for long or have become too uncertain.
 
     Parameters
     ----------
@@ -187,7 +187,7 @@ def kept(
 def line_places(
     local: LocalMap, frame: int, camera_xy: tuple[float, float]
 ) -> tuple[FloatArray, IntArray]:
-    """Where the lines seen in a frame stand.
+    """Positions of the lines seen in a frame.
 
     Parameters
     ----------

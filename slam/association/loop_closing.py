@@ -21,7 +21,7 @@ from slam.models.motion import relative_pose, rotation
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-# What a step of the path, and a match of two stretches, is trusted to (rad, m).
+# Standard deviations of a step of the path and of a match of two stretches (rad, m).
 _STEP_SIGMA = (0.005, 0.01)
 _MATCH_SIGMA = (0.02, 0.05)
 
@@ -131,7 +131,7 @@ def pairs_by_votes(matches: Sequence[Match]) -> list[tuple[int, int]]:
 
 
 def pairs_in_place(stretches: Sequence[Stretch], reach_m: float) -> list[tuple[int, int]]:
-    """Labels of stretches known to be one place that lie at one spot there.
+    """Pairs of labels at the same position, in stretches known to be the same place.
 
     Parameters
     ----------

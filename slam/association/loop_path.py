@@ -1,6 +1,6 @@
 """The path and the landmarks that a run's rows and labels say: sparse least squares.
 
-What closing loops needs between two rounds: Gauss-Newton steps, damped where they fail, from the
+For loop closing between two rounds: Gauss-Newton steps, damped where they fail, from the
 last round's solution, with weights that let rows count less which contradict all others. The map
 for its own sake, with marginal covariances and calibration, is `slam map`.
 """
@@ -50,7 +50,7 @@ class Solution:
     circle_squared, line_squared : (n,) float64
         Squared normalised residual of each row (of a row of an unknown line 0).
     cost : float
-        What was minimised: sum of Huber's function of the squared normalised residuals.
+        The minimum: sum of Huber's function of the squared normalised residuals.
     """
 
     path: FloatArray
@@ -63,7 +63,7 @@ class Solution:
 
 @dataclass(frozen=True, eq=False)
 class _System:
-    """What stays the same from step to step: rows, labels and roots of the information."""
+    """Constants of all steps: rows, labels and roots of the information."""
 
     recording: Recording
     circle_label: IntArray
@@ -181,8 +181,8 @@ def solve_path(
     path : (N + 1, 3) float64, optional
         Where to start from; by default odometry.
     line_xy : (L, 2) float64, optional
-        Where lines stand at the start (m); rows of lines that are NaN do not count. Without it no
-        lines do.
+        Initial positions of the lines (m); rows of lines with NaN are ignored. Without it, all
+        lines are ignored.
     camera_xy : (2,)
         The camera's centre in the robot frame (m).
     sigma_scale : float

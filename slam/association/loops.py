@@ -1,9 +1,9 @@
 """Loops: which parts of a run's map are one place, found by the landmarks' mutual distances.
 
 Landmarks seen in a short stretch of the run form a constellation that odometry's drift bends by
-little. Two constellations of one place are laid on each other by a rigid motion that pairs of
-landmarks vote for. A match is believed where so many landmarks agree as chance would bring about
-less than once in a thousand runs: the expected number of matches at least as good among random
+little. Two constellations of one place are aligned by a rigid motion that pairs of landmarks vote
+for. A match is accepted if as many landmarks agree as would by chance in less than one of a
+thousand runs. The criterion is the expected number of matches at least as good among random
 constellations, over all motions tried ("number of false alarms", A. Desolneux, L. Moisan,
 J.-M. Morel, "Meaningful alignments", International Journal of Computer Vision 40, 2000).
 """
@@ -30,16 +30,16 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
-# The area that a constellation covers: what is within this distance of one of its landmarks.
+# A constellation covers the area within this distance of its landmarks.
 _COVER_M = 0.6
 _GRID_M = 0.15
-#: Stretches that share so many landmarks are one place already.
+#: Stretches that share at least this many landmarks are known to be the same place.
 SHARED_BY_ONE_PLACE = 3
 
 
 @dataclass(frozen=True)
 class LoopSettings:
-    """How loops are looked for.
+    """Settings of the search for loops.
 
     Attributes
     ----------
@@ -52,19 +52,19 @@ class LoopSettings:
     least_length_m : float
         Pairs shorter than this do not vote.
     reach_m : float
-        How near landmarks must fall to agree.
+        Largest distance of landmarks that agree.
     most_turn_rad, most_shift_m : float
         Largest motion that brings one constellation onto the other.
     least_agreeing : int
-        Fewer landmarks are no match, whatever chance says.
+        Least number of agreeing landmarks, whatever the number of false alarms.
     false_alarms : float
-        Matches at least as good that chance may bring about over the whole search.
+        Largest number of matches at least as good that are expected by chance in the whole search.
     later_step, earlier_step : int
-        Stretches overlap: only every so many are matched to earlier ones, of which only every so
-        many are looked at.
+        Stretches overlap: only every `later_step`-th is matched to earlier ones, and only to every
+        `earlier_step`-th of these.
     attached_frames : int
-        A stretch that shares landmarks with one at least so many frames before is attached to the
-        map already, and not matched again; 0 to match all.
+        A stretch that shares landmarks with one at least this many frames earlier is part of the
+        map already and not matched again; 0 to match all.
     """
 
     stretch_frames: int = 50
@@ -208,7 +208,7 @@ def find_matches(
         In the order of the run.
     settings : LoopSettings
     progress : callable, optional
-        Told how far the search is.
+        Called with the progress of the search.
 
     Returns
     -------
@@ -328,7 +328,7 @@ def log10_false_alarms(agreeing: int, present: int, chance: float, tried: int) -
     chance : float
         Probability that a landmark at random falls near one of the other constellation.
     tried : int
-        How many motions were looked at.
+        Number of motions tried.
 
     Returns
     -------
@@ -348,7 +348,7 @@ def _refined(
     tried: int,
     settings: LoopSettings,
 ) -> Match | None:
-    """Least squares over all landmarks that agree, which ones do then, and how surely."""
+    """Match by least squares over all landmarks that agree; None if too few agree then."""
     place, target = later.xy[moved], earlier.xy[fixed]
     centre = place.mean(axis=0)
     shift = centre + offset - _turned(centre, turn)

@@ -1,4 +1,4 @@
-"""Compiled search for the rigid motion that lays one constellation of landmarks on another."""
+"""Compiled search for the rigid motion that aligns one constellation of landmarks with another."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ IntArray = NDArray[np.int64]
 
 # Width of the cells in which the nearest landmark is looked up.
 _CELL_M = 0.05
-# Landmarks are in order of first sight: what is seen together stands together.
+# Landmarks are in order of first sight, so neighbours in this order are near each other.
 _NEIGHBOURS = 5
 
 
@@ -68,11 +68,11 @@ def best_motion(
     least_length_m : float
         Shorter pairs say too little about the turn.
     reach_m : float
-        How near a landmark must fall to agree.
+        Largest distance of a landmark that agrees.
     most_turn_rad, most_shift_m : float
-        Motions beyond are not looked at; the shift is that of the first one's centroid.
+        Larger motions are not tried; the shift is that of the first one's centroid.
     least_agreeing : int
-        A motion with which fewer landmarks agree need not be found.
+        Motions with fewer agreeing landmarks may be missed.
 
     Returns
     -------
@@ -85,7 +85,7 @@ def best_motion(
     squared : float
         Sum of their squared distances (m^2).
     tried : int
-        How many motions were looked at.
+        Number of motions tried.
     """
     n, m = len(moved), len(fixed)
     centre_x, centre_y = 0.0, 0.0

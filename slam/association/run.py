@@ -1,12 +1,12 @@
 """Which rows of a run show the same landmark: frame to frame, then from place to place.
 
-First every row is associated with landmarks seen a moment before
-(`slam.association.frame_to_frame`). What comes out is right nearly always, but a landmark that is
-met again later has several labels. Then loops are looked for (`slam.association.loops`) and closed
-(`slam.association.loop_closing`, `slam.association.loop_path`) in rounds: the first looks where
-odometry's drift may have led, the next ones everywhere, since a closed loop straightens the map for
-the next. Verticals, which the local association often mistakes, are then associated anew on the
-path that the discs give (`slam.association.line_points`).
+First, every row is associated with recently seen landmarks (`slam.association.frame_to_frame`).
+The result is nearly always right, but a landmark that is seen again later has several labels. Then
+loops are detected (`slam.association.loops`) and closed (`slam.association.loop_closing`,
+`slam.association.loop_path`) in rounds. The first round searches within the possible drift of the
+odometry, later rounds everywhere, since each closed loop reduces the map's distortion. Verticals,
+which the local association often confuses, are then associated again along the path that the discs
+give (`slam.association.line_points`).
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 Progress = Callable[[str], None]
 
-# Edges of one door frame may stand 0.1 m apart.
+# Edges of one door frame may be 0.1 m apart.
 _LINE_REACH_M = 0.05
 # Longer than a landmark is in view or waited for by the local map.
 _ATTACHED_FRAMES = 200
@@ -53,13 +53,13 @@ class AssociateSettings:
     local : LocalSettings
         From frame to frame.
     map_level : bool
-        Whether loops are looked for.
+        Whether loops are detected.
     loops : LoopSettings
-        How, in the first round.
+        Settings of the first round.
     points : PointSettings
-        How verticals are then told apart on the path that the discs give.
+        How verticals are then associated along the path that the discs give.
     most_rounds : int
-        Bound of the rounds.
+        Largest number of rounds.
     """
 
     local: LocalSettings = field(default_factory=LocalSettings)
@@ -106,7 +106,7 @@ def associate_run(
     camera_xy: tuple[float, float] = (0.0, 0.0),
     progress: Progress | None = None,
 ) -> RunAssociation:
-    """Find out which rows show the same landmark; IDs in the file are not looked at.
+    """Find which rows show the same landmark, ignoring IDs in the file.
 
     Parameters
     ----------
@@ -116,30 +116,30 @@ def associate_run(
     camera_xy : (2,)
         The camera's centre in the robot frame (m); only bearings of lines need it.
     progress : callable, optional
-        Told what is being done.
+        Called with a description of the current stage.
 
     Returns
     -------
     RunAssociation
     """
     setting = settings or AssociateSettings()
-    tell = progress or (lambda _: None)
+    report = progress or (lambda _: None)
     local = associate_locally(
         recording,
         setting.local,
         camera_xy=camera_xy,
-        progress=lambda done: tell(f"frame {done} of {len(recording)}"),
+        progress=lambda done: report(f"frame {done} of {len(recording)}"),
     )
     incomplete = local.incomplete
     if len(recording.circles) and len(recording.lines):
-        # Discs help to tell lines apart; lines, often mistaken, would only harm the discs.
+        # Discs help to associate lines; lines are often confused and would only harm the discs.
         discs_alone = associate_locally(_without_lines(recording), setting.local)
         local = replace(local, circle_labels=discs_alone.circle_labels)
     circle_labels, line_labels = local.circle_labels, local.line_labels
     matches: list[Match] = []
     path = None
     if setting.map_level:
-        # The map is made of discs where there are any: their rows say where they are.
+        # The map is built from discs if there are any: their rows give positions.
         by_discs = len(recording.circles) > 0
         rows = recording.circles if by_discs else recording.lines
         labels = circle_labels if by_discs else line_labels
@@ -151,7 +151,7 @@ def associate_run(
             found = find_matches(
                 stretches,
                 loops,
-                lambda text, n=number: tell(f"round {n + 1}: {text}"),  # type: ignore[misc]
+                lambda text, n=number: report(f"round {n + 1}: {text}"),  # type: ignore[misc]
             )
             labels, matched = merge_labels(rows.frame, labels, pairs_by_votes(found))
             path = closed_path(solution.path, found) if found else solution.path
@@ -178,7 +178,7 @@ def associate_run(
         if by_discs:
             circle_labels = labels
             if len(line_labels):
-                tell("verticals on the path of the discs")
+                report("verticals on the path of the discs")
                 line_labels, path_of_both = lines_by_points(
                     _swayed(recording, setting.local),
                     path,
@@ -253,7 +253,7 @@ def _merged_lines(
     setting: AssociateSettings,
     camera_xy: tuple[float, float],
 ) -> IntArray:
-    """Labels of lines where those that stand at one spot of the map are one."""
+    """Labels of lines after merging lines at the same position in the map."""
     if len(labels) == 0:
         return labels
     for _ in range(setting.most_rounds):

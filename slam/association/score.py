@@ -56,7 +56,7 @@ def score_association(labels: IntArray, ids: Sequence[tuple[int, ...]]) -> Assoc
     Parameters
     ----------
     labels : (n,) int64
-        What was found, at least 0.
+        Labels found, at least 0.
     ids : sequence of n tuples of int
         The file's IDs of each row; empty where unknown.
 

@@ -106,7 +106,7 @@ def perform(options: Associate) -> int:
 
 
 def score_run(recording: Recording, found: RunAssociation) -> Scores:
-    """Score what was found against the file's own IDs.
+    """Score the association with the file's own IDs.
 
     Parameters
     ----------

@@ -154,10 +154,10 @@ def _import(command: Import) -> int:
     demand_readable(frames, str(command.file))
     unknown = int(np.sum(~np.isfinite(graph.quality)))
     head = _made_by(command.file)
-    told = f"; {unknown} of them without quality: 1 is written" if unknown else ""
+    note = f"; {unknown} of them without quality: 1 is written" if unknown else ""
     write_frames(command.output, frames, head=head, overwrite=command.force)
     print(
-        f"{command.output}: {len(frames)} steps, {len(graph.circles)} measurements of discs{told}"
+        f"{command.output}: {len(frames)} steps, {len(graph.circles)} measurements of discs{note}"
     )
     return 0
 

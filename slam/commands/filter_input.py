@@ -1,4 +1,4 @@
-"""What the commands of both filters read: the run, the camera, the reference path."""
+"""Input of the filters' commands: the run, the camera, the reference path."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the commands of both filters write: a summary and pictures, and how long the filter took."""
+"""Output of the filters' commands: a summary, pictures, and the filter's time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The rows of the run that a command names."""
+"""Reads the rows of the run that a command names."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from slam.recording import Recording, read_recording
 
 
 def recording_of(flags: RunFlags) -> Recording:
-    """The rows of the run that a command names; what is assumed of its odometry is told."""
+    """Read the rows of the run that a command names; assumptions on its odometry are printed."""
     recording = read_recording(
         flags.run,
         circles=flags.circles or not flags.lines,

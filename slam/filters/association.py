@@ -30,12 +30,12 @@ IntArray = NDArray[np.int64]
 
 Association = Literal["known", "nearest", "joint"]
 
-#: A row of a disc is a new one if it is so many times farther than the gate from all known ones.
+#: A row shows a new disc if its distance from all known discs is this many times the gate.
 NEW_DISC_GATES = 4.0
 #: Lines farther than this from the camera are not taken to be in view (m): walls hide them.
 FARTHEST_LINE_M = 15.0
 
-# A disc may be so far from where its row says (m), and so many standard deviations of the pose.
+# Largest distance of a disc from its row: metres, plus this many standard deviations of the pose.
 _NEAR_M, _NEAR_SIGMAS = 0.6, 4.0
 
 _NONE = np.zeros(0, dtype=np.int64)
@@ -46,7 +46,7 @@ _NO_LINES = MeasuredLines(
 
 
 class Estimate(Protocol):
-    """What pairing needs of a filter."""
+    """The part of a filter that pairing needs."""
 
     disc_slots: dict[int, int]
     line_slots: dict[int, int]
@@ -86,7 +86,7 @@ class Associator:
         Parameters
         ----------
         rows : FrameRows
-            A frame's rows. Unless association is known, their identifiers are not looked at.
+            A frame's rows. Unless association is known, their identifiers are ignored.
         estimate : Estimate
             The filter, predicted to that frame.
         new_id : callable, optional

@@ -1,4 +1,4 @@
-"""Where a vertical line stands, from bearings out of several poses: delayed initialisation.
+"""Position of a vertical line from bearings at several poses: delayed initialisation.
 
 A line joins the state of EKF-SLAM with all the bearings that were kept of it at once. Their
 linearised equations, in standard deviations,
@@ -37,7 +37,7 @@ class LineStart:
     Attributes
     ----------
     xy : (2,) float64
-        Where it most likely stands in the map (m); the equations are linearised there.
+        Its most likely position in the map (m); the equations are linearised there.
     correction : (2,) float64
         What the place is off from where Q1's two equations alone have it (m): to be added to it
         before the residual is used, which takes it back.

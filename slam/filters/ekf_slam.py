@@ -55,9 +55,9 @@ class EkfSlam:
     jacobians : str
         `first`: evaluate them at the first estimate of each landmark and at the poses as predicted
         (Huang, Mourikis, Roumeliotis: Observability-based rules for designing consistent EKF SLAM
-        estimators, 2010), so that the filter does not believe to learn its heading from
-        landmarks it has placed itself. `latest`: at the latest estimates, as the textbook filter
-        does.
+        estimators, 2010), so that landmarks that the filter has initialised itself give it no
+        spurious information about its heading. `latest`: at the latest estimates, as the textbook
+        filter does.
     """
 
     def __init__(
@@ -114,7 +114,7 @@ class EkfSlam:
         self.frame += 1
 
     def measure(self, rows: FrameRows) -> None:
-        """Use the rows of the frame: what is known first, then new landmarks.
+        """Update with the rows of the frame: known landmarks first, then new ones.
 
         Rows without ID are left out, and so are rows of several lines of which not all are in the
         map yet. A row of several lines measures the mean of their bearings.
@@ -155,7 +155,7 @@ class EkfSlam:
             self._view_lines(rows, single)
 
     def finish(self) -> None:
-        """The run is over: lines that still wait are given up."""
+        """The run is over: lines that were not initialised are dropped."""
         given_up = self._waiting.forget_all()
         if given_up:
             self.count.left_out[_GIVEN_UP] += given_up

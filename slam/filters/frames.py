@@ -1,4 +1,4 @@
-"""A recording frame by frame, as filters take it, and what a filter's run comes to."""
+"""A recording frame by frame, as input of filters, and the result of a filter."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ NO_CAMERA = np.zeros(2)
 
 @dataclass(frozen=True, eq=False)
 class FrameRows:
-    """What was seen in one frame.
+    """Measurements of one frame.
 
     Attributes
     ----------
@@ -31,7 +31,7 @@ class FrameRows:
         In the robot frame (m).
     disc_covariance : (d, 2, 2) float64
     line_ids : tuple of l tuples of int
-        All lines that a row stands for; empty where unknown.
+        All lines that a row shows; empty where unknown.
     bearing_rad : (l,) float64
     sigma_rad : (l,) float64
     """
@@ -61,7 +61,7 @@ class FrameRows:
         linearised_at: FloatArray,
         camera_xy: FloatArray,
     ) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
-        """What some of the rows say beyond what the state predicts.
+        """Innovation of some of the rows.
 
         Parameters
         ----------
@@ -100,7 +100,7 @@ class FrameRows:
 
 @dataclass
 class RowCount:
-    """What became of a run's rows.
+    """How a run's rows were used.
 
     Attributes
     ----------

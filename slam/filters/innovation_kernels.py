@@ -1,6 +1,6 @@
 """Compiled measurement equations of a frame, for the filters: innovation and Jacobian in one pass.
 
-The same models as in `slam.models.measurement`, which are held against them in the tests.
+The same models as in `slam.models.measurement`, with which the tests compare them.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ def frame_innovation(
     noise : (m, m) float64
         Covariance of the measurements.
     index : (3 + 2 d + 2 e,) int64
-        Into the state. A landmark that several rows show stands in it several times.
+        Into the state. A landmark that several rows show is included several times.
     """
     disc_count, line_count = len(discs.slot), len(lines.bearing_rad)
     rows = 2 * disc_count + line_count

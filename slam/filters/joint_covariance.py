@@ -4,7 +4,7 @@ It is kept as P = B - W W^T. An update by a frame's rows subtracts a product of 
 from all of P; here its factor only becomes further columns of W, and is subtracted from B once W is
 full, by one symmetric product of high rank (BLAS dsyrk). That is exact, and several times
 quicker: a product of high rank keeps the processor busy, one of low rank waits for the memory. What
-a frame needs of P (the columns of what it shows) is computed from B and W.
+a frame needs of P (the columns of its landmarks) is computed from B and W.
 
 Of B only the lower triangle is kept, so that P is symmetric whatever is done to it; and P changes
 by congruences (F P F^T) and by symmetric products alone.
@@ -41,7 +41,7 @@ _PENDING = 128
 
 
 class JointCovariance:
-    """Covariance of a pose and of what else is estimated, which grows.
+    """Covariance of a pose and of a growing number of landmarks.
 
     Parameters
     ----------
@@ -94,7 +94,7 @@ class JointCovariance:
         return np.asarray(product)
 
     def move_pose(self, by_pose: FloatArray, noise: FloatArray) -> None:
-        """The pose moves: P becomes F P F^T + Q, F the identity but for the pose.
+        """The pose moves: P becomes F P F^T + Q, F the identity except for the pose.
 
         Parameters
         ----------
@@ -162,7 +162,7 @@ class JointCovariance:
         Parameters
         ----------
         index : (k,) int64 array
-            What of the state they depend on.
+            Indices of the state that they depend on.
         jacobian : (d, k) array
             Their derivative by that.
         noise : (d, d) array
@@ -180,7 +180,7 @@ class JointCovariance:
         return first
 
     def replace(self, first: int, index: IntArray, jacobian: FloatArray, noise: FloatArray) -> None:
-        """Forget numbers from `first` on and put others in their place; see `append`."""
+        """Replace numbers from `first` on by others; see `append`."""
         count, size = len(jacobian), self.size
         columns = np.empty((size, len(index)), order="F")
         symmetric_columns(self._base, size, index, columns)

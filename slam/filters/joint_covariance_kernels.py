@@ -17,7 +17,7 @@ def symmetric_columns(lower: FloatArray, size: int, index: IntArray, columns: Fl
     Parameters
     ----------
     lower : (capacity, capacity) float64, column by column in memory
-        Its lower triangle; the upper is not looked at.
+        Its lower triangle; the upper is not used.
     size : int
         Rows to copy.
     index : (k,) int64
@@ -63,7 +63,7 @@ def symmetric_block(lower: FloatArray, index: IntArray) -> FloatArray:
     Parameters
     ----------
     lower : (capacity, capacity) float64, column by column in memory
-        Its lower triangle; the upper is not looked at.
+        Its lower triangle; the upper is not used.
     index : (k,) int64
         The rows, and columns, wanted.
 

@@ -5,8 +5,8 @@ covariance to each measurement's would let the filter average them away, which i
 the filter *considers* them: it carries the correlation of the pose with each landmark's error along
 without estimating the landmarks anew (Schmidt-Kalman filter).
 
-Landmarks of a map made by driving have most of their error in common with their neighbours. That is
-told by the joint covariance (`slam.mapping.covariance_file`); without it landmarks are taken to be
+Landmarks of a map made by driving share most of their error with their neighbours. The joint
+covariance describes this (`slam.mapping.covariance_file`); without it landmarks are assumed to be
 independent of each other.
 """
 

@@ -91,7 +91,7 @@ def map_distance(landmark_map: LandmarkMap, reference: LandmarkMap) -> dict[str,
 
 
 def summary(run: FilterRun, settings: Any, distance: dict[str, float] | None) -> dict[str, object]:
-    """What the command's .json holds.
+    """Content of the command's .json file.
 
     Parameters
     ----------

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-# A line that was out of sight for so many frames begins anew.
+# A line that was out of sight for this many frames is initialised again.
 LONGEST_ABSENCE_FRAMES = 50
-# Poses kept at most. If there are more, every other one is given up: what counts is the span.
+# Poses kept at most. If there are more, every other one is dropped: the span is what matters.
 MOST_KEPT_POSES = 24
 # Below this angle between its rays (rad) a line is not tried to be placed; and after it was, not
 # before the angle has grown by this factor.
@@ -52,7 +52,7 @@ class WaitingLines:
         return True
 
     def views(self, number: int) -> list[View]:
-        """What is kept of a line, in the order of the frames."""
+        """The stored views of a line, in the order of the frames."""
         return self._views.get(number, [])
 
     def keep(self, number: int, view: View) -> None:
@@ -65,7 +65,7 @@ class WaitingLines:
         self._tried_rad.pop(number, None)
 
     def forget_absent(self, frame: int) -> int:
-        """Forget lines that are out of sight for long; returns how many views were given up."""
+        """Forget lines that are out of sight for long; returns how many views were dropped."""
         absent = [
             number
             for number, views in self._views.items()
@@ -76,13 +76,13 @@ class WaitingLines:
         return sum(len(self._views.pop(number)) for number in absent)
 
     def forget_all(self) -> int:
-        """Forget all lines; returns how many views were given up."""
+        """Forget all lines; returns how many views were dropped."""
         given_up = sum(map(len, self._views.values()))
         self._views.clear()
         return given_up
 
     def thin(self) -> int:
-        """Give up every other pose if there are too many; returns how many views went with them."""
+        """Drop every other pose if there are too many; returns how many views were dropped, too."""
         if len(self.slots) <= MOST_KEPT_POSES:
             return 0
         given_up = set(sorted(self.slots)[1:-1:2])

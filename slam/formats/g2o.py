@@ -9,8 +9,8 @@ The error of an EDGE_SE2 is measured in the axes at the *end* of the step, (meas
 * to), while the covariance of a STEP row is of dx and dy in the axes before it: the information is
 rotated by dphi, so that a graph's error is the one of this project's models.
 
-What the format has no place for, names of frames and qualities of rows, follows in comments at the
-file's end: GTSAM's reader takes no edge after the first row that it does not know.
+Names of frames and qualities of rows, which the format does not have, follow in comments at the
+file's end: GTSAM's reader ignores all edges after the first row that it does not know.
 """
 
 from __future__ import annotations
@@ -172,7 +172,7 @@ def _rows(graph: RunGraph, axes: Axes, comments: Sequence[str]) -> Iterator[str]
     yield f"{AXES_COMMENT} {axes} ({MEANING[axes]})"
     for k in range(len(steps)):
         qualities = graph.quality[of_frame[k] : of_frame[k + 1]]
-        # One unknown quality makes all of the frame's unknown: they are told by their order.
+        # Qualities are identified by their order: if one is unknown, none of the frame is written.
         known = qualities if np.all(np.isfinite(qualities)) else qualities[:0]
         words = [FRAME_COMMENT, str(k + 1), graph.prefixes[k + 1], *map(_number, known)]
         yield " ".join(words)

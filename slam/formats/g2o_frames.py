@@ -26,7 +26,7 @@ from slam.recording import CircleRows, Recording, recording_of_frames
 
 FloatArray = NDArray[np.float64]
 
-# A row of a landmark file cannot tell what is nearer to 0 from it.
+# Smaller values are rounded to 0 in a row of a landmark file.
 _LEAST_STEP_COVARIANCE = 0.5e-12
 
 
@@ -38,7 +38,7 @@ def graph_of_frames(frames: Sequence[Frame], name: str, solution: Path | None = 
     frames : sequence of Frame
         The run. Of a row with several identifiers the first that is known counts.
     name : str
-        What stands for its file in messages.
+        What messages call its file.
     solution : Path, optional
         Folder with path.csv and map.csv; by default poses are odometry's, and each disc lies where
         it was first seen.
@@ -129,14 +129,14 @@ def frames_of_graph(graph: RunGraph) -> list[Frame]:
 
 
 def demand_readable(frames: Sequence[Frame], name: str) -> None:
-    """Refuse what the digits of a landmark file cannot hold.
+    """Refuse values that the digits of a landmark file cannot represent.
 
     Parameters
     ----------
     frames : sequence of Frame
         What is to be written.
     name : str
-        What stands for its source in messages.
+        What messages call its source.
 
     Raises
     ------

@@ -38,7 +38,7 @@ class _Row:
 
 @dataclass(frozen=True, slots=True)
 class _Rows:
-    """What stands in a file; vertices by their numbers."""
+    """The rows of a file; vertices by their numbers."""
 
     poses: dict[int, _Row] = field(default_factory=dict)
     discs: dict[int, _Row] = field(default_factory=dict)
@@ -148,12 +148,12 @@ def _read_rows(path: str | os.PathLike[str], axes: Axes) -> _Rows:
             rows.sights.append(row)
         elif tag == "EDGE_SE2":
             if row.vertices in rows.steps:
-                raise SlamError(f"{path}:{line}: EDGE_SE2 between these poses stands there already")
+                raise SlamError(f"{path}:{line}: there is an EDGE_SE2 between these poses already")
             rows.steps[row.vertices] = row
         else:
             vertex = row.vertices[0]
             if vertex in rows.poses or vertex in rows.discs:
-                raise SlamError(f"{path}:{line}: vertex {vertex} stands there already")
+                raise SlamError(f"{path}:{line}: there is a vertex {vertex} already")
             (rows.poses if tag == "VERTEX_SE2" else rows.discs)[vertex] = row
     return rows
 
@@ -244,7 +244,7 @@ def _table(rows: list[tuple[float, ...]], width: int) -> FloatArray:
 
 
 def _symmetric(rows: list[_Row], size: int) -> FloatArray:
-    """Information matrices of their upper triangles, which stand last in each row."""
+    """Information matrices from their upper triangles, which are last in each row."""
     triangle = np.triu_indices(size)
     count = len(triangle[0])
     matrices = np.zeros((len(rows), size, size))

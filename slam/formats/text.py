@@ -1,4 +1,4 @@
-"""What the text formats of other tools have in common: rows, numbers, and what their axes are."""
+"""Common parts of other tools' text formats: rows, numbers and axes."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def whole(path: str | os.PathLike[str], line: int, name: str, word: str) -> int:
 
 
 def demand_axes(path: str | os.PathLike[str], line: int, comment: str, axes: Axes) -> None:
-    """Refuse a file whose comment says that it is in other axes than those asked for."""
+    """Refuse a file whose comment says that it is in other axes than those requested."""
     if comment.startswith(AXES_COMMENT + " "):
         said = (comment[len(AXES_COMMENT) :].split() or [""])[0]
         if said != axes:

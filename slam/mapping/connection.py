@@ -1,4 +1,4 @@
-"""Whether one map can hold a run: is each part of it tied to the others?"""
+"""Checks that all parts of a run are connected, so that one map can represent it."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from slam.recording import Recording
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-#: Beyond these standard deviations a step says nothing of where the robot went.
+#: Beyond these standard deviations a step gives no information about the robot's motion.
 MOST_STEP_SIGMA_M = 100.0
 MOST_STEP_SIGMA_RAD = float(np.pi)
-#: Two parts of a run are one where they share so many landmarks: one leaves a turn free.
+#: Parts of a run are connected if they share this many landmarks; one leaves a rotation free.
 FEWEST_SHARED = 2
 
 
 def lost_steps(step_covariance: FloatArray) -> IntArray:
-    """Steps whose odometry is worth nothing.
+    """Steps whose odometry gives no information.
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ def check_connected(recording: Recording, name: str) -> None:
     recording : Recording
         The run.
     name : str
-        What stands for it in messages.
+        What messages call it.
 
     Raises
     ------

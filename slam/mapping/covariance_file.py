@@ -1,8 +1,8 @@
 """The joint covariance of a map's landmarks, in a file beside the map.
 
 A map's own file holds the covariance of each landmark by itself. Landmarks of a map made by driving
-have most of their error in common with their neighbours (the drift from the start to there), which
-only the joint covariance tells.
+share most of their error with their neighbours (the drift from the start), which only the joint
+covariance describes.
 """
 
 from __future__ import annotations

@@ -92,7 +92,7 @@ class Estimate:
         robot_from_camera as mounted; None: as calibrated, and discs are taken as the rows say.
     tilt : (N + 1, 2) float64 or None
         Pitch and roll per pose (rad): x and y of a rotation vector in the robot frame; None: the
-        robot stands upright.
+        robot is upright.
     """
 
     poses: FloatArray

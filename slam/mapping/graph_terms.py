@@ -45,7 +45,7 @@ _SWAY_RAD = Bounds("from 0 to less than a right angle", 0.0, 0.5 * math.pi, belo
 
 @dataclass(frozen=True)
 class Weighting:
-    """What is minimised and what is unknown.
+    """The cost function and the unknowns.
 
     Attributes
     ----------
@@ -58,11 +58,11 @@ class Weighting:
     row_errors : "corrected" or "recorded"
         Where rows and discs are compared when the mounting is unknown. `corrected`: the row's pixel
         is put on the floor by the camera as mounted, under the row's own covariance. `recorded`:
-        what the camera as calibrated would have written of the disc is compared with what it wrote,
+        the row that the calibrated camera would have written is compared with the one it wrote,
         which is where that covariance belongs.
     tilt_sigma_rad : float
-        Standard deviation of each pose's pitch and roll; 0: the robot stands upright. With a tilt,
-        rows are compared as recorded.
+        Standard deviation of each pose's pitch and roll; 0: the robot is upright. With a tilt, rows
+        are compared as recorded.
     """
 
     loss: Loss = "none"
@@ -77,7 +77,7 @@ class Weighting:
 
 @dataclass(frozen=True)
 class Layout:
-    """Where in the vector of unknowns things stand: poses but the first, tilt, discs, lines."""
+    """Layout of the vector of unknowns: poses except the first, tilt, discs, lines."""
 
     poses: int
     discs: int
@@ -102,7 +102,7 @@ class Layout:
 
 
 def layout_of(graph: Graph, weighting: Weighting) -> Layout:
-    """Where the unknowns of a problem stand."""
+    """Layout of a problem's unknowns."""
     return Layout(
         poses=len(graph.steps) + 1,
         discs=len(graph.disc_ids),
@@ -119,7 +119,7 @@ class Errors:
     ----------
     odometry : (N, 3) float64
     discs : (n, 2) float64
-        NaN where a disc would lie out of the camera's sight.
+        NaN where a disc would be out of the camera's sight.
     lines : (q,) float64
     tilt : (N, 2) or (0, 2) float64
     """
@@ -183,7 +183,7 @@ def robust(squared: FloatArray, weighting: Weighting) -> tuple[FloatArray, Float
 
 
 def cost(graph: Graph, estimate: Estimate, weighting: Weighting) -> float:
-    """What is minimised; infinite where a disc would lie out of the camera's sight."""
+    """The function to minimise; infinite if a disc would be out of the camera's sight."""
     error = errors(graph, estimate, weighting)
     discs, _ = robust(np.sum(error.discs**2, axis=1), weighting)
     lines, _ = robust(error.lines**2, weighting)
@@ -239,7 +239,7 @@ def linearise(graph: Graph, estimate: Estimate, weighting: Weighting) -> Lineari
         border[first_disc_row:first_line_row] = (by_mounting * scale).reshape(-1, 4)
         if estimate.mounting is not None and graph.camera is not None:
             # Rows' bearings were put into the robot frame as calibrated: a camera that is really
-            # turned to the left sees things further to the right than they are.
+            # turned to the left sees landmarks further to the right than they are.
             _, by_turn = turn_to_the_left(graph.camera, estimate.mounting)
             lines = -(line_root / graph.bearing_sigma_rad)[:, None] * by_turn
             border[first_line_row:first_tilt_row] = lines

@@ -1,4 +1,4 @@
-"""Where vertical lines stand, from bearings alone: the start of their estimation."""
+"""Initial estimates of the positions of vertical lines, from bearings alone."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ IntArray = NDArray[np.int64]
 
 #: Rays to a line have to cross under at least this angle somewhere.
 LEAST_PARALLAX_RAD = float(np.radians(5.0))
-#: Rays may miss the place they define by so many standard deviations (median).
+#: Largest median distance of rays from their intersection, in standard deviations.
 MOST_MEDIAN_MISS = 10.0
 # Odometry is good enough for a first triangulation over about this many metres of path.
 _LOCAL_PATH_M = 15.0
@@ -29,7 +29,7 @@ class InitialLines:
     ids : (K,) int64
         Lines that can be placed, ascending.
     xy : (K, 2) float64
-        Where they stand in the map (m).
+        Their positions in the map (m).
     unplaced : (U,) int64
         Lines never seen, alone in a row, under enough parallax.
     """
@@ -48,9 +48,9 @@ def place_lines(
 ) -> InitialLines:
     """Triangulate lines from poses that are known well enough.
 
-    Only rows of one line count: of two lines that were always joined nothing tells which is where.
-    A line is placed by its views along some metres of path from its first sight on; if they have
-    too little parallax, by all of its views.
+    Only rows of a single line are used: two lines that were always joined cannot be separated. A
+    line is triangulated from its views along some metres of path from its first sight on; if they
+    have too little parallax, from all of its views.
 
     Parameters
     ----------

@@ -48,7 +48,7 @@ def marginals(graph: Graph, estimate: Estimate, weighting: Weighting) -> Margina
     estimate : Estimate
         Where their sum of squares is least.
     weighting : Weighting
-        As it was minimised. Under a robust loss the weights stand for the rows' information.
+        As it was minimised. Under a robust loss, rows' information is multiplied by their weights.
 
     Returns
     -------
@@ -104,7 +104,7 @@ def inverse_blocks(
         raise RuntimeError("the matrix is not positive definite")
     # Row i of the matrix is row order[i] of the factor's.
     entries = matrix.tocoo()
-    # What is asked for has to be in the pattern even where the matrix has a zero.
+    # The requested entries must be in the pattern, even if the matrix is zero there.
     asked = [
         (first + i, first + j)
         for width, first in blocks

@@ -27,13 +27,13 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 Solver = Literal["separable", "gtsam"]
 
-# Near enough to the minimum for what then goes to the end.
+# Near enough to the minimum for the final optimisation.
 _COARSE = 1e-3
 
 
 @dataclass(frozen=True)
 class LeftOut:
-    """What a map does without.
+    """Rows and landmarks that a map cannot use, or cannot check.
 
     Attributes
     ----------
@@ -125,9 +125,9 @@ def map_run(
     weighting : Weighting, optional
         Loss and unknowns; plain least squares by default.
     solver : "separable" or "gtsam"
-        Who goes the last way to the minimum.
+        The solver that does the final optimisation.
     name : str
-        What stands for the run in messages.
+        What messages call the run.
 
     Returns
     -------

@@ -84,11 +84,11 @@ def solve(
     start : Estimate
         Where to begin. Odometry and first sight do for thousands of poses.
     weighting : Weighting
-        What is minimised and what is unknown.
+        The cost function and the unknowns.
     tolerance : float
         Stop at a step that lowers the cost by less than this share of it.
     most_steps : int
-        Give up after so many.
+        Largest number of steps before giving up.
 
     Returns
     -------
@@ -186,7 +186,7 @@ def moved(estimate: Estimate, layout: Layout, step: FloatArray, mounting: FloatA
     estimate : Estimate
         Before.
     layout : Layout
-        Where in the step things stand.
+        Layout of the step.
     step : (K,) float64
         Changes of all unknowns but the mounting.
     mounting : (0,) or (4,) float64
@@ -222,7 +222,7 @@ def _with_unknowns(graph: Graph, start: Estimate, weighting: Weighting) -> Estim
         start = replace(start, mounting=nominal_mounting(graph.camera))
     if weighting.tilt_sigma_rad > 0.0:
         if weighting.calibrate and weighting.row_errors != "recorded":
-            raise SlamError("a tilt of its own for each pose: expected row errors as recorded")
+            raise SlamError("a separate tilt for each pose: expected row errors as recorded")
         if start.tilt is None:
             start = replace(start, tilt=np.zeros((len(start.poses), 2)))
     return start

@@ -1,4 +1,4 @@
-"""The same least squares by GTSAM, for those who want the field's own solver, and as a check.
+"""The same least squares by GTSAM, a standard solver of the field, and as a check.
 
 GTSAM has no factor for a point of the plane in the robot frame with a full covariance, but
 `PlanarProjectionFactor2` is one, exactly: a camera one metre below the robot's centre that looks up
@@ -58,7 +58,7 @@ def solve_gtsam(
     tolerance : float
         Stop at a step that lowers the cost by less than this share of it.
     most_steps : int
-        Give up after so many.
+        Largest number of steps before giving up.
 
     Returns
     -------

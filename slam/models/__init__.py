@@ -3,5 +3,5 @@
 - `motion`: composition of poses.
 - `measurement`: discs and lines as a pose sees them.
 - `mounting`, `mounted_discs`: rows as a differently mounted camera would have written them.
-- `odometry_noise`: what is assumed where a source states no covariance.
+- `odometry_noise`: assumed where a source states no covariance.
 """

@@ -1,4 +1,4 @@
-"""What a robot at a pose measures of landmarks in the map, with Jacobians (the report's J5, J6).
+"""Measurements of landmarks in the map from a pose, with Jacobians (the report's J5, J6).
 
 Robot frame: X left, Y backward, so a bearing is atan2(x, -y): 0 forward, positive to the left.
 Everything is vectorised over leading axes.
@@ -125,7 +125,7 @@ def bearing_of_vertical(pose: ArrayLike, line_xy: ArrayLike, camera_xy: ArrayLik
     pose : (..., 3) array_like
         The robot's pose in the map.
     line_xy : (..., 2) array_like
-        Where the line stands in the map (m).
+        Position of the line in the map (m).
     camera_xy : (2,) array_like
         (cx, cy): the camera's centre in the robot frame (m), from `sensor2World`.
 

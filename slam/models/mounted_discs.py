@@ -1,7 +1,7 @@
-"""What a tilted, differently mounted camera makes of discs on the floor, with derivatives.
+"""Measurements of discs by a tilted, differently mounted camera, with derivatives.
 
 A landmark row is a pixel at which the camera *as mounted* (and tilted) saw a disc, put on the floor
-by the camera *as calibrated*. `predict_pixels` goes the first half of that way.
+by the camera *as calibrated*. `predict_pixels` computes the first half of that.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ class Geometry:
 
 
 def nominal_geometry(camera: Camera, poses: FloatArray, disc_xy: FloatArray) -> Geometry:
-    """A geometry whose camera is mounted as calibrated and whose robot stands upright."""
+    """The geometry with the camera mounted as calibrated and the robot upright."""
     return Geometry(
         poses=poses,
         disc_xy=disc_xy,

@@ -100,7 +100,7 @@ class RecordedJacobians:
 def rows_as_recorded(
     camera: Camera, floor_xy: FloatArray, mounting: FloatArray, tilt: FloatArray
 ) -> tuple[FloatArray, RecordedJacobians]:
-    """What the camera as calibrated writes of discs that it sees as mounted and tilted.
+    """Rows by the calibration of discs that the camera sees as mounted and tilted.
 
     The lens cancels: the ray that shows a disc is put on the floor from where the calibration has
     the camera.

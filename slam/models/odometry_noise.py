@@ -1,4 +1,4 @@
-"""What the noise of odometry is taken for where its source states none.
+"""Noise of odometry to assume where its source states none.
 
 A trajectory of a file, or wheel ticks, come without covariances, and zeros in a STEP row mean just
 that. Errors of wheels grow with the way and with the turn, and there is a least one by the digits
@@ -62,7 +62,7 @@ class OdometryNoise:
         return np.asarray(diagonal[:, :, None] * np.eye(3))
 
     def sentence(self) -> str:
-        """What is assumed, in words."""
+        """Description of the assumed noise."""
         return (
             f"{100.0 * self.per_metre:g} % of the way, {100.0 * self.per_radian:g} % of the turn "
             f"and {self.turn_per_metre:g} rad per metre, at least {self.least_m:g} m and "

@@ -173,7 +173,7 @@ def test_a_video_that_is_cut_off_gives_what_it_has_and_says_so(
     path.write_bytes(path.read_bytes()[: path.stat().st_size * 3 // 5])
     found = len(list(calibration_images([path], 1, 99)))
     assert 5 < found < 20
-    told = f"{path}: {found} of the 20 frames it speaks of are there\n"
+    told = f"{path}: only {found} of 20 frames can be read\n"
     assert capsys.readouterr().err == told
     # Every fourth, and one of them is not there.
     assert len(list(calibration_images([path], 1, 5))) == -(-found // 4)

@@ -340,7 +340,7 @@ def test_parallel_boards_are_refused() -> None:
         views.append(
             BoardView(f"{i}", np.arange(54), pixels + rng.normal(scale=0.05, size=pixels.shape))
         )
-    with pytest.raises(CalibrationError, match=r"too much alike.*tilt the board"):
+    with pytest.raises(CalibrationError, match=r"almost the same orientation.*tilt the board"):
         calibrate(views, BOARD, (640, 480), CalibrationSettings(coefficients=1))
 
 

@@ -210,11 +210,11 @@ def test_the_same_bytes_and_nothing_overwritten(tmp_path: Path, to: str, capsys:
         (FILES["circles"], ["--rate-hz", "0"], "rate_hz is 0: expected above 0"),
         (FILES["circles"], ["--times", "gone.times"], "gone.times: no such file of times"),
         ("LANDMARK_C 1 2\n", [], "x.circles:1: LANDMARK_C with 2 values"),
-        (FILES["circles"], ["-o", "x.circles", "--force"], "x.circles: is what is exported"),
+        (FILES["circles"], ["-o", "x.circles", "--force"], "x.circles: is the file to export"),
         (
             FILES["circles"],
             ["-o", "./x.circles", "--force", "--to", "mcap", "--rate-hz", "1"],
-            "x.circles: is what is exported",
+            "x.circles: is the file to export",
         ),
     ],
 )

@@ -316,7 +316,7 @@ def test_poses_have_to_be_in_order_and_finite(tmp_path: Path) -> None:
     ros = Ros()
     blank = [Said("/i", t, ros.image(GRAY, "mono8", t)) for t in (1.0, 2.0, 3.0, 4.0)]
     for name, stamps, x, told in (
-        ("back", (1.0, 3.0, 2.0), 0.0, "stands after that of 3.000000 s: expected times in order"),
+        ("back", (1.0, 3.0, 2.0), 0.0, "comes after that of 3.000000 s: expected times in order"),
         ("nan", (1.0, 2.0, 3.0), float("nan"), "expected a finite pose"),
     ):
         poses = [

@@ -92,7 +92,7 @@ def test_rows_in_another_order_are_refused(small_run: Path, tmp_path: Path) -> N
     swapped = tmp_path / "swapped.txt"
     swapped.write_text("\n".join([rows[1], rows[0], rows[2]]) + "\n")
     run = open_source(small_run, None, SourceOptions(odometry=str(swapped)))
-    with pytest.raises(DetectError, match=r"the row of s\.0001 stands too early"):
+    with pytest.raises(DetectError, match=r"the row of s\.0001 comes too early"):
         list(run.frames)
 
 
@@ -114,7 +114,7 @@ def test_rows_and_images_without_each_other(small_run: Path, tmp_path: Path) -> 
         ("# head\n1 0 0 0 0 0 0 nan\n", r"a\.tum:2: .*expected 8 numbers"),
         ("1 0 0 0 0 0 0 2\n", r"a\.tum:1: qx qy qz qw: expected a unit quaternion"),
         ("", r"a\.tum: no pose in it: expected odometry"),
-        (tum_row(100.1, 0, 0, 0) + tum_row(100, 0, 0, 0), "stands after that of 100.1"),
+        (tum_row(100.1, 0, 0, 0) + tum_row(100, 0, 0, 0), "comes after that of 100.1"),
     ],
 )
 def test_malformed_trajectories(timed_run: Path, tmp_path: Path, content: str, told: str) -> None:
