@@ -79,7 +79,7 @@ def test_steps_are_those_of_the_floor(table: DiscTable, v: int) -> None:
     """The steeper axis comes first where the disc is seen flat."""
     image = np.zeros(table.floor_xy.shape[:2], np.uint8)
     found, patch = gathered(table, image, Candidate(400, v, RADIUS, 0.8))
-    rows, columns = np.divmod(patch["pixel"][: found.fitted].astype(int), image.shape[1])
+    rows, columns = np.divmod(patch["pixel"][: found.fitted].astype(int), table.floor_xy.shape[1])
     floor = table.floor_xy.astype(float)
     by_u = (floor[rows, columns + 1] - floor[rows, columns - 1]) / (2.0 * RADIUS)
     by_v = (floor[rows + 1, columns] - floor[rows - 1, columns]) / (2.0 * RADIUS)
