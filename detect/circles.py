@@ -26,9 +26,9 @@ from detect.discs.alone_kernels import strong_and_highest
 from detect.discs.centre_rows import CentreRows, rows_to_look_at
 from detect.discs.centres import best_centres, good_centres
 from detect.discs.centres import quality_of_centres as quality_of_centres
-from detect.discs.covariance_kernels import refined_covariances
 from detect.discs.fit import blur_ratio_of, fit_settings, working_space
-from detect.discs.pixel_floor_kernels import published_positions as pixel_positions
+from detect.discs.positions import published_positions as pixel_positions
+from detect.discs.positions import refined_covariances
 from detect.discs.search_kernels import DiscSearch, search_discs
 from detect.errors import FrameError
 from detect.latest import kept_for_latest
@@ -128,7 +128,7 @@ def detect_circles(
         fit_settings(noise, kernel.blur_ratio),
         kernel.numbers,
         kernel.centre,
-        *working_space(),
+        working_space(),
     )
     if not settings.refine:
         floor_xy, covariance = published_positions(camera, pixels)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from camera import Camera
 from detect.circles import CircleDetections
-from detect.discs.levelling_kernels import level_discs, level_floor, level_floor_covariances
+from detect.discs.levelling import level_discs
 from detect.latest import kept_for_latest
 from landmarks import FrameTilt
 
@@ -21,19 +21,14 @@ def levelled(found: CircleDetections, camera: Camera, tilt: FrameTilt) -> Circle
 
     Discs that the levelled camera would see above the horizon are left out.
     """
-    floor_xy, covariance = np.empty((len(found), 2)), np.empty((len(found), 2, 2))
-    down = np.empty(len(found), np.bool_)
-    all_down = level_discs(
+    floor_xy, covariance, down = level_discs(
         np.ascontiguousarray(found.floor_xy),
         np.ascontiguousarray(found.covariance),
         _centre_of(camera),
         (tilt.pitch, tilt.roll, tilt.cpp, tilt.cpr, tilt.crr),
-        floor_xy,
-        covariance,
-        down,
     )
     by = (tilt.pitch, tilt.roll)
-    if all_down:
+    if down.all():
         return CircleDetections(
             found.pixels, floor_xy, covariance, found.quality, found.evidence, by
         )
@@ -68,14 +63,11 @@ def level_positions(
     (N, 2) float64
         In the level robot frame, metres; NaN where the levelled ray does not meet the floor.
     """
-    return np.asarray(
-        level_floor(
-            np.ascontiguousarray(floor_xy, dtype=np.float64),
-            _centre_of(camera),
-            pitch_rad,
-            roll_rad,
-        )
-    )
+    unknown = np.zeros((len(floor_xy), 2, 2))
+    return level_discs(
+        np.ascontiguousarray(floor_xy, dtype=np.float64), unknown, _centre_of(camera),
+        (pitch_rad, roll_rad, 0.0, 0.0, 0.0),
+    )[0]  # fmt: skip
 
 
 def level_covariances(
@@ -102,17 +94,13 @@ def level_covariances(
     (N, 2, 2) float64
         Square metres.
     """
-
-    return np.asarray(
-        level_floor_covariances(
-            np.ascontiguousarray(floor_xy, dtype=np.float64),
-            np.ascontiguousarray(covariance, dtype=np.float64),
-            _centre_of(camera),
-            pitch_rad,
-            roll_rad,
-            np.ascontiguousarray(tilt_covariance, dtype=np.float64),
-        )
-    )
+    (cpp, cpr), (_, crr) = np.asarray(tilt_covariance, np.float64).tolist()
+    return level_discs(
+        np.ascontiguousarray(floor_xy, dtype=np.float64),
+        np.ascontiguousarray(covariance, dtype=np.float64),
+        _centre_of(camera),
+        (pitch_rad, roll_rad, cpp, cpr, crr),
+    )[1]
 
 
 @kept_for_latest

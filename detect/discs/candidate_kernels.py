@@ -11,9 +11,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from detect.discs.list_kernels import floor_steps
-from detect.discs.model_kernels import F32, FASTMATH
-from detect.discs.patch_kernels import padded
+from detect.discs.model import F32, FASTMATH
+from detect.discs.patch import floor_steps, padded
 from detect.discs.quality_kernels import suppress_neighbours
 
 #: Candidates of a lower quality than this are looked at only if the grey value steps in this share

@@ -1,24 +1,39 @@
 """Is it a disc, and where exactly: the fit of a disc through the camera to the grey values.
 
-Around each candidate a blurred disc on an unevenly lit background is fitted (Levenberg-Marquardt,
-through the camera's exact geometry). The fit gives the position with its covariance, and the
-evidence that there is a disc at all.
+Around each candidate a blurred disc on an unevenly lit background is fitted: pixels are gathered
+(`detect.discs.patch`), the descent goes to the least squares (`detect.discs.descent`), and the
+residuals tell how far the fit is to be believed (`detect.discs.residuals`). It gives the position
+with its covariance, and the evidence that there is a disc at all.
 """
 
 from __future__ import annotations
 
+import math
 import threading
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from camera import Camera
-from detect.discs import fit_kernels as kernels
-from detect.discs.descent_kernels import WORK_INDICES, WORK_MEMORY
+from detect.discs.descent import (
+    MOST_BLUR,
+    PATIENT,
+    WORK,
+    Descent,
+    Hope,
+    blur_of,
+    descend,
+    moved,
+    solve_step,
+)
 from detect.discs.evidence_kernels import evidence_of_all
-from detect.discs.model_kernels import CAPACITY
-from detect.discs.patch_kernels import FitSettings
+from detect.discs.model import BY_BLUR, BY_X, BY_Y, SHARE, Disc
+from detect.discs.normal_equations import BACKGROUND, UNKNOWNS, factor_rows, solution
+from detect.discs.patch import EDGE, Candidate, FitSettings, Gathered, gather
+from detect.discs.residuals import blur_width, correlated_area, outline_statistics, residuals
 
 FloatArray = NDArray[np.float64]
 
@@ -34,6 +49,163 @@ _BLUR_SIGMA = 0.7
 _BLUR_PX = 0.6
 #: Grey values are rounded: noise is never below this.
 _LEAST_NOISE = 0.3
+#: Most evaluations of the model.
+_MOST_EVALUATIONS, _LOOK_EVALUATIONS = 15, 3
+#: A flat disc's blur may grow from the one its pixels were gathered for by this factor, and pixels.
+_MOST_GROWTH, _MOST_GROWTH_PX = 1.5, 1.0
+
+#: Result of a fit (the meaning: `DiscFits`), and the names of its fields. The centre and its
+#: covariance in metres; a blur of `blur_bound` is the most that the patch allowed.
+RESULT = np.dtype(
+    [
+        (name, np.float64)
+        for name in (
+            "x", "y", "radius", "blur", "contrast", "explained", "cov_xx", "cov_xy", "cov_yy",
+            "sectors_good", "outline_deviation", "middle_step", "relative_blur", "blur_bound",
+        )
+    ]
+)  # fmt: skip
+X, Y, RADIUS, BLUR, CONTRAST, EXPLAINED = "x", "y", "radius", "blur", "contrast", "explained"
+COV_XX, COV_XY, COV_YY = "cov_xx", "cov_xy", "cov_yy"
+SECTORS_GOOD, OUTLINE_DEVIATION, MIDDLE_STEP = "sectors_good", "outline_deviation", "middle_step"
+RELATIVE_BLUR, BLUR_BOUND = "relative_blur", "blur_bound"
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def fit_disc(
+    image: NDArray[np.uint8],
+    floor_xy: NDArray[np.float32],
+    candidate: Candidate,
+    settings: FitSettings,
+    start: Disc,
+    look: bool,
+    hope: Hope,
+    work: Any,
+    result: Any,
+) -> bool:
+    """Fit one candidate.
+
+    Parameters
+    ----------
+    image : (H, W) uint8
+    floor_xy : (H, W, 2) float32
+        Floor position of each pixel, metres.
+    candidate : Candidate
+    settings : FitSettings
+    start : Disc
+        Where to start.
+    look : bool
+        Take about 160 pixels and few steps: covariance and outline are left out.
+    hope : Hope
+        When to give up.
+    work : WORK
+        Working space.
+    result : RESULT
+        The result.
+
+    Returns
+    -------
+    bool
+        Whether the fit came to a result.
+    """
+    patch, radius = work.patch, candidate.radius
+    _clear(result)
+    gathered = gather(image, floor_xy, candidate, settings, look, patch)
+    most_blur = MOST_BLUR
+    if gathered.shape != EDGE:
+        most_blur = min(_MOST_GROWTH * candidate.blur + _MOST_GROWTH_PX, MOST_BLUR)
+    result.blur_bound = most_blur
+    if gathered.fitted - UNKNOWNS < 4:
+        return False
+    evaluations = _LOOK_EVALUATIONS if look else _MOST_EVALUATIONS
+    descent = descend(gathered, start, settings, most_blur, evaluations, hope, work)
+    if not descent.arrived or not _solve_last_step(descent, settings, most_blur, work):
+        return False
+    # The last step is taken as the linear model has it, and so are its residuals.
+    disc = moved(descent.best, descent.contrast, math.log(most_blur), work)
+    residual, near, near_total = residuals(patch, gathered.n, work.values, work.bare)
+    blur = blur_of(gathered.shape, disc, settings.blur_ratio)
+    result.x = floor_xy[candidate.v, candidate.u, 0] + disc.x * radius
+    result.y = floor_xy[candidate.v, candidate.u, 1] + disc.y * radius
+    result.radius = disc.radius * radius
+    result.blur = math.exp(disc.log_blur)
+    result.contrast = work.values[SHARE]
+    result.explained = 1.0 - min(near / max(near_total, 1e-12), 1.0)
+    result.relative_blur = blur_width(patch, gathered.n, disc, blur) / disc.radius
+    result.sectors_good = 1.0
+    result.middle_step = 1.0
+    if not look:
+        variance = max(residual / (gathered.fitted - UNKNOWNS), settings.noise**2)
+        _judge(gathered, disc, radius, variance, work, result)
+    return True
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _clear(result: Any) -> None:
+    result.x = result.y = result.radius = result.blur = result.contrast = result.explained = 0.0
+    result.cov_xx = result.cov_xy = result.cov_yy = result.sectors_good = 0.0
+    result.outline_deviation = result.middle_step = result.relative_blur = 0.0
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _solve_last_step(descent: Descent, settings: FitSettings, most_blur: float, work: Any) -> bool:
+    """All unknowns of the undamped step into `work.values`, the background alone into `bare`."""
+    factor = work.factor
+    if not factor_rows(work.best, 0, BY_BLUR, factor):
+        return False
+    solution(factor, 0, BACKGROUND, work.bare)
+    if not solve_step(
+        descent.best, descent.contrast, descent.variance, 0.0, settings, math.log(most_blur), work
+    ):
+        return False
+    solution(factor, 0, UNKNOWNS, work.values)
+    return True
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _judge(
+    gathered: Gathered, disc: Disc, radius: float, variance: float, work: Any, result: Any
+) -> None:
+    """Covariance and outline of a fit, from the factor and the residuals in the working space.
+
+    `variance` is that of the residuals. x and y are the last unknowns: their covariance is the
+    inverse of the factor's last two rows.
+    """
+    patch, factor = work.patch, work.factor
+    contrast = work.values[SHARE]
+    scale = variance * correlated_area(patch, gathered.n) * (radius / contrast) ** 2
+    per_xx, per_yy, xy = factor[BY_X, BY_X], factor[BY_Y, BY_Y], factor[BY_Y, BY_X]
+    result.cov_xx = scale * per_xx * per_xx * (1.0 + (xy * per_yy) ** 2)
+    result.cov_xy = -scale * per_xx * per_yy * per_yy * xy
+    result.cov_yy = scale * per_yy * per_yy
+    outline = outline_statistics(patch, gathered.n, disc, contrast, work.sector_sums)
+    result.sectors_good = outline.good
+    result.outline_deviation = outline.deviation
+    result.middle_step = outline.middle
+
+
+@njit(cache=True, error_model="numpy")
+def _fit_all(
+    image: NDArray[np.uint8],
+    floor_xy: NDArray[np.float32],
+    pixels: NDArray[np.int64],
+    radius: float,
+    blur_guess: FloatArray,
+    settings: FitSettings,
+    look: bool,
+) -> tuple[Any, NDArray[np.bool_]]:
+    """(N,) results of `fit_disc` from each pixel, and whether there is one."""
+    n = len(pixels)
+    results = np.zeros(n, RESULT)
+    fitted = np.zeros(n, np.bool_)
+    work = np.zeros(1, WORK)
+    for i in range(n):
+        candidate = Candidate(pixels[i, 0], pixels[i, 1], radius, blur_guess[i])
+        start = Disc(0.0, 0.0, 1.0, math.log(blur_guess[i]))
+        fitted[i] = fit_disc(
+            image, floor_xy, candidate, settings, start, look, PATIENT, work[0], results[i]
+        )
+    return results, fitted
 
 
 @dataclass(frozen=True)
@@ -114,32 +286,25 @@ def fit_discs(
     -------
     DiscFits
     """
-    settings = fit_settings(noise, blur_ratio)
     if blur_guess is None:
         blur_guess = np.full(len(pixels), _BLUR_PX)
-    results, fitted = kernels.fit_discs(
-        image,
-        floor_xy,
-        np.ascontiguousarray(pixels[:, 0]),
-        np.ascontiguousarray(pixels[:, 1]),
-        radius_m,
-        settings,
-        blur_guess,
-        kernels.LOOK if first_look else kernels.ALL,
-    )
+    results, fitted = _fit_all(
+        image, floor_xy, np.ascontiguousarray(pixels), radius_m, blur_guess,
+        fit_settings(noise, blur_ratio), first_look,
+    )  # fmt: skip
     centres, covariance = fitted_positions(results)
     return DiscFits(
         fitted=fitted,
         floor_xy=centres,
         covariance=covariance,
-        radius_m=results[:, kernels.RADIUS],
-        blur_px=results[:, kernels.BLUR],
-        contrast=results[:, kernels.CONTRAST],
-        explained=results[:, kernels.EXPLAINED],
-        sectors_good=results[:, kernels.SECTORS_GOOD],
-        middle_step=results[:, kernels.MIDDLE_STEP],
-        outline_deviation=results[:, kernels.OUTLINE_DEVIATION],
-        relative_blur=results[:, kernels.RELATIVE_BLUR],
+        radius_m=results[RADIUS],
+        blur_px=results[BLUR],
+        contrast=results[CONTRAST],
+        explained=results[EXPLAINED],
+        sectors_good=results[SECTORS_GOOD],
+        middle_step=results[MIDDLE_STEP],
+        outline_deviation=results[OUTLINE_DEVIATION],
+        relative_blur=results[RELATIVE_BLUR],
     )
 
 
@@ -161,26 +326,22 @@ def fit_settings(noise: float, blur_ratio: float) -> FitSettings:
 _kept = threading.local()
 
 
-def working_space() -> tuple[NDArray[np.float32], NDArray[np.uint32], NDArray[np.uint8]]:
-    """What the calling thread's fits work in (see `detect.discs.descent_kernels.work_in`)."""
-    space: tuple[NDArray[np.float32], NDArray[np.uint32], NDArray[np.uint8]] | None
-    space = getattr(_kept, "space", None)
+def working_space() -> NDArray[Any]:
+    """(1,) `detect.discs.descent.WORK`: what the calling thread's fits work in."""
+    space: NDArray[Any] | None = getattr(_kept, "space", None)
     if space is None:
-        space = (
-            np.zeros(WORK_MEMORY, np.float32),
-            np.zeros(WORK_INDICES, np.uint32),
-            np.zeros(CAPACITY, np.uint8),
-        )
+        space = np.zeros(1, WORK)
         _kept.space = space
     return space
 
 
-def fitted_positions(results: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """(N, 2) centres, metres, and their (N, 2, 2) covariances from (N, RESULT_SIZE) results."""
+def fitted_positions(results: NDArray[Any]) -> tuple[FloatArray, FloatArray]:
+    """(N, 2) centres, metres, and their (N, 2, 2) covariances from (N,) `RESULT`."""
     covariance = np.empty((len(results), 2, 2))
-    covariance[:, 0] = results[:, kernels.COV_XX : kernels.COV_XY + 1]
-    covariance[:, 1] = results[:, kernels.COV_XY : kernels.COV_YY + 1]
-    return results[:, kernels.X : kernels.Y + 1].copy(), covariance
+    covariance[:, 0, 0] = results[COV_XX]
+    covariance[:, 0, 1] = covariance[:, 1, 0] = results[COV_XY]
+    covariance[:, 1, 1] = results[COV_YY]
+    return np.stack([results[X], results[Y]], axis=-1), covariance
 
 
 def blur_ratio_of(camera: Camera) -> float:

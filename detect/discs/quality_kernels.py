@@ -19,7 +19,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from detect.discs.patch_kernels import padded
+from detect.discs.patch import padded
 from detect.discs.vector_kernels import (
     gather,
     lowest_bit,

@@ -1,6 +1,6 @@
 """The rim of a disc, direction by direction: how much of one circle of the right size is in view.
 
-The fit of a whole disc (`detect.discs.fit_kernels`) explains every grey value near it, so that a
+The fit of a whole disc (`detect.discs.fit`) explains every grey value near it, so that a
 door's edge before the disc, a cable across it or a sheet of paper beside it speaks against the
 disc. A person follows the rim instead: where it is in view it lies on one circle of known size, and
 elsewhere something hides it. So does this module. From the middle of a candidate the grey value is

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from detect.discs import fit_kernels as fit
+from detect.discs import fit
 from detect.discs.candidate_kernels import middles, nearest_pixel, strong_and_alone, worth_a_look
-from detect.discs.covariance_kernels import refined_covariances
-from detect.discs.descent_kernels import PATIENT, Hope, Work, work_in
+from detect.discs.descent import PATIENT, Hope
 from detect.discs.evidence_kernels import (
     CLEAR_EVIDENCE,
     LEAST_MIDDLE_STEP,
@@ -22,8 +21,10 @@ from detect.discs.evidence_kernels import (
     evidence_of,
     evidence_with_rim,
 )
-from detect.discs.fit_kernels import fit_disc
-from detect.discs.patch_kernels import FitSettings
+from detect.discs.fit import RESULT, fit_disc
+from detect.discs.model import Disc
+from detect.discs.patch import Candidate, FitSettings
+from detect.discs.positions import refined_covariances
 from detect.discs.quality_kernels import suppress_neighbours
 from detect.discs.rim import follow_rim
 
@@ -84,9 +85,7 @@ def search_discs(
     settings: FitSettings,
     camera_numbers: NDArray[np.float64],
     centre: NDArray[np.float64],
-    memory: NDArray[np.float32],
-    indices: NDArray[np.uint32],
-    marks: NDArray[np.uint8],
+    work: NDArray[Any],
 ) -> tuple[
     NDArray[np.int64],
     NDArray[np.float64],
@@ -108,9 +107,9 @@ def search_discs(
         Least contrast, grey levels.
     settings : FitSettings
     camera_numbers, centre : (K,) float64, (3,) float64
-        See `detect.discs.covariance_kernels.refined_covariances`.
-    memory, indices, marks : float32, uint32, uint8
-        Memory to work in (`detect.discs.descent_kernels.work_in`).
+        See `detect.discs.positions.refined_covariances`.
+    work : (1,) WORK
+        See `detect.discs.fit.working_space`.
 
     Returns
     -------
@@ -128,7 +127,7 @@ def search_discs(
     starts = middles(pixels, quality, contrast, floor_xy, weakest, near, keep)
     results, evidence, found = _fit_all(
         image, floor_xy, starts, quality[keep], contrast[keep], search, settings,
-        work_in(memory, indices, marks), camera_numbers,
+        work[0], camera_numbers,
     )  # fmt: skip
     own_pixels = np.empty((len(found), 2), np.int64)
     own_quality = np.empty(len(found))
@@ -154,7 +153,7 @@ def search_discs(
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _evidence(result: NDArray[np.float64], radius: float, optics_px: float) -> float:
+def _evidence(result: Any, radius: float, optics_px: float) -> float:
     return evidence_of(
         result[fit.EXPLAINED],
         result[fit.RADIUS] / radius,
@@ -177,7 +176,7 @@ def _shows_rim(
     image: NDArray[np.uint8],
     camera_numbers: NDArray[np.float64],
     search: DiscSearch,
-    result: NDArray[np.float64],
+    result: Any,
 ) -> bool:
     """Whether enough of a rim is in view round a poor first look to be worth a fit."""
     rim = follow_rim(
@@ -193,7 +192,7 @@ def _with_rim(
     search: DiscSearch,
     quality: float,
     told: float,
-    result: NDArray[np.float64],
+    result: Any,
 ) -> float:
     """The evidence of a doubtful fit with its rim, which also places a partly hidden disc."""
     relative = result[fit.RADIUS] / search.radius
@@ -270,9 +269,9 @@ def _fit_all(
     contrast: NDArray[np.float32],
     search: DiscSearch,
     settings: FitSettings,
-    work: Work,
+    work: Any,
     camera_numbers: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
+) -> tuple[Any, NDArray[np.float64], NDArray[np.int64]]:
     """Look at the candidates, then fit what the looks left: the results, the evidence, the discs.
 
     Both are fits, and one call: it is inlined, and machine code of it twice takes twice as long to
@@ -280,13 +279,13 @@ def _fit_all(
     """
     n = len(pixels)
     radius = search.radius
-    looks = np.zeros((n, fit.RESULT_SIZE))
-    results = np.zeros((n, fit.RESULT_SIZE))
+    looks = np.zeros(n, RESULT)
+    results = np.zeros(n, RESULT)
     place = np.zeros((n, 2))
     promise = np.full(n, -np.inf)
     evidence = np.full(n, -np.inf)
     score = np.full(n, -np.inf)
-    start = np.zeros(4)
+    start = Disc(0.0, 0.0, 1.0, 0.0)
     blur_start = max(settings.blur_px, 0.6 * search.optics_px)
     hope = PATIENT
     clear = np.empty((n, 2))
@@ -296,10 +295,9 @@ def _fit_all(
     looking = True
     at = -1
     refits = 0
-    detail = fit.LOOK
     i = 0
     u = v = 0
-    blur = log_blur = at_x = at_y = 0.0
+    blur = at_x = at_y = 0.0
     while True:
         if looking:
             at = _next_to_look_at(
@@ -324,17 +322,11 @@ def _fit_all(
         result = looks[i] if looking else results[i]
         if looking:
             u, v = int(pixels[i, 0]), int(pixels[i, 1])
-            start[0] = 0.0
-            start[1] = 0.0
-            start[2] = 1.0
             blur = blur_start
-            log_blur = math.log(blur_start)
+            start = Disc(0.0, 0.0, 1.0, math.log(blur_start))
         else:
             before = looks[i] if refits == 0 else results[i]
             at_x, at_y = before[fit.X], before[fit.Y]
-            log_blur = math.log(before[fit.BLUR])
-            start[2] = before[fit.RADIUS] / radius
-            detail = fit.ALL
             if refits == 0:
                 u, v = nearest_pixel(floor_xy, pixels[i, 0], pixels[i, 1], at_x, at_y)
                 # A look tells the blur but roughly: too small a patch would be gathered again.
@@ -342,14 +334,15 @@ def _fit_all(
             else:
                 # Too blurred for its patch: once more, in a wider one.
                 blur = before[fit.BLUR_BOUND]
-            start[0] = (at_x - floor_xy[v, u, 0]) / radius
-            start[1] = (at_y - floor_xy[v, u, 1]) / radius
-        start[3] = log_blur
+            start = Disc(
+                (at_x - floor_xy[v, u, 0]) / radius, (at_y - floor_xy[v, u, 1]) / radius,
+                before[fit.RADIUS] / radius, math.log(before[fit.BLUR]),
+            )  # fmt: skip
         if search.verify:
             hope = Hope(_LEAST_SHARE, search.least_evidence - _slack(quality[i]), search.optics_px)
         fitted = fit_disc(
-            image, floor_xy, u, v, radius, settings, start, blur,
-            detail, hope, work, result,
+            image, floor_xy, Candidate(u, v, radius, blur), settings, start, looking, hope, work,
+            result,
         )  # fmt: skip
         told = -math.inf
         if fitted:

@@ -356,22 +356,3 @@ def lowest_bit(_typing: Any, mask: Any) -> Any:
         return builder.cttz(args[0], ir.Constant(ir.IntType(1), 1))
 
     return types.uint64(types.uint64), generate
-
-
-@_operation
-def copy_pair(_typing: Any, values: Any, at: Any, copies: Any, to: Any) -> Any:
-    """Copy two neighbouring numbers at once.
-
-    Parameters
-    ----------
-    values, copies : float32, contiguous
-    at, to : uint64
-        Index of the first of the two, in either.
-    """
-
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        code = _Code(context, builder, signature, args)
-        code.store(2, args[3], code.load(0, args[1], _I64))
-        return context.get_dummy_value()
-
-    return types.void(values, types.uint64, copies, types.uint64), generate

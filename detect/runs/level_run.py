@@ -8,7 +8,7 @@ from typing import BinaryIO
 import numpy as np
 
 from camera import Camera
-from detect.discs.levelling_kernels import level_discs
+from detect.discs.levelling import level_discs
 from detect.run_tilt import RunTilt, frame_tilts, tilt_of_run
 from detect.runs.outputs import LEVEL_CIRCLES, LEVEL_TILT
 from detect.runs.rows import RunSummary, disc_numbers, encoded, landmark_rows
@@ -87,16 +87,11 @@ def _levelled(rows: list[bytes], tilt: FrameTilt, camera: Camera) -> bytes:
     words = [row.split() for row in rows[1:]]
     numbers = np.array([word[1:7] for word in words], np.float64)
     covariance = np.ascontiguousarray(numbers[:, [3, 4, 4, 5]]).reshape(-1, 2, 2)
-    floor_xy, level_covariance = np.empty((len(rows) - 1, 2)), np.empty_like(covariance)
-    down = np.empty(len(floor_xy), np.bool_)
-    level_discs(
+    floor_xy, level_covariance, down = level_discs(
         np.ascontiguousarray(numbers[:, :2]),
         covariance,
         np.array(camera.centre),
         (tilt.pitch, tilt.roll, tilt.cpp, tilt.cpr, tilt.crr),
-        floor_xy,
-        level_covariance,
-        down,
     )
     level = disc_numbers(floor_xy[down], numbers[down, 2], level_covariance[down])
     ids = [tuple(map(int, words[k][7:])) for k in np.flatnonzero(down)]

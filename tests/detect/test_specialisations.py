@@ -18,8 +18,8 @@ from numba import typeof
 
 from camera import Camera, parse_camera
 from detect.circles import CircleDetections, refined_covariance
-from detect.discs.covariance_kernels import refined_covariances
-from detect.discs.levelling_kernels import level_discs, level_floor, level_floor_covariances
+from detect.discs.levelling import level_discs
+from detect.discs.positions import refined_covariances
 from detect.levelling import level_covariances, level_positions, levelled
 from detect.settings import CircleSettings
 from landmarks import FrameTilt
@@ -67,10 +67,7 @@ def test_cameras_that_are_read_and_handed_over_are_of_one_kind() -> None:
     assert read.centre[2] > 0.0  # kept by the camera, and handed over with it
     assert read.rotation.shape == (3, 3)
     handed_over = pickle.loads(pickle.dumps(read))
-    kernels = (
-        level_floor, level_floor_covariances, level_discs, refined_covariances,
-        fill_floor_positions,
-    )  # fmt: skip
+    kernels = (level_discs, refined_covariances, fill_floor_positions)
     pixels, two = np.array([[400, 200], [300, 150]]), np.ones(2)
     discs = CircleDetections(pixels, FLOOR_XY, COVARIANCE, two, two)
     tilt = FrameTilt("e.0000", 0.01, 0.02, 1e-6, 0.0, 1e-6, 9)

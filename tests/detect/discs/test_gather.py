@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from numba import njit
@@ -11,25 +13,12 @@ from camera import Camera
 from detect.circles import disc_shape
 from detect.discs.candidate_kernels import share_of_steps
 from detect.discs.fit import fit_settings
-from detect.discs.list_kernels import gather_list
-from detect.discs.model_kernels import CAPACITY, GEOMETRY
-from detect.discs.patch_kernels import (
-    GREY,
-    LINKED,
-    NEAR,
-    ONE,
-    PLANE_X,
-    PLANE_Y,
-    TERMS,
-    WHOLE,
-    FitSettings,
-    Patch,
-    new_patch,
-    padded,
-)
+from detect.discs.model import GREY, ONE, PLANE_X, PLANE_Y
+from detect.discs.patch import EDGE, PATCH, WHOLE, Candidate, FitSettings, Gathered, gather, padded
 from detect.settings import CircleSettings
 from lut import DiscTable, build_disc_table
 from tests.detect.painted_floor import PaintedFloor
+from tests.reference.discs import pixels_within_reach
 
 RADIUS = 0.1
 
@@ -40,71 +29,101 @@ def table(published_camera: Camera) -> DiscTable:
 
 
 @njit(error_model="numpy")
+def _gather(
+    image: NDArray[np.uint8], floor_xy: NDArray[np.float32], candidate: Candidate,
+    settings: FitSettings, look: bool, patch: Any,
+) -> Gathered:  # fmt: skip
+    return gather(image, floor_xy, candidate, settings, look, patch[0])
+
+
 def gathered(
-    image: NDArray[np.uint8],
-    floor_xy: NDArray[np.float32],
-    u: int,
-    v: int,
-    settings: FitSettings,
-    half: int,
-    every: int,
-) -> tuple[int, Patch]:
-    """`gather_list` into a patch that was used before."""
-    patch = new_patch()
-    patch.terms[:] = 7.0
-    patch.geometry[:] = 7.0
-    return gather_list(
-        image, floor_xy, u, v, RADIUS, 0.8, settings, half, half, every, patch
-    ), patch
+    table: DiscTable, image: NDArray[np.uint8], candidate: Candidate, look: bool = False
+) -> tuple[Gathered, dict[str, Any]]:
+    """`gather` into a patch that was used before."""
+    patch = np.zeros(1, PATCH)
+    for name in ("x", "y", "design", "weight", "row"):
+        patch[name] = 7.0
+    found = _gather(image, table.floor_xy, candidate, fit_settings(1.0, 0.5), look, patch)
+    return found, {name: patch[name][0] for name in PATCH.names or ()}
 
 
-def test_lists_are_the_pixels_within_reach(table: DiscTable) -> None:
+@pytest.mark.parametrize(("u", "v"), [(400, 160), (200, 130), (500, 110), (3, 150), (765, 165)])
+def test_patches_are_the_pixels_within_reach(table: DiscTable, u: int, v: int) -> None:
     image = np.random.default_rng(3).integers(0, 256, table.floor_xy.shape[:2], np.uint8)
-    settings = fit_settings(1.0, 0.5)
-    u0, v0 = 400, 200
-    n, patch = gathered(image, table.floor_xy, u0, v0, settings, 50, 1)
-    index = patch.pixels[:n].astype(int)
+    candidate = Candidate(u, v, RADIUS, 0.8)
+    found, patch = gathered(table, image, candidate)
+    n = found.fitted
+    index = patch["pixel"][:n].astype(int)
     assert np.all(np.diff(index) > 0)
+    expected = pixels_within_reach(table.floor_xy, candidate, fit_settings(1.0, 0.5))
+    # Single and double precision may differ about a pixel on the limit.
+    assert len(set(expected) ^ set(index)) <= 2
     floor = table.floor_xy.astype(float)
-    off = np.linalg.norm(floor - floor[v0, u0], axis=-1)
-    inside = (off <= settings.reach_radii * RADIUS).ravel()
-    # The reach in pixels adds nothing to a disc as near as this one.
-    unsure = (np.abs(off - settings.reach_radii * RADIUS) < 1e-6).ravel()
-    expected = np.flatnonzero(inside & ~unsure)
-    assert len(expected) > 500
-    assert set(expected) <= set(index) <= set(np.flatnonzero(inside | unsure))
-    terms = patch.terms.reshape(TERMS, CAPACITY)
     rows, columns = np.divmod(index, image.shape[1])
-    place = (floor[rows, columns] - floor[v0, u0]) / RADIUS
-    np.testing.assert_allclose(terms[[PLANE_X, PLANE_Y], :n].T, place, atol=1e-5)
-    np.testing.assert_array_equal(terms[GREY, :n], image[rows, columns].astype(int) - image[v0, u0])
-    np.testing.assert_array_equal(terms[LINKED, 1:n], np.diff(index) == 1)
-    np.testing.assert_array_equal(terms[NEAR, :n], off[rows, columns] <= 1.45 * RADIUS)
-    np.testing.assert_array_equal(terms[ONE, :n], 1.0)
-    # What fills up the list is nowhere.
-    whole = padded(n)
-    assert n <= whole < n + WHOLE
-    assert whole % WHOLE == 0
-    np.testing.assert_array_equal(terms[:, n:whole], 0.0)
-    assert np.all(patch.geometry.reshape(GEOMETRY, CAPACITY)[0, n:whole] > 100.0)
+    place = (floor[rows, columns] - floor[v, u]) / RADIUS
+    design = patch["design"]
+    np.testing.assert_allclose(design[[PLANE_X, PLANE_Y], :n].T, place, atol=2e-5)
+    np.testing.assert_array_equal(design[GREY, :n], image[rows, columns].astype(int) - image[v, u])
+    np.testing.assert_array_equal(design[ONE, :n], 1.0)
+    np.testing.assert_array_equal(patch["linked"][1:n], np.diff(index) == 1)
+    # What fills up the patch is nowhere.
+    assert n <= found.n == padded(n) < n + WHOLE
+    assert found.n % WHOLE == 0
+    np.testing.assert_array_equal(design[[*range(5), GREY], n : found.n], 0.0)
+    np.testing.assert_array_equal(patch["weight"][n : found.n], 0.0)
+    assert np.all(patch["x"][n : found.n] > 100.0)
 
 
-def test_sparse_lists_keep_the_edge_and_some_of_the_others(table: DiscTable) -> None:
+@pytest.mark.parametrize("v", [200, 115])
+def test_steps_are_those_of_the_floor(table: DiscTable, v: int) -> None:
+    """The steeper axis comes first where the disc is seen flat."""
     image = np.zeros(table.floor_xy.shape[:2], np.uint8)
-    settings = fit_settings(1.0, 0.5)
-    n, patch = gathered(image, table.floor_xy, 400, 200, settings, 50, 1)
-    every = set(patch.pixels[:n].astype(int))
-    m, patch = gathered(image, table.floor_xy, 400, 200, settings, 50, 8)
-    index = patch.pixels[:m].astype(int)
-    weight = patch.pixels[CAPACITY : CAPACITY + m]
-    assert len(set(index)) == m
-    assert set(index) <= every
+    found, patch = gathered(table, image, Candidate(400, v, RADIUS, 0.8))
+    rows, columns = np.divmod(patch["pixel"][: found.fitted].astype(int), table.floor_xy.shape[1])
+    floor = table.floor_xy.astype(float)
+    by_u = (floor[rows, columns + 1] - floor[rows, columns - 1]) / (2.0 * RADIUS)
+    by_v = (floor[rows + 1, columns] - floor[rows - 1, columns]) / (2.0 * RADIUS)
+    assert (found.shape == EDGE) == (v == 200)
+    first, second = (by_u, by_v) if found.shape == EDGE else (by_v, by_u)
+    for axis, steps in ((1, first), (2, second)):
+        for k, name in enumerate("xy"):
+            told = patch[f"{name}{axis}"][: found.fitted]
+            np.testing.assert_allclose(told, steps[:, k], atol=1e-5)
+    if found.shape != EDGE:
+        lengths = np.linalg.norm(np.diff(floor[v - 1 : v + 2, 400], axis=0), axis=-1)
+        expected = 2.0 * (lengths[1] - lengths[0]) / lengths.sum()
+        assert patch["growth"] == pytest.approx(expected, abs=1e-4)
+
+
+def test_of_large_discs_all_of_the_edge_is_taken_and_some_of_the_rest(table: DiscTable) -> None:
+    image = np.zeros(table.floor_xy.shape[:2], np.uint8)
+    candidate = Candidate(400, 250, RADIUS, 0.8)
+    found, patch = gathered(table, image, candidate)
+    index = patch["pixel"][: found.fitted].astype(int)
+    weight = patch["weight"][: found.fitted]
+    every = set(pixels_within_reach(table.floor_xy, candidate, fit_settings(1.0, 0.5)))
+    assert len(set(index)) == found.fitted < 0.7 * len(every)
+    assert len(set(index) - every) <= 2
+    off = np.linalg.norm(table.floor_xy.reshape(-1, 2)[index] - table.floor_xy[250, 400], axis=-1)
     at_edge = weight == 1
-    off = np.linalg.norm(table.floor_xy.reshape(-1, 2)[index] - table.floor_xy[200, 400], axis=-1)
-    assert np.all(np.abs(off[at_edge] / RADIUS - 1.0) < 0.5)
-    # The others stand for eight pixels each, those far from the disc for none.
-    assert set(weight[~at_edge]) == {0, 8}
-    assert (~at_edge).sum() == pytest.approx((n - at_edge.sum()) / 8, rel=0.1)
+    assert np.all(np.abs(off[at_edge] / RADIUS - 1.0) < 0.3)
+    # The others stand for several pixels each, those far from the disc for none.
+    often = int(weight.max())
+    assert set(weight[~at_edge]) == {0, often}
+    assert (~at_edge).sum() == pytest.approx((len(every) - at_edge.sum()) / often, rel=0.1)
+
+
+@pytest.mark.parametrize("v", [250, 200, 150])
+def test_looks_take_some_pixels_evenly(table: DiscTable, v: int) -> None:
+    image = np.zeros(table.floor_xy.shape[:2], np.uint8)
+    candidate = Candidate(400, v, RADIUS, 0.6)
+    found, patch = gathered(table, image, candidate, look=True)
+    every = pixels_within_reach(table.floor_xy, candidate, fit_settings(1.0, 0.5))
+    index = patch["pixel"][: found.fitted].astype(int)
+    assert set(index) <= set(every)
+    assert 60 < found.fitted < 200
+    spread = [np.stack(np.divmod(pixels, 768)).std(axis=1) for pixels in (index, every)]
+    np.testing.assert_allclose(spread[0], spread[1], rtol=0.15)
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])

@@ -2,37 +2,37 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.discs import normal_kernels as normal
-from detect.discs.model_kernels import CAPACITY, FIELDS
-from detect.discs.patch_kernels import TERMS
+from detect.discs import normal_equations as normal
+from detect.discs.model import ROWS
+from detect.discs.patch import PATCH
 
 FloatArray = NDArray[np.float64]
 
 
-def patch(n: int, seed: int) -> tuple[NDArray[np.float32], NDArray[np.float32], FloatArray]:
-    """Terms, fields, and the same as the (n, 11) columns of a least-squares problem."""
+def patch(n: int, seed: int) -> tuple[NDArray[Any], FloatArray]:
+    """A patch, and the (n, 11) columns of its least-squares problem."""
     rng = np.random.default_rng(seed)
-    terms = np.zeros((TERMS, CAPACITY), np.float32)
-    fields = np.zeros((FIELDS, CAPACITY), np.float32)
+    found = np.zeros(1, PATCH)
+    design = found["design"][0]
     x, y = rng.uniform(-1.7, 1.7, (2, n))
-    terms[:5, :n] = np.ones(n), x, y, x * x - y * y, x * y
-    terms[5, :n] = rng.normal(0.0, 80.0, n)
-    fields[:, :n] = rng.normal(0.0, 1.0, (FIELDS, n))
-    columns = np.vstack([terms[:5, :n], fields[:, :n], terms[5:6, :n]]).T.astype(float)
+    design[:5, :n] = np.ones(n), x, y, x * x - y * y, x * y
+    design[5:10, :n] = rng.normal(0.0, 1.0, (5, n))
+    design[10, :n] = rng.normal(0.0, 80.0, n)
     # Beyond the patch there is rubbish that must not count.
-    terms[:, n:] = 1e6
-    fields[:, n:] = 1e6
-    return terms.ravel(), fields.ravel(), columns
+    design[:, n:] = 1e6
+    return found, design[:, :n].T.astype(float)
 
 
 def test_sums_of_products() -> None:
-    terms, fields, columns = patch(333, 1)
-    products = np.zeros((normal.ROWS, normal.ROWS))
-    normal.background_products(terms, 333, products)
-    normal.disc_products(terms, fields, 333, products)
+    found, columns = patch(333, 1)
+    products = np.zeros((ROWS, ROWS))
+    normal.background_products(found[0], 333, products)
+    normal.disc_products(found[0], 333, products)
     expected = np.tril(columns.T @ columns)
     scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
     np.testing.assert_allclose(np.tril(products) / scale, expected / scale, atol=1e-5)
@@ -40,10 +40,10 @@ def test_sums_of_products() -> None:
 
 def test_factor_tells_solutions_and_what_is_left() -> None:
     """In two goes, as the fit does it: without the disc's steps, and with them."""
-    _, _, columns = patch(200, 2)
+    _, columns = patch(200, 2)
     products = columns.T @ columns
     factor = np.zeros_like(products)
-    values = np.zeros(normal.ROWS)
+    values = np.zeros(ROWS)
     assert normal.factor_rows(products, 0, 6, factor)
     assert normal.factor_rows(products, 6, 10, factor)
     for count in (5, 6, 10):
@@ -58,7 +58,7 @@ def test_factor_tells_solutions_and_what_is_left() -> None:
 
 
 def test_dependent_columns_are_refused() -> None:
-    _, _, columns = patch(100, 3)
+    _, columns = patch(100, 3)
     columns[:, 7] = columns[:, 6]
     products = columns.T @ columns
     factor = np.zeros_like(products)

@@ -11,6 +11,7 @@ import pytest
 from camera import read_camera
 from detect.circles import detect_circles, disc_shape
 from detect.discs.fit import working_space
+from detect.discs.patch import CAPACITY
 from detect.settings import CircleSettings
 from lut import cached_disc_table
 
@@ -23,10 +24,15 @@ def test_what_is_left_in_the_memory_of_fits_does_not_matter(
     table = cached_disc_table(camera, disc_shape(settings))
     file = project_root / "images" / "e" / "images" / "e.0010.jpg"
     image = np.asarray(cv2.imread(str(file), cv2.IMREAD_GRAYSCALE), np.uint8)
-    numbers, indices, marks = working_space()
+    work = working_space()
     found = []
-    for number, index, mark in ((0.0, 0, 0), (left, 12345, 77)):
-        numbers[:], indices[:], marks[:] = number, index, mark
+    for number in (0.0, left):
+        for name in ("products", "best", "damped", "factor", "values", "bare", "sector_sums"):
+            work[name] = number
+        for name in ("weight", "linked", "x", "y", "x1", "y2", "growth", "design", "residual"):
+            work["patch"][name] = number
+        # Such as would be neighbours.
+        work["patch"]["pixel"] = work["patch"]["sector"] = np.arange(CAPACITY) if number else 0
         found.append(detect_circles(image, camera, table, settings))
     clean, dirty = found
     assert len(clean) > 0

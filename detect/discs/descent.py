@@ -1,0 +1,273 @@
+"""The descent of the disc fit to the least squares: Levenberg-Marquardt, by variable projection.
+
+Model of a grey value, with W the share of the disc that the pixel sees (`detect.discs.model`):
+
+    grey = background + contrast * W(x, y, radius, log blur)
+
+The background is a plane plus the two saddle terms, which let light fall off across the disc
+without imitating one. Contrast and background are linear, and every step solves for them anew
+(Golub and Pereyra 1973). Radius and log blur are normally distributed beforehand.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import njit
+
+from detect.discs.evidence_kernels import LEAST_EXPLAINED, evidence_of
+from detect.discs.model import (
+    BY_BLUR,
+    BY_RADIUS,
+    BY_X,
+    BY_Y,
+    GREY,
+    PIXEL_VARIANCE,
+    ROWS,
+    SHARE,
+    Blur,
+    Disc,
+    chord_shares,
+    edge_shares,
+)
+from detect.discs.normal_equations import (
+    BACKGROUND,
+    UNKNOWNS,
+    background_products,
+    disc_products,
+    factor_rows,
+    left_over,
+    solution,
+)
+from detect.discs.patch import CHORDS_ALONG_V, EDGE, PATCH, FitSettings, Gathered
+from detect.discs.residuals import SECTORS, blur_width
+
+#: Limits of what a fit may come to; the blur in pixels, the radius in nominal ones.
+LEAST_BLUR, MOST_BLUR = 0.1, 8.0
+_LEAST_RADIUS, _MOST_RADIUS = 0.4, 2.0
+#: Longest step of the position, in nominal radii.
+_LONGEST_STEP = 0.3
+#: A step that promises less than this, in variances of the noise, is the last,
+_CONVERGED = 0.3
+#: and one that is shorter than this share of the blur's width, and changes that by less than this
+#: share: what is left is less than the square of it.
+_SHORT = 0.05
+#: After so many evaluations, the step after one that made it worse is damped at least so much:
+#: mostly it was the blur of a sharp edge, of which the grey values tell little.
+_EARLY, _LATE_DAMPING = 3, 0.2
+#: What the first step of a fit promises may be this much less evidence than is needed.
+_FIRST_STEP_SLACK = 2.0
+
+_SQUARE = (np.float64, (ROWS, ROWS))
+#: What the fits of one image work in, from one to the next. What is left there does not matter.
+WORK = np.dtype(
+    [
+        ("patch", PATCH),
+        # The normal equations now, where the fit was best, and those with the damping; the factor.
+        ("products", *_SQUARE),
+        ("best", *_SQUARE),
+        ("damped", *_SQUARE),
+        ("factor", *_SQUARE),
+        # The unknowns, and the background without a disc.
+        ("values", np.float64, UNKNOWNS),
+        ("bare", np.float64, BACKGROUND),
+        ("sector_sums", np.float32, (SECTORS + 1, 8)),
+    ]
+)
+
+
+class Hope(NamedTuple):
+    """When a fit is given up: as soon as a step promises less than this."""
+
+    least_share: float
+    """Share of the variance that the disc explains."""
+    least_evidence: float
+    """Evidence, as far as it is known by then: for an even outline."""
+    optics_px: float
+    """Blur of the camera's optics, for the evidence."""
+
+
+#: Never give up.
+PATIENT = Hope(-math.inf, -math.inf, 1.0)
+
+
+class Descent(NamedTuple):
+    """Where a descent came to."""
+
+    arrived: bool
+    best: Disc
+    contrast: float
+    variance: float
+    """Of the residuals, grey levels squared."""
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def blur_of(shape: int, disc: Disc, ratio: float) -> Blur:
+    """A disc's blur along the axes of a patch of that shape."""
+    blur = math.exp(disc.log_blur)
+    return Blur(blur * ratio, blur) if shape == CHORDS_ALONG_V else Blur(blur, blur * ratio)
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _sigma(disc: Disc) -> float:
+    """Standard deviation of optics and pixel together, pixels."""
+    return math.sqrt(math.exp(2.0 * disc.log_blur) + PIXEL_VARIANCE)
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _add_ridge(begin: int, end: int, n: int, work: Any) -> None:
+    """Where two unknowns do the same, or one does nothing, there is still one solution."""
+    for j in range(begin, end):
+        work.products[j, j] += 1e-9 * n
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def solve_step(
+    best: Disc, contrast: float, variance: float, damping: float, settings: FitSettings,
+    log_most: float, work: Any,
+) -> bool:  # fmt: skip
+    """Solve for the steps of the four nonlinear parameters, times contrast, into `work.values`.
+
+    The factor has its first six rows from the products; what is known beforehand of radius and
+    blur, and the damping, come in only then.
+    """
+    damped, factor, values = work.damped, work.factor, work.values
+    damped[BY_BLUR:, :] = work.best[BY_BLUR:, :]
+    for parameter, off, sigma in (
+        (BY_BLUR, best.log_blur - math.log(settings.blur_px), settings.blur_sigma),
+        (BY_RADIUS, best.radius - 1.0, settings.radius_sigma),
+    ):
+        prior = variance / (sigma * sigma)
+        damped[parameter, parameter] += prior / (contrast * contrast)
+        damped[GREY, parameter] -= prior * off / contrast
+    for i in range(BY_BLUR, UNKNOWNS):
+        damped[i, i] *= 1.0 + damping
+    if not factor_rows(damped, BY_BLUR, UNKNOWNS, factor):
+        return False
+    solution(factor, BY_BLUR, UNKNOWNS, values)
+    if best.log_blur >= log_most and values[BY_BLUR] / contrast > 0.0:
+        # The blur stays at its bound.
+        damped[BY_BLUR, BY_BLUR] *= 1e9
+        damped[GREY, BY_BLUR] = 0.0
+        if not factor_rows(damped, BY_BLUR, UNKNOWNS, factor):
+            return False
+        solution(factor, BY_BLUR, UNKNOWNS, values)
+    return True
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def moved(best: Disc, contrast: float, log_most: float, work: Any) -> Disc:
+    """A step on from the best parameters, within limits."""
+    values = work.values
+    length = math.hypot(values[BY_X], values[BY_Y]) / abs(contrast)
+    share = min(1.0, _LONGEST_STEP / max(length, 1e-12)) / contrast
+    radius = best.radius + share * values[BY_RADIUS]
+    log_blur = best.log_blur + share * values[BY_BLUR]
+    return Disc(
+        best.x + share * values[BY_X],
+        best.y + share * values[BY_Y],
+        min(max(radius, _LEAST_RADIUS), _MOST_RADIUS),
+        min(max(log_blur, math.log(LEAST_BLUR)), log_most),
+    )
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def descend(
+    gathered: Gathered, start: Disc, settings: FitSettings, most_blur: float,
+    most_evaluations: int, hope: Hope, work: Any,
+) -> Descent:  # fmt: skip
+    """Levenberg-Marquardt steps from `start` (see `detect.discs.fit.fit_disc`).
+
+    In the working space are then the normal equations for the best parameters (`best`), and in the
+    patch the rows of the design matrix.
+    """
+    patch, products, factor = work.patch, work.products, work.factor
+    n = gathered.n
+    freedom = gathered.fitted - UNKNOWNS
+    noise_2 = settings.noise * settings.noise
+    log_most = math.log(most_blur)
+    disc = best = Disc(start.x, start.y, start.radius, min(start.log_blur, log_most))
+    damping = 1e-3
+    cost = math.inf
+    contrast = 0.0
+    variance = noise_2
+    evaluations = 0
+    width_per_px = 0.0
+    done = False
+    background_products(patch, n, products)
+    _add_ridge(0, BACKGROUND, gathered.fitted, work)
+    while True:
+        blur = blur_of(gathered.shape, disc, settings.blur_ratio)
+        if gathered.shape == EDGE:
+            edge_shares(patch, n, disc, blur)
+        else:
+            chord_shares(patch, n, disc, blur)
+        if done:
+            # These were the best parameters' shares once more.
+            return Descent(True, best, contrast, variance)
+        evaluations += 1
+        disc_products(patch, n, products)
+        _add_ridge(BACKGROUND, UNKNOWNS, gathered.fitted, work)
+        if not factor_rows(products, 0, BY_BLUR, factor):
+            break
+        without = left_over(products, factor, BACKGROUND)
+        residual = left_over(products, factor, BY_BLUR)
+        variance_now = max(residual / freedom, noise_2)
+        prior_blur = (disc.log_blur - math.log(settings.blur_px)) / settings.blur_sigma
+        prior_radius = (disc.radius - 1.0) / settings.radius_sigma
+        now = residual + variance_now * (prior_blur * prior_blur + prior_radius * prior_radius)
+        better = now <= cost
+        if better:
+            done = cost - now <= 1e-3 * variance_now
+            cost, variance, best = now, variance_now, disc
+            contrast = factor[GREY, SHARE] * factor[SHARE, SHARE]
+            work.best[:] = products
+            damping = max(0.2 * damping, 1e-7)
+            if not abs(contrast) > 1e-6:
+                break
+        else:
+            damping *= 10.0
+            if evaluations > _EARLY:
+                damping = max(damping, _LATE_DAMPING)
+            done = damping > 1e6
+            if not factor_rows(work.best, 0, BY_BLUR, factor):
+                break
+        if not done:
+            if not solve_step(best, contrast, variance, damping, settings, log_most, work):
+                break
+            promised = 0.0
+            for k in range(BY_BLUR, UNKNOWNS):
+                promised += factor[GREY, k] ** 2
+            disc = moved(best, contrast, log_most, work)
+            if evaluations == 1:
+                # How wide a blur is on the floor: the first pixels tell it for all blurs.
+                width_per_px = blur_width(patch, n, best, blur) / _sigma(best)
+            sigma = _sigma(disc)
+            width = width_per_px * sigma
+            share = 1.0 - max(cost - promised, 0.0) / max(without, 1e-9)
+            if _is_hopeless(share, disc.radius, width, evaluations == 1, hope):
+                break
+            longest = max(
+                math.hypot(disc.x - best.x, disc.y - best.y), abs(disc.radius - best.radius)
+            )
+            short = longest < _SHORT * width and abs(sigma - _sigma(best)) < _SHORT * sigma
+            done = promised <= _CONVERGED * variance or short or evaluations == most_evaluations
+        if done:
+            if better:
+                return Descent(True, best, contrast, variance)
+            disc = best
+    return Descent(False, best, contrast, variance)
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _is_hopeless(share: float, radius: float, width: float, first: bool, hope: Hope) -> bool:
+    """Whether what a step promises, the explained share and the radius, is too little."""
+    if share < hope.least_share:
+        return True
+    if hope.least_evidence == -math.inf:
+        return False
+    slack = _FIRST_STEP_SLACK if first else 0.0
+    promise = evidence_of(share, radius, 0.0, 1.0, 1.0, width / radius, hope.optics_px)
+    return bool(share < LEAST_EXPLAINED or promise < hope.least_evidence - slack)

@@ -1,0 +1,368 @@
+"""The pixels to which a disc is fitted, with the floor that they see and their grey values.
+
+Pixels count if they are within some radii of the candidate, or within some pixels or deviations of
+the blur of the disc's edge. A first look takes some of them, evenly spread. A fit takes all; of
+large discs all of those at the edge, which tell where it is, and some of the others, which tell the
+grey levels. How far a pixel is from the edge is told to first order, with the floor's steps at the
+candidate: ``|r - R| r / |J^T p|`` pixels for a place p on the floor, r = ``|p|``, and the steps J.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from detect.discs.model import (
+    F32,
+    FASTMATH,
+    GREY,
+    ONE,
+    PIXEL_VARIANCE,
+    PLANE_X,
+    PLANE_Y,
+    ROWS,
+    SADDLE,
+    SADDLE_XY,
+)
+
+#: Most pixels of a patch.
+CAPACITY = 4096
+#: Loops work on this many pixels at a time, or on single ones: a patch is filled up with pixels far
+#: from the disc, whose rows of the design matrix are zero.
+WHOLE = 32
+
+_VALUES = (np.float32, CAPACITY)
+#: A patch. A structure, so that the compiler knows that its arrays do not overlap.
+PATCH = np.dtype(
+    [
+        # Index of each pixel in the image.
+        ("pixel", np.uint32, CAPACITY),
+        # How many pixels it stands for in the explained variance: 0 too far from the disc to speak
+        # for or against it.
+        ("weight", *_VALUES),
+        # 1 where it is the right neighbour of the pixel before it, else 0.
+        ("linked", *_VALUES),
+        # Place on the floor relative to the candidate, in nominal radii, and how far that moves by
+        # one step along the first axis and along the second: u and v, or the steeper one and the
+        # other.
+        *((name, *_VALUES) for name in ("x", "y", "x1", "y1", "x2", "y2")),
+        # By what share steps along the first axis grow from each to the next.
+        ("growth", np.float32),
+        # See `detect.discs.model`: relative to the grey value of the candidate.
+        ("design", np.float32, (ROWS, CAPACITY)),
+        # Of the fit, grey levels.
+        ("residual", *_VALUES),
+        ("sector", np.int32, CAPACITY),
+        # Working space: weights of one row of the image.
+        ("row", *_VALUES),
+    ]
+)  # fmt: skip
+
+#: By which formula discs are seen, and along which axis their chords run: see `detect.discs.model`.
+EDGE, CHORDS_ALONG_V, CHORDS_ALONG_U = range(3)
+
+#: A disc is seen flat if the edge of its flattest end is more curved than this, in units of the
+#: blur, or its smaller half axis less than so many deviations of the blur.
+_MOST_CURVED = 0.25
+_LEAST_HALF_AXIS = 4.0
+#: Pixels within this many radii, or this near to the edge, count in the explained variance.
+_NEAR_RADII = 1.45
+_NEAR_PX = 2.0
+#: What is called the edge: this many deviations of the blur on either side.
+_EDGE_BLURS = 2.8
+#: About how many pixels a look takes; of windows larger than the other a fit takes some.
+_LOOK_PIXELS = 160
+_DENSE_WINDOW = 2048
+#: Share of the distance between pixels that are taken by which they shift from row to row: one that
+#: never repeats soon.
+_SHIFT = 0.381966
+
+
+class FitSettings(NamedTuple):
+    """What the fit is told, apart from the image and the candidates."""
+
+    noise: float
+    """Standard deviation of the noise, grey levels."""
+    reach_radii: float
+    """Pixels within this many radii of the candidate are fitted,"""
+    reach_px: float
+    """and those this near to the disc's edge, pixels,"""
+    reach_blurs: float
+    """or this many standard deviations of the blur."""
+    radius_sigma: float
+    """Standard deviation of the radius about the nominal one, relative."""
+    blur_px: float
+    """The blur about which the fitted one lies (along u), pixels,"""
+    blur_sigma: float
+    """and the standard deviation of its logarithm."""
+    blur_ratio: float
+    """Blur along v over blur along u, in pixels: 0.5 in single fields of interlaced frames."""
+
+
+class Candidate(NamedTuple):
+    """Where a disc may be."""
+
+    u: int
+    v: int
+    radius: float
+    """Nominal, metres."""
+    blur: float
+    """About how blurred it is (along u), pixels."""
+
+
+class View(NamedTuple):
+    """How a candidate is seen."""
+
+    shape: int
+    """`EDGE`, or along which axis its chords run."""
+    u_per_radius: float
+    v_per_radius: float
+    """How many pixels one radius can be at most; 0 where no floor is seen."""
+    steps: tuple[float, float, float, float]
+    """By how much the floor moves from pixel to pixel: x, y by u, and by v; nominal radii."""
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def padded(n: int) -> int:
+    """So many pixels, rounded up to what loops work on at once."""
+    return (n + WHOLE - 1) // WHOLE * WHOLE
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def floor_steps(
+    floor_xy: NDArray[np.float32], u0: int, v0: int
+) -> tuple[float, float, float, float]:
+    """By how much the floor moves from pixel to pixel: x, y by u, and by v."""
+    height, width = floor_xy.shape[:2]
+    u = min(max(u0, 1), width - 2)
+    v = min(max(v0, 1), height - 2)
+    return (
+        0.5 * (floor_xy[v, u + 1, 0] - floor_xy[v, u - 1, 0]),
+        0.5 * (floor_xy[v, u + 1, 1] - floor_xy[v, u - 1, 1]),
+        0.5 * (floor_xy[v + 1, u, 0] - floor_xy[v - 1, u, 0]),
+        0.5 * (floor_xy[v + 1, u, 1] - floor_xy[v - 1, u, 1]),
+    )
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def view_of(floor_xy: NDArray[np.float32], candidate: Candidate, ratio: float) -> View:
+    """How a candidate is seen, with the blur's ratio of `FitSettings`."""
+    per_radius = 1.0 / candidate.radius
+    xu, yu, xv, yv = floor_steps(floor_xy, candidate.u, candidate.v)
+    xu, yu, xv, yv = xu * per_radius, yu * per_radius, xv * per_radius, yv * per_radius
+    area = abs(xu * yv - xv * yu)
+    if not area > 1e-10:
+        return View(EDGE, 0.0, 0.0, (0.0, 0.0, 0.0, 0.0))
+    along_u = math.hypot(xv, yv) / area
+    along_v = math.hypot(xu, yu) / area
+    # In the metric in which the blur is round, the ellipse has the half axes a and b.
+    variance_u = candidate.blur * candidate.blur + PIXEL_VARIANCE
+    variance_v = candidate.blur * candidate.blur * ratio * ratio + PIXEL_VARIANCE
+    uu = variance_u * (xu * xu + yu * yu)
+    vv = variance_v * (xv * xv + yv * yv)
+    uv = math.sqrt(variance_u * variance_v) * (xu * xv + yu * yv)
+    steepest = 0.5 * (uu + vv) + math.hypot(0.5 * (uu - vv), uv)
+    flattest = variance_u * variance_v * area * area / steepest
+    b = 1.0 / math.sqrt(steepest)
+    a = 1.0 / math.sqrt(flattest)
+    shape = EDGE
+    if a > _MOST_CURVED * b * b or b < _LEAST_HALF_AXIS:
+        shape = CHORDS_ALONG_V if along_v <= along_u else CHORDS_ALONG_U
+    return View(shape, along_u, along_v, (xu, yu, xv, yv))
+
+
+class Gathered(NamedTuple):
+    """What became of a patch."""
+
+    shape: int
+    """`EDGE`, or along which axis chords run."""
+    n: int
+    """Pixels of the patch, those that only fill it up included."""
+    fitted: int
+    """Those of them that are fitted."""
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def gather(
+    image: NDArray[np.uint8],
+    floor_xy: NDArray[np.float32],
+    candidate: Candidate,
+    settings: FitSettings,
+    look: bool,
+    patch: Any,
+) -> Gathered:
+    """Fill a patch with the pixels round a candidate; none where it sees no floor.
+
+    Parameters
+    ----------
+    image : (H, W) uint8
+    floor_xy : (H, W, 2) float32
+        Floor position of each pixel, metres.
+    candidate : Candidate
+    settings : FitSettings
+    look : bool
+        Take about 160 pixels, rather than all that matter.
+    patch : PATCH
+        The result.
+    """
+    view = view_of(floor_xy, candidate, settings.blur_ratio)
+    if view.u_per_radius == 0.0:
+        return Gathered(view.shape, 0, 0)
+    count = _choose(floor_xy, candidate, settings, view, look, patch)
+    _describe(image, floor_xy, candidate, view.shape, count, patch)
+    return Gathered(view.shape, padded(count), count)
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _choose(
+    floor_xy: NDArray[np.float32],
+    candidate: Candidate,
+    settings: FitSettings,
+    view: View,
+    look: bool,
+    patch: Any,
+) -> int:
+    """Which pixels are taken, and how many each stands for; returns their number."""
+    height, width = floor_xy.shape[:2]
+    u0, v0 = candidate.u, candidate.v
+    most = 1.08 * settings.reach_radii
+    beyond_u = max(settings.reach_px, settings.reach_blurs * candidate.blur)
+    beyond_v = max(settings.reach_px, settings.reach_blurs * candidate.blur * settings.blur_ratio)
+    half_u = int(max(most * view.u_per_radius, 1.08 * view.u_per_radius + beyond_u)) + 1
+    half_v = int(max(most * view.v_per_radius, 1.08 * view.v_per_radius + beyond_v)) + 1
+    first_u, last_u = max(1, u0 - half_u), min(width - 2, u0 + half_u)
+    first_v, last_v = max(1, v0 - half_v), min(height - 2, v0 + half_v)
+    window = (2 * half_u + 1) * (2 * half_v + 1)
+    # A look takes some pixels of some rows; a fit goes through all, but off the edge takes some.
+    every, row_step = 1 + window // _DENSE_WINDOW, 1
+    if look:
+        row_step = max(1, int(math.sqrt(window / _LOOK_PIXELS)))
+        every = max(1, window // (_LOOK_PIXELS * row_step))
+    stands_for = F32(every * row_step)
+    at_edge = stands_for if look else F32(1.0)
+    shift = max(1, int(_SHIFT * every + 0.5))
+    floor = floor_xy.reshape(-1)
+    pixel, weight, row = patch.pixel, patch.weight, patch.row
+    length = last_u - first_u + 1
+    count = 0
+    for v in range(v0 - (v0 - first_v) // row_step * row_step, last_v + 1, row_step):
+        if count + length > CAPACITY:
+            break
+        begin = v * width + first_u
+        _weigh(
+            floor[2 * begin :], length, floor_xy[v0, u0], candidate, settings, view, stands_for,
+            at_edge, row,
+        )  # fmt: skip
+        turn = (u0 - first_u + shift * (v - v0)) % every
+        for k in range(length):
+            if row[k] >= F32(0.0) and (turn == 0 or row[k] == F32(1.0)):
+                pixel[count] = begin + k
+                weight[count] = row[k]
+                count += 1
+            turn = turn - 1 if turn > 0 else every - 1
+    return count
+
+
+@njit(cache=True, error_model="numpy", forceinline=True, fastmath=FASTMATH)
+def _weigh(
+    floor: NDArray[np.float32],
+    length: int,
+    middle: NDArray[np.float32],
+    candidate: Candidate,
+    settings: FitSettings,
+    view: View,
+    stands_for: float,
+    at_edge: float,
+    row: NDArray[np.float32],
+) -> None:
+    """What pixels of a row stand for: -1 beyond reach, 0 too far from the disc."""
+    x0, y0, per_radius = F32(middle[0]), F32(middle[1]), F32(1.0 / candidate.radius)
+    xu, yu, xv, yv = (
+        F32(view.steps[0]), F32(view.steps[1]), F32(view.steps[2]), F32(view.steps[3]),
+    )  # fmt: skip
+    ratio_2 = settings.blur_ratio**2
+    blur_2 = candidate.blur**2
+    reach_px = F32(settings.reach_px**2)
+    reach_u = F32(settings.reach_blurs**2 * blur_2)
+    reach_v = F32(settings.reach_blurs**2 * blur_2 * ratio_2)
+    edge_u = F32(_EDGE_BLURS**2 * (blur_2 + PIXEL_VARIANCE))
+    edge_v = F32(_EDGE_BLURS**2 * (blur_2 * ratio_2 + PIXEL_VARIANCE))
+    reach_radii, near_radii = F32(settings.reach_radii), F32(_NEAR_RADII)
+    near_px = F32(_NEAR_PX**2)
+    for k in range(length):
+        x = (floor[2 * k] - x0) * per_radius
+        y = (floor[2 * k + 1] - y0) * per_radius
+        r_2 = x * x + y * y
+        r = math.sqrt(r_2)
+        # Distance from the edge, and the floor's steps across it, times the distance.
+        off_2 = (r_2 - r) * (r_2 - r)
+        gu = xu * x + yu * y
+        gv = xv * x + yv * y
+        gu = gu * gu
+        gv = gv * gv
+        within = (
+            (r <= reach_radii)
+            | (off_2 <= reach_px * (gu + gv))
+            | (off_2 <= reach_u * gu + reach_v * gv)
+        )
+        near = (r <= near_radii) | (off_2 <= near_px * (gu + gv))
+        # At the candidate itself, where all is zero, there is no edge.
+        edge = off_2 < edge_u * gu + edge_v * gv
+        weight = F32(0.0) if within else F32(-1.0)
+        weight = stands_for if near else weight
+        row[k] = at_edge if near & edge else weight
+
+
+@njit(cache=True, error_model="numpy", forceinline=True, fastmath=FASTMATH)
+def _describe(
+    image: NDArray[np.uint8],
+    floor_xy: NDArray[np.float32],
+    candidate: Candidate,
+    shape: int,
+    count: int,
+    patch: Any,
+) -> None:
+    """The floor at the pixels chosen, and the design matrix but for the disc's rows."""
+    grey, floor = image.reshape(-1), floor_xy.reshape(-1, 2)
+    design, pixel = patch.design, patch.pixel
+    width = image.shape[1]
+    first, second = (width, 1) if shape == CHORDS_ALONG_V else (1, width)
+    x0, y0 = floor_xy[candidate.v, candidate.u, 0], floor_xy[candidate.v, candidate.u, 1]
+    middle = F32(image[candidate.v, candidate.u])
+    per_radius, per_two = F32(1.0 / candidate.radius), F32(0.5 / candidate.radius)
+    at = min(max(candidate.v, 1), image.shape[0] - 2) * width
+    at += min(max(candidate.u, 1), width - 2)
+    after = math.hypot(floor[at + first, 0] - floor[at, 0], floor[at + first, 1] - floor[at, 1])
+    before = math.hypot(floor[at, 0] - floor[at - first, 0], floor[at, 1] - floor[at - first, 1])
+    patch.growth = F32(2.0) * (after - before) / (after + before + F32(1e-9))
+    for i in range(count):
+        at = np.int64(pixel[i])
+        x, y = floor[at, 0], floor[at, 1]
+        patch.x[i] = (x - x0) * per_radius
+        patch.y[i] = (y - y0) * per_radius
+        patch.x1[i] = (floor[at + first, 0] - floor[at - first, 0]) * per_two
+        patch.y1[i] = (floor[at + first, 1] - floor[at - first, 1]) * per_two
+        patch.x2[i] = (floor[at + second, 0] - floor[at - second, 0]) * per_two
+        patch.y2[i] = (floor[at + second, 1] - floor[at - second, 1]) * per_two
+        design[GREY, i] = F32(grey[at]) - middle
+    nowhere, zero = F32(1e3), F32(0.0)
+    for i in range(count, padded(count)):
+        patch.x[i] = patch.y[i] = nowhere
+        patch.linked[i] = zero
+        patch.x1[i] = patch.y2[i] = F32(1.0)
+        patch.y1[i] = patch.x2[i] = patch.weight[i] = design[GREY, i] = zero
+    patch.linked[0] = zero
+    for i in range(1, count):
+        patch.linked[i] = F32(1.0) if pixel[i] == pixel[i - 1] + np.uint32(1) else zero
+    for i in range(padded(count)):
+        x = patch.x[i] if patch.x[i] < nowhere else zero
+        y = patch.y[i] if patch.x[i] < nowhere else zero
+        design[ONE, i] = F32(1.0) if patch.x[i] < nowhere else zero
+        design[PLANE_X, i] = x
+        design[PLANE_Y, i] = y
+        design[SADDLE, i] = x * x - y * y
+        design[SADDLE_XY, i] = x * y

@@ -1,0 +1,204 @@
+"""What the residuals of a fitted disc tell: do they hang together, is the outline even?
+
+`residuals` are the grey values less the fitted model's. Where the model does not fit they are
+correlated, and neighbours say less than their number: `correlated_area`. `outline_statistics`
+asks each of 16 sectors of the disc alone how large its step is and where its edge lies.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from detect.discs.model import (
+    BY_RADIUS,
+    F32,
+    FASTMATH,
+    GREY,
+    ONE,
+    PIXEL_VARIANCE,
+    PLANE_X,
+    PLANE_Y,
+    SHARE,
+    Blur,
+    Disc,
+)
+from detect.discs.normal_equations import BACKGROUND, UNKNOWNS
+
+SECTORS = 16
+#: Pixels without which the middle of a disc, this part of its radius, says nothing.
+_LEAST_MIDDLE = 2.0
+_MIDDLE = 0.3
+#: A sector counts from this many pixels on, and this spread of the shares in it.
+_LEAST_PIXELS, _LEAST_SPREAD = 3.0, 0.15
+#: A step is good if it has this much of the size of the whole disc's.
+_GOOD_STEP = 0.4
+# Where the sectors of a quadrant meet.
+_TAN_1, _TAN_3 = F32(math.tan(math.pi / 8.0)), F32(math.tan(3.0 * math.pi / 8.0))
+
+
+@njit(cache=True, error_model="numpy", forceinline=True, fastmath=FASTMATH)
+def residuals(
+    patch: Any, n: int, values: NDArray[np.float64], bare: NDArray[np.float64]
+) -> tuple[float, float, float]:
+    """Residuals of a fit, into the patch.
+
+    Parameters
+    ----------
+    patch, n
+        The patch, and its pixels.
+    values : (10,) float64
+        The unknowns of `detect.discs.normal_equations`.
+    bare : (5,) float64
+        The terms of the background where there is no disc.
+
+    Returns
+    -------
+    residual, near_residual, near_total : float
+        Sums of squares: of the residuals, of those near the disc, and of what a background alone
+        leaves there.
+    """
+    design, residual, without = patch.design, patch.residual, patch.row
+    residual[:n] = design[GREY, :n]
+    without[:n] = design[GREY, :n]
+    for row in range(UNKNOWNS):
+        value = F32(values[row])
+        for i in range(n):
+            residual[i] -= value * design[row, i]
+    for row in range(BACKGROUND):
+        value = F32(bare[row])
+        for i in range(n):
+            without[i] -= value * design[row, i]
+    total = near = near_total = F32(0.0)
+    for i in range(n):
+        total += residual[i] * residual[i]
+        near += patch.weight[i] * residual[i] * residual[i]
+        near_total += patch.weight[i] * without[i] * without[i]
+    return total, near, near_total
+
+
+@njit(cache=True, error_model="numpy", forceinline=True, fastmath=FASTMATH)
+def correlated_area(patch: Any, n: int) -> float:
+    """How many pixels go with one independent residual, from the correlation of neighbours.
+
+    White noise gives 1. Where the model does not fit (texture, reflections, a disc that is none)
+    the residuals hang together, and their number overstates what they tell: for a first-order
+    process of correlation c by (1 + c) / (1 - c) in either direction.
+    """
+    product = square = pairs = F32(0.0)
+    for i in range(1, n):
+        linked = patch.linked[i]
+        here, before = patch.residual[i], patch.residual[i - 1]
+        product += linked * here * before
+        square += linked * (here * here + before * before)
+        pairs += linked
+    if not square > 0.0:
+        return 1.0
+    # By chance alone the correlation of n residuals scatters by 1 / sqrt(n).
+    correlation = min(max(2.0 * product / square - 1.5 / math.sqrt(pairs), 0.0), 0.8)
+    area: float = ((1.0 + correlation) / (1.0 - correlation)) ** 2
+    return area
+
+
+@njit(cache=True, error_model="numpy", forceinline=True, fastmath=FASTMATH)
+def blur_width(patch: Any, n: int, disc: Disc, blur: Blur) -> float:
+    """Mean width of the blur, of optics and pixel, across the edge, in nominal radii."""
+    x0, y0, most = F32(disc.x), F32(disc.y), F32(2.5)
+    variance_1 = F32(blur.first * blur.first + PIXEL_VARIANCE)
+    variance_2 = F32(blur.second * blur.second + PIXEL_VARIANCE)
+    widths = weights = F32(0.0)
+    for i in range(n):
+        x, y = patch.x[i] - x0, patch.y[i] - y0
+        g1 = patch.x1[i] * x + patch.y1[i] * y
+        g2 = patch.x2[i] * x + patch.y2[i] * y
+        r_2 = x * x + y * y + F32(1e-12)
+        width = math.sqrt((variance_1 * g1 * g1 + variance_2 * g2 * g2) / r_2)
+        weight = abs(patch.design[BY_RADIUS, i])
+        widths += weight * min(width, most)
+        weights += weight
+    mean: float = widths / max(weights, F32(1e-12))
+    return mean
+
+
+class Outline(NamedTuple):
+    """How evenly the edge of a fitted disc goes round."""
+
+    good: float
+    """Share of sectors whose step has the sign, and 0.4 of the size, of the disc's."""
+    deviation: float
+    """Root mean square over the sectors of how far the edge is from the circle, in radii."""
+    middle: float
+    """Step of the middle (the inner 0.3 of the radius) from the background, relative to the
+    contrast: 1 where it has not two pixels."""
+
+
+@njit(cache=True, error_model="numpy", forceinline=True, fastmath=FASTMATH)
+def _find_sectors(patch: Any, n: int, disc: Disc) -> None:
+    """Which sector pixels are in; `SECTORS` for those in the middle, and those not fitted."""
+    design = patch.design
+    x0, y0 = F32(disc.x), F32(disc.y)
+    middle = F32((_MIDDLE * disc.radius) ** 2)
+    for i in range(n):
+        x = design[PLANE_X, i] - x0
+        y = design[PLANE_Y, i] - y0
+        ax, ay = abs(x), abs(y)
+        k = np.int32(ay > _TAN_1 * ax) + np.int32(ay > ax) + np.int32(ay > _TAN_3 * ax)
+        k = np.int32(7) - k if x < F32(0.0) else k
+        k = np.int32(15) - k if y < F32(0.0) else k
+        counts = (design[ONE, i] > F32(0.0)) & (x * x + y * y >= middle)
+        patch.sector[i] = k if counts else np.int32(SECTORS)
+
+
+@njit(cache=True, error_model="numpy", forceinline=True, fastmath=FASTMATH)
+def outline_statistics(
+    patch: Any, n: int, disc: Disc, contrast: float, sums: NDArray[np.float32]
+) -> Outline:
+    """How evenly the edge goes round: in each sector its step and how far it is from the circle.
+
+    The step is the regression of the grey values on the model's, relative to the whole disc's; the
+    distance is the Gauss-Newton step of the radius from that sector's residuals alone. `sums` is
+    (17, 8) working space.
+    """
+    _find_sectors(patch, n, disc)
+    c = F32(contrast)
+    sums[:] = 0.0
+    for i in range(n):
+        w, e = patch.design[SHARE, i], patch.residual[i]
+        r = c * patch.design[BY_RADIUS, i]
+        g = e + c * w
+        k = patch.sector[i]
+        sums[k, 0] += F32(1.0)
+        sums[k, 1] += w
+        sums[k, 2] += w * w
+        sums[k, 3] += g
+        sums[k, 4] += w * g
+        sums[k, 5] += r * e
+        sums[k, 6] += r * r
+    strongest = 0.0
+    for k in range(SECTORS):
+        strongest = max(strongest, float(sums[k, 6]))
+    seen = good = 0
+    deviation = 0.0
+    for k in range(SECTORS):
+        pixels, shares, greys = float(sums[k, 0]), float(sums[k, 1]), float(sums[k, 3])
+        spread = sums[k, 2] - shares * shares / max(pixels, 1.0)
+        if pixels < _LEAST_PIXELS or spread < _LEAST_SPREAD:
+            continue
+        seen += 1
+        relative = (sums[k, 4] - shares * greys / pixels) / spread / contrast
+        if relative > _GOOD_STEP:
+            good += 1
+        # Sectors with little edge in them say little about its place.
+        offset = sums[k, 5] / (sums[k, 6] + 0.1 * strongest)
+        deviation += min(offset * offset, 0.25)
+    # Pixels that are not fitted are in there, too, with shares and grey values of nothing.
+    middle = 1.0
+    if sums[SECTORS, 1] >= _LEAST_MIDDLE:
+        middle = float(sums[SECTORS, 3]) / float(sums[SECTORS, 1]) / contrast
+    if seen == 0:
+        return Outline(0.0, 0.0, middle)
+    return Outline(good / seen, math.sqrt(deviation / seen), middle)
