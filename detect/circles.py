@@ -24,12 +24,20 @@ from camera.distortion import inverse_table
 from camera.kernels import camera_numbers, lens_numbers
 from detect.discs.alone_kernels import strong_and_highest
 from detect.discs.centre_rows import CentreRows, rows_to_look_at
-from detect.discs.centres import best_centres, good_centres
+from detect.discs.centres import (
+    NO_VOTES,
+    Centres,
+    Votes,
+    best_centres,
+    good_centres,
+    scored_centres,
+)
 from detect.discs.centres import quality_of_centres as quality_of_centres
 from detect.discs.fit import blur_ratio_of, fit_settings, working_space
 from detect.discs.positions import published_positions as pixel_positions
 from detect.discs.positions import refined_covariances
 from detect.discs.search_kernels import DiscSearch, search_discs
+from detect.discs.second_kernels import second_looks
 from detect.errors import FrameError
 from detect.latest import kept_for_latest
 from detect.noise import estimate_noise
@@ -46,6 +54,9 @@ PUBLISHED_PIXEL_VARIANCE = 2.0
 _LEAST_NOISE = 1.0
 #: So many rows of an image tell its noise well enough.
 _NOISE_ROWS = 32
+#: Where the quality is low, a centre is looked at if the grey value steps by this much, grey
+#: levels, in this share of the directions.
+_VOTE_STEP, _VOTES = 10, 0.65
 
 
 @dataclass(frozen=True)
@@ -111,25 +122,35 @@ def detect_circles(
         )
     if not (settings.verify or settings.refine):
         return _without_fit(image, camera, table, settings)
-    centres = _looked_at(table)(settings)
-    pixels, found_quality, contrast = best_centres(
-        image, centres.table, settings.threshold, settings.polarity, centres.rank
-    )
     noise = estimate_noise(image, _NOISE_ROWS)
+    weakest = settings.noise_floor * max(noise, _LEAST_NOISE)
+    centres = candidates_of(image, table, settings, weakest)
+    # Those of votes alone are for a second look.
+    good = centres.score >= settings.threshold
     kernel = _kernel_camera(camera)
     pixels, found_quality, floor_xy, covariance, evidence = search_discs(
         image,
         table.floor_xy,
-        pixels,
-        found_quality,
-        contrast,
+        centres.pixels[good],
+        centres.quality[good],
+        centres.contrast[good],
         _disc_search(settings),
-        settings.noise_floor * max(noise, _LEAST_NOISE),
+        weakest,
         fit_settings(noise, kernel.blur_ratio),
         kernel.numbers,
         kernel.centre,
         working_space(),
     )
+    if _looks_twice(settings):
+        more = second_looks_at(image, camera, table, settings, centres, floor_xy, noise)
+        is_disc = more.evidence >= settings.evidence
+        pixels = np.concatenate([pixels, more.pixels[is_disc]])
+        order = np.argsort(pixels[:, 1] * image.shape[1] + pixels[:, 0], kind="stable")
+        pixels = pixels[order]
+        found_quality = np.concatenate([found_quality, more.quality[is_disc]])[order]
+        floor_xy = np.concatenate([floor_xy, more.place[is_disc]])[order]
+        covariance = np.concatenate([covariance, more.covariance[is_disc]])[order]
+        evidence = np.concatenate([evidence, more.evidence[is_disc]])[order]
     if not settings.refine:
         floor_xy, covariance = published_positions(camera, pixels)
     return CircleDetections(
@@ -138,6 +159,98 @@ def detect_circles(
         covariance=covariance,
         quality=found_quality,
         evidence=evidence,
+    )
+
+
+def _looks_twice(settings: CircleSettings) -> bool:
+    """Whether the grey value may vote: of two signs, chance would vote for either."""
+    return settings.polarity != "any" and settings.verify and settings.refine
+
+
+def candidates_of(
+    image: NDArray[np.uint8], table: DiscTable, settings: CircleSettings, weakest: float
+) -> Centres:
+    """Centres that are looked at: maxima of the quality and, for one polarity, of the votes.
+
+    Parameters
+    ----------
+    image, table, settings
+        As of `detect_circles`.
+    weakest : float
+        Least step of the grey value, grey levels.
+    """
+    votes = NO_VOTES
+    if _looks_twice(settings):
+        votes = Votes(_vote_step(weakest), math.ceil(_VOTES * table.samples))
+    centres = _looked_at(table)(settings)
+    return scored_centres(
+        image, centres.table, settings.threshold, settings.polarity, centres.rank, votes
+    )
+
+
+def _vote_step(weakest: float) -> int:
+    return min(max(math.ceil(weakest), _VOTE_STEP), 254)
+
+
+class SecondLooks(NamedTuple):
+    """Candidates looked at a second time."""
+
+    pixels: NDArray[np.int64]
+    quality: FloatArray
+    features: FloatArray
+    place: FloatArray
+    covariance: FloatArray
+    evidence: FloatArray
+
+
+def second_looks_at(
+    image: NDArray[np.uint8],
+    camera: Camera,
+    table: DiscTable,
+    settings: CircleSettings,
+    centres: Centres,
+    found_xy: FloatArray,
+    noise: float,
+) -> SecondLooks:
+    """Look a second time where no disc was found (see `detect.discs.second_kernels`).
+
+    Parameters
+    ----------
+    image, camera, table, settings
+        As of `detect_circles`.
+    centres : Centres
+        See `candidates_of`.
+    found_xy : (N, 2) float64
+        Discs found already, metres.
+    noise : float
+        Of the image, grey levels.
+
+    Returns
+    -------
+    SecondLooks
+        At most one in each place; covariances as `refined_covariance` has them.
+    """
+    kernel = _kernel_camera(camera)
+    weakest = settings.noise_floor * max(noise, _LEAST_NOISE)
+    index, features, place, covariance, evidence = second_looks(
+        image,
+        table.floor_xy,
+        centres.pixels,
+        centres.contrast,
+        centres.score,
+        np.ascontiguousarray(found_xy),
+        _disc_search(settings),
+        float(_vote_step(weakest)),
+        fit_settings(noise, kernel.blur_ratio),
+        kernel.numbers,
+    )
+    return SecondLooks(
+        centres.pixels[index],
+        centres.quality[index],
+        features,
+        place,
+        refined_covariance(camera, place, covariance, settings),
+        evidence,
     )
 
 

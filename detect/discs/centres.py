@@ -31,6 +31,38 @@ _SIGNS: dict[Polarity, float] = {"any": 0.0, "light": 1.0, "dark": -1.0}
 _ROOM = 4096
 
 
+class Votes(NamedTuple):
+    """Which centres count although their quality is low: where the grey value steps all round."""
+
+    step: int
+    """Pairs of samples vote if they differ by more than this, grey levels, below 255."""
+    least: int
+    """Centres with so many votes count; 0: none does."""
+
+
+NO_VOTES = Votes(0, 0)
+
+
+class Centres(NamedTuple):
+    """Some centres, in scan order.
+
+    Attributes
+    ----------
+    pixels : (N, 2) int64
+        Pixels (u, v).
+    quality : (N,) float64
+    contrast : (N,) float32
+        As in `quality_of_centres`. Where votes alone count, the contrast has their sign.
+    score : (N,) float64
+        The quality; where votes alone count their share of all, scaled to less than the threshold.
+    """
+
+    pixels: NDArray[np.int64]
+    quality: FloatArray
+    contrast: NDArray[np.float32]
+    score: FloatArray
+
+
 def best_centres(
     image: NDArray[np.uint8],
     table: DiscTable,
@@ -38,7 +70,19 @@ def best_centres(
     polarity: Polarity = "any",
     rank: NDArray[np.int64] | None = None,
 ) -> tuple[NDArray[np.int64], FloatArray, NDArray[np.float32]]:
-    """Local maxima of the quality: the peaks of `quality_of_centres`, without the map.
+    """Local maxima of the quality: the pixels, quality and contrast of `scored_centres`."""
+    return scored_centres(image, table, threshold, polarity, rank)[:3]
+
+
+def scored_centres(
+    image: NDArray[np.uint8],
+    table: DiscTable,
+    threshold: float,
+    polarity: Polarity = "any",
+    rank: NDArray[np.int64] | None = None,
+    votes: Votes = NO_VOTES,
+) -> Centres:
+    """Local maxima of the score: the peaks of `quality_of_centres`, without the map.
 
     Parameters
     ----------
@@ -53,15 +97,14 @@ def best_centres(
     rank : (H,) int64, optional
         Of each row of the image: rows whose ranks differ by 1 are neighbours. By default each row
         is the neighbour of the next one.
+    votes : Votes
+        What else counts.
 
     Returns
     -------
-    pixels : (N, 2) int64
-        Pixels (u, v) that none of their 8 neighbours exceeds, in scan order. Connected pixels of
-        equal quality are one maximum, at the one nearest to their centroid.
-    quality : (N,) float64
-    contrast : (N,) float32
-        As in `quality_of_centres`.
+    Centres
+        Pixels that none of their 8 neighbours exceeds, in scan order. Connected pixels of equal
+        score are one maximum, at the one nearest to their centroid.
 
     Raises
     ------
@@ -69,8 +112,8 @@ def best_centres(
         If the image does not belong to the table.
     """
     rank = _all_rows(len(image)) if rank is None else rank
-    found = good_centres(image, table, threshold, polarity)
-    return highest(*found, len(found[0]), rank)
+    found = _good_centres(image, table, threshold, polarity, votes)
+    return Centres(*highest(*found, len(found[0]), rank))
 
 
 def good_centres(
@@ -87,29 +130,39 @@ def good_centres(
     contrast : (N,) float32
         As in `quality_of_centres`. Until the calling thread asks again: then they change.
     """
+    return _good_centres(image, table, threshold, polarity, NO_VOTES)[:4]
+
+
+def _good_centres(
+    image: NDArray[np.uint8], table: DiscTable, threshold: float, polarity: Polarity, votes: Votes
+) -> tuple[
+    NDArray[np.int64], NDArray[np.int64], FloatArray, NDArray[np.float32], NDArray[np.float64]
+]:
+    """`good_centres` with those that votes add, and the scores."""
     sign = _SIGNS[polarity]
     space = _working_space(image.size, table.samples)
     arguments = _kernel_arguments(image, table, space.pixels)
-    room = space.columns, space.rows, space.quality, space.contrast
+    room = space.columns, space.rows, space.quality, space.contrast, space.score
     full: list[tuple[NDArray[Any], ...]] = []
     block, count = 0, 0
     while True:
         block, count = centres_above(
-            *arguments, threshold, sign, *space.memory, block,
-            space.columns, space.rows, space.quality, space.contrast,
+            *arguments, threshold, sign, votes.step, votes.least, space.votes, *space.memory, block,
+            space.columns, space.rows, space.quality, space.contrast, space.score,
         )  # fmt: skip
         if block == len(table.block_row):
             break
         full.append(tuple([values[:count].copy() for values in room]))
     if full:
         full.append(tuple([values[:count] for values in room]))
-        columns, rows, quality, contrast = (np.concatenate(values) for values in zip(*full))
-        return columns, rows, quality, contrast
+        columns, rows, quality, contrast, score = (np.concatenate(values) for values in zip(*full))
+        return columns, rows, quality, contrast, score
     return (
         space.columns[:count],
         space.rows[:count],
         space.quality[:count],
         space.contrast[:count],
+        space.score[:count],
     )
 
 
@@ -160,6 +213,8 @@ class _WorkingSpace(NamedTuple):
     rows: NDArray[np.int64]
     quality: FloatArray
     contrast: NDArray[np.float32]
+    score: FloatArray
+    votes: _Bytes
 
 
 _kept = threading.local()
@@ -176,6 +231,8 @@ def _working_space(size: int, samples: int) -> _WorkingSpace:
             np.empty(_ROOM, np.int64),
             np.empty(_ROOM),
             np.empty(_ROOM, np.float32),
+            np.empty(_ROOM),
+            np.empty(2 * BLOCK, np.uint8),
         )
         _kept.key = size, samples
     space: _WorkingSpace = _kept.space

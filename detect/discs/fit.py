@@ -185,7 +185,7 @@ def _judge(
 
 
 @njit(cache=True, error_model="numpy")
-def _fit_all(
+def fit_all(
     image: NDArray[np.uint8],
     floor_xy: NDArray[np.float32],
     pixels: NDArray[np.int64],
@@ -288,7 +288,7 @@ def fit_discs(
     """
     if blur_guess is None:
         blur_guess = np.full(len(pixels), _BLUR_PX)
-    results, fitted = _fit_all(
+    results, fitted = fit_all(
         image, floor_xy, np.ascontiguousarray(pixels), radius_m, blur_guess,
         fit_settings(noise, blur_ratio), first_look,
     )  # fmt: skip

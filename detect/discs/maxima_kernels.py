@@ -57,27 +57,31 @@ def highest(
     rows: NDArray[np.int64],
     quality: NDArray[np.float64],
     contrast: NDArray[np.float32],
+    score: NDArray[np.float64],
     count: int,
     rank: NDArray[np.int64],
-) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float32]]:
-    """The `maxima` among the first `count` of some pixels: (M, 2) u and v, quality, contrast.
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float32], NDArray[np.float64]]:
+    """The `maxima` of the score among the first `count` of some pixels: their (M, 2) u and v, and
+    quality, contrast and score.
 
     `rank` says which rows are neighbours: those whose ranks differ by 1.
     """
     ranks = np.empty(count, np.int64)
     for i in range(count):
         ranks[i] = rank[rows[i]]
-    index = maxima(columns[:count], ranks, quality[:count])
+    index = maxima(columns[:count], ranks, score[:count])
     pixels = np.empty((len(index), 2), np.int64)
     own_quality = np.empty(len(index))
     own_contrast = np.empty(len(index), np.float32)
+    own_score = np.empty(len(index))
     for k in range(len(index)):
         i = index[k]
         pixels[k, 0] = columns[i]
         pixels[k, 1] = rows[i]
         own_quality[k] = quality[i]
         own_contrast[k] = contrast[i]
-    return pixels, own_quality, own_contrast
+        own_score[k] = score[i]
+    return pixels, own_quality, own_contrast, own_score
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

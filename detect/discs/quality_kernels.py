@@ -26,6 +26,7 @@ from detect.discs.vector_kernels import (
     promising,
     promising_all_vote,
     sum_and_gather,
+    vote,
 )
 from lut.kernels import BLOCK, GROUP, LEAST_COPIES
 
@@ -154,6 +155,39 @@ def quality_map(
             )
 
 
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _vote_block(
+    gathered: NDArray[np.uint8],
+    samples: int,
+    block: int,
+    some_outside: bool,
+    sign: float,
+    step: int,
+    least_votes: int,
+    votes: NDArray[np.uint8],
+) -> tuple[np.uint64, np.uint64]:
+    """Which centres of the block whose sums were taken last have votes enough: light, dark ones."""
+    groups = np.uint64(-(-samples // GROUP))
+    inner = np.uint64((block & 1) * (len(gathered) // 2))
+    outer = inner + groups * np.uint64(GROUP * BLOCK)
+    light = dark = np.uint64(0)
+    if sign >= 0.0:
+        light = vote(
+            gathered,
+            inner,
+            outer,
+            groups,
+            step,
+            1 if some_outside else 0,
+            least_votes,
+            votes,
+            np.uint64(0),
+        )
+    if sign <= 0.0:
+        dark = vote(gathered, outer, inner, groups, step, 0, least_votes, votes, np.uint64(BLOCK))
+    return light, dark
+
+
 @njit(cache=True, error_model="numpy", nogil=True)
 def centres_above(
     pixels: NDArray[np.uint8],
@@ -166,6 +200,9 @@ def centres_above(
     patterns: NDArray[np.uint8],
     threshold: float,
     sign: float,
+    step: int,
+    least_votes: int,
+    votes: NDArray[np.uint8],
     gathered: NDArray[np.uint8],
     sums: NDArray[np.uint16],
     products: NDArray[np.uint32],
@@ -174,8 +211,12 @@ def centres_above(
     rows: NDArray[np.int64],
     quality: NDArray[np.float64],
     contrast: NDArray[np.float32],
+    score: NDArray[np.float64],
 ) -> tuple[int, int]:
     """Centres whose quality reaches a threshold: those of `quality_map`, without the map.
+
+    And, if so asked, those round which the grey value steps in most directions: something bright or
+    dark beside a disc raises the total variance, and so ruins the quality, but not the steps.
 
     It goes on from one block until the image or the room for results ends. Nothing is allocated
     here: counting references would cost as much as all the rest.
@@ -188,6 +229,12 @@ def centres_above(
         Least quality, above 0.
     sign : float
         1 for centres lighter than what is around them, -1 for darker ones, 0 for both.
+    step : int
+        Pairs of samples in the same direction vote if they differ by more than this, grey levels.
+    least_votes : int
+        Centres with so many votes of the sign are results, too; 0: the quality alone decides.
+    votes : (2 * BLOCK,) uint8
+        Memory to work in.
     gathered, sums, products
         Memory to work in (`working_memory`).
     block : int
@@ -195,7 +242,10 @@ def centres_above(
     columns, rows : (M,) int64, M >= 64
     quality : (M,) float64
     contrast : (M,) float32
-        Results, in scan order.
+    score : (M,) float64
+        Results, in scan order. The score is the quality where that reaches the threshold; else it
+        is the share of the votes, scaled to stay below the threshold, and the contrast has their
+        sign.
 
     Returns
     -------
@@ -204,6 +254,7 @@ def centres_above(
     """
     count = 0
     share = np.float32(threshold * _FIRST_COMPARISON)
+    per_vote = threshold / (samples + 1.0)
     blocks = len(block_row)
     for b in range(block, blocks):
         if count + BLOCK > len(columns):
@@ -215,6 +266,12 @@ def centres_above(
             mask = promising_all_vote(sums, products, samples, share)
         else:
             mask = promising(sums, products, patterns, pattern, share)
+        light, dark = np.uint64(0), np.uint64(0)
+        if least_votes > 0:
+            light, dark = _vote_block(
+                gathered, samples, b, pattern != 0, sign, step, least_votes, votes
+            )
+            mask |= light | dark
         while mask != 0:
             i = lowest_bit(mask)
             mask &= mask - _ONE
@@ -225,11 +282,22 @@ def centres_above(
                 np.float64(patterns[pattern, 0, i]),
                 np.float64(patterns[pattern, 1, i]),
             )
-            if here >= threshold and here > 0.0 and difference * sign >= 0.0:
+            clear = here >= threshold and here > 0.0 and difference * sign >= 0.0
+            by_light = (light >> i) & _ONE
+            voted = (by_light | ((dark >> i) & _ONE)) != 0 and patterns[pattern, 0, i] > 0
+            if clear or voted:
                 columns[count] = block_column[b] + np.int64(i)
                 rows[count] = block_row[b]
                 quality[count] = here
-                contrast[count] = difference
+                if clear:
+                    contrast[count] = difference
+                    score[count] = here
+                else:
+                    least = step + 1.0
+                    contrast[count] = (
+                        max(difference, least) if by_light else min(difference, -least)
+                    )
+                    score[count] = per_vote * votes[(_ONE - by_light) * np.uint64(BLOCK) + i]
                 count += 1
     return blocks, count
 

@@ -43,6 +43,8 @@ _SAME_DISC = 0.3
 #: A blur that reached this share of the most that a patch allows is fitted again in a wider one.
 _AT_BOUND = 0.98
 _MOST_REFITS = 2
+#: From so many clear discs on, what sign they have speaks against doubtful ones of the other.
+_LEAST_CLEAR = 20
 #: By fit and rim together, a candidate that the fit speaks against needs these log-odds, and one
 #: that it speaks for is dropped below those.
 _RESCUED, _REFUTED = 0.93, 0.0
@@ -129,6 +131,8 @@ def search_discs(
         image, floor_xy, starts, quality[keep], contrast[keep], search, settings,
         work[0], camera_numbers,
     )  # fmt: skip
+    if search.verify:
+        found = _of_likely_sign(results, evidence, found, search.least_evidence)
     own_pixels = np.empty((len(found), 2), np.int64)
     own_quality = np.empty(len(found))
     found_xy = np.empty((len(found), 2))
@@ -150,6 +154,37 @@ def search_discs(
         camera_numbers, centre, found_xy, covariance, search.pixel_variance, search.tilt_variance
     )
     return own_pixels, own_quality, found_xy, covariance, told
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _of_likely_sign(
+    results: NDArray[Any],
+    evidence: NDArray[np.float64],
+    found: NDArray[np.int64],
+    least_evidence: float,
+) -> NDArray[np.int64]:
+    """Which discs are not both doubtful and the only dark ones among light ones, or vice versa.
+
+    Discs of one place are mostly alike. With m of n clear discs of a sign, the odds of that sign
+    are (m + 1) : (n - m + 1) by Laplace's rule of succession; where they speak against a doubtful
+    disc, they are weighed with its evidence. Few clear discs say too little.
+    """
+    light = dark = 0
+    for i in found:
+        if evidence[i] >= least_evidence + CLEAR_EVIDENCE:
+            if results[i][fit.CONTRAST] > 0.0:
+                light += 1
+            else:
+                dark += 1
+    if light + dark < _LEAST_CLEAR:
+        return found
+    log_odds = math.log((light + 1.0) / (dark + 1.0))
+    likely = np.ones(len(found), np.bool_)
+    for k in range(len(found)):
+        i = found[k]
+        sign = 1.0 if results[i][fit.CONTRAST] > 0.0 else -1.0
+        likely[k] = evidence[i] + min(sign * log_odds, 0.0) >= least_evidence
+    return found[likely]
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)

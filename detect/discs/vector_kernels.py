@@ -88,7 +88,8 @@ class _Code:
         first = self.builder.insert_element(
             ir.Constant(vector, ir.Undefined), value, ir.Constant(_I32, 0)
         )
-        return self.builder.shuffle_vector(first, first, _constant(_INTS, 0))
+        mask = _constant(ir.VectorType(_I32, vector.count), 0)
+        return self.builder.shuffle_vector(first, first, mask)
 
     def even_odd(self, shorts: Any) -> list[Any]:
         """16-bit numbers as two vectors of 32-bit ones."""
@@ -346,6 +347,83 @@ def _mask(code: _Code, compare: Callable[[Any, Any, Any, int, int], Any]) -> Any
         number = builder.zext(builder.bitcast(bits, ir.IntType(LANES)), _I64)
         mask = builder.or_(mask, builder.shl(number, code.number(part * LANES)))
     return mask
+
+
+@_operation
+def vote(
+    _typing: Any,
+    gathered: Any,
+    higher: Any,
+    lower: Any,
+    groups: Any,
+    step: Any,
+    outside: Any,
+    least: Any,
+    votes: Any,
+    to: Any,
+) -> Any:
+    """In how many directions one outline's grey value exceeds the other's, centre by centre.
+
+    Parameters
+    ----------
+    gathered : uint8, contiguous
+        As in `sum_and_gather`.
+    higher, lower : uint64
+        Index in `gathered` at which the rows of the one outline, and of the other, begin.
+    groups : uint64
+        Groups of `GROUP` rows in each outline.
+    step : uint8
+        It has to exceed the other's by more than this, below 255.
+    outside : uint8
+        1: zeros of the lower outline, which are outside the image, are exceeded by nothing (and
+        all else by one grey level more); 0: zeros are black.
+    least : uint8
+        Directions that matter, at least 1.
+    votes : uint8, contiguous
+        Result: `BLOCK` numbers of directions.
+    to : uint64
+        Index in `votes` at which they begin.
+
+    Returns
+    -------
+    uint64
+        Bit i is set if centre i has at least `least` directions.
+    """
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        code = _Code(context, builder, signature, args)
+        above, below = code.variable(args[1]), code.variable(args[2])
+        next_step = builder.add(args[4], ir.Constant(_I8, 1))
+        enough = code.everywhere(next_step, _BLOCK)
+        shift = code.everywhere(args[5], _BLOCK)
+        count = code.zeros(_BLOCK)
+        with cgutils.for_range(builder, args[3]):
+            for k in range(GROUP):
+                x, y = (
+                    code.load(0, code.add(builder.load(row), code.number(k * BLOCK)), _BLOCK)
+                    for row in (above, below)
+                )
+                y = code.sub(y, shift)
+                more = builder.icmp_unsigned(">", x, y)
+                # A saturating difference, in a form that LLVM knows as such.
+                difference = builder.select(more, code.sub(x, y), _constant(_BLOCK, 0))
+                votes_for = builder.icmp_unsigned(">=", difference, enough)
+                # True is -1.
+                code.increase(
+                    count, code.sub(_constant(_BLOCK, 0), builder.sext(votes_for, _BLOCK))
+                )
+            for row in (above, below):
+                code.increase(row, code.number(GROUP * BLOCK))
+        total = builder.load(count)
+        code.store(7, args[8], total)
+        bits = builder.icmp_unsigned(">=", total, code.everywhere(args[6], _BLOCK))
+        return builder.bitcast(bits, _I64)
+
+    result = types.uint64(
+        gathered, types.uint64, types.uint64, types.uint64, types.uint8, types.uint8, types.uint8,
+        votes, types.uint64,
+    )  # fmt: skip
+    return result, generate
 
 
 @_operation

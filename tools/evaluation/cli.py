@@ -20,6 +20,7 @@ from detect.line_settings import LineSettings
 from detect.settings import CircleSettings
 from landmarks import FrameTilt
 from storage.exit_codes import exit_code_of
+from tools.evaluation.evidence_weights import gather, report
 from tools.evaluation.markers_command import Markers, MarkersCommand
 from tools.evaluation.markers_command import perform as evaluate_markers
 from tools.evaluation.published_lines import print_printed_lines
@@ -130,6 +131,25 @@ class RealRun:
 
 
 @dataclass(frozen=True)
+class EvidenceWeights:
+    """Fit the weights of a second look at discs anew, and print what each source gains by them.
+
+    Parameters
+    ----------
+    data : Path
+        Folder with `rendered` and `dlr`.
+    every : int
+        Every n-th frame of the recorded run is used.
+    seed : int
+        Of the disturbances.
+    """
+
+    data: Positional[Path] = Path("../shared/data")
+    every: int = 3
+    seed: int = 1
+
+
+@dataclass(frozen=True)
 class TiltOfDiscs:
     """Hold the tilt that verticals show against the tilt that the discs of a map show.
 
@@ -198,6 +218,7 @@ def main(arguments: list[str] | None = None) -> int:
         | Annotated[Buildings, subcommand("buildings")]
         | Annotated[PublishedLines, subcommand("published-lines")]
         | Annotated[RealRun, subcommand("real-run")]
+        | Annotated[EvidenceWeights, subcommand("evidence-weights")]
         | Annotated[TiltOfDiscs, subcommand("tilt-of-discs")]
         | Annotated[RenderedLines, subcommand("rendered-lines")]
         | Annotated[Tilt, subcommand("tilt")]
@@ -216,6 +237,7 @@ def _carry_out(
     | Buildings
     | PublishedLines
     | RealRun
+    | EvidenceWeights
     | TiltOfDiscs
     | RenderedLines
     | Tilt
@@ -238,6 +260,9 @@ def _carry_out(
     if isinstance(command, RealRun):
         with tempfile.TemporaryDirectory() as folder:
             print(table_of(measure_run(command.run, Path(folder))))
+        return 0
+    if isinstance(command, EvidenceWeights):
+        print(report(gather(command.data, command.every, command.seed)))
         return 0
     if isinstance(command, TiltOfDiscs):
         compared = compare_tilts(

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 import detect.circles
 from camera import Camera, parse_camera, read_camera
 from detect.circles import detect_circles, disc_shape
-from detect.discs.centres import best_centres, quality_of_centres
+from detect.discs.centres import Centres, best_centres, quality_of_centres
 from detect.discs.maxima_kernels import local_maxima
 from detect.errors import FrameError
 from detect.settings import REPORT, CircleSettings, Polarity
@@ -228,11 +228,13 @@ def test_landmarks_are_those_of_plain_centres(
         table: DiscTable,
         threshold: float,
         polarity: Polarity,
-        rank: object = None,
-    ) -> Found:
-        return plain_best_centres(image, outlines, threshold, polarity)
+        rank: object,
+        votes: object,
+    ) -> Centres:
+        pixels, quality, contrast = plain_best_centres(image, outlines, threshold, polarity)
+        return Centres(pixels, quality, contrast, quality)
 
-    monkeypatch.setattr(detect.circles, "best_centres", plain)
+    monkeypatch.setattr(detect.circles, "scored_centres", plain)
     expected = detect_circles(image, PUBLISHED_CAMERA, table, preset)
     for field in dataclasses.fields(expected):
         left, right = getattr(found, field.name), getattr(expected, field.name)

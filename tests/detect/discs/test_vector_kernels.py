@@ -13,6 +13,7 @@ from detect.discs.vector_kernels import (
     promising,
     promising_all_vote,
     sum_and_gather,
+    vote,
 )
 from lut.kernels import ADVANCE_BITS, BLOCK, GROUP, LEAST_COPIES
 
@@ -197,3 +198,31 @@ def test_the_lowest_bit() -> None:
     for bit in range(64):
         assert _lowest_bit(np.uint64(1 << bit)) == bit
         assert _lowest_bit(np.uint64((1 << 63) | (1 << bit))) == bit
+
+
+@njit(error_model="numpy")
+def _vote(gathered: Bytes, groups: int, step: int, outside: int, least: int, votes: Bytes) -> int:
+    mask: int = vote(
+        gathered, np.uint64(0), np.uint64(groups * GROUP * BLOCK), np.uint64(groups),
+        np.uint8(step), np.uint8(outside), np.uint8(least), votes, np.uint64(BLOCK),
+    )  # fmt: skip
+    return mask
+
+
+@pytest.mark.parametrize("outside", [0, 1])
+def test_votes_are_counted(outside: int) -> None:
+    rng = np.random.default_rng(5)
+    groups = 4
+    grey = rng.integers(0, 256, (2, groups * GROUP, BLOCK)).astype(np.uint8)
+    grey[1, rng.random(grey[1].shape) < 0.2] = 0
+    votes = np.zeros(2 * BLOCK, np.uint8)
+    mask = _vote(grey.ravel(), groups, 10, outside, 6, votes)
+    inner, outer = grey.astype(int)
+    difference = inner - outer + outside
+    counts = outer > 0 if outside else np.ones(outer.shape, bool)
+    expected = ((difference > 10) & counts).sum(axis=0)
+    np.testing.assert_array_equal(votes[BLOCK:], expected)
+    assert not votes[:BLOCK].any()
+    bits = [bool(int(mask) >> i & 1) for i in range(BLOCK)]
+    np.testing.assert_array_equal(bits, expected >= 6)
+    assert 0 < sum(bits) < BLOCK

@@ -1,0 +1,133 @@
+"""Discs beside sun patches and glare, and under cables, against the truth; and what is no disc."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from camera import Camera
+from detect.circles import CircleDetections, candidates_of, detect_circles, disc_shape
+from detect.discs import fit
+from detect.discs.search_kernels import _of_likely_sign
+from detect.settings import CircleSettings
+from lut import DiscTable, build_disc_table
+from tests.detect.painted_floor import FLOOR, LIGHT, PaintedFloor
+
+SETTINGS = CircleSettings(polarity="light")
+PLACES = np.array([(0.3, -2.0), (-0.5, -2.6), (0.5, -3.2)])
+#: Of the sun on the floor.
+SUN = 255.0
+Shape = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.bool_]]
+
+
+@pytest.fixture(scope="module")
+def table(published_camera: Camera) -> DiscTable:
+    return build_disc_table(published_camera, disc_shape(SETTINGS))
+
+
+def beside(angle: float) -> Shape:
+    """A patch that touches the disc's rim over nearly a quarter of it."""
+    cos, sin = np.cos(angle), np.sin(angle)
+
+    def inside(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.bool_]:
+        along, across = cos * x + sin * y, cos * y - sin * x
+        outside_disc = np.hypot(x, y) > 0.1
+        return np.asarray(outside_disc & (along > 0.075) & (along < 0.25) & (abs(across) < 0.2))
+
+    return inside
+
+
+def found_at(found: CircleDetections, place: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(np.hypot(*(found.floor_xy - place).T))
+
+
+@pytest.mark.parametrize("place", PLACES[:2])
+def test_a_disc_that_a_sun_patch_touches_is_a_candidate_and_a_row(
+    published_camera: Camera, table: DiscTable, place: NDArray[np.float64]
+) -> None:
+    rows = candidates = 0
+    angles = np.arange(8) * np.pi / 4.0
+    for seed, angle in enumerate(angles):
+        floor = PaintedFloor(published_camera).disc(place, LIGHT).shape(place, beside(angle), SUN)
+        image = floor.image(seed=seed)
+        centres = candidates_of(image, table, SETTINGS, 3.0)
+        at = table.floor_xy[centres.pixels[:, 1], centres.pixels[:, 0]]
+        near = np.hypot(*(at - place).T) < 0.06
+        candidates += bool(near.any())
+        found = detect_circles(image, published_camera, table, SETTINGS)
+        distance = found_at(found, place)
+        rows += bool((distance < 0.03).any())
+        assert (distance < 0.14).sum() <= 1
+    assert candidates == len(angles)
+    assert rows >= 6
+
+
+def test_votes_add_centres_where_the_quality_is_low(
+    published_camera: Camera, table: DiscTable
+) -> None:
+    place = PLACES[1]
+    floor = PaintedFloor(published_camera).disc(place, LIGHT).shape(place, beside(0.0), SUN)
+    centres = candidates_of(floor.image(), table, SETTINGS, 3.0)
+    at = table.floor_xy[centres.pixels[:, 1], centres.pixels[:, 0]]
+    near = np.hypot(*(at - place).T) < 0.06
+    assert (centres.quality[near] < SETTINGS.threshold).all()
+    assert (centres.score[near] < SETTINGS.threshold).all()
+    assert (centres.contrast[near] > 0.0).all()
+    either = candidates_of(floor.image(), table, CircleSettings(), 3.0)
+    at = table.floor_xy[either.pixels[:, 1], either.pixels[:, 0]]
+    assert not (np.hypot(*(at - place).T) < 0.06).any()
+
+
+def square(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.bool_]:
+    return np.asarray(np.maximum(abs(x), abs(y)) < 0.09)
+
+
+def ring(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.bool_]:
+    return np.asarray(abs(np.hypot(x, y) - 0.085) < 0.015)
+
+
+def saucer(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.bool_]:
+    return np.asarray(np.hypot(x, y) < 0.07)
+
+
+@pytest.mark.parametrize("shape", [square, ring, saucer])
+@pytest.mark.parametrize("disturbed", [False, True])
+def test_what_is_no_disc_stays_out(
+    published_camera: Camera, table: DiscTable, shape: Shape, disturbed: bool
+) -> None:
+    for seed, place in enumerate(PLACES):
+        floor = PaintedFloor(published_camera).shape(place, shape, LIGHT)
+        if disturbed:
+            floor.shape(place, beside(seed), FLOOR + 40.0)
+        image = floor.image(seed=seed)
+        found = detect_circles(image, published_camera, table, SETTINGS)
+        # Small squares pass for discs at the first look already; a second one adds none.
+        first = detect_circles(image, published_camera, table, CircleSettings())
+        expected = (found_at(first, place) < 0.1).any() if shape is square else False
+        assert (found_at(found, place) < 0.1).any() == expected
+
+
+def test_a_pool_of_light_is_no_disc(published_camera: Camera, table: DiscTable) -> None:
+    floor = PaintedFloor(published_camera)
+    v, u = np.mgrid[: published_camera.height, : published_camera.width]
+    for place in PLACES:
+        at = published_camera.project_floor(place)
+        floor.grey += 120.0 * np.exp(-0.5 * (((u - at[0]) / 14.0) ** 2 + ((v - at[1]) / 7.0) ** 2))
+    assert len(detect_circles(floor.image(), published_camera, table, SETTINGS)) == 0
+
+
+@pytest.mark.parametrize(("clear", "kept"), [(30, False), (15, True)])
+def test_a_doubtful_disc_of_the_other_sign_among_many_clear_ones_is_dropped(
+    clear: int, kept: bool
+) -> None:
+    results = np.zeros(clear + 2, fit.RESULT)
+    results[fit.CONTRAST] = -80.0
+    results[fit.CONTRAST][-2:] = 40.0
+    evidence = np.full(clear + 2, 12.0)
+    evidence[-1] = 2.5
+    found = _of_likely_sign(results, evidence, np.arange(clear + 2), 1.1)
+    assert clear in found
+    assert (clear + 1 in found) == kept
