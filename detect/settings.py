@@ -100,7 +100,7 @@ class CircleSettings:
     noise_floor: float = 3.0
     separation: float = 1.4
     verify: bool = True
-    evidence: float = 1.1
+    evidence: float = 0.6
     blur_px: float = 1.0
     refine: bool = True
     systematic_px: float = 0.002
