@@ -32,7 +32,15 @@ def main() -> int:
             f"error: python3 is {found}: expected 3.11 or newer (make PYTHON=...)", file=sys.stderr
         )
         return 1
-    environment = Path(sys.argv[1]).resolve()
+    environment = Path(sys.argv[1]).absolute()
+    if environment.is_symlink():
+        print(
+            f"error: {environment} is a link to {environment.resolve()}: expected a folder of "
+            "this checkout: what is made anew there would be missing elsewhere",
+            file=sys.stderr,
+        )
+        return 1
+    environment = environment.resolve()
     stamp = environment / "ready"
     wanted = _fingerprint(environment)
     if stamp.is_file() and stamp.read_text() == wanted:
@@ -104,14 +112,22 @@ def _installed_unlocked(environment: Path) -> bool:
 def _new_environment(environment: Path) -> list[str]:
     """Make it anew, with nothing in it; returns how its pip is called."""
     shutil.rmtree(environment, ignore_errors=True)
-    subprocess.run([sys.executable, "-m", "venv", str(environment)], check=True)
+    subprocess.run([_interpreter(), "-m", "venv", str(environment)], check=True)
     return [str(environment / "bin" / "python"), "-m", "pip", "--disable-pip-version-check"]
+
+
+def _interpreter() -> str:
+    """The interpreter outside of environments: one that is active may be the one made anew."""
+    if sys.prefix == sys.base_prefix:
+        return str(Path(sys.executable).resolve())
+    found = Path(sys.base_prefix) / "bin" / f"python{sys.version_info[0]}.{sys.version_info[1]}"
+    return str(found.resolve())
 
 
 def _fingerprint(environment: Path) -> str:
     """What the environment depends on: its place, the interpreter and the declared packages."""
     files = [path.read_text() for path in (ROOT / "pyproject.toml", LOCK) if path.is_file()]
-    parts = [str(environment), sys.executable, sys.version, *files]
+    parts = [str(environment), _interpreter(), sys.version, *files]
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()
 
 
