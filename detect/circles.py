@@ -52,9 +52,9 @@ PUBLISHED_PIXEL_VARIANCE = 2.0
 
 #: For the noise floor an image's noise is never less than this: one grey level, its resolution.
 _LEAST_NOISE = 1.0
-#: So many rows of an image tell its noise well enough.
+#: Rows of an image from which its noise is estimated.
 _NOISE_ROWS = 32
-#: Where the quality is low, a centre is looked at if the grey value steps by this much, grey
+#: Where the quality is low, a centre is a candidate if the grey value steps by this much, grey
 #: levels, in this share of the directions.
 _VOTE_STEP, _VOTES = 10, 0.65
 
@@ -74,7 +74,7 @@ class CircleDetections:
     quality : (N,) float64
         Otsu's quality at the pixel, 0 to 1.
     evidence : (N,) float64
-        Log-odds that it is a disc; NaN if that was not looked at.
+        Log-odds that it is a disc; NaN where nothing was fitted.
     levelled_by : (float, float) or None
         Pitch and roll (rad) that turned the positions level, if any did.
     """
@@ -170,7 +170,7 @@ def _looks_twice(settings: CircleSettings) -> bool:
 def candidates_of(
     image: NDArray[np.uint8], table: DiscTable, settings: CircleSettings, weakest: float
 ) -> Centres:
-    """Centres that are looked at: maxima of the quality and, for one polarity, of the votes.
+    """Candidate centres: maxima of the quality and, for one polarity, of the votes.
 
     Parameters
     ----------
@@ -193,7 +193,7 @@ def _vote_step(weakest: float) -> int:
 
 
 class SecondLooks(NamedTuple):
-    """Candidates looked at a second time."""
+    """Candidates of the second look."""
 
     pixels: NDArray[np.int64]
     quality: FloatArray
@@ -415,7 +415,7 @@ def refined_covariance(
 def tilt_jacobian(camera: Camera, floor_xy: FloatArray) -> FloatArray:
     """How far positions seem to move when the robot tilts about the robot frame's X and Y axes.
 
-    The robot tilts where it stands, on the floor: a floor point then has the height
+    The robot tilts about its origin on the floor: a floor point then has the height
     x w_Y - y w_X in the robot's frame, and is seen where the ray through it meets the floor that
     the calibration believes in.
 

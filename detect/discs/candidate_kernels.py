@@ -1,4 +1,4 @@
-"""Compiled: which of the maxima of the quality are looked at, and where the looks start.
+"""Compiled: which maxima of the quality are candidates, and where their fits start.
 
 Rows of arrays are never taken as arrays of their own here: their references would be counted.
 """
@@ -15,7 +15,7 @@ from detect.discs.model import F32, FASTMATH
 from detect.discs.patch import floor_steps, padded
 from detect.discs.quality_kernels import suppress_neighbours
 
-#: Candidates of a lower quality than this are looked at only if the grey value steps in this share
+#: Candidates of a lower quality than this are kept only if the grey value steps in this share
 #: of the directions, by this share of the contrast.
 CLEAR_QUALITY = 0.55
 _LEAST_STEPS = 0.9

@@ -1,4 +1,4 @@
-"""Which rows of centres are looked at where whatever looks like a disc there is fitted anyway.
+"""Which rows of centres are evaluated where whatever looks like a disc is fitted anyway.
 
 The quality of a large disc's centre is also that of the centres round it: as long as one outline is
 on the disc and the other off it. A fit finds the same disc from each of them, so it is enough to
@@ -26,7 +26,7 @@ class CentreRows(NamedTuple):
     table : DiscTable
         With the blocks of these rows alone.
     rank : (H,) int64
-        Of each row of the image: which of the rows looked at it is. Neighbours differ by 1.
+        Of each row of the image: its number among the rows evaluated. Neighbours differ by 1.
     """
 
     table: DiscTable
@@ -34,7 +34,7 @@ class CentreRows(NamedTuple):
 
 
 def rows_to_look_at(table: DiscTable, settings: CircleSettings) -> CentreRows:
-    """The rows of centres that the detector looks at: all, unless whatever is found is fitted.
+    """The rows of centres that are evaluated: all, unless whatever is found is fitted.
 
     Parameters
     ----------

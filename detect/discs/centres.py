@@ -27,7 +27,7 @@ _Arguments = tuple[_Bytes, int, NDArray[Any], NDArray[np.int64], _Ints, _Ints, _
 
 _SIGNS: dict[Polarity, float] = {"any": 0.0, "light": 1.0, "dark": -1.0}
 
-#: Room for so many centres above the threshold at a time.
+#: Capacity for centres above the threshold, at a time.
 _ROOM = 4096
 
 
@@ -37,7 +37,7 @@ class Votes(NamedTuple):
     step: int
     """Pairs of samples vote if they differ by more than this, grey levels, below 255."""
     least: int
-    """Centres with so many votes count; 0: none does."""
+    """Centres with at least this number of votes count; 0: none does."""
 
 
 NO_VOTES = Votes(0, 0)
@@ -142,7 +142,7 @@ def _good_centres(
     sign = _SIGNS[polarity]
     space = _working_space(image.size, table.samples)
     arguments = _kernel_arguments(image, table, space.pixels)
-    room = space.columns, space.rows, space.quality, space.contrast, space.score
+    buffers = space.columns, space.rows, space.quality, space.contrast, space.score
     full: list[tuple[NDArray[Any], ...]] = []
     block, count = 0, 0
     while True:
@@ -152,9 +152,9 @@ def _good_centres(
         )  # fmt: skip
         if block == len(table.block_row):
             break
-        full.append(tuple([values[:count].copy() for values in room]))
+        full.append(tuple([values[:count].copy() for values in buffers]))
     if full:
-        full.append(tuple([values[:count] for values in room]))
+        full.append(tuple([values[:count] for values in buffers]))
         columns, rows, quality, contrast, score = (np.concatenate(values) for values in zip(*full))
         return columns, rows, quality, contrast, score
     return (
@@ -221,7 +221,7 @@ _kept = threading.local()
 
 
 def _working_space(size: int, samples: int) -> _WorkingSpace:
-    """The calling thread's working space for images of so many pixels."""
+    """The calling thread's working space for images of a size."""
     if getattr(_kept, "key", None) != (size, samples):
         _kept.key = None
         _kept.space = _WorkingSpace(
@@ -244,8 +244,8 @@ def _kernel_arguments(
 ) -> _Arguments:
     """The image's pixels, with the zeros that the table wants behind them, and the table.
 
-    `pixels` are as many as the image's, and those zeros: where the table looks at them, they become
-    the image's.
+    `pixels` are as many as the image's, and those zeros: where the table refers to them, they
+    become the image's.
     """
     expected = table.floor_xy.shape[:2]
     if image.shape != expected or image.dtype != np.uint8:

@@ -54,8 +54,8 @@ _CONVERGED = 0.3
 #: and one that is shorter than this share of the blur's width, and changes that by less than this
 #: share: what is left is less than the square of it.
 _SHORT = 0.05
-#: After so many evaluations, the step after one that made it worse is damped at least so much:
-#: mostly it was the blur of a sharp edge, of which the grey values tell little.
+#: After this number of evaluations, the step after one that made it worse is damped at least this
+#: much: mostly it was the blur of a sharp edge, which the grey values hardly determine.
 _EARLY, _LATE_DAMPING = 3, 0.2
 #: What the first step of a fit promises may be this much less evidence than is needed.
 _FIRST_STEP_SLACK = 2.0
@@ -130,8 +130,8 @@ def solve_step(
 ) -> bool:  # fmt: skip
     """Solve for the steps of the four nonlinear parameters, times contrast, into `work.values`.
 
-    The factor has its first six rows from the products; what is known beforehand of radius and
-    blur, and the damping, come in only then.
+    The factor has its first six rows from the products; the priors of radius and blur, and
+    the damping, come in only then.
     """
     damped, factor, values = work.damped, work.factor, work.values
     damped[BY_BLUR:, :] = work.best[BY_BLUR:, :]
@@ -242,7 +242,7 @@ def descend(
                 promised += factor[GREY, k] ** 2
             disc = moved(best, contrast, log_most, work)
             if evaluations == 1:
-                # How wide a blur is on the floor: the first pixels tell it for all blurs.
+                # How wide a blur is on the floor: the first pixels give it for all blurs.
                 width_per_px = blur_width(patch, n, best, blur) / _sigma(best)
             sigma = _sigma(disc)
             width = width_per_px * sigma

@@ -2,7 +2,7 @@
 
 Around each candidate a blurred disc on an unevenly lit background is fitted: pixels are gathered
 (`detect.discs.patch`), the descent goes to the least squares (`detect.discs.descent`), and the
-residuals tell how far the fit is to be believed (`detect.discs.residuals`). It gives the position
+residuals say how far the fit can be trusted (`detect.discs.residuals`). It gives the position
 with its covariance, and the evidence that there is a disc at all.
 """
 
@@ -279,7 +279,7 @@ def fit_discs(
     blur_guess : (N,) float64, optional
         About how blurred each candidate is (along u), pixels.
     first_look : bool
-        Use some of the pixels and few steps: several times faster, good enough to tell what is no
+        Use some of the pixels and few steps: several times faster, good enough to reject what is no
         disc. Covariance and outline are left out.
 
     Returns
@@ -309,7 +309,7 @@ def fit_discs(
 
 
 def fit_settings(noise: float, blur_ratio: float) -> FitSettings:
-    """What an image's fits are told: its noise (grey levels) and `blur_ratio_of` the camera."""
+    """Settings of an image's fits: its noise (grey levels) and `blur_ratio_of` the camera."""
     return FitSettings(
         noise=max(noise, _LEAST_NOISE),
         reach_radii=_REACH_RADII,

@@ -1,6 +1,6 @@
 """Discs' positions turned level, with the covariances that come of it.
 
-The robot tilts where it stands, about the origin of its frame on the floor, by pitch and roll. Its
+The robot tilts about the origin of its frame on the floor, by pitch and roll. Its
 camera, at c, believes the floor where it would be on a level robot: a disc seen at p lies on the
 ray c + s (p - c). Turned level by R, that ray meets the floor at
 

@@ -2,7 +2,7 @@
 
 The unknowns of one Gauss-Newton step are in the order of the design matrix's rows: the five terms
 of the background, the contrast, and the contrast times the steps of log blur, radius, x and y. The
-grey value comes last. So one factor of all sums of products tells, row by row, what is left of the
+grey value comes last. So one factor of all sums of products gives, row by row, what is left of the
 grey values' squares without a disc, with the disc where it is, and after the step.
 """
 

@@ -2,8 +2,8 @@
 
 Pixels count if they are within some radii of the candidate, or within some pixels or deviations of
 the blur of the disc's edge. A first look takes some of them, evenly spread. A fit takes all; of
-large discs all of those at the edge, which tell where it is, and some of the others, which tell the
-grey levels. How far a pixel is from the edge is told to first order, with the floor's steps at the
+large discs all of those at the edge, which locate it, and some of the others, which give the grey
+levels. How far a pixel is from the edge is known to first order, with the floor's steps at the
 candidate: ``|r - R| r / |J^T p|`` pixels for a place p on the floor, r = ``|p|``, and the steps J.
 """
 
@@ -41,8 +41,7 @@ PATCH = np.dtype(
     [
         # Index of each pixel in the image.
         ("pixel", np.uint32, CAPACITY),
-        # How many pixels it stands for in the explained variance: 0 too far from the disc to speak
-        # for or against it.
+        # Its weight in the explained variance, in pixels: 0 too far from the disc to count.
         ("weight", *_VALUES),
         # 1 where it is the right neighbour of the pixel before it, else 0.
         ("linked", *_VALUES),
@@ -66,7 +65,7 @@ PATCH = np.dtype(
 EDGE, CHORDS_ALONG_V, CHORDS_ALONG_U = range(3)
 
 #: A disc is seen flat if the edge of its flattest end is more curved than this, in units of the
-#: blur, or its smaller half axis less than so many deviations of the blur.
+#: blur, or its smaller half axis less than this number of deviations of the blur.
 _MOST_CURVED = 0.25
 _LEAST_HALF_AXIS = 4.0
 #: Pixels within this many radii, or this near to the edge, count in the explained variance.
@@ -83,7 +82,7 @@ _SHIFT = 0.381966
 
 
 class FitSettings(NamedTuple):
-    """What the fit is told, apart from the image and the candidates."""
+    """Settings of a fit, apart from the image and the candidates."""
 
     noise: float
     """Standard deviation of the noise, grey levels."""
@@ -128,7 +127,7 @@ class View(NamedTuple):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def padded(n: int) -> int:
-    """So many pixels, rounded up to what loops work on at once."""
+    """A number of pixels, rounded up to what loops work on at once."""
     return (n + WHOLE - 1) // WHOLE * WHOLE
 
 
@@ -226,7 +225,7 @@ def _choose(
     look: bool,
     patch: Any,
 ) -> int:
-    """Which pixels are taken, and how many each stands for; returns their number."""
+    """Which pixels are taken, and the weight of each; returns their number."""
     height, width = floor_xy.shape[:2]
     u0, v0 = candidate.u, candidate.v
     most = 1.08 * settings.reach_radii
@@ -279,7 +278,7 @@ def _weigh(
     at_edge: float,
     row: NDArray[np.float32],
 ) -> None:
-    """What pixels of a row stand for: -1 beyond reach, 0 too far from the disc."""
+    """Weights of the pixels of a row: -1 beyond reach, 0 too far from the disc."""
     x0, y0, per_radius = F32(middle[0]), F32(middle[1]), F32(1.0 / candidate.radius)
     xu, yu, xv, yv = (
         F32(view.steps[0]), F32(view.steps[1]), F32(view.steps[2]), F32(view.steps[3]),

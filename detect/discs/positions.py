@@ -24,7 +24,7 @@ from camera.kernels import has_brown, project_floor_point
 
 FloatArray = NDArray[np.float64]
 
-#: Newton's method in `camera.distortion` takes at most so many steps, and ends with one this small.
+#: Most steps of Newton's method in `camera.distortion`, and the step that ends it.
 _NEWTON_STEPS = 60
 _LAST_STEP = 1e-9
 #: Of the central differences of the projection, metres.

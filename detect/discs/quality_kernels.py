@@ -52,7 +52,7 @@ def _sum_block(
 ) -> None:
     """Sums of a block, which is already gathered unless `fresh`, and gather the next.
 
-    There are two places for grey values, used by turns: what was just written cannot be read at
+    There are two places for grey values, used alternately: what was just written cannot be read at
     once.
     """
     groups = -(-samples // GROUP)
@@ -218,7 +218,7 @@ def centres_above(
     And, if so asked, those round which the grey value steps in most directions: something bright or
     dark beside a disc raises the total variance, and so ruins the quality, but not the steps.
 
-    It goes on from one block until the image or the room for results ends. Nothing is allocated
+    It goes on from one block until the image or the space for results ends. Nothing is allocated
     here: counting references would cost as much as all the rest.
 
     Parameters
@@ -232,7 +232,8 @@ def centres_above(
     step : int
         Pairs of samples in the same direction vote if they differ by more than this, grey levels.
     least_votes : int
-        Centres with so many votes of the sign are results, too; 0: the quality alone decides.
+        Centres with at least this number of votes of the sign are results, too; 0: the quality
+        alone decides.
     votes : (2 * BLOCK,) uint8
         Memory to work in.
     gathered, sums, products
@@ -250,7 +251,7 @@ def centres_above(
     Returns
     -------
     block, count : int
-        The first block that was not looked at, and the number of results.
+        The first block that was not evaluated, and the number of results.
     """
     count = 0
     share = np.float32(threshold * _FIRST_COMPARISON)

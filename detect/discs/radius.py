@@ -23,7 +23,7 @@ from lut import build_disc_table
 #: Radii that are tried, metres, and the factor from one to the next.
 SMALLEST_M, LARGEST_M = 0.02, 0.5
 FACTOR = 1.1
-#: So many discs must be found at the best of them.
+#: Discs that must be found at the best of them.
 LEAST_DISCS = 3
 
 

@@ -1,4 +1,4 @@
-"""What the residuals of a fitted disc tell: do they hang together, is the outline even?
+"""Residuals of a fitted disc: are they correlated, is the outline even?
 
 `residuals` are the grey values less the fitted model's. Where the model does not fit they are
 correlated, and neighbours say less than their number: `correlated_area`. `outline_statistics`
@@ -86,7 +86,7 @@ def correlated_area(patch: Any, n: int) -> float:
     """How many pixels go with one independent residual, from the correlation of neighbours.
 
     White noise gives 1. Where the model does not fit (texture, reflections, a disc that is none)
-    the residuals hang together, and their number overstates what they tell: for a first-order
+    the residuals are correlated, and their number overstates their information: for a first-order
     process of correlation c by (1 + c) / (1 - c) in either direction.
     """
     product = square = pairs = F32(0.0)

@@ -67,7 +67,7 @@ _BEGIN, _MIDDLE, _END = (
 
 
 class Rim(NamedTuple):
-    """What is known of the rim of a candidate; lengths are in nominal radii."""
+    """The rim of a candidate; lengths are in nominal radii."""
 
     agreeing: float
     """Share of all directions in which the rim lies on the circle."""

@@ -43,14 +43,14 @@ _SAME_DISC = 0.3
 #: A blur that reached this share of the most that a patch allows is fitted again in a wider one.
 _AT_BOUND = 0.98
 _MOST_REFITS = 2
-#: From so many clear discs on, what sign they have speaks against doubtful ones of the other.
+#: From this number of clear discs on, their sign counts against doubtful ones of the other.
 _LEAST_CLEAR = 20
 #: By fit and rim together, a candidate that the fit speaks against needs these log-odds, and one
 #: that it speaks for is dropped below those.
 _RESCUED, _REFUTED = 0.93, 0.0
 #: Where the edge is farther than this from a circle (radii), the rim is a coincidence.
 _MOST_UNEVEN = 0.14
-#: From this share of the rim on, the fit of the whole disc tells the place better.
+#: From this share of the rim on, the fit of the whole disc gives the place better.
 _WHOLE_RIM = 0.9
 
 
@@ -137,7 +137,7 @@ def search_discs(
     own_quality = np.empty(len(found))
     found_xy = np.empty((len(found), 2))
     covariance = np.empty((len(found), 2, 2))
-    told = np.empty(len(found))
+    log_odds = np.empty(len(found))
     for k in range(len(found)):
         result = results[found[k]]
         i = keep[found[k]]
@@ -149,11 +149,11 @@ def search_discs(
         covariance[k, 0, 0] = result[fit.COV_XX]
         covariance[k, 0, 1] = covariance[k, 1, 0] = result[fit.COV_XY]
         covariance[k, 1, 1] = result[fit.COV_YY]
-        told[k] = evidence[found[k]]
+        log_odds[k] = evidence[found[k]]
     covariance = refined_covariances(
         camera_numbers, centre, found_xy, covariance, search.pixel_variance, search.tilt_variance
     )
-    return own_pixels, own_quality, found_xy, covariance, told
+    return own_pixels, own_quality, found_xy, covariance, log_odds
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -226,7 +226,7 @@ def _with_rim(
     camera_numbers: NDArray[np.float64],
     search: DiscSearch,
     quality: float,
-    told: float,
+    log_odds: float,
     result: Any,
 ) -> float:
     """The evidence of a doubtful fit with its rim, which also places a partly hidden disc."""
@@ -235,19 +235,19 @@ def _with_rim(
         RADIUS_RANGE[0] < relative < RADIUS_RANGE[1] and result[fit.MIDDLE_STEP] > LEAST_MIDDLE_STEP
     )
     if not possible:
-        return told
+        return log_odds
     rim = follow_rim(
         image, camera_numbers, result[fit.X], result[fit.Y], search.radius, result[fit.CONTRAST]
     )
     if rim.radius_px < LEAST_RIM_PX:
-        return told
+        return log_odds
     together = evidence_with_rim(
-        told, result[fit.EXPLAINED], result[fit.CONTRAST], quality, rim, search.radius
+        log_odds, result[fit.EXPLAINED], result[fit.CONTRAST], quality, rim, search.radius
     )
-    if told >= search.least_evidence:
-        return told if together >= _REFUTED else -math.inf
+    if log_odds >= search.least_evidence:
+        return log_odds if together >= _REFUTED else -math.inf
     if result[fit.OUTLINE_DEVIATION] > _MOST_UNEVEN:
-        return told
+        return log_odds
     if rim.agreeing < _WHOLE_RIM:
         result[fit.X], result[fit.Y] = rim.x, rim.y
         result[fit.COV_XX], result[fit.COV_XY], result[fit.COV_YY] = (
@@ -272,7 +272,7 @@ def _next_to_look_at(
 ) -> int:
     """The place in the order, from `begin` on, of the next candidate worth a look; or the end.
 
-    What lies within a disc that showed clearly need not be looked at.
+    What lies within a disc that showed clearly need not be fitted.
     """
     within_2 = (_WITHIN * search.separation) ** 2
     for at in range(begin, len(order)):
@@ -364,7 +364,7 @@ def _fit_all(
             at_x, at_y = before[fit.X], before[fit.Y]
             if refits == 0:
                 u, v = nearest_pixel(floor_xy, pixels[i, 0], pixels[i, 1], at_x, at_y)
-                # A look tells the blur but roughly: too small a patch would be gathered again.
+                # A look gives the blur but roughly: too small a patch would be gathered again.
                 blur = max(before[fit.BLUR], blur_start)
             else:
                 # Too blurred for its patch: once more, in a wider one.
@@ -379,29 +379,29 @@ def _fit_all(
             image, floor_xy, Candidate(u, v, radius, blur), settings, start, looking, hope, work,
             result,
         )  # fmt: skip
-        told = -math.inf
+        log_odds = -math.inf
         if fitted:
-            told = _evidence(result, radius, search.optics_px)
+            log_odds = _evidence(result, radius, search.optics_px)
         if looking:
             place[i, 0] = result[fit.X]
             place[i, 1] = result[fit.Y]
             if not search.verify:
                 if fitted:
-                    promise[i] = told if told > -math.inf else -1e9
-            elif told >= search.least_evidence - _FIRST_LOOK_SLACK or (
-                told >= search.least_evidence - _slack(quality[i])
+                    promise[i] = log_odds if log_odds > -math.inf else -1e9
+            elif log_odds >= search.least_evidence - _FIRST_LOOK_SLACK or (
+                log_odds >= search.least_evidence - _slack(quality[i])
                 and _shows_rim(image, camera_numbers, search, result)
             ):
-                promise[i] = told
-                if told >= search.least_evidence + _CLEAR:
+                promise[i] = log_odds
+                if log_odds >= search.least_evidence + _CLEAR:
                     clear[clear_count, 0] = result[fit.X]
                     clear[clear_count, 1] = result[fit.Y]
                     clear_count += 1
             continue
-        if search.verify and fitted and told < search.least_evidence + CLEAR_EVIDENCE:
-            told = _with_rim(image, camera_numbers, search, quality[i], told, result)
-        evidence[i] = told
-        enough = fitted and (not search.verify or told >= search.least_evidence)
+        if search.verify and fitted and log_odds < search.least_evidence + CLEAR_EVIDENCE:
+            log_odds = _with_rim(image, camera_numbers, search, quality[i], log_odds, result)
+        evidence[i] = log_odds
+        enough = fitted and (not search.verify or log_odds >= search.least_evidence)
         again = result[fit.BLUR] > _AT_BOUND * result[fit.BLUR_BOUND]
         if enough and again and refits < _MOST_REFITS:
             refits += 1
@@ -414,7 +414,7 @@ def _fit_all(
         stayed = math.hypot(result[fit.X] - candidate[0], result[fit.Y] - candidate[1]) < radius
         same_sign = result[fit.CONTRAST] * contrast[i] > 0.0
         if enough and stayed and same_sign:
-            score[i] = told if told > -math.inf else -1e9 + quality[i]
+            score[i] = log_odds if log_odds > -math.inf else -1e9 + quality[i]
     sound = np.flatnonzero(score > -np.inf)
     if search.separation > 0.0:
         sound = sound[suppress_neighbours(place[sound], score[sound], search.separation)]

@@ -100,7 +100,7 @@ class _Code:
         ]
 
     def copy(self, pixels: int, copies: int, next_copy: Any, gathered: int, place: Any) -> None:
-        """Carry out the copy at which the variable `next_copy` stands; it and `place` move on."""
+        """Carry out the copy that the variable `next_copy` names; it and `place` move on."""
         index = self.builder.load(next_copy)
         width = ir.IntType(self.kinds[copies].dtype.bitwidth)
         number = self.builder.zext(self.load(copies, index, width), _I64)

@@ -128,7 +128,7 @@ def cell_values(
 
 @njit(cache=True, error_model="numpy")
 def inflation_of(pixels: NDArray[np.int32], left: Residuals) -> float:
-    """How much less a pixel tells for what is left over being alike at neighbouring pixels.
+    """Factor of the covariance for residuals that are correlated between neighbouring pixels.
 
     A pixel's residual that is correlated with its neighbours' by rho along a row (geometrically
     falling off) counts as (1 - rho) / (1 + rho) of an independent one; rows and columns alike. Only

@@ -257,7 +257,7 @@ class MovementProblem:
         return found
 
     def _anchor(self, begin: int, end: int, variances: FloatArray, smoothed: Smoothed) -> None:
-        """Let the second half of a gap that was cut be told by what comes after it."""
+        """Determine the second half of a gap that was cut from the measurements after it."""
         gap = slice(begin, end + 1)
         states, spreads = back_from(
             self.controls[gap],
