@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from detect.discs.model import F32, FASTMATH
+from detect.discs.model import F32
 from detect.discs.patch import floor_steps, padded
 from detect.discs.quality_kernels import suppress_neighbours
 
@@ -111,7 +111,7 @@ def middles(
     return middle
 
 
-@njit(cache=True, error_model="numpy", nogil=True, fastmath=FASTMATH)
+@njit(cache=True, error_model="numpy", nogil=True)
 def _mean_offset(
     centres: NDArray[np.float32],
     x0: float,

@@ -201,7 +201,7 @@ class Circle(NamedTuple):
     cov_yy: float
 
 
-@njit(cache=True, error_model="numpy", nogil=True, fastmath={"contract", "reassoc"})
+@njit(cache=True, error_model="numpy", nogil=True)
 def fit_circle(
     x: NDArray[np.float64], y: NDArray[np.float64], weight: NDArray[np.float64], circle: Circle
 ) -> Circle:
