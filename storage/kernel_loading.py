@@ -18,6 +18,7 @@ as Numba does it.
 from __future__ import annotations
 
 import os
+import pickle
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -95,7 +96,7 @@ def load_kernels_alone() -> bool:
     def load_index(self: Any) -> dict[Any, str]:
         try:
             indexed: dict[Any, str] = numbas_load_index(self)
-        except Exception:
+        except (AttributeError, ImportError, pickle.UnpicklingError):
             return {}  # written by another version, whose classes are no longer there
         return indexed
 

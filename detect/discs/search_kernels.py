@@ -50,6 +50,8 @@ _LEAST_CLEAR = 20
 _RESCUED, _REFUTED = 0.93, 0.0
 #: Where the edge is farther than this from a circle (radii), the rim is a coincidence.
 _MOST_UNEVEN = 0.14
+#: A disc whose evidence exceeds the least by this much is placed by the fit.
+_BY_FIT = 0.5
 #: From this share of the rim on, the fit of the whole disc gives the place better.
 _WHOLE_RIM = 0.9
 
@@ -244,10 +246,14 @@ def _with_rim(
     together = evidence_with_rim(
         log_odds, result[fit.EXPLAINED], result[fit.CONTRAST], quality, rim, search.radius
     )
-    if log_odds >= search.least_evidence:
-        return log_odds if together >= _REFUTED else -math.inf
-    if result[fit.OUTLINE_DEVIATION] > _MOST_UNEVEN:
-        return log_odds
+    by_fit = log_odds
+    if log_odds >= search.least_evidence and together < _REFUTED:
+        by_fit = -math.inf
+    by_rim = search.least_evidence + together - _RESCUED
+    if log_odds >= search.least_evidence + _BY_FIT or result[fit.OUTLINE_DEVIATION] > _MOST_UNEVEN:
+        return by_fit
+    if by_rim < search.least_evidence and log_odds >= search.least_evidence:
+        return by_fit
     if rim.agreeing < _WHOLE_RIM:
         result[fit.X], result[fit.Y] = rim.x, rim.y
         result[fit.COV_XX], result[fit.COV_XY], result[fit.COV_YY] = (
@@ -255,7 +261,7 @@ def _with_rim(
             rim.cov_xy,
             rim.cov_yy,
         )
-    return search.least_evidence + together - _RESCUED
+    return by_rim
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

@@ -49,7 +49,7 @@ def kernels_find_no_room(place: Path, run: Path) -> None:
     assert done.returncode == 1, done.stderr
     *_, line = done.stderr.splitlines()
     assert line.startswith("error: compiled kernels cannot be kept: [Errno 28] No space left")
-    assert line.endswith("NUMBA_CACHE_DIR")
+    assert line.endswith("set the environment variable NUMBA_CACHE_DIR to another folder")
     assert output.read_bytes() == PREVIOUS
     # Room for the index of a kernel, but not for itself.
     with filler.open("r+b") as stream:
