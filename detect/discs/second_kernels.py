@@ -27,7 +27,7 @@ from detect.discs.patch import FitSettings, floor_steps
 from detect.discs.quality_kernels import suppress_neighbours
 from detect.discs.rim import Rim, follow_rim
 from detect.discs.search_kernels import DiscSearch
-from detect.discs.sectors import Sectors, sector_levels
+from detect.discs.sectors import Sectors, about_plane, sector_levels
 
 _DIRECTIONS = 16
 _ANGLES = 2.0 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
@@ -147,7 +147,7 @@ def outline_steps(
     weight = (
         weights[0] * np.sum(difference > _LEAST_STEP * median)
         + weights[1] * min(spread / median, 1.2)
-        + weights[2] * min(_about_plane(outside, votes) / median, 1.2)
+        + weights[2] * min(about_plane(outside, votes, _COS, _SIN) / median, 1.2)
         + weights[3] * min(slope / median, 1.2)
     )
     return float(weight), median
@@ -164,41 +164,6 @@ def _median(values: NDArray[np.float64], count: int) -> float:
             k -= 1
         values[k] = value
     return float(0.5 * (values[(count - 1) // 2] + values[count // 2]))
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def _about_plane(level: NDArray[np.float64], votes: NDArray[np.bool_]) -> float:
-    """Root mean square of some levels about a + b cos + c sin of their directions."""
-    products = np.zeros((3, 3))
-    sums = np.zeros(3)
-    squares = 0.0
-    n = 0
-    for k in range(_DIRECTIONS):
-        if votes[k]:
-            term = (1.0, _COS[k], _SIN[k])
-            n += 1
-            squares += level[k] * level[k]
-            for i in range(3):
-                sums[i] += term[i] * level[k]
-                for j in range(3):
-                    products[i, j] += term[i] * term[j]
-    for i in range(3):
-        products[i, i] += 1e-6
-    return math.sqrt(max(squares - _explained(products, sums), 0.0) / n)
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def _explained(products: NDArray[np.float64], sums: NDArray[np.float64]) -> float:
-    """What three terms explain of a sum of squares: by elimination, one after the other."""
-    explained = 0.0
-    for i in range(3):
-        explained += sums[i] * sums[i] / products[i, i]
-        for j in range(i + 1, 3):
-            share = products[j, i] / products[i, i]
-            sums[j] -= share * sums[i]
-            for k in range(i, 3):
-                products[j, k] -= share * products[i, k]
-    return explained
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

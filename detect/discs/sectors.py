@@ -103,8 +103,8 @@ def sector_levels(
         runs,
         step,
         float(np.mean(within[good])) / step,
-        _about_plane(inside, good) / step,
-        _about_plane(outside, good) / step,
+        about_plane(inside, good, _COS, _SIN) / step,
+        about_plane(outside, good, _COS, _SIN) / step,
         np.sum(seen & (np.abs(inside - level) > _LEAST_STEP * step)) / DIRECTIONS,
         float(np.median(np.abs(inside[seen] - level))) / step,
         float(np.median(np.abs(outside[seen] - around))) / step,
@@ -135,15 +135,24 @@ def _level(
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _about_plane(level: NDArray[np.float64], good: NDArray[np.bool_]) -> float:
-    """Root mean square of the levels of the good directions about a + b cos + c sin."""
+def about_plane(
+    level: NDArray[np.float64],
+    counted: NDArray[np.bool_],
+    cos: NDArray[np.float64],
+    sin: NDArray[np.float64],
+) -> float:
+    """Root mean square of some levels about a + b cos + c sin of their directions.
+
+    Solved by elimination: NumPy's own would have Numba look LAPACK up at the first call, which an
+    interrupt must not meet.
+    """
     products = np.zeros((3, 3))
     sums = np.zeros(3)
     squares = 0.0
     n = 0
-    for k in range(DIRECTIONS):
-        if good[k]:
-            term = (1.0, _COS[k], _SIN[k])
+    for k in range(len(level)):
+        if counted[k]:
+            term = (1.0, cos[k], sin[k])
             n += 1
             squares += level[k] * level[k]
             for i in range(3):
@@ -152,5 +161,12 @@ def _about_plane(level: NDArray[np.float64], good: NDArray[np.bool_]) -> float:
                     products[i, j] += term[i] * term[j]
     for i in range(3):
         products[i, i] += 1e-6
-    explained = np.sum(np.linalg.solve(products, sums) * sums)
+    explained = 0.0
+    for i in range(3):
+        explained += sums[i] * sums[i] / products[i, i]
+        for j in range(i + 1, 3):
+            share = products[j, i] / products[i, i]
+            sums[j] -= share * sums[i]
+            for k in range(i, 3):
+                products[j, k] -= share * products[i, k]
     return math.sqrt(max(squares - explained, 0.0) / n)
