@@ -39,6 +39,8 @@ def perform(command: Compare) -> int:
 
 def _demand_rows(command: Compare) -> None:
     """Refuse missing files, with a message that says how to make them."""
+    if command.lines and (command.unlisted or command.lookalikes):
+        raise DetectError("--unlisted and --lookalikes are of discs: expected neither with --lines")
     kind = "lines" if command.lines else "circles"
     reference = command.reference or command.run / f"map.{kind}"
     detected = command.detected or command.run / f"detected.{kind}"
