@@ -36,8 +36,9 @@ from detect.discs.centres import quality_of_centres as quality_of_centres
 from detect.discs.fit import blur_ratio_of, fit_settings, working_space
 from detect.discs.positions import published_positions as pixel_positions
 from detect.discs.positions import refined_covariances
+from detect.discs.rim_network import RimNetwork, rim_network
 from detect.discs.search_kernels import DiscSearch, search_discs
-from detect.discs.second_kernels import second_looks
+from detect.discs.second_look import second_looks
 from detect.errors import FrameError
 from detect.latest import kept_for_latest
 from detect.noise import estimate_noise
@@ -57,6 +58,8 @@ _NOISE_ROWS = 32
 #: Where the quality is low, a centre is a candidate if the grey value steps by this much, grey
 #: levels, in this share of the directions.
 _VOTE_STEP, _VOTES = 10, 0.65
+#: Discs of so little more than the least evidence are for the second look, where there is one.
+_DOUBTFUL = 0.5
 
 
 @dataclass(frozen=True)
@@ -134,7 +137,7 @@ def detect_circles(
         centres.pixels[good],
         centres.quality[good],
         centres.contrast[good],
-        _disc_search(settings),
+        _first_search(settings),
         weakest,
         fit_settings(noise, kernel.blur_ratio),
         kernel.numbers,
@@ -211,8 +214,9 @@ def second_looks_at(
     centres: Centres,
     found_xy: FloatArray,
     noise: float,
+    network: RimNetwork | None = None,
 ) -> SecondLooks:
-    """Look a second time where no disc was found (see `detect.discs.second_kernels`).
+    """Look a second time where no disc was found (see `detect.discs.second_look`).
 
     Parameters
     ----------
@@ -224,6 +228,8 @@ def second_looks_at(
         Discs found already, metres.
     noise : float
         Of the image, grey levels.
+    network : RimNetwork, optional
+        Another than the trained one.
 
     Returns
     -------
@@ -235,14 +241,12 @@ def second_looks_at(
     index, features, place, covariance, evidence = second_looks(
         image,
         table.floor_xy,
-        centres.pixels,
-        centres.contrast,
-        centres.score,
+        centres,
         np.ascontiguousarray(found_xy),
         _disc_search(settings),
         float(_vote_step(weakest)),
-        fit_settings(noise, kernel.blur_ratio),
         kernel.numbers,
+        network or rim_network(),
     )
     return SecondLooks(
         centres.pixels[index],
@@ -301,6 +305,14 @@ def _disc_search(settings: CircleSettings) -> DiscSearch:
         pixel_variance=settings.systematic_px**2,
         tilt_variance=math.radians(settings.tilt_sigma_deg) ** 2,
     )
+
+
+def _first_search(settings: CircleSettings) -> DiscSearch:
+    """What the first look goes by: a second one behind it decides about doubtful discs."""
+    search = _disc_search(settings)
+    if not _looks_twice(settings):
+        return search
+    return search._replace(least_evidence=search.least_evidence + _DOUBTFUL)
 
 
 def disc_shape(settings: CircleSettings) -> DiscShape:

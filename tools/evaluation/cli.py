@@ -19,12 +19,14 @@ from detect.line_settings import PRESETS as LINE_PRESETS
 from detect.line_settings import LineSettings
 from detect.settings import CircleSettings
 from landmarks import FrameTilt
+from storage import write_whole
 from storage.exit_codes import exit_code_of
-from tools.evaluation.evidence_weights import gather, report
 from tools.evaluation.markers_command import Markers, MarkersCommand
 from tools.evaluation.markers_command import perform as evaluate_markers
 from tools.evaluation.published_lines import print_printed_lines
 from tools.evaluation.real_run import measure_run, table_of
+from tools.evaluation.rim_network_training import cross_validation, train
+from tools.evaluation.second_look_data import gather
 from tools.evaluation.tilt_of_discs import compare_tilts, report_of
 
 _BLURS_PX = (0.3, 0.7, 1.2)
@@ -131,8 +133,8 @@ class RealRun:
 
 
 @dataclass(frozen=True)
-class EvidenceWeights:
-    """Fit the weights of a second look at discs anew, and print what each source gains by them.
+class TrainRimNetwork:
+    """Train the network of the second look at discs, and print what it finds in unseen buildings.
 
     Parameters
     ----------
@@ -141,12 +143,18 @@ class EvidenceWeights:
     every : int
         Every n-th frame of the recorded run is used.
     seed : int
-        Of the disturbances.
+        Of the disturbances and the networks.
+    output : Path
+        Where the weights go, which replace `detect/discs/rim_network.npz`.
+    force : bool
+        Replace that file.
     """
 
     data: Positional[Path] = Path("../shared/data")
-    every: int = 3
+    every: int = 4
     seed: int = 1
+    output: Path = Path("build/rim_network.npz")
+    force: bool = False
 
 
 @dataclass(frozen=True)
@@ -218,7 +226,7 @@ def main(arguments: list[str] | None = None) -> int:
         | Annotated[Buildings, subcommand("buildings")]
         | Annotated[PublishedLines, subcommand("published-lines")]
         | Annotated[RealRun, subcommand("real-run")]
-        | Annotated[EvidenceWeights, subcommand("evidence-weights")]
+        | Annotated[TrainRimNetwork, subcommand("train-rim-network")]
         | Annotated[TiltOfDiscs, subcommand("tilt-of-discs")]
         | Annotated[RenderedLines, subcommand("rendered-lines")]
         | Annotated[Tilt, subcommand("tilt")]
@@ -237,7 +245,7 @@ def _carry_out(
     | Buildings
     | PublishedLines
     | RealRun
-    | EvidenceWeights
+    | TrainRimNetwork
     | TiltOfDiscs
     | RenderedLines
     | Tilt
@@ -261,9 +269,8 @@ def _carry_out(
         with tempfile.TemporaryDirectory() as folder:
             print(table_of(measure_run(command.run, Path(folder))))
         return 0
-    if isinstance(command, EvidenceWeights):
-        print(report(gather(command.data, command.every, command.seed)))
-        return 0
+    if isinstance(command, TrainRimNetwork):
+        return _train_rim_network(command)
     if isinstance(command, TiltOfDiscs):
         compared = compare_tilts(
             read_camera(command.camera),
@@ -278,6 +285,19 @@ def _carry_out(
     if isinstance(command, RenderedLines):
         return _rendered_lines(command)
     return _tilt(command)
+
+
+def _train_rim_network(command: TrainRimNetwork) -> int:
+    looks = gather(command.data, command.every, command.seed)
+    print(f"{len(looks.is_disc)} looks, {looks.is_disc.sum()} at discs")
+    for line in cross_validation(looks, command.seed):
+        print(line)
+    network = train(looks, np.ones(len(looks.is_disc), np.bool_), command.seed)
+    command.output.parent.mkdir(parents=True, exist_ok=True)
+    with write_whole(command.output, overwrite=command.force) as stream:
+        np.savez(stream, **network._asdict())
+    print(f"{command.output}: {sum(array.size for array in network)} weights")
+    return 0
 
 
 def _accuracy(command: Accuracy) -> int:

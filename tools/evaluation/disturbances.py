@@ -100,6 +100,63 @@ DISTURBANCES: dict[str, Callable[[_Place], _Disturbed]] = {
 }
 
 
+LOOK_ALIKES = ("square", "ring", "oval", "saucer", "plate")
+
+
+def _look_alike(p: _Place, kind: str) -> FloatArray:
+    """The floor with something else of the disc's grey value in the disc's place."""
+    width, height = p.rng.uniform([0.75, 0.75], [1.25, 1.25])
+    share = {
+        "square": p.side(width - np.abs(p.s)) * p.side(height - np.abs(p.t)),
+        "ring": p.side(1.0 - p.radius) * p.side(p.radius - p.rng.uniform(0.3, 0.85)),
+        "oval": p.side(1.0 - np.hypot(p.s / (0.7 * width), p.t / (1.2 * height))),
+        "saucer": p.side(p.rng.uniform(0.45, 0.75) - p.radius),
+        "plate": p.side(p.rng.uniform(1.3, 1.7) - p.radius),
+    }[kind]
+    bare = np.where(p.radius < 1.15, p.floor, p.grey)
+    return np.asarray(bare * (1.0 - share) + share * p.disc)
+
+
+def replaced(
+    image: NDArray[np.uint8],
+    floor_xy: NDArray[np.float32],
+    place: FloatArray,
+    radius: float,
+    kind: str,
+    rng: np.random.Generator,
+) -> NDArray[np.uint8]:
+    """An image with one of `LOOK_ALIKES` instead of a disc; parameters as of `disturbed`."""
+    window, p = _surroundings(image, floor_xy, place, radius, rng)
+    return _with(image, window, p, _look_alike(p, kind))
+
+
+_Window = tuple[slice, slice]
+
+
+def _surroundings(
+    image: NDArray[np.uint8],
+    floor_xy: NDArray[np.float32],
+    place: FloatArray,
+    radius: float,
+    rng: np.random.Generator,
+) -> tuple[_Window, _Place]:
+    offset = (floor_xy - place.astype(np.float32)) / np.float32(radius)
+    rows, columns = np.nonzero(np.hypot(offset[..., 0], offset[..., 1]) < _REACH)
+    window = slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1)
+    return window, _Place(image[window].astype(np.float64), offset[window].astype(np.float64), rng)
+
+
+def _with(
+    image: NDArray[np.uint8], window: _Window, p: _Place, grey: FloatArray
+) -> NDArray[np.uint8]:
+    """An image with other grey values about a disc, and noise where they are others."""
+    changed = np.abs(grey - p.grey) > 1.0
+    noisy = grey + changed * p.rng.normal(0.0, 0.8, grey.shape)
+    result = image.copy()
+    result[window] = np.clip(np.round(noisy), 0, 255).astype(np.uint8)
+    return result
+
+
 def disturbed(
     image: NDArray[np.uint8],
     floor_xy: NDArray[np.float32],
@@ -128,17 +185,9 @@ def disturbed(
     (H, W) uint8 or None
         None where too little of the disc is left to be seen.
     """
-    offset = (floor_xy - place.astype(np.float32)) / np.float32(radius)
-    rows, columns = np.nonzero(np.hypot(offset[..., 0], offset[..., 1]) < _REACH)
-    if len(rows) == 0:
-        return None
-    window = slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1)
-    p = _Place(image[window].astype(np.float64), offset[window].astype(np.float64), rng)
+    window, p = _surroundings(image, floor_xy, place, radius, rng)
     grey, hidden = DISTURBANCES[kind](p)
-    changed = np.abs(grey - p.grey) > 1.0
-    noisy = grey + changed * rng.normal(0.0, 0.8, grey.shape)
-    result = image.copy()
-    result[window] = np.clip(np.round(noisy), 0, 255).astype(np.uint8)
+    result = _with(image, window, p, grey)
     seen = 0
     angles = 2.0 * np.pi * np.arange(32) / 32
     for angle in angles:

@@ -1,4 +1,4 @@
-"""Weights of the evidence of a second look (`detect.discs.second_kernels`), fitted anew.
+"""Second looks of known truth (`detect.discs.second_look`), for training its network.
 
 Candidates come from rendered buildings with known truth, from discs of these and of real images
 that were disturbed (`tools.evaluation.disturbances`), and from a recorded run with its map: there
@@ -10,60 +10,83 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize
 
 from camera import Camera, read_camera
 from camera.calibration.floor import with_pose
+from camera.kernels import camera_numbers
 from detect.circles import candidates_of, detect_circles, disc_shape, second_looks_at
-from detect.discs.second_kernels import FEATURES
+from detect.discs.rim import DIRECTIONS, STEPS, profiles
+from detect.discs.rim_network import INPUTS, SCALES, RimNetwork
+from detect.discs.second_look import FEATURES
 from detect.noise import estimate_noise
 from detect.settings import CircleSettings
 from lut import DiscTable, cached_disc_table
-from tools.evaluation.disturbances import DISTURBANCES, disturbed
+from tools.evaluation.disturbances import DISTURBANCES, LOOK_ALIKES, disturbed, replaced
 
 FloatArray = NDArray[np.float64]
 
 _SETTINGS = CircleSettings(polarity="light")
 #: There is no second look with these.
 _FIRST = CircleSettings(polarity="any")
-#: Of the weights about 0: one over its variance.
-_RIDGE = 3.0
-#: A row of a real image that is no disc counts as much as so many others.
-_REAL_WEIGHT, _DISTURBED_WEIGHT = 2.0, 0.3
+#: Of a disc, metres.
+_RADIUS = 0.1
+#: How much a row counts that is a disturbed disc, or no disc on a real image.
+_DISTURBED_WEIGHT, _REAL_WEIGHT = 0.2, 0.4
+#: How often discs of a frame are disturbed, and how many each time.
+_ROUNDS, _PER_ROUND = 6, 3
+#: Views of each rim, and how far all but the first are off its place (metres) and size (relative).
+_VIEWS, _OFF_PLACE, _OFF_SIZE = 5, 0.007, 0.06
 
 
-@dataclass(frozen=True)
-class Looks:
+def _network_by_rim() -> RimNetwork:
+    """Prefers, of the looks at one place, the one with most of a rim."""
+    shapes = (1, 3, INPUTS, 1), (1, 1), (1, 3, 1, 1), (1, 1), (1, 3 + SCALES, 1), (1, 1)
+    out = np.zeros((1, 1 + len(FEATURES)), np.float32)
+    out[0, 1 + FEATURES.index("rim")] = 1.0
+    return RimNetwork._make(
+        [*(np.zeros(shape, np.float32) for shape in shapes), out, np.zeros(1, np.float32)]
+    )
+
+
+_NOWHERE = np.zeros((0, 4))
+
+
+class Looks(NamedTuple):
     """Second looks of known truth.
 
     Attributes
     ----------
     features : (N, F) float64
+        Of the rims.
+    grey : (N, V, DIRECTIONS, STEPS) float32
+    pixels_per_radius : (N, V, DIRECTIONS) float32
+        Profiles of the rims (`detect.discs.rim.profiles`), seen from V places nearby.
     is_disc : (N,) bool
     weight : (N,) float64
     source : (N,) str
-    frame : (N,) int64
-    place : (N, 2) float64
-        Metres.
     """
 
     features: FloatArray
+    grey: NDArray[np.float32]
+    pixels_per_radius: NDArray[np.float32]
     is_disc: NDArray[np.bool_]
     weight: FloatArray
     source: NDArray[np.str_]
-    frame: NDArray[np.int64]
-    place: FloatArray
+
+
+_BY_RIM = _network_by_rim()
 
 
 class _Gathering:
-    def __init__(self) -> None:
-        self.rows: list[tuple[FloatArray, bool, float, str, int, FloatArray]] = []
+    def __init__(self, rng: np.random.Generator) -> None:
+        self._rng = rng
+        self.rows: list[tuple[FloatArray, FloatArray, FloatArray, bool, float, str]] = []
 
     def add(
         self,
@@ -73,29 +96,47 @@ class _Gathering:
         unsure: FloatArray,
         weight: tuple[float, float],
         source: str,
-        frame: int,
+        only: bool = False,
     ) -> None:
-        """Looks at an image with discs and unsure places in pixels: u, v, half width and height."""
+        """Look at an image with discs and unsure places in pixels: u, v, half width and height.
+
+        With `only`, the places are known to be of something else, and nothing else counts.
+        """
         camera, table = view
         noise = estimate_noise(image, 32)
         centres = candidates_of(image, table, _SETTINGS, 0.0)
         found = detect_circles(image, camera, table, _FIRST)
-        looks = second_looks_at(image, camera, table, _SETTINGS, centres, found.floor_xy, noise)
+        looks = second_looks_at(
+            image, camera, table, _SETTINGS, centres, found.floor_xy, noise, _BY_RIM
+        )
         pixels = camera.project_floor(looks.place)
         for features, place, uv in zip(looks.features, looks.place, pixels, strict=True):
             if not np.isfinite(features).all():
                 continue
             near, far = _nearest(uv, discs), _nearest(uv, unsure)
-            if near < 0.6 and weight[0] > 0.0:
-                self.rows.append((features, True, weight[0], source, frame, place))
-            elif near > 1.5 and far > 1.5 and weight[1] > 0.0:
-                self.rows.append((features, False, weight[1], source, frame, place))
+            is_disc, is_other = near < 0.6, far < 0.6 if only else min(near, far) > 1.5
+            counts = weight[0] if is_disc else weight[1]
+            if (is_disc or is_other) and counts > 0.0:
+                views = self._views(image, camera, place)
+                self.rows.append((features, *views, is_disc, counts, source))
+
+    def _views(
+        self, image: NDArray[np.uint8], camera: Camera, place: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        grey, scale = np.empty((_VIEWS, DIRECTIONS, STEPS)), np.empty((_VIEWS, DIRECTIONS))
+        off = self._rng.normal(size=(_VIEWS, 3)) * [_OFF_PLACE, _OFF_PLACE, _OFF_SIZE]
+        off[0] = 0.0
+        numbers = camera_numbers(camera)
+        for k, (dx, dy, size) in enumerate(off):
+            radius = _RADIUS * (1.0 + size)
+            grey[k], scale[k] = profiles(image, numbers, place[0] + dx, place[1] + dy, radius)
+        return grey, scale
 
     def looks(self) -> Looks:
-        features, is_disc, weight, source, frame, place = zip(*self.rows, strict=True)
+        features, grey, scale, is_disc, weight, source = zip(*self.rows, strict=True)
         return Looks(
-            np.array(features), np.array(is_disc), np.array(weight), np.array(source),
-            np.array(frame), np.array(place),
+            np.array(features), np.array(grey, np.float32), np.array(scale, np.float32),
+            np.array(is_disc), np.array(weight), np.array(source),
         )  # fmt: skip
 
 
@@ -109,7 +150,7 @@ def _nearest(uv: FloatArray, places: FloatArray) -> float:
 def _images(camera: Camera, places: FloatArray, slack_px: float) -> FloatArray:
     """(N, 4) pixel, half width and half height of discs."""
     angle = np.linspace(0.0, 2.0 * np.pi, 24)
-    rim = 0.1 * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    rim = _RADIUS * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     rows = []
     for place in places.reshape(-1, 2):
         outline = camera.project_floor(place + rim)
@@ -123,7 +164,7 @@ def _images(camera: Camera, places: FloatArray, slack_px: float) -> FloatArray:
 def gather(data: Path, every: int, seed: int) -> Looks:
     """Look at all sources of a folder of data (see `docs/measured.md`); every n-th real frame."""
     rng = np.random.default_rng(seed)
-    gathering = _Gathering()
+    gathering = _Gathering(rng)
     for folder in sorted((data / "rendered").glob("r*")):
         camera = read_camera(folder / f"{folder.name}.cam")
         view = camera, cached_disc_table(camera, disc_shape(_SETTINGS))
@@ -140,8 +181,8 @@ def gather(data: Path, every: int, seed: int) -> Looks:
             ]
             sure = np.array([a for mandatory, a in at if mandatory]).reshape(-1, 4)
             unsure = np.array([a for mandatory, a in at if not mandatory]).reshape(-1, 4)
-            gathering.add(image, view, sure, unsure, (1.0, 1.0), folder.name, frame["index"])
-            _add_disturbed(gathering, image, view, rng, f"{folder.name} disturbed", frame["index"])
+            gathering.add(image, view, sure, unsure, (1.0, 1.0), folder.name)
+            _add_disturbed(gathering, image, view, rng, f"{folder.name} disturbed")
     run = data / "dlr"
     camera = read_camera(run / "e" / "e.cam")
     view = camera, cached_disc_table(camera, disc_shape(_SETTINGS))
@@ -151,9 +192,9 @@ def gather(data: Path, every: int, seed: int) -> Looks:
             continue
         image = _read(path)
         places = np.zeros((0, 4))
-        gathering.add(image, view, places, mapped, (0.0, _REAL_WEIGHT), "real", number)
+        gathering.add(image, view, places, mapped, (0.0, _REAL_WEIGHT), "real")
         if number % (3 * every) == 0:
-            _add_disturbed(gathering, image, view, rng, "real disturbed", number)
+            _add_disturbed(gathering, image, view, rng, "real disturbed")
     return gathering.looks()
 
 
@@ -163,18 +204,23 @@ def _add_disturbed(
     view: tuple[Camera, DiscTable],
     rng: np.random.Generator,
     source: str,
-    frame: int,
 ) -> None:
     found = detect_circles(image, *view, _FIRST)
     clear = np.flatnonzero(found.evidence > 4.0)
-    for i in rng.permutation(clear)[:3]:
+    for i in (i for _ in range(_ROUNDS) for i in rng.permutation(clear)[:_PER_ROUND]):
+        at = found.floor_xy[i]
+        place = _images(view[0], at, 0.0)
         kind = str(rng.choice(list(DISTURBANCES)))
-        changed = disturbed(image, view[1].floor_xy, found.floor_xy[i], 0.1, kind, rng)
+        changed = disturbed(image, view[1].floor_xy, at, _RADIUS, kind, rng)
         if changed is not None:
-            disc = _images(view[0], found.floor_xy[i], 0.0)
-            gathering.add(
-                changed, view, disc, np.zeros((0, 4)), (_DISTURBED_WEIGHT, 0.0), source, frame
-            )
+            gathering.add(changed, view, place, _NOWHERE, (_DISTURBED_WEIGHT, 0.0), source)
+        kind = str(rng.choice(LOOK_ALIKES))
+        other = replaced(image, view[1].floor_xy, at, _RADIUS, kind, rng)
+        if rng.random() < 0.5:
+            kind = str(rng.choice(list(DISTURBANCES)))
+            other = disturbed(other, view[1].floor_xy, at, _RADIUS, kind, rng)
+        if other is not None:
+            gathering.add(other, view, _NOWHERE, place, (0.0, _DISTURBED_WEIGHT), source, only=True)
 
 
 def _mapped(run: Path) -> Iterator[tuple[str, FloatArray]]:
@@ -196,48 +242,3 @@ def _mapped(run: Path) -> Iterator[tuple[str, FloatArray]]:
 
 def _read(path: Path) -> NDArray[np.uint8]:
     return np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), np.uint8)
-
-
-def fit_weights(looks: Looks, used: NDArray[np.bool_]) -> FloatArray:
-    """(1 + F,) constant and weights of the logistic regression on some looks."""
-    terms = np.c_[np.ones(used.sum()), looks.features[used]]
-    target, weight = looks.is_disc[used].astype(np.float64), looks.weight[used]
-
-    def cost(b: FloatArray) -> tuple[float, FloatArray]:
-        odds = terms @ b
-        ridge = np.append(0.0, b[1:])
-        value = float(weight @ (np.logaddexp(0.0, odds) - target * odds))
-        slope = terms.T @ (weight * (1.0 / (1.0 + np.exp(-odds)) - target))
-        return value + 0.5 * _RIDGE * float(ridge @ ridge), slope + _RIDGE * ridge
-
-    start = np.zeros(terms.shape[1])
-    return np.asarray(minimize(cost, start, jac=True, method="L-BFGS-B").x)
-
-
-def report(looks: Looks) -> str:
-    """Weights, and what they do to each source when it was left out of fitting them."""
-    every = np.ones(len(looks.is_disc), np.bool_)
-    lines = [
-        f"{len(every)} looks, {looks.is_disc.sum()} at discs",
-        "name weight",
-    ]
-    weights = fit_weights(looks, every)
-    lines += [f"{n} {w:.2f}" for n, w in zip(("constant", *FEATURES), weights, strict=True)]
-    buildings = np.array([s.split()[0] for s in looks.source])
-    for left_out in np.unique(buildings):
-        own = buildings == left_out
-        halves = [own & (looks.frame % 20 < 10), own & (looks.frame % 20 >= 10)]
-        parts = halves if left_out == "real" else [own]
-        odds = np.full(len(own), np.nan)
-        for part in parts:
-            b = fit_weights(looks, ~part)
-            odds[part] = b[0] + looks.features[part] @ b[1:]
-        for source in np.unique(looks.source[own]):
-            of = looks.source == source
-            discs, others = odds[of & looks.is_disc], odds[of & ~looks.is_disc]
-            text = ", ".join(
-                f">= {t:g}: {(discs >= t).sum()}/{len(discs)} discs, {(others >= t).sum()} others"
-                for t in (-1.5, -1.0, -0.5, 0.0, 0.5, 1.0)
-            )
-            lines.append(f"left out {source}: {text}")
-    return "\n".join(lines)

@@ -1,0 +1,63 @@
+"""Training of the network of the second look: its gradient, and that it learns what is there."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from detect.discs.rim import DIRECTIONS, STEPS
+from detect.discs.rim_network import network_inputs, network_log_odds
+from tools.evaluation import rim_network_training as training
+from tools.evaluation.second_look_data import Looks
+
+
+def looks_of(count: int, seed: int) -> Looks:
+    """Half of them discs, whose outer steps are darker; their features say nothing."""
+    rng = np.random.default_rng(seed)
+    is_disc = np.arange(count) % 2 == 0
+    grey = 120.0 + rng.normal(0.0, 8.0, (count, 2, DIRECTIONS, STEPS))
+    grey[is_disc, :, :, STEPS // 2 :] -= 40.0
+    return Looks(
+        rng.normal(size=(count, 3)), grey.astype(np.float32),
+        rng.uniform(4.0, 9.0, (count, 2, DIRECTIONS)).astype(np.float32),
+        is_disc, np.ones(count), np.full(count, "here"),
+    )  # fmt: skip
+
+
+def test_the_gradient_is_that_of_finite_differences() -> None:
+    looks = looks_of(6, 1)
+    batch = training.batch_of(
+        looks.grey[:, 0], looks.pixels_per_radius[:, 0], looks.features.astype(np.float32)
+    )
+    rng = np.random.default_rng(2)
+    member = training._Member(3, rng)
+    member.weights = [w + 0.05 * rng.normal(size=w.shape) for w in member.weights]
+    d_odds = rng.normal(size=6)
+    member.log_odds(batch)
+    gradient = member.gradient(d_odds)
+    for layer, slopes in zip(member.weights, gradient, strict=True):
+        assert slopes.shape == layer.shape
+        for _ in range(5):
+            at = tuple(rng.integers(n) for n in layer.shape)
+            before, sums = layer[at], []
+            for step in (-1e-6, 1e-6):
+                layer[at] = before + step
+                sums.append(d_odds @ member.log_odds(batch))
+            layer[at] = before
+            assert (sums[1] - sums[0]) / 2e-6 == pytest.approx(slopes[at], rel=1e-4, abs=1e-6)
+
+
+def test_training_learns_and_the_detector_computes_the_same(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(training, "MEMBERS", 2)
+    looks, unseen = looks_of(400, 3), looks_of(40, 4)
+    network = training.train(looks, np.ones(400, np.bool_), 1)
+    grey, scale = unseen.grey[:, 0], unseen.pixels_per_radius[:, 0]
+    batch = training.batch_of(grey, scale, unseen.features.astype(np.float32))
+    odds = training.log_odds(network, batch)
+    assert ((odds > 0.0) == unseen.is_disc).all()
+    for k in range(5):
+        inputs = network_inputs(grey[k].astype(np.float64), scale[k].astype(np.float64), 1.0)
+        found = network_log_odds(*inputs, unseen.features[k], network)
+        assert found == pytest.approx(odds[k], abs=1e-3)
