@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.markers.candidates import Mask
+from detect.markers.candidates import Mask, Region
 from detect.markers.refinement import RefinedQuadrangle
-from detect.markers.regions import Region
 from landmarks import MarkerCorner, MarkerLandmark
 
 FloatArray = NDArray[np.float64]

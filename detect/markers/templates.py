@@ -9,12 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from detect.markers.dictionaries import MarkerDictionary, marker_dictionary
+from detect.markers.settings import MarkerSettings
 
 FloatArray = NDArray[np.float64]
 
 #: A random pattern is one of the dictionary's with a probability of 2 to the power of minus this:
 #: in strong dictionaries, and in weak ones.
 _STRONG_BITS, _WEAK_BITS = 24.0, 14.0
+
+#: Size of the cells and the margin of a specimen.
+_CELL_PX, _MARGIN_PX = 5, 20
 
 #: Blurs for which templates are kept, in cells.
 _BLURS_CELLS = (0.2, 0.35, 0.5, 0.7, 1.0)
@@ -66,19 +70,17 @@ class Templates:
     first: int
     border: float
 
+    @property
+    def grid(self) -> slice:
+        """Rows, and columns, of the grid among the cells between the lines."""
+        return slice(self.first, self.first + self.dictionary.patterns.shape[-1])
+
     def blackness(self, template: int) -> FloatArray:
         """(L - 1, L - 1) pattern of a template between the lines, 1 for black."""
         side = self.dictionary.patterns.shape[-1]
         result = np.ones((len(self.lines) - 1,) * 2)
-        inner = slice(self.first, self.first + side)
-        result[inner, inner] = 1.0 - self.cells[template].reshape(side, side)
+        result[self.grid, self.grid] = 1.0 - self.cells[template].reshape(side, side)
         return result
-
-    def grid_of(self, between_lines: FloatArray) -> FloatArray:
-        """(G * G,) the grid's part of values given for all cells between the lines."""
-        side = self.dictionary.patterns.shape[-1]
-        inner = slice(self.first, self.first + side)
-        return np.ascontiguousarray(between_lines[inner, inner]).ravel()
 
     def nearest_blur(self, blur_cells: float) -> NDArray[np.float32]:
         """The normalised templates of the blur next to the given one."""
@@ -215,3 +217,17 @@ def _border(dictionary: MarkerDictionary, first_edge: float) -> float:
     ):  # fmt: skip
         rings += 1
     return first_edge + rings * dictionary.cell
+
+
+def specimen_image(settings: MarkerSettings) -> NDArray[np.uint8]:
+    """A grey image of one of the expected markers on white, seen from the front."""
+    templates = templates_of(settings.dictionary, settings.ids)
+    widths = np.diff(templates.lines) / templates.dictionary.cell
+    pixels = np.maximum(1, np.rint(widths * _CELL_PX)).astype(np.intp)
+    black = np.repeat(np.repeat(templates.blackness(0), pixels, axis=0), pixels, axis=1)
+    grey = np.where(np.pad(black, _MARGIN_PX) > 0.5, 40.0, 200.0)
+    # Soft edges, as all images have them: a mean over 3 x 3 pixels.
+    soft = np.pad(grey, 1, mode="edge")
+    height, width = grey.shape
+    total = sum(soft[j : j + height, i : i + width] for j in range(3) for i in range(3))
+    return np.asarray(np.rint(total / 9.0), np.uint8)

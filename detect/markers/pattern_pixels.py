@@ -1,4 +1,4 @@
-"""Compiled choice of the pixels that a marker is fitted to."""
+"""Choice of the pixels that a marker is fitted to."""
 
 from __future__ import annotations
 
@@ -9,9 +9,38 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from detect.markers.homography_kernels import inverse_3x3, square_homography
-from detect.markers.lens_kernels import straightened
-from detect.markers.pattern_residual_kernels import Samples
+from detect.markers.homography import inverse_3x3, square_homography
+from detect.markers.lens import Picture, straightened
+from detect.markers.quadrangle import signed_area
+
+FloatArray = NDArray[np.float64]
+
+
+class Samples(NamedTuple):
+    """Pixels to which a marker is fitted, row by row.
+
+    Attributes
+    ----------
+    pixel : (N, 2) int32
+        u, v.
+    straight : (N, 2) float64
+        Their positions without distortion, pixels.
+    grey : (N,) float64
+        Grey values.
+    """
+
+    pixel: NDArray[np.int32]
+    straight: FloatArray
+    grey: FloatArray
+
+
+class PixelBox(NamedTuple):
+    """First and last column, first and last row."""
+
+    left: int
+    right: int
+    top: int
+    bottom: int
 
 
 class Seam(NamedTuple):
@@ -32,28 +61,47 @@ class Seam(NamedTuple):
     most_pixels: int
 
 
+def pixel_box(picture: Picture, corners: FloatArray, seam: float) -> PixelBox | None:
+    """The pixels of a marker with its seam; None if it leaves the image."""
+    homography = square_homography(corners)
+    along = np.linspace(0.0, 1.0, 5)
+    zero, one = np.zeros(5), np.ones(5)
+    sides = ((along, zero), (one, along), (along, one), (zero, along))
+    outline = np.concatenate([np.stack(side, axis=-1) for side in sides])
+    straight = outline @ homography[:2, :2].T + homography[:2, 2]
+    straight /= (outline @ homography[2, :2] + 1.0)[:, None]
+    pixels = picture.lens.bend(straight)
+    if not np.all(np.isfinite(pixels)):
+        return None
+    height, width = picture.grey.shape
+    low, high = pixels.min(axis=0), pixels.max(axis=0)
+    if low.min() < 0.0 or high[0] > width - 1.0 or high[1] > height - 1.0:
+        return None
+    reach = 1.5 * seam + 2.0
+    return PixelBox(
+        max(0, int(low[0] - reach)),
+        min(width - 1, int(high[0] + reach)),
+        max(0, int(low[1] - reach)),
+        min(height - 1, int(high[1] + reach)),
+    )
+
+
 @njit(cache=True, error_model="numpy")
 def select_pixels(
-    image: NDArray[np.uint8],
-    grid: NDArray[np.float64],
-    step: float,
-    corners: NDArray[np.float64],
-    box: NDArray[np.int64],
-    lines: NDArray[np.float64],
-    seam: Seam,
+    picture: Picture, corners: FloatArray, lines: FloatArray, box: PixelBox, seam: Seam
 ) -> Samples:
     """Pixels of a marker and of a seam round it.
 
     Parameters
     ----------
-    image, grid, step
-        The image and its lens.
+    picture : Picture
+        The image.
     corners : (4, 2) float64
         Straight pixels.
-    box : (4,) int64
-        First and last column, first and last row to look at (within the image).
     lines : (L,) float64
         Where cells end, in widths of the marker.
+    box : PixelBox
+        Where to look.
     seam : Seam
         How far from the marker, and how many pixels.
 
@@ -62,15 +110,12 @@ def select_pixels(
     Samples
     """
     reach, near, limit = seam.reach, seam.near, seam.most_pixels
-    most = (box[1] - box[0] + 1) * (box[3] - box[2] + 1)
+    most = (box.right - box.left + 1) * (box.bottom - box.top + 1)
     pixels = np.empty((most, 2), np.int32)
     straight = np.empty((most, 2))
     grey = np.empty(most)
     inverse = inverse_3x3(square_homography(corners))
-    area = 0.0
-    for k in range(4):
-        j = (k + 1) % 4
-        area += 0.5 * (corners[k, 0] * corners[j, 1] - corners[j, 0] * corners[k, 1])
+    area = signed_area(corners)
     expected = area + reach * 4.0 * math.sqrt(area)
     thin = expected > limit
     every = 1
@@ -81,9 +126,9 @@ def select_pixels(
         share = 1.0 - (1.0 - inner) ** 2
         every = max(1, math.ceil(expected * (share + 0.1) / limit))
     count = 0
-    for v in range(box[2], box[3] + 1):
-        for u in range(box[0], box[1] + 1):
-            x, y, _, _, _, _ = straightened(grid, step, float(u), float(v))
+    for v in range(box.top, box.bottom + 1):
+        for u in range(box.left, box.right + 1):
+            x, y, _, _, _, _ = straightened(picture.lens, float(u), float(v))
             q = inverse[2, 0] * x + inverse[2, 1] * y + inverse[2, 2]
             if q <= 0.0:
                 continue
@@ -114,6 +159,6 @@ def select_pixels(
             pixels[count, 1] = v
             straight[count, 0] = x
             straight[count, 1] = y
-            grey[count] = image[v, u]
+            grey[count] = picture.grey[v, u]
             count += 1
     return Samples(pixels[:count], straight[:count], grey[:count])

@@ -1,4 +1,4 @@
-"""Compiled model of a marker: the grey values of a pattern, blurred and lit.
+"""Model of a marker: the grey values of a pattern, blurred and lit.
 
 A pattern of black and white cells on the marker's plane is seen through a homography, blurred by a
 Gaussian of any shape (optics, motion and the pixel itself) and lit unevenly. The blurred pattern is
