@@ -117,25 +117,9 @@ def detect_markers(
     templates = templates_of(settings.dictionary, settings.ids)
     picture = picture_of(image, camera)
     lens = picture.lens
-    rejected: Counter[str] = Counter()
-    masks: list[Mask] = []
 
     # Phases 1 and 2: dark regions that may be markers, and their rough corners.
-    quadrangles: list[tuple[Region, FloatArray]] = []
-    layers = candidate_layers(picture.grey, settings)
-    for layer in layers:
-        for mask in dark_masks(layer, picture.noise, settings):
-            regions, causes = marker_regions(
-                mask, templates.dictionary, settings, last=layer is layers[-1]
-            )
-            rejected += causes
-            masks += [mask] if keep_masks else []
-            for region in regions:
-                corners = _rough_quadrangle(region, lens, settings)
-                if isinstance(corners, str):
-                    rejected[corners] += 1
-                else:
-                    quadrangles.append((region, corners))
+    quadrangles, rejected, masks = _quadrangles(picture, templates, settings)
 
     # Phase 3: the edges in the image itself, and which marker it is.
     markers: list[_Marker] = []
@@ -178,8 +162,31 @@ def detect_markers(
         explained=np.array([m.explained for m in markers]),
         candidates=tuple(candidates),
         rejected=+rejected,
-        masks=tuple(masks),
+        masks=tuple(masks) if keep_masks else (),
     )
+
+
+def _quadrangles(
+    picture: Picture, templates: Templates, settings: MarkerSettings
+) -> tuple[list[tuple[Region, FloatArray]], Counter[str], list[Mask]]:
+    """Regions with their rough corners; how many were rejected, by cause; all masks."""
+    found, masks = [], []
+    rejected: Counter[str] = Counter()
+    layers = candidate_layers(picture.grey, settings)
+    for layer in layers:
+        for mask in dark_masks(layer, picture.noise, settings):
+            masks.append(mask)
+            regions, causes = marker_regions(
+                mask, templates.dictionary, settings, last=layer is layers[-1]
+            )
+            rejected += causes
+            for region in regions:
+                corners = _rough_quadrangle(region, picture.lens, settings)
+                if isinstance(corners, str):
+                    rejected[corners] += 1
+                else:
+                    found.append((region, corners))
+    return found, rejected, masks
 
 
 def _corners(markers: list[_Marker]) -> FloatArray:

@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from detect.markers.homography import square_homography
+from detect.markers.homography import project, square_homography
 from detect.markers.lens import Picture, bent, middle_pixel, straightened
 from detect.positive_definite import invert_positive, solve_positive
 
@@ -169,9 +169,7 @@ def _border_thickness(corners: FloatArray, border: float) -> FloatArray:
     for k in range(4):
         mx = 0.5 if k % 2 == 0 else (1.0 - border if k == 1 else border)
         my = 0.5 if k % 2 == 1 else (border if k == 0 else 1.0 - border)
-        w = homography[2, 0] * mx + homography[2, 1] * my + 1.0
-        x = (homography[0, 0] * mx + homography[0, 1] * my + homography[0, 2]) / w
-        y = (homography[1, 0] * mx + homography[1, 1] * my + homography[1, 2]) / w
+        x, y, _ = project(homography, mx, my)
         p0 = corners[k]
         p1 = corners[(k + 1) % 4]
         length = math.hypot(p1[0] - p0[0], p1[1] - p0[1])

@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from detect.markers.homography import square_homography
+from detect.markers.homography import project, square_homography
 from detect.markers.lens import Picture, bent, middle_pixel
 from detect.markers.pattern_fit import PatternFit
 from detect.markers.settings import MarkerSettings
@@ -106,11 +106,7 @@ def _sample_cells(
             total = 0.0
             for b in range(-1, 2):
                 for a in range(-1, 2):
-                    mx = centres[i] + a * spread
-                    my = centres[j] + b * spread
-                    w = homography[2, 0] * mx + homography[2, 1] * my + 1.0
-                    x = (homography[0, 0] * mx + homography[0, 1] * my + homography[0, 2]) / w
-                    y = (homography[1, 0] * mx + homography[1, 1] * my + homography[1, 2]) / w
+                    x, y, _ = project(homography, centres[i] + a * spread, centres[j] + b * spread)
                     u, v = bent(picture.lens, x, y, guess)
                     if not (0.0 <= u <= width - 1.0 and 0.0 <= v <= height - 1.0):
                         return False

@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from detect.markers.homography import inverse_3x3, square_homography
+from detect.markers.homography import inverse_3x3, project, square_homography
 from detect.markers.lens import Picture, straightened
 from detect.markers.quadrangle import signed_area
 
@@ -129,21 +129,13 @@ def select_pixels(
     for v in range(box.top, box.bottom + 1):
         for u in range(box.left, box.right + 1):
             x, y, _, _, _, _ = straightened(picture.lens, float(u), float(v))
-            q = inverse[2, 0] * x + inverse[2, 1] * y + inverse[2, 2]
-            if q <= 0.0:
+            mx, my, q = project(inverse, x, y)
+            if q <= 0.0 or mx < -1.0 or mx > 2.0 or my < -1.0 or my > 2.0:
                 continue
-            mx = (inverse[0, 0] * x + inverse[0, 1] * y + inverse[0, 2]) / q
-            my = (inverse[1, 0] * x + inverse[1, 1] * y + inverse[1, 2]) / q
-            if mx < -1.0 or mx > 2.0 or my < -1.0 or my > 2.0:
-                continue
-            gx = (
-                math.hypot(inverse[0, 0] - mx * inverse[2, 0], inverse[0, 1] - mx * inverse[2, 1])
-                / q
-            )
-            gy = (
-                math.hypot(inverse[1, 0] - my * inverse[2, 0], inverse[1, 1] - my * inverse[2, 1])
-                / q
-            )
+            gx = math.hypot(inverse[0, 0] - mx * inverse[2, 0], inverse[0, 1] - mx * inverse[2, 1])
+            gy = math.hypot(inverse[1, 0] - my * inverse[2, 0], inverse[1, 1] - my * inverse[2, 1])
+            gx /= q
+            gy /= q
             if max(-mx, mx - 1.0) > reach * gx or max(-my, my - 1.0) > reach * gy:
                 continue
             if thin:

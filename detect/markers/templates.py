@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import functools
+import itertools
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -179,18 +181,12 @@ def _decoys(
     varied = np.asarray(dictionary.patterns.any(axis=0))
     rows, columns = np.flatnonzero(varied.any(axis=1)), np.flatnonzero(varied.any(axis=0))
     top, left, height, width = rows[0], columns[0], len(rows), len(columns)
-    inner = [np.zeros((height, width), bool), np.ones((height, width), bool)]
-    for begin in range(width):
-        for end in range(begin + 1, width + 1):
-            bar = np.zeros((height, width), bool)
-            bar[:, begin:end] = True
-            inner += [bar, ~bar]
-    for begin in range(height):
-        for end in range(begin + 1, height + 1):
-            bar = np.zeros((height, width), bool)
-            bar[begin:end] = True
-            inner += [bar, ~bar]
     j, i = np.indices((height, width))
+    inner = [np.zeros((height, width), bool), np.ones((height, width), bool)]
+    for place, count in ((i, width), (j, height)):
+        for begin, end in itertools.combinations(range(count + 1), 2):
+            bar = (place >= begin) & (place < end)
+            inner += [bar, ~bar]
     for thick in range(1, max(2, width // 2)):
         for shift in range(thick):
             column, row = (i + shift) // thick % 2 == 0, (j + shift) // thick % 2 == 0
@@ -226,8 +222,5 @@ def specimen_image(settings: MarkerSettings) -> NDArray[np.uint8]:
     pixels = np.maximum(1, np.rint(widths * _CELL_PX)).astype(np.intp)
     black = np.repeat(np.repeat(templates.blackness(0), pixels, axis=0), pixels, axis=1)
     grey = np.where(np.pad(black, _MARGIN_PX) > 0.5, 40.0, 200.0)
-    # Soft edges, as all images have them: a mean over 3 x 3 pixels.
-    soft = np.pad(grey, 1, mode="edge")
-    height, width = grey.shape
-    total = sum(soft[j : j + height, i : i + width] for j in range(3) for i in range(3))
-    return np.asarray(np.rint(total / 9.0), np.uint8)
+    # Soft edges, as all images have them.
+    return np.asarray(np.rint(cv2.blur(grey, (3, 3))), np.uint8)
