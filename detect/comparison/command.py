@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import sys
 
-from rich.console import Console, Group
+from rich.console import Console
 
 from camera import read_camera
 from detect.comparison.circles import Sight, beside_reference, compare_runs
 from detect.comparison.lines import compare_line_runs
-from detect.comparison.lines_report import format_line_json, line_comparison_tables
-from detect.comparison.lines_result import LineCompareOptions
 from detect.comparison.report import comparison_tables, format_json
-from detect.comparison.result import Rates, unmet_demands
+from detect.comparison.result import (
+    Comparison,
+    LineCompareOptions,
+    LineComparison,
+    unmet_demands,
+)
 from detect.drawing.head import read_head
 from detect.errors import DetectError
 from detect.options import Compare
@@ -24,11 +27,11 @@ from storage.exit_codes import EXIT_ERROR
 def perform(command: Compare) -> int:
     """Compare rows with reference rows; returns the exit code."""
     _demand_rows(command)
-    tables, text, result = _compared_lines(command) if command.lines else _compared_discs(command)
-    Console().print(tables)
+    result = _compared_lines(command) if command.lines else _compared_discs(command)
+    Console().print(comparison_tables(result))
     if command.json is not None:
         with write_whole(command.json, overwrite=command.force) as stream:
-            stream.write(text.encode())
+            stream.write(format_json(result).encode())
     unmet = unmet_demands(
         result, min_recall=command.min_recall, min_precision=command.min_precision
     )
@@ -55,12 +58,11 @@ def _demand_rows(command: Compare) -> None:
         )
 
 
-def _compared_discs(command: Compare) -> tuple[Group, str, Rates]:
-    """The tables, the JSON and the result of a comparison of discs."""
+def _compared_discs(command: Compare) -> Comparison:
     sight = _sight(command)
     if sight is None and not command.options.on_floor:
         print("no calibration: positions are compared on the floor; --camera names one")
-    result = compare_runs(
+    return compare_runs(
         command.run,
         reference=command.reference,
         detected=command.detected,
@@ -70,7 +72,6 @@ def _compared_discs(command: Compare) -> tuple[Group, str, Rates]:
             command.reference or command.run / "map.circles", command.unlisted, command.lookalikes
         ),
     )
-    return comparison_tables(result), format_json(result), result
 
 
 def _sight(command: Compare) -> Sight | None:
@@ -83,15 +84,13 @@ def _sight(command: Compare) -> Sight | None:
     return Sight(camera, detected.circle_settings.radius_m, reference.level)
 
 
-def _compared_lines(command: Compare) -> tuple[Group, str, Rates]:
-    """The tables, the JSON and the result of a comparison of verticals."""
+def _compared_lines(command: Compare) -> LineComparison:
     options = LineCompareOptions(
         tolerance_deg=command.tolerance_deg,
         sigmas=command.sigmas,
         only_identified=command.options.only_identified,
         all_frames=command.options.all_frames,
     )
-    result = compare_line_runs(
+    return compare_line_runs(
         command.run, reference=command.reference, detected=command.detected, options=options
     )
-    return line_comparison_tables(result), format_line_json(result), result

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.comparison.lines_result import LineCompareOptions
+from detect.comparison.result import LineCompareOptions
 from detect.drawing.frame import draw_rows
 from detect.drawing.inputs import find_files, open_rows, picture_name
 from detect.drawing.selection import select_frames

@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from camera import Camera
 from detect.comparison.circles import pair_discs
 from detect.comparison.lines import joined_lines, pair_lines
-from detect.comparison.lines_result import LineCompareOptions
-from detect.comparison.result import CompareOptions
+from detect.comparison.result import CompareOptions, LineCompareOptions
 from detect.drawing.detections import EDGE_COLOUR, outline_disc
 from detect.drawing.inputs import SeenRows
 from detect.drawing.strokes import Colour, canvas_of, draw_curve, draw_text, enlargement

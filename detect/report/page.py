@@ -11,7 +11,7 @@ from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 
 from detect.comparison.circles import FLOOR_GATE_M
-from detect.comparison.tables import number
+from detect.comparison.report import number
 from detect.drawing.inputs import picture_name
 from detect.line_settings import LineSettings
 from detect.markers.settings import MarkerSettings

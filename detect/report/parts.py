@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from detect.comparison.tables import number
+from detect.comparison.report import number
 
 _INCHES_PX = 96.0
 

@@ -11,8 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from detect.comparison.circles import pair_discs
 from detect.comparison.lines import joined_lines, pair_lines
-from detect.comparison.lines_result import LineCompareOptions
-from detect.comparison.result import CompareOptions, DiscPairs
+from detect.comparison.result import CompareOptions, DiscPairs, LineCompareOptions
 from detect.seen import FrameView
 from landmarks import (
     CircleLandmark,

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from camera import Camera
 from detect.circles import CircleDetections
 from detect.cli import main
-from detect.comparison.lines_result import LineCompareOptions
-from detect.comparison.result import CompareOptions
+from detect.comparison.result import CompareOptions, LineCompareOptions
 from detect.drawing.frame import draw_rows, line_curves, sigma_bars
 from detect.drawing.head import read_head
 from detect.drawing.inputs import SeenRows
