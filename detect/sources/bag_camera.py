@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from camera import Camera
 from camera.calibration.floor import with_pose
@@ -22,7 +23,7 @@ from camera.formats.ros import camera_from_message
 from detect.errors import DetectError
 from detect.sources.bag_messages import LONGEST_NAME, messages, opened_bag, understood
 from detect.sources.interface import Calibration
-from detect.sources.steps import DATASET_FROM_ROBOTICS
+from detect.sources.poses import DATASET_FROM_ROBOTICS
 from storage.messages import one_line
 
 if TYPE_CHECKING:
@@ -154,15 +155,8 @@ def rotation_of(qx: float, qy: float, qz: float, qw: float) -> Matrix:
     largest = np.abs(q).max()
     if not 0.0 < largest < np.inf:
         raise ValueError(f"a rotation of {qx:g}, {qy:g}, {qz:g}, {qw:g}")
-    q = q / largest  # squares of very large or small numbers overflow or underflow
-    x, y, z, w = q / np.linalg.norm(q)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    # Squares of very large or small numbers overflow or underflow.
+    return np.asarray(Rotation.from_quat(q / largest).as_matrix())
 
 
 def _field(message: Any, letter: str) -> NDArray[np.float64]:
