@@ -16,7 +16,7 @@ from detect.comparison.result import (
     LineComparison,
     unmet_demands,
 )
-from detect.drawing.head import read_head
+from detect.drawing.inputs import read_head
 from detect.errors import DetectError
 from detect.options import Compare
 from detect.run import camera_in

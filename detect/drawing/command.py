@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from detect.comparison.result import LineCompareOptions
 from detect.drawing.frame import draw_rows
-from detect.drawing.inputs import find_files, open_rows, picture_name
-from detect.drawing.selection import select_frames
+from detect.drawing.inputs import find_files, open_rows, picture_name, select_frames
 from detect.errors import EXIT_FRAMES_FAILED, DetectError, FrameError
 from detect.run import Run, read_image
 from detect.runs.progress import print_failures, progress_bar

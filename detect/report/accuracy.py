@@ -27,7 +27,7 @@ from detect.report.statistics import (
     line_residuals,
     normality,
 )
-from detect.tune.curve import knee
+from detect.tune.table import knee
 
 _CURVE_POINTS = 41
 _TABLE_POINTS = 5

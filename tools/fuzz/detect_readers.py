@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from camera import CameraError, parse_camera
 from camera.calibration.images import read_grey
-from detect.drawing.head import read_head
+from detect.drawing.inputs import read_head
 from detect.errors import DetectError, FrameError
 from detect.runs.journal import digest_of, left_journal
 from detect.runs.run_log import demand_log_place

@@ -184,7 +184,8 @@ def test_the_lens_is_the_cameras_distortion(published_camera: Camera) -> None:
     for pixel in pixels[:20]:
         straight = lens.straighten(pixel[None])
         far = (pixel[0] + 3.0, pixel[1] + 3.0)
-        np.testing.assert_allclose(bent(lens, *straight[0], far), pixel, atol=1e-5)
+        again = np.array(bent(lens, straight[0, 0], straight[0, 1], far))
+        np.testing.assert_allclose(again, pixel, atol=1e-5)
         jacobian = lens.pixel_jacobian(pixel)
         moved = lens.bend(straight + np.array([[1e-4, 0.0], [0.0, 1e-4]]))
         np.testing.assert_allclose(jacobian, (moved - pixel).T / 1e-4, atol=1e-3)

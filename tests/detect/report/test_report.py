@@ -15,7 +15,7 @@ from detect.cli import main
 from detect.comparison.circles import Sight, compare_frames, compare_runs
 from detect.comparison.lines import compare_line_frames
 from detect.comparison.result import CompareOptions, LineCompareOptions
-from detect.drawing.head import read_head
+from detect.drawing.inputs import read_head
 from detect.line_settings import PUBLISHED as PUBLISHED_LINES
 from detect.report.figures import binned
 from detect.report.statistics import (
