@@ -21,7 +21,7 @@ from detect.comparison.circles import pair_discs
 from detect.comparison.lines import joined_lines, pair_lines
 from detect.comparison.result import CompareOptions, LineCompareOptions
 from detect.drawing.inputs import SeenRows
-from detect.drawing.strokes import Colour, canvas_of, draw_curve, draw_text, enlargement
+from detect.drawing.strokes import Colour, canvas_of, draw_bar, draw_curve, draw_text, enlargement
 from detect.markers.drawing import mark_marker
 from detect.seen import FrameView, circle_on_floor, image_positions
 from detect.settings import CircleSettings
@@ -219,12 +219,9 @@ def _draw_lines(
     ends = ends_of(found)
     bars = sigma_bars(camera, ends, np.array([row.sigma for row in found], dtype=np.float64))
     times = enlargement(canvas)
-    tick = times * np.array([[0.0, -2.0], [0.0, 2.0]])
     for curve, bar, colour, text in zip(line_curves(camera, ends), bars, colours, texts):
         draw_curve(canvas, curve, colour)
-        draw_curve(canvas, bar, _SIGMA_COLOUR)
-        for end in bar:
-            draw_curve(canvas, end + tick, _SIGMA_COLOUR)
+        draw_bar(canvas, bar, _SIGMA_COLOUR)
         if text and np.all(np.isfinite(curve[-1])):
             at = (round(float(curve[-1, 0])) - 8 * times, round(float(curve[-1, 1])) + 9 * times)
             draw_text(canvas, text, at, _SIGMA_COLOUR, 0.3)

@@ -55,8 +55,6 @@ _LEAST_SIDE_PX = 4
 #: If the next level searches larger markers, a region this wide (in radii of the disc) is left to
 #: that level.
 _WIDEST_RADII = 12.0
-#: Holes of fewer pixels are noise.
-_LEAST_HOLE_PX = 1
 
 
 @dataclass(frozen=True)

@@ -127,7 +127,7 @@ def detect_markers(
     tried, tries = np.empty((len(quadrangles), 4, 2)), 0
     for region, rough in quadrangles:
         if count_same(rough, _corners(markers)):
-            candidates.append(Candidate(region, rough, lens.bend(rough), SAME_MARKER))
+            candidates.append(Candidate(lens.bend(rough), SAME_MARKER))
             continue
         if count_same(rough, tried[:tries]) >= _TRIES:
             continue
@@ -146,7 +146,7 @@ def detect_markers(
         else:
             fate = ACCEPTED
             markers.append(found)
-        candidates.append(Candidate(region, rough, lens.bend(rough), fate, refined))
+        candidates.append(Candidate(lens.bend(rough), fate, refined))
 
     # Back to the image as it is.
     markers.sort(key=lambda m: (m.id, m.corners[0, 0], m.corners[0, 1]))

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.markers.candidates import Mask, Region
+from detect.markers.candidates import Mask
 from detect.markers.refinement import RefinedQuadrangle
 from landmarks import MarkerCorner, MarkerLandmark
 
@@ -25,20 +25,14 @@ class Candidate:
 
     Attributes
     ----------
-    region : Region
-        Where it comes from.
-    rough : (4, 2) float64
-        Its rough corners, straight pixels.
     outline : (4, 2) float64
-        The same as pixels of the image.
+        Its rough corners, pixels of the image.
     fate : str
         ``accepted`` or why not.
     refined : RefinedQuadrangle or None
         Its fitted edges, if it came so far.
     """
 
-    region: Region
-    rough: FloatArray
     outline: FloatArray
     fate: str
     refined: RefinedQuadrangle | None = None

@@ -58,12 +58,7 @@ def open_calibrated(
     camera.CameraError, landmarks.LandmarkFileError
         If the calibration or the odometry cannot be read.
     """
-    options = SourceOptions() if options is None else options
-    if _is_plain_folder(name, options):
-        run: ImageRun = open_run(name, camera_path, bits=options.bits or None)
-        run = _shortened(run, options.frames)
-    else:
-        run = _open(name, camera_path, options, posed=True)
+    run = _open(name, camera_path, options or SourceOptions(), posed=True)
     if isinstance(run, Run):
         return run
     raise DetectError(
@@ -92,11 +87,7 @@ def open_source(
     DetectError, camera.CameraError, landmarks.LandmarkFileError
         As `open_calibrated`, except for a missing calibration.
     """
-    options = SourceOptions() if options is None else options
-    if _is_plain_folder(name, options):
-        run = open_images(name, camera_path, bits=options.bits or None)
-        return _shortened(run, options.frames)
-    return _open(name, camera_path, options, posed=False)
+    return _open(name, camera_path, options or SourceOptions(), posed=False)
 
 
 def demand_recording(name: Path) -> None:
@@ -116,6 +107,10 @@ def demand_recording(name: Path) -> None:
 
 def _open(name: Path, camera_path: Path | None, options: SourceOptions, *, posed: bool) -> ImageRun:
     """Open any source, with a calibration where there is one; `posed`: one with a pose."""
+    if name.is_dir() and not _is_ros2_bag(name) and options.plain:
+        # A run folder as the data set has them, with nothing more to be said of it.
+        opened = open_run if posed else open_images
+        return _shortened(opened(name, camera_path, bits=options.bits or None), options.frames)
     from detect.sources.interface import Calibration
 
     source = _source(name, options)
@@ -137,11 +132,6 @@ def _open(name: Path, camera_path: Path | None, options: SourceOptions, *, posed
     )
     run = _shortened(run, options.frames)
     return run if camera is None else run.calibrated(camera)
-
-
-def _is_plain_folder(name: Path, options: SourceOptions) -> bool:
-    """Whether this is a run folder as the data set has them, with nothing more to be said of it."""
-    return name.is_dir() and not _is_ros2_bag(name) and options.plain
 
 
 def _source(name: Path, options: SourceOptions) -> Source:

@@ -102,7 +102,6 @@ def test_whitened_residuals_are_the_mahalanobis_distance() -> None:
         (residuals.whitened**2).sum(), offset @ np.linalg.solve(covariance, offset)
     )
     np.testing.assert_allclose(residuals.error, np.hypot(*offset))
-    np.testing.assert_allclose(residuals.distance_m, np.hypot(0.3, 1.0))
     # To the left of forward is positive.
     np.testing.assert_allclose(residuals.bearing_rad, np.arctan2(0.3, 1.0))
 
