@@ -56,15 +56,15 @@ def rough_corners(hull: FloatArray, algorithm: CornerAlgorithm) -> FloatArray | 
     if algorithm == "B":
         corners = hull[largest_quadrangle(hull, _SEED)]
     else:
-        chain = dense_chain(hull)
-        index = farthest_corners(chain, _CORNER_SPACING_RAD)
+        chain = _dense_chain(hull)
+        index = _farthest_corners(chain, _CORNER_SPACING_RAD)
         if len(index) != 4:
             return None
         corners = chain[index]
     return np.ascontiguousarray(corners if signed_area(corners) > 0.0 else corners[::-1])
 
 
-def dense_chain(hull: FloatArray) -> FloatArray:
+def _dense_chain(hull: FloatArray) -> FloatArray:
     """Points at equal distances along a closed polygon."""
     closed = np.concatenate([hull, hull[:1]])
     along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(closed, axis=0).T))])
@@ -167,23 +167,11 @@ def largest_quadrangle(points: FloatArray, seed: int) -> NDArray[np.int64]:
 
 
 @njit(cache=True, error_model="numpy")
-def farthest_corners(points: FloatArray, spacing: float) -> NDArray[np.int64]:
-    """Indices of the local maxima of the distance from the barycentre of a closed chain.
+def _farthest_corners(points: FloatArray, spacing: float) -> NDArray[np.int64]:
+    """Algorithm A: which points (M,) of a closed chain are farthest from its barycentre.
 
-    Algorithm A. A maximum is the farthest point of all whose direction from the barycentre differs
-    by less than `spacing` radians.
-
-    Parameters
-    ----------
-    points : (N, 2) float64
-        The chain, so dense that its mean is the barycentre of the outline.
-    spacing : float
-        Radians.
-
-    Returns
-    -------
-    (M,) int64
-        In the order of the chain; M need not be 4.
+    That is, of all whose direction from there differs by less than `spacing` radians. The chain is
+    so dense that its mean is the barycentre of the outline.
     """
     n = len(points)
     cx = points[:, 0].mean()
