@@ -274,7 +274,46 @@ NO_PAIRS = DiscPairs(*(np.zeros((0, 2)),) * 3, np.zeros((0, 2, 2)), np.zeros((0,
 
 
 @dataclass(frozen=True, slots=True)
-class Comparison:
+class _Counts:
+    """What comparisons of discs and of lines have in common.
+
+    Attributes
+    ----------
+    reference_name, detected_name : str
+        The files.
+    options : CompareOptions or LineCompareOptions
+        What counted as the same landmark.
+    reference, detected : int
+        Rows that count.
+    matched : int
+        Pairs of a reference and a detected row; no row is in two of them.
+    """
+
+    reference_name: str
+    detected_name: str
+    options: CompareOptions | LineCompareOptions
+    reference: int
+    detected: int
+    matched: int
+
+    @property
+    def found(self) -> int:
+        """Reference rows that a detected row represents."""
+        return self.matched
+
+    @property
+    def missed(self) -> int:
+        """Reference rows that no detected row represents."""
+        return self.reference - self.found
+
+    @property
+    def extra(self) -> int:
+        """Detected rows that fit no reference row."""
+        return self.detected - self.matched
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison(_Counts):
     """How a run's detected discs compare with reference rows.
 
     Figures are None where there are no rows to compute them from. Qualities are medians. Rows set
@@ -282,12 +321,7 @@ class Comparison:
     that is known to look like a disc.
     """
 
-    reference_name: str
-    detected_name: str
     options: CompareOptions
-    reference: int
-    detected: int
-    matched: int
     set_aside: int
     on_lookalikes: int | None
     recall: float | None
@@ -312,37 +346,19 @@ class Comparison:
     frames_only_in_reference: tuple[str, ...] = field(repr=False)
     frames_only_in_detected: tuple[str, ...] = field(repr=False)
 
-    @property
-    def missed(self) -> int:
-        """Reference rows that no detected row fits."""
-        return self.reference - self.matched
-
-    @property
-    def extra(self) -> int:
-        """Detected rows that fit no reference row."""
-        return self.detected - self.matched
-
     def worst_frames(self, count: int) -> tuple[FrameScore, ...]:
         """The frames with most missed and extra rows; of equals, with the largest error first."""
         return _worst(self.frames, count)
 
 
 @dataclass(frozen=True, slots=True)
-class LineComparison:
+class LineComparison(_Counts):
     """How a run's detected lines compare with reference rows.
 
     Figures are None where there are no rows to compute them from.
 
     Attributes
     ----------
-    reference_name, detected_name : str
-        The files.
-    options : LineCompareOptions
-        What counted as the same line.
-    reference, detected : int
-        Rows that count.
-    matched : int
-        Pairs of a reference and a detected row; no row is in two of them.
     joined : int
         Further reference rows within the deviation of a matched detected row, which represents
         several lines.
@@ -365,12 +381,7 @@ class LineComparison:
         Images that only one file has.
     """
 
-    reference_name: str
-    detected_name: str
     options: LineCompareOptions
-    reference: int
-    detected: int
-    matched: int
     joined: int
     set_aside: int
     recall: float | None
@@ -388,16 +399,6 @@ class LineComparison:
     def found(self) -> int:
         """Reference rows that a detected row represents, alone or with others."""
         return self.matched + self.joined
-
-    @property
-    def missed(self) -> int:
-        """Reference rows that no detected row represents."""
-        return self.reference - self.found
-
-    @property
-    def extra(self) -> int:
-        """Detected rows that fit no reference row."""
-        return self.detected - self.matched
 
     def worst_frames(self, count: int) -> tuple[LineFrameScore, ...]:
         """The frames with most missed and extra rows; of equals, with the largest error first."""
