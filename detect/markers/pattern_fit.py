@@ -122,7 +122,7 @@ class PatternFit(NamedTuple):
 
 
 class _Start(NamedTuple):
-    """Where a fit begins, which pixels it looks at, and its limits."""
+    """Initial values of a fit, the pixels that it uses, and its limits."""
 
     corners: FloatArray
     levels: Levels
