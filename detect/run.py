@@ -23,8 +23,7 @@ from numpy.typing import NDArray
 
 from camera import Camera, read_camera
 from detect.errors import DetectError, FrameError
-from detect.sources.gray import decode_gray
-from detect.sources.image_bounds import bounded_content
+from detect.sources.gray import bounded_content, decode_gray
 from detect.sources.image_names import IMAGE_SUFFIXES, FileStamp, ImageNames, images_of_folder
 from landmarks import Step, iterate_prefixes, iterate_steps
 

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from detect.drawing.frame import ends_of, line_curves, sigma_bars
-from detect.drawing.inputs import SeenRows, find_files, open_rows
-from detect.drawing.selection import select_frames
+from detect.drawing.inputs import SeenRows, find_files, open_rows, select_frames
 from detect.errors import EXIT_FRAMES_FAILED, DetectError, FrameError
 from detect.run import Run, read_image
 from detect.runs.progress import print_failures, progress_bar

@@ -19,24 +19,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera
-from detect.comparison.figures import fraction, normalised_error, quantile
-from detect.comparison.lean import Lean, common_lean
+from detect.comparison.figures import disc_normalised_error, fraction, quantile
+from detect.comparison.floor import floor_bins, floor_pairs, stated_lean
 from detect.comparison.pairing import FrameMatch, match_rows, pair_frames, shown_name
 from detect.comparison.result import (
-    CommonLean,
     CompareError,
     CompareOptions,
     Comparison,
-    DiscPairs,
     DistanceBin,
-    ErrorCovariance,
-    FloorBin,
-    FloorDifference,
     FrameScore,
     Levelling,
-    NormalisedError,
 )
-from detect.seen import FrameView, Tilt, image_positions, level_seen
+from detect.seen import FrameView, Tilt, image_positions
 from detect.sources.image_names import image_name
 from landmarks import (
     Association,
@@ -48,10 +42,7 @@ from landmarks import (
     circle_arrays,
     is_positive_definite,
     read_frames,
-    squared_mahalanobis,
 )
-
-__all__ = ["DISTANCE_EDGES_M", "compare_frames", "compare_runs", "image_name", "pair_discs"]
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -217,9 +208,15 @@ def compare_frames(
     wanted = _pool([(match.reference, match.pairs.first) for match in matches])
     found = _pool([(match.detected, match.pairs.second) for match in matches])
     apart_px = _apart_px(matches, views)
-    covariance = _error_covariance(wanted, found, options.error_covariance)
-    lean, pairs = _floor_pairs(
-        wanted.xy[wanted.paired], found.xy[found.paired], covariance, matches, sight
+    sides = {"detected": (found,), "reference": (wanted,), "sum": (wanted, found)}
+    errors_of = sides[options.error_covariance]
+    covariance = np.sum([side.covariance[side.paired] for side in errors_of], axis=0)
+    lean, pairs = floor_pairs(
+        None if sight is None else sight.camera,
+        wanted.xy[wanted.paired],
+        found.xy[found.paired],
+        covariance,
+        np.repeat(np.arange(len(matches)), [len(match.pairs.first) for match in matches]),
     )
     error_m = np.asarray(np.linalg.norm(pairs.offset, axis=1), dtype=np.float64)
     names = [name for name, *_ in paired.frames]
@@ -236,7 +233,7 @@ def compare_frames(
         precision=_mean(found.is_paired),
         error_median_m=quantile(error_m, 0.5),
         error_95_m=quantile(error_m, 0.95),
-        normalised_error=_normalised_error(pairs.offset, covariance),
+        normalised_error=disc_normalised_error(pairs.offset, covariance),
         reference_quality_matched=quantile(wanted.quality[wanted.is_paired], 0.5),
         reference_quality_missed=quantile(wanted.quality[~wanted.is_paired], 0.5),
         detected_quality_matched=quantile(found.quality[found.is_paired], 0.5),
@@ -249,8 +246,8 @@ def compare_frames(
             names, wanted_by, true=sight is not None and sight.reference_level
         ),
         detected_levelling=_levelling(names, found_by),
-        floor=_floor_bins(pairs, lean),
-        lean=_stated(lean, pairs),
+        floor=floor_bins(pairs, lean, _ranges()),
+        lean=stated_lean(lean, pairs),
         pairs=pairs,
         frames=_frame_scores(matches, error_m),
         frames_only_in_reference=paired.only_in_reference,
@@ -366,23 +363,6 @@ def _pool(frames: Sequence[tuple[Sequence[CircleLandmark], NDArray[np.intp]]]) -
     return _Pool(arrays.xy, arrays.quality, arrays.covariance, paired, is_paired)
 
 
-def _error_covariance(wanted: _Pool, found: _Pool, source: ErrorCovariance) -> FloatArray:
-    if source == "detected":
-        return found.covariance[found.paired]
-    if source == "reference":
-        return wanted.covariance[wanted.paired]
-    return wanted.covariance[wanted.paired] + found.covariance[found.paired]
-
-
-def _normalised_error(offset_xy: FloatArray, covariance: FloatArray) -> NormalisedError:
-    usable = is_positive_definite(covariance)
-    return normalised_error(
-        squared_mahalanobis(offset_xy[usable], covariance[usable]),
-        dof_per_row=2,
-        left_out=int((~usable).sum()),
-    )
-
-
 def _ranges() -> list[tuple[float, float]]:
     return list(pairwise((-inf, *DISTANCE_EDGES_M, inf)))
 
@@ -422,74 +402,6 @@ def _apart_px(
         apart.append(np.linalg.norm(offset, axis=1))
     together = np.concatenate(apart)
     return together[np.isfinite(together)]
-
-
-def _floor_pairs(
-    reference_xy: FloatArray,
-    detected_xy: FloatArray,
-    covariance: FloatArray,
-    matches: Sequence[FrameMatch[CircleLandmark]],
-    sight: Sight | None,
-) -> tuple[Lean | None, DiscPairs]:
-    offset = detected_xy - reference_xy
-    left, lean, centre = offset, None, np.zeros(2)
-    if sight is not None:
-        centre = sight.camera.centre[:2]
-        of = np.repeat(np.arange(len(matches)), [len(match.pairs.first) for match in matches])
-        lean = common_lean(sight.camera, reference_xy, detected_xy, of)
-        if lean is not None:
-            level = level_seen(sight.camera, reference_xy, lean.tilt, lean.raised_m)
-            left = detected_xy - level
-    away = reference_xy - centre
-    away = away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)
-    return lean, DiscPairs(reference_xy, offset, left, covariance, away)
-
-
-def _stated(lean: Lean | None, pairs: DiscPairs) -> CommonLean | None:
-    if lean is None:
-        return None
-    sigma_p, sigma_r, sigma_h = lean.sigma
-    seen = np.isfinite(pairs.left).all(axis=1)
-    return CommonLean(
-        pitch_deg=float(np.degrees(lean.pitch_rad)),
-        pitch_sigma_deg=float(np.degrees(sigma_p)),
-        roll_deg=float(np.degrees(lean.roll_rad)),
-        roll_sigma_deg=float(np.degrees(sigma_r)),
-        raised_m=lean.raised_m,
-        raised_sigma_m=sigma_h,
-        left=_difference(pairs.left, pairs.away),
-        normalised_error=_normalised_error(pairs.left[seen], pairs.covariance[seen]),
-    )
-
-
-def _floor_bins(pairs: DiscPairs, lean: Lean | None) -> tuple[FloorBin, ...]:
-    forward = -pairs.reference_xy[:, 1]
-    bins = []
-    for from_m, to_m in _ranges():
-        here = (from_m <= forward) & (forward < to_m)
-        bins.append(
-            FloorBin(
-                from_m if isfinite(from_m) else None,
-                to_m if isfinite(to_m) else None,
-                _difference(pairs.offset[here], pairs.away[here]),
-                None if lean is None else _difference(pairs.left[here], pairs.away[here]),
-            )
-        )
-    return tuple(bins)
-
-
-def _difference(offset: FloatArray, away: FloatArray) -> FloorDifference:
-    seen = np.isfinite(offset).all(axis=1)
-    offset, away = offset[seen], away[seen]
-    size = np.asarray(np.linalg.norm(offset, axis=1), dtype=np.float64)
-    return FloorDifference(
-        pairs=len(offset),
-        median_m=quantile(size, 0.5),
-        most_m=quantile(size, 0.95),
-        along_m=quantile((offset * away).sum(axis=1), 0.5),
-        # Forward is -Y and left is X: left of a direction is it turned from -Y to X.
-        across_m=quantile(away[:, 0] * offset[:, 1] - away[:, 1] * offset[:, 0], 0.5),
-    )
 
 
 def _distance_bin(

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 
-from rich.console import Console, Group
+from rich.console import Console
 
 from camera import read_camera
 from detect.comparison.circles import Sight, beside_reference, compare_runs
 from detect.comparison.lines import compare_line_runs
-from detect.comparison.lines_report import format_line_json, line_comparison_tables
-from detect.comparison.lines_result import LineCompareOptions
 from detect.comparison.report import comparison_tables, format_json
-from detect.comparison.result import Rates, unmet_demands
-from detect.drawing.head import read_head
+from detect.comparison.result import (
+    Comparison,
+    LineCompareOptions,
+    LineComparison,
+    unmet_demands,
+)
+from detect.drawing.inputs import read_head
 from detect.errors import DetectError
 from detect.options import Compare
 from detect.run import camera_in
@@ -23,12 +27,13 @@ from storage.exit_codes import EXIT_ERROR
 
 def perform(command: Compare) -> int:
     """Compare rows with reference rows; returns the exit code."""
-    _demand_rows(command)
-    tables, text, result = _compared_lines(command) if command.lines else _compared_discs(command)
-    Console().print(tables)
+    reference, detected = _files(command)
+    compared = _compared_lines if command.lines else _compared_discs
+    result = compared(command, reference, detected)
+    Console().print(comparison_tables(result))
     if command.json is not None:
         with write_whole(command.json, overwrite=command.force) as stream:
-            stream.write(text.encode())
+            stream.write(format_json(result).encode())
     unmet = unmet_demands(
         result, min_recall=command.min_recall, min_precision=command.min_precision
     )
@@ -37,8 +42,8 @@ def perform(command: Compare) -> int:
     return EXIT_ERROR if unmet else 0
 
 
-def _demand_rows(command: Compare) -> None:
-    """Refuse missing files, with a message that says how to make them."""
+def _files(command: Compare) -> tuple[Path, Path]:
+    """Reference and detected rows; missing ones are refused, saying how to make them."""
     if command.lines and (command.unlisted or command.lookalikes):
         raise DetectError("--unlisted and --lookalikes are of discs: expected neither with --lines")
     kind = "lines" if command.lines else "circles"
@@ -53,45 +58,33 @@ def _demand_rows(command: Compare) -> None:
             f"{detected}: no such landmark file: `detect {kind}` writes it, --detected names "
             "another"
         )
+    return reference, detected
 
 
-def _compared_discs(command: Compare) -> tuple[Group, str, Rates]:
-    """The tables, the JSON and the result of a comparison of discs."""
-    sight = _sight(command)
-    if sight is None and not command.options.on_floor:
+def _compared_discs(command: Compare, reference: Path, detected: Path) -> Comparison:
+    camera = camera_in(command.run) if command.camera is None else read_camera(command.camera)
+    sight = None
+    if camera is not None:
+        level = read_head(reference).level
+        sight = Sight(camera, read_head(detected).circle_settings.radius_m, level)
+    elif not command.options.on_floor:
         print("no calibration: positions are compared on the floor; --camera names one")
-    result = compare_runs(
+    beside = beside_reference(reference, command.unlisted, command.lookalikes)
+    return compare_runs(
         command.run,
-        reference=command.reference,
-        detected=command.detected,
+        reference=reference,
+        detected=detected,
         options=command.options,
         sight=sight,
-        beside=beside_reference(
-            command.reference or command.run / "map.circles", command.unlisted, command.lookalikes
-        ),
+        beside=beside,
     )
-    return comparison_tables(result), format_json(result), result
 
 
-def _sight(command: Compare) -> Sight | None:
-    """How rows come back into the images; None without a calibration."""
-    camera = camera_in(command.run) if command.camera is None else read_camera(command.camera)
-    if camera is None:
-        return None
-    reference = read_head(command.reference or command.run / "map.circles")
-    detected = read_head(command.detected or command.run / "detected.circles")
-    return Sight(camera, detected.circle_settings.radius_m, reference.level)
-
-
-def _compared_lines(command: Compare) -> tuple[Group, str, Rates]:
-    """The tables, the JSON and the result of a comparison of verticals."""
+def _compared_lines(command: Compare, reference: Path, detected: Path) -> LineComparison:
     options = LineCompareOptions(
         tolerance_deg=command.tolerance_deg,
         sigmas=command.sigmas,
         only_identified=command.options.only_identified,
         all_frames=command.options.all_frames,
     )
-    result = compare_line_runs(
-        command.run, reference=command.reference, detected=command.detected, options=options
-    )
-    return line_comparison_tables(result), format_line_json(result), result
+    return compare_line_runs(command.run, reference=reference, detected=detected, options=options)

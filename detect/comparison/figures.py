@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from detect.comparison.result import NormalisedError
+from landmarks import is_positive_definite, squared_mahalanobis
 
 FloatArray = NDArray[np.float64]
 
@@ -47,3 +48,13 @@ def normalised_error(
         return NormalisedError(per_dof=None, dof=0, band=None, left_out=left_out)
     low, high = (float(chdtri(dof, 1.0 - p)) / dof for p in _BAND)
     return NormalisedError(float(squared.sum()) / dof, dof, (low, high), left_out)
+
+
+def disc_normalised_error(offset_xy: FloatArray, covariance: FloatArray) -> NormalisedError:
+    """Of (N, 2) offsets on the floor with (N, 2, 2) covariances, positive definite ones alone."""
+    usable = is_positive_definite(covariance)
+    return normalised_error(
+        squared_mahalanobis(offset_xy[usable], covariance[usable]),
+        dof_per_row=2,
+        left_out=int((~usable).sum()),
+    )

@@ -17,9 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from detect.comparison.figures import fraction, normalised_error, quantile
-from detect.comparison.lines_result import LineCompareOptions, LineComparison, LineFrameScore
 from detect.comparison.pairing import FrameMatch, match_rows, pair_frames
-from detect.comparison.result import NormalisedError
+from detect.comparison.result import LineCompareOptions, LineComparison, LineFrameScore
 from landmarks import Association, Frame, LineLandmark, associate, read_frames, wrap_angle
 
 FloatArray = NDArray[np.float64]
@@ -105,6 +104,8 @@ def compare_line_frames(
     second = [match.detected[i] for match in matches for i in match.pairs.second]
     error_rad = wrap_angle(_numbers(second, "alpha") - _numbers(first, "alpha"))
     error_deg = np.degrees(np.abs(error_rad))
+    sigma_rad = _numbers(second, "sigma")
+    stated = sigma_rad >= _LEAST_SIGMA_RAD
     wanted_count = sum(len(match.reference) for match in matches)
     found_count = sum(len(match.detected) for match in matches)
     return LineComparison(
@@ -120,7 +121,11 @@ def compare_line_frames(
         precision=fraction(len(second), found_count),
         bearing_median_deg=quantile(error_deg, 0.5),
         bearing_95_deg=quantile(error_deg, 0.95),
-        normalised_error=_normalised_error(error_rad, _numbers(second, "sigma")),
+        normalised_error=normalised_error(
+            (error_rad[stated] / sigma_rad[stated]) ** 2,
+            dof_per_row=1,
+            left_out=int((~stated).sum()),
+        ),
         ends_median=quantile(_end_distances(first, second), 0.5),
         beta_median_deg=quantile(
             np.degrees(np.abs(_numbers(second, "beta") - _numbers(first, "beta"))), 0.5
@@ -198,15 +203,6 @@ def joined_lines(
 def _differences(reference: Sequence[LineLandmark], detected: Sequence[LineLandmark]) -> FloatArray:
     """(N, M) bearings of detected rows less those of reference rows (rad)."""
     return wrap_angle(_numbers(detected, "alpha") - _numbers(reference, "alpha")[:, np.newaxis])
-
-
-def _normalised_error(error_rad: FloatArray, sigma_rad: FloatArray) -> NormalisedError:
-    usable = sigma_rad >= _LEAST_SIGMA_RAD
-    return normalised_error(
-        (error_rad[usable] / sigma_rad[usable]) ** 2,
-        dof_per_row=1,
-        left_out=int((~usable).sum()),
-    )
 
 
 def _end_distances(first: Sequence[LineLandmark], second: Sequence[LineLandmark]) -> FloatArray:

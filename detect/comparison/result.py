@@ -1,10 +1,11 @@
-"""Options and result of a comparison of two runs."""
+"""Options and results of comparisons of the discs, or of the lines, of two runs."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from math import isfinite
-from typing import Literal, Protocol
+from typing import Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,14 +63,77 @@ class CompareOptions:
 
 
 @dataclass(frozen=True, slots=True)
+class LineCompareOptions:
+    """What counts as the same line, and which rows count.
+
+    Attributes
+    ----------
+    tolerance_deg : float
+        Bearings of the same line may always differ by this much (degrees).
+    sigmas : float
+        They may also differ by as many of the detected row's standard deviations, and all reference
+        rows that near a matched row are found with it.
+    only_identified : bool
+        Count only reference rows that have an ID. Detected rows that fit a reference row without
+        one are then neither right nor wrong: they are set aside.
+    all_frames : bool
+        Count frames that only one file has, too: all their rows are missed, or extra.
+    """
+
+    tolerance_deg: float = 0.5
+    sigmas: float = 2.0
+    only_identified: bool = False
+    all_frames: bool = False
+
+    def __post_init__(self) -> None:
+        if not (isfinite(self.tolerance_deg) and self.tolerance_deg > 0):
+            raise CompareError(f"tolerance_deg is {self.tolerance_deg}: expected a positive number")
+        if not (isfinite(self.sigmas) and self.sigmas >= 0):
+            raise CompareError(f"sigmas is {self.sigmas}: expected a number of at least 0")
+
+
+@dataclass(frozen=True, slots=True)
 class FrameScore:
-    """Result for one frame's rows."""
+    """Result for one frame's discs."""
 
     name: str
     matched: int
     missed: int
     extra: int
     largest_error_m: float | None
+
+    @property
+    def largest_error(self) -> float | None:
+        """That of any pair."""
+        return self.largest_error_m
+
+
+@dataclass(frozen=True, slots=True)
+class LineFrameScore:
+    """Result for one frame's lines; `joined` ones were found with another row's match."""
+
+    name: str
+    matched: int
+    joined: int
+    missed: int
+    extra: int
+    largest_error_deg: float | None
+
+    @property
+    def largest_error(self) -> float | None:
+        """That of any pair."""
+        return self.largest_error_deg
+
+
+Score = TypeVar("Score", FrameScore, LineFrameScore)
+
+
+def _worst(frames: Iterable[Score], count: int) -> tuple[Score, ...]:
+    """The frames with most missed and extra rows; of equals, with the largest error first."""
+    ranked = sorted(
+        frames, key=lambda f: (-(f.missed + f.extra), -(f.largest_error or 0.0), f.name)
+    )
+    return tuple(ranked[:count])
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,7 +274,46 @@ NO_PAIRS = DiscPairs(*(np.zeros((0, 2)),) * 3, np.zeros((0, 2, 2)), np.zeros((0,
 
 
 @dataclass(frozen=True, slots=True)
-class Comparison:
+class _Counts:
+    """What comparisons of discs and of lines have in common.
+
+    Attributes
+    ----------
+    reference_name, detected_name : str
+        The files.
+    options : CompareOptions or LineCompareOptions
+        What counted as the same landmark.
+    reference, detected : int
+        Rows that count.
+    matched : int
+        Pairs of a reference and a detected row; no row is in two of them.
+    """
+
+    reference_name: str
+    detected_name: str
+    options: CompareOptions | LineCompareOptions
+    reference: int
+    detected: int
+    matched: int
+
+    @property
+    def found(self) -> int:
+        """Reference rows that a detected row represents."""
+        return self.matched
+
+    @property
+    def missed(self) -> int:
+        """Reference rows that no detected row represents."""
+        return self.reference - self.found
+
+    @property
+    def extra(self) -> int:
+        """Detected rows that fit no reference row."""
+        return self.detected - self.matched
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison(_Counts):
     """How a run's detected discs compare with reference rows.
 
     Figures are None where there are no rows to compute them from. Qualities are medians. Rows set
@@ -218,12 +321,7 @@ class Comparison:
     that is known to look like a disc.
     """
 
-    reference_name: str
-    detected_name: str
     options: CompareOptions
-    reference: int
-    detected: int
-    matched: int
     set_aside: int
     on_lookalikes: int | None
     recall: float | None
@@ -248,39 +346,70 @@ class Comparison:
     frames_only_in_reference: tuple[str, ...] = field(repr=False)
     frames_only_in_detected: tuple[str, ...] = field(repr=False)
 
-    @property
-    def missed(self) -> int:
-        """Reference rows that no detected row fits."""
-        return self.reference - self.matched
-
-    @property
-    def extra(self) -> int:
-        """Detected rows that fit no reference row."""
-        return self.detected - self.matched
-
     def worst_frames(self, count: int) -> tuple[FrameScore, ...]:
         """The frames with most missed and extra rows; of equals, with the largest error first."""
-        ranked = sorted(
-            self.frames,
-            key=lambda f: (-(f.missed + f.extra), -(f.largest_error_m or 0.0), f.name),
-        )
-        return tuple(ranked[:count])
+        return _worst(self.frames, count)
 
 
-class Rates(Protocol):
-    """A comparison of discs or of lines, for which limits can be demanded."""
+@dataclass(frozen=True, slots=True)
+class LineComparison(_Counts):
+    """How a run's detected lines compare with reference rows.
+
+    Figures are None where there are no rows to compute them from.
+
+    Attributes
+    ----------
+    joined : int
+        Further reference rows within the deviation of a matched detected row, which represents
+        several lines.
+    set_aside : int
+        Detected rows on reference rows that do not count.
+    recall, precision : float or None
+        Shares of the reference rows that were found, and of the detected rows that were matched.
+    bearing_median_deg, bearing_95_deg : float or None
+        Median and 95 % quantile of the differences in alpha of the pairs, without sign (degrees).
+    normalised_error : NormalisedError
+        Of these differences in units of the detected rows' sigmas.
+    ends_median : float or None
+        Median distance between the pairs' ends, top and bottom alike (normalised image
+        coordinates).
+    beta_median_deg : float or None
+        Median difference in beta of the pairs, without sign (degrees).
+    frames : tuple of LineFrameScore
+        Each frame that was compared.
+    frames_only_in_reference, frames_only_in_detected : tuple of str
+        Images that only one file has.
+    """
+
+    options: LineCompareOptions
+    joined: int
+    set_aside: int
+    recall: float | None
+    precision: float | None
+    bearing_median_deg: float | None
+    bearing_95_deg: float | None
+    normalised_error: NormalisedError
+    ends_median: float | None
+    beta_median_deg: float | None
+    frames: tuple[LineFrameScore, ...] = field(repr=False)
+    frames_only_in_reference: tuple[str, ...] = field(repr=False)
+    frames_only_in_detected: tuple[str, ...] = field(repr=False)
 
     @property
-    def recall(self) -> float | None:
-        """Share of the reference rows that were found."""
+    def found(self) -> int:
+        """Reference rows that a detected row represents, alone or with others."""
+        return self.matched + self.joined
 
-    @property
-    def precision(self) -> float | None:
-        """Share of the detected rows that are right."""
+    def worst_frames(self, count: int) -> tuple[LineFrameScore, ...]:
+        """The frames with most missed and extra rows; of equals, with the largest error first."""
+        return _worst(self.frames, count)
 
 
 def unmet_demands(
-    comparison: Rates, *, min_recall: float | None = None, min_precision: float | None = None
+    comparison: Comparison | LineComparison,
+    *,
+    min_recall: float | None = None,
+    min_precision: float | None = None,
 ) -> tuple[str, ...]:
     """Say which demands a comparison fails: a command that made them exits 1 if there are any.
 

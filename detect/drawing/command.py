@@ -13,10 +13,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.comparison.lines_result import LineCompareOptions
+from detect.comparison.result import LineCompareOptions
 from detect.drawing.frame import draw_rows
-from detect.drawing.inputs import find_files, open_rows, picture_name
-from detect.drawing.selection import select_frames
+from detect.drawing.inputs import find_files, open_rows, picture_name, select_frames
 from detect.errors import EXIT_FRAMES_FAILED, DetectError, FrameError
 from detect.run import Run, read_image
 from detect.runs.progress import print_failures, progress_bar

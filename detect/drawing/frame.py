@@ -9,8 +9,9 @@ rows that fit none have another colour.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,11 +19,9 @@ from numpy.typing import NDArray
 from camera import Camera
 from detect.comparison.circles import pair_discs
 from detect.comparison.lines import joined_lines, pair_lines
-from detect.comparison.lines_result import LineCompareOptions
-from detect.comparison.result import CompareOptions
-from detect.drawing.detections import EDGE_COLOUR, outline_disc
+from detect.comparison.result import CompareOptions, LineCompareOptions
 from detect.drawing.inputs import SeenRows
-from detect.drawing.strokes import Colour, canvas_of, draw_curve, draw_text, enlargement
+from detect.drawing.strokes import Colour, canvas_of, draw_bar, draw_curve, draw_text, enlargement
 from detect.markers.drawing import mark_marker
 from detect.seen import FrameView, circle_on_floor, image_positions
 from detect.settings import CircleSettings
@@ -34,12 +33,18 @@ from landmarks import (
     wrap_angle,
 )
 
+if TYPE_CHECKING:
+    from detect.circles import CircleDetections
+
 FloatArray = NDArray[np.float64]
 
 _POINTS = 33
 _LEGEND_PX = 16
 _LINE_COLOUR: Colour = (60, 220, 60)
 _SIGMA_COLOUR: Colour = (0, 170, 255)
+_EDGE_COLOUR: Colour = (0, 170, 255)
+_OUTLINE_COLOUR: Colour = (60, 200, 60)
+_TEXT_COLOUR: Colour = (0, 230, 255)
 _EXTRA_COLOUR: Colour = (255, 60, 255)
 _MISSED_COLOUR: Colour = (60, 60, 255)
 _WORDS_COLOUR: Colour = (230, 230, 230)
@@ -168,7 +173,7 @@ def _draw_discs(
     camera = view.camera
     project = partial(image_positions, camera, levelled_by=view.detected_by)
     places = circle_arrays(found)
-    colours = [EDGE_COLOUR if wanted is None else _EXTRA_COLOUR] * len(found)
+    colours = [_EDGE_COLOUR if wanted is None else _EXTRA_COLOUR] * len(found)
     texts = [f"{row.quality:.2f}" for row in found]
     words = f"{len(found)} discs"
     if wanted is not None:
@@ -177,14 +182,14 @@ def _draw_discs(
         at = partial(image_positions, camera, levelled_by=view.reference_by)
         apart = project(places.xy[pairs.second]) - at(reference_xy[pairs.first])
         for j, size in zip(pairs.second, np.hypot(*apart.T)):
-            colours[j] = EDGE_COLOUR
+            colours[j] = _EDGE_COLOUR
             texts[j] += f" {size:.1f}px"
         for i in pairs.first_alone:
             edge = at(circle_on_floor(reference_xy[i], settings.radius_m))
             draw_curve(canvas, edge, _MISSED_COLOUR, closed=True)
         words += _fate(len(pairs.second_alone), len(pairs.first_alone))
     for centre, text, colour in zip(places.xy, texts, colours):
-        outline_disc(canvas, project, centre, settings, text, edge_colour=colour)
+        _outline_disc(canvas, project, centre, settings, text, edge_colour=colour)
     return words
 
 
@@ -214,12 +219,9 @@ def _draw_lines(
     ends = ends_of(found)
     bars = sigma_bars(camera, ends, np.array([row.sigma for row in found], dtype=np.float64))
     times = enlargement(canvas)
-    tick = times * np.array([[0.0, -2.0], [0.0, 2.0]])
     for curve, bar, colour, text in zip(line_curves(camera, ends), bars, colours, texts):
         draw_curve(canvas, curve, colour)
-        draw_curve(canvas, bar, _SIGMA_COLOUR)
-        for end in bar:
-            draw_curve(canvas, end + tick, _SIGMA_COLOUR)
+        draw_bar(canvas, bar, _SIGMA_COLOUR)
         if text and np.all(np.isfinite(curve[-1])):
             at = (round(float(curve[-1, 0])) - 8 * times, round(float(curve[-1, 1])) + 9 * times)
             draw_text(canvas, text, at, _SIGMA_COLOUR, 0.3)
@@ -236,3 +238,59 @@ def _draw_markers(canvas: NDArray[np.uint8], found: Sequence[MarkerLandmark]) ->
 
 def _fate(extra: int, missed: int) -> str:
     return f" ({extra} extra, {missed} missed)"
+
+
+def draw_circles(
+    image: NDArray[np.uint8],
+    camera: Camera,
+    found: CircleDetections,
+    settings: CircleSettings,
+) -> NDArray[np.uint8]:
+    """Draw the outlines of detected discs and their quality (the report's figure 8).
+
+    Parameters
+    ----------
+    image : (H, W) uint8
+        The grey image.
+    camera : Camera
+        The calibrated camera, through which the outlines are drawn.
+    found : CircleDetections
+        The discs.
+    settings : CircleSettings
+        The radii of the outlines.
+
+    Returns
+    -------
+    (H, W, 3) uint8
+        In OpenCV's order blue, green, red.
+    """
+    canvas = canvas_of(image, camera)
+    for centre, quality in zip(found.floor_xy, found.quality):
+        _outline_disc(canvas, camera.project_floor, centre, settings, f"{quality:.2f}")
+    return canvas
+
+
+def _outline_disc(
+    canvas: NDArray[np.uint8],
+    project: Callable[[FloatArray], FloatArray],
+    centre_xy: FloatArray,
+    settings: CircleSettings,
+    text: str,
+    *,
+    edge_colour: Colour = _EDGE_COLOUR,
+) -> None:
+    """Draw a disc's edge and its two outlines, and a word above.
+
+    `project` takes (N, 2) places on the floor (m) to (N, 2) pixels, NaN where they are not seen.
+    """
+    for radius, colour in (
+        (settings.inner_radius_m, _OUTLINE_COLOUR),
+        (settings.radius_m, edge_colour),
+        (settings.outer_radius_m, _OUTLINE_COLOUR),
+    ):
+        draw_curve(canvas, project(circle_on_floor(centre_xy, radius)), colour, closed=True)
+    u, v = project(centre_xy + np.array([0.0, -settings.outer_radius_m]))
+    if np.isfinite(u) and np.isfinite(v):
+        times = enlargement(canvas)
+        at = (round(float(u)) - 14 * times, max(10 * times, round(float(v)) - 3 * times))
+        draw_text(canvas, text, at, _TEXT_COLOUR)

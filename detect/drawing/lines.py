@@ -6,9 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera
+from detect.drawing.frame import line_curves
 from detect.drawing.strokes import (
     Colour,
     canvas_of,
+    draw_bar,
     draw_curve,
     draw_text,
     enlargement,
@@ -20,7 +22,6 @@ from lut.verticals import VerticalTable
 
 FloatArray = NDArray[np.float64]
 
-_POINTS = 33
 _LINE_COLOUR: Colour = (60, 220, 60)
 _JOINED_COLOUR: Colour = (255, 190, 0)
 _SIGMA_COLOUR: Colour = (0, 170, 255)
@@ -65,23 +66,18 @@ def draw_lines(
         In OpenCV's order blue, green, red.
     """
     canvas = canvas_of(image, camera)
-    times = enlargement(canvas)
-    tick = times * np.array([[0.0, -2.0], [0.0, 2.0]])
-    share = np.linspace(0.0, 1.0, _POINTS)[:, None]
-    for ends, sigma, members in zip(found.ends, found.sigma_rad, found.members):
-        points = camera.distort((1.0 - share) * ends[:2] + share * ends[2:])
+    curves = line_curves(camera, found.ends)
+    for points, sigma, members in zip(curves, found.sigma_rad, found.members):
         draw_curve(canvas, points, _LINE_COLOUR if len(members) == 1 else _JOINED_COLOUR)
         u, v = _horizon_crossing(table, found, members[0])
         reach = sigma / found.fits.pixel_rad[members[0]]
-        bar = np.array([[u - reach, v], [u + reach, v]])
-        draw_curve(canvas, bar, _SIGMA_COLOUR)
-        for end in bar:
-            draw_curve(canvas, end + tick, _SIGMA_COLOUR)
+        draw_bar(canvas, np.array([[u - reach, v], [u + reach, v]]), _SIGMA_COLOUR)
     if found.tilt is None:
         text = "no tilt"
     else:
         pitch, roll = np.degrees([found.tilt.pitch_rad, found.tilt.roll_rad])
         text = f"pitch {pitch:.2f}  roll {roll:.2f} deg  ({found.tilt.lines} lines)"
+    times = enlargement(canvas)
     draw_text(canvas, text, (4 * times, image.shape[0] - 5 * times), _SIGMA_COLOUR, 0.4)
     return canvas
 

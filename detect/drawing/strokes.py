@@ -65,6 +65,13 @@ def draw_curve(
         cv2.polylines(canvas, [fixed], closed, colour, width, cv2.LINE_AA, _SUBPIXEL_BITS)
 
 
+def draw_bar(canvas: NDArray[np.uint8], ends: FloatArray, colour: Colour) -> None:
+    """Draw an error bar between two points (2, 2) u, v, with a tick at each."""
+    tick = enlargement(canvas) * np.array([[0.0, -2.0], [0.0, 2.0]])
+    for points in (ends, ends[0] + tick, ends[1] + tick):
+        draw_curve(canvas, points, colour)
+
+
 def draw_text(
     canvas: NDArray[np.uint8], text: str, at: tuple[int, int], colour: Colour, size: float = 0.35
 ) -> None:

@@ -4,6 +4,6 @@ The columns are those of `landmarks.columns`, the numbers those of the files.
 
     options    the flags of ``detect export``
     rows       a file's rows, one after the other, with their frames and times
-    csv_file, parquet_file, mcap_file    a module per format
+    writers    the formats
     command    what ``detect export`` does
 """

@@ -5,11 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from detect.errors import DetectError
-from detect.exports.csv_file import write_csv
-from detect.exports.mcap_file import write_mcap
 from detect.exports.options import Export
-from detect.exports.parquet_file import demand_pyarrow, write_parquet
 from detect.exports.rows import ExportedRows
+from detect.exports.writers import demand_pyarrow, write_csv, write_mcap, write_parquet
 from detect.sources.times import TimesByImage
 from landmarks.columns import TableName
 from storage import OutputExistsError, write_whole

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from detect.markers.candidates import Mask
 from detect.markers.refinement import RefinedQuadrangle
-from detect.markers.regions import Region
 from landmarks import MarkerCorner, MarkerLandmark
 
 FloatArray = NDArray[np.float64]
@@ -26,20 +25,14 @@ class Candidate:
 
     Attributes
     ----------
-    region : Region
-        Where it comes from.
-    rough : (4, 2) float64
-        Its rough corners, straight pixels.
     outline : (4, 2) float64
-        The same as pixels of the image.
+        Its rough corners, pixels of the image.
     fate : str
         ``accepted`` or why not.
     refined : RefinedQuadrangle or None
         Its fitted edges, if it came so far.
     """
 
-    region: Region
-    rough: FloatArray
     outline: FloatArray
     fate: str
     refined: RefinedQuadrangle | None = None
@@ -91,29 +84,14 @@ class MarkerDetections:
 
     def landmarks(self) -> tuple[MarkerLandmark, ...]:
         """The markers as rows of a file."""
-        return tuple(
-            MarkerLandmark(
-                self.dictionary,
-                int(number),
-                float(quality),
-                (
-                    _corner(corners[0], covariance[0]),
-                    _corner(corners[1], covariance[1]),
-                    _corner(corners[2], covariance[2]),
-                    _corner(corners[3], covariance[3]),
-                ),
+        rows = []
+        for k, number in enumerate(self.ids):
+            first, second, third, fourth = (
+                MarkerCorner(*map(float, (*place, spread[0, 0], spread[0, 1], spread[1, 1])))
+                for place, spread in zip(self.corners[k], self.covariance[k])
             )
-            for number, quality, corners, covariance in zip(
-                self.ids, self.quality, self.corners, self.covariance
+            corners = (first, second, third, fourth)
+            rows.append(
+                MarkerLandmark(self.dictionary, int(number), float(self.quality[k]), corners)
             )
-        )
-
-
-def _corner(place: FloatArray, covariance: FloatArray) -> MarkerCorner:
-    return MarkerCorner(
-        float(place[0]),
-        float(place[1]),
-        float(covariance[0, 0]),
-        float(covariance[0, 1]),
-        float(covariance[1, 1]),
-    )
+        return tuple(rows)

@@ -8,14 +8,16 @@ away.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
-from detect.markers.lens import Lens
+from detect.markers.homography import project, square_homography
+from detect.markers.lens import Picture, bent, middle_pixel
 from detect.markers.pattern_fit import PatternFit
-from detect.markers.sampling_kernels import sample_cells
 from detect.markers.settings import MarkerSettings
 from detect.markers.templates import Templates
 
@@ -81,19 +83,41 @@ class Identity:
     margin: float
 
 
-def sampled_cells(
-    image: NDArray[np.uint8], lens: Lens, corners: FloatArray, templates: Templates
-) -> FloatArray | None:
+def sampled_cells(picture: Picture, corners: FloatArray, templates: Templates) -> FloatArray | None:
     """(G, G) grey values of the grid's cells; None if some are outside the image."""
     dictionary = templates.dictionary
     cells = np.empty((len(dictionary.centres),) * 2)
-    middle = corners.mean(axis=0)
-    guess = lens.bend(middle[None], middle)[0]
-    inside = sample_cells(
-        image, lens.grid, lens.step, corners, guess, dictionary.centres,
-        _SPREAD_CELLS * dictionary.cell, cells,
-    )  # fmt: skip
-    return cells if inside else None
+    spread = _SPREAD_CELLS * dictionary.cell
+    return cells if _sample_cells(picture, corners, dictionary.centres, spread, cells) else None
+
+
+@njit(cache=True, error_model="numpy")
+def _sample_cells(
+    picture: Picture, corners: FloatArray, centres: FloatArray, spread: float, cells: FloatArray
+) -> bool:
+    """Mean of 3x3 grey values, `spread` apart, round the middle of each cell; False outside."""
+    image = picture.grey
+    height, width = image.shape
+    guess = middle_pixel(picture.lens, corners)
+    homography = square_homography(corners)
+    n = len(centres)
+    for j in range(n):
+        for i in range(n):
+            total = 0.0
+            for b in range(-1, 2):
+                for a in range(-1, 2):
+                    x, y, _ = project(homography, centres[i] + a * spread, centres[j] + b * spread)
+                    u, v = bent(picture.lens, x, y, guess)
+                    if not (0.0 <= u <= width - 1.0 and 0.0 <= v <= height - 1.0):
+                        return False
+                    iu = min(math.floor(u), width - 2)
+                    iv = min(math.floor(v), height - 2)
+                    fu, fv = u - iu, v - iv
+                    total += (1.0 - fv) * (
+                        (1.0 - fu) * image[iv, iu] + fu * image[iv, iu + 1]
+                    ) + fv * ((1.0 - fu) * image[iv + 1, iu] + fu * image[iv + 1, iu + 1])
+            cells[j, i] = total / 9.0
+    return True
 
 
 def nearest_pattern(

@@ -8,29 +8,34 @@ coordinates, and what comes out is bent back. Without a camera both are the same
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
+import math
+from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from camera import Camera
 from detect.errors import FrameError
-from detect.markers.lens_kernels import bend_points, straighten_points, straightened
+from detect.noise import estimate_noise
 
 FloatArray = NDArray[np.float64]
 
 #: Spacing for bilinear interpolation; the error is an eighth of its square times the curvature.
 _STEP_PX = 2
+_NEWTON_STEPS = 12
+_CLOSE_ENOUGH = 1e-7
+#: Rows of the image that its noise is estimated from.
+_NOISE_ROWS = 64
 
 
-@dataclass(frozen=True, eq=False)
-class Lens:
+class Lens(NamedTuple):
     """Where pixels are in an image without distortion.
 
     Attributes
     ----------
     grid : (H, W, 2) float64
-        Straight position of every so manieth pixel; empty without distortion.
+        Straight position of pixel (step * i, step * j) at [j, i]; empty without distortion.
     step : float
         Distance of the grid's pixels.
     """
@@ -40,22 +45,43 @@ class Lens:
 
     def straighten(self, pixels: FloatArray) -> FloatArray:
         """(N, 2) straight positions of (N, 2) pixels."""
-        return np.asarray(straighten_points(self.grid, self.step, pixels))
+        return np.asarray(_straighten_points(self, pixels))
 
-    def bend(self, straight: FloatArray, guess: FloatArray) -> FloatArray:
-        """(N, 2) pixels of (N, 2) straight positions; NaN where there is none.
-
-        `guess` (2,) is a pixel not far away.
-        """
-        return np.asarray(bend_points(self.grid, self.step, straight, guess))
+    def bend(self, straight: FloatArray) -> FloatArray:
+        """(N, 2) pixels of (N, 2) straight positions near each other; NaN where there is none."""
+        return np.asarray(_bend_points(self, straight))
 
     def pixel_jacobian(self, pixel: FloatArray) -> FloatArray:
         """(2, 2) d(pixel) / d(straight position) at a pixel (2,)."""
-        _, _, xu, xv, yu, yv = straightened(self.grid, self.step, pixel[0], pixel[1])
+        _, _, xu, xv, yu, yv = straightened(self, pixel[0], pixel[1])
         return np.asarray(np.linalg.inv(np.array([[xu, xv], [yu, yv]])))
 
 
+class Picture(NamedTuple):
+    """An image, the lens that it was taken through, and the standard deviation of its noise.
+
+    Attributes
+    ----------
+    grey : (H, W) uint8
+        Grey values.
+    lens : Lens
+    noise : float
+        Grey levels.
+    """
+
+    grey: NDArray[np.uint8]
+    lens: Lens
+    noise: float
+
+
 NO_LENS = Lens(np.empty((0, 0, 2)), 1.0)
+
+
+def picture_of(image: NDArray[np.uint8], camera: Camera | None) -> Picture:
+    """An image with its lens and its noise; errors as of `lens_of`."""
+    lens = lens_of(camera, image)
+    image = np.ascontiguousarray(image)
+    return Picture(image, lens, estimate_noise(image, _NOISE_ROWS))
 
 
 def lens_of(camera: Camera | None, image: NDArray[np.uint8]) -> Lens:
@@ -106,3 +132,73 @@ def _cached_lens(camera: Camera) -> Lens:
     grid[:, -1] += (grid[:, -1] - grid[:, -2]) * ((u_there[-1] - u[-1]) / (u[-1] - u[-2]))
     grid[-1] += (grid[-1] - grid[-2]) * ((v_there[-1] - v[-1]) / (v[-1] - v[-2]))
     return Lens(np.ascontiguousarray(grid), float(_STEP_PX))
+
+
+@njit(cache=True, error_model="numpy")
+def straightened(lens: Lens, u: float, v: float) -> tuple[float, float, float, float, float, float]:
+    """Straight position of a pixel and its derivatives: x, y, dx/du, dx/dv, dy/du, dy/dv.
+
+    Bilinear interpolation in the grid; beyond its border its outermost cells are continued.
+    """
+    grid, step = lens.grid, lens.step
+    if grid.shape[0] == 0:
+        return u, v, 1.0, 0.0, 0.0, 1.0
+    fu = u / step
+    fv = v / step
+    i = min(max(math.floor(fu), 0), grid.shape[1] - 2)
+    j = min(max(math.floor(fv), 0), grid.shape[0] - 2)
+    a = fu - i
+    b = fv - j
+    x00, x01, x10, x11 = grid[j, i, 0], grid[j, i + 1, 0], grid[j + 1, i, 0], grid[j + 1, i + 1, 0]
+    y00, y01, y10, y11 = grid[j, i, 1], grid[j, i + 1, 1], grid[j + 1, i, 1], grid[j + 1, i + 1, 1]
+    x = (1.0 - b) * ((1.0 - a) * x00 + a * x01) + b * ((1.0 - a) * x10 + a * x11)
+    y = (1.0 - b) * ((1.0 - a) * y00 + a * y01) + b * ((1.0 - a) * y10 + a * y11)
+    xu = ((1.0 - b) * (x01 - x00) + b * (x11 - x10)) / step
+    xv = ((1.0 - a) * (x10 - x00) + a * (x11 - x01)) / step
+    yu = ((1.0 - b) * (y01 - y00) + b * (y11 - y10)) / step
+    yv = ((1.0 - a) * (y10 - y00) + a * (y11 - y01)) / step
+    return x, y, xu, xv, yu, yv
+
+
+@njit(cache=True, error_model="numpy")
+def bent(lens: Lens, x: float, y: float, guess: tuple[float, float]) -> tuple[float, float]:
+    """The pixel whose straight position is (x, y), from a pixel near it; NaN if none is found."""
+    if lens.grid.shape[0] == 0:
+        return x, y
+    u, v = guess
+    for _ in range(_NEWTON_STEPS):
+        at_x, at_y, xu, xv, yu, yv = straightened(lens, u, v)
+        determinant = xu * yv - xv * yu
+        dx = x - at_x
+        dy = y - at_y
+        du = (yv * dx - xv * dy) / determinant
+        dv = (xu * dy - yu * dx) / determinant
+        u += du
+        v += dv
+        if abs(du) + abs(dv) < _CLOSE_ENOUGH:
+            return u, v
+    return math.nan, math.nan
+
+
+@njit(cache=True, error_model="numpy")
+def middle_pixel(lens: Lens, straight: FloatArray) -> tuple[float, float]:
+    """The pixel of the mean of (N, 2) straight positions."""
+    x, y = straight[:, 0].mean(), straight[:, 1].mean()
+    return bent(lens, x, y, (x, y))
+
+
+@njit(cache=True, error_model="numpy")
+def _straighten_points(lens: Lens, pixels: FloatArray) -> FloatArray:
+    result = np.empty_like(pixels)
+    for k in range(len(pixels)):
+        result[k, 0], result[k, 1], _, _, _, _ = straightened(lens, pixels[k, 0], pixels[k, 1])
+    return result
+
+
+@njit(cache=True, error_model="numpy")
+def _bend_points(lens: Lens, straight: FloatArray) -> FloatArray:
+    result = np.empty_like(straight)
+    guess = middle_pixel(lens, straight)
+    for k in range(len(straight)):
+        result[k, 0], result[k, 1] = bent(lens, straight[k, 0], straight[k, 1], guess)
+    return result

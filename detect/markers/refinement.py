@@ -1,23 +1,21 @@
 """Phase 3, first part: edges and corners with sub-pixel precision.
 
-Each edge of the rough quadrangle is fitted to the image itself: a straight, blurred step between
-two grey levels, by robust least squares of all pixels near its expected place except near the
-corners. Intersections of the edges are the refined corners; their covariance follows from the
-edges'. Everything happens at straight positions (see `detect.markers.lens`).
+Each edge of the rough quadrangle is fitted to the image itself (`detect.markers.edges`).
+Intersections of the edges are the refined corners; their covariance follows from the edges'.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
-from detect.interrupts import interrupts_deferred_in
-from detect.markers.edge_corner_kernels import corners_of_edges
-from detect.markers.edge_kernels import EdgeSearch, fit_edges
-from detect.markers.lens import Lens
-from detect.markers.polygon_kernels import is_convex
+from detect.markers.edges import EdgeFits, EdgeSearch, fit_edges
+from detect.markers.lens import Picture
+from detect.markers.quadrangle import is_convex
 
 FloatArray = NDArray[np.float64]
 
@@ -45,8 +43,7 @@ _LEAST_REACH_PX = 2.2
 _LARGEST_MOVE = 2.5
 
 
-@dataclass(frozen=True)
-class RefinedQuadrangle:
+class RefinedQuadrangle(NamedTuple):
     """A quadrangle whose edges were fitted.
 
     Attributes
@@ -55,57 +52,35 @@ class RefinedQuadrangle:
         Straight pixels, clockwise as seen in the image; edge k goes from corner k to k + 1.
     covariance : (4, 2, 2) float64
         Of each corner, from its two edges, pixels squared.
-    contrast : (4,) float64
-        Step of each edge, from inside to outside, grey levels.
-    dark, light : (4,) float64
-        Its two levels.
-    blur_px : (4,) float64
-        Its blur (standard deviation), the pixel's own included.
-    rest : (4,) float64
-        Standard deviation of what the step leaves over, grey levels.
-    pixels : (4,) float64
-        How many were used.
-    support : (4,) float64
-        Share of the edge's length where the step is seen.
+    edges : EdgeFits
+        Grey levels, blur and support of each edge.
     """
 
     corners: FloatArray
     covariance: FloatArray
-    contrast: FloatArray
-    dark: FloatArray
-    light: FloatArray
-    blur_px: FloatArray
-    rest: FloatArray
-    pixels: FloatArray
-    support: FloatArray
+    edges: EdgeFits
 
 
 def refine_quadrangle(
-    image: NDArray[np.uint8],
-    lens: Lens,
+    picture: Picture,
     rough: FloatArray,
     *,
     capture_px: float,
     border: float,
-    noise: float,
     quick: bool = False,
 ) -> RefinedQuadrangle | None:
     """Fit the edges of a quadrangle to the image.
 
     Parameters
     ----------
-    image : (H, W) uint8
+    picture : Picture
         The image.
-    lens : Lens
-        Its lens.
     rough : (4, 2) float64
         Rough corners, straight pixels, clockwise as seen in the image.
     capture_px : float
         How far edges may be from the rough ones.
     border : float
         Thickness of the marker's black border, in its widths.
-    noise : float
-        Standard deviation of the image's noise, grey levels.
     quick : bool
         Use few pixels and two passes: enough to begin the fit of the whole marker with.
 
@@ -115,22 +90,20 @@ def refine_quadrangle(
         None if an edge is not there, or the edges make no convex quadrangle near the rough one.
     """
     corners = np.ascontiguousarray(rough, dtype=np.float64)
-    guess = lens.bend(corners.mean(axis=0)[None], corners.mean(axis=0))[0]
     covariance = np.empty((4, 2, 2))
+    edges = EdgeFits(*np.empty((len(EdgeFits._fields), 4)))
     capture, blur = capture_px, _FIRST_BLUR_PX
     pixels = _QUICK_PIXELS if quick else _MOST_PIXELS
     for attempt in range(_QUICK_PASSES if quick else _PASSES):
         search = EdgeSearch(
-            capture, border, blur, noise,
+            capture, border, blur,
             _FIRST_PIXELS if attempt == 0 else pixels,
             _ROUGHLY_PX if quick or attempt == 0 else _EXACTLY_PX,
         )  # fmt: skip
-        with interrupts_deferred_in(fit_edges):
-            found, edges = fit_edges(image, lens.grid, lens.step, corners, guess, search)
-        if not found:
-            return None
         refined = np.empty((4, 2))
-        if not corners_of_edges(corners, edges, refined, covariance):
+        if not fit_edges(picture, corners, search, edges):
+            return None
+        if not _intersect(corners, edges, refined, covariance):
             return None
         if np.abs(refined - rough).max() > _LARGEST_MOVE * capture_px or not is_convex(refined):
             return None
@@ -140,14 +113,61 @@ def refine_quadrangle(
         capture = max(_REACH_BLURS * blur + _REACH_PX, _LEAST_REACH_PX)
         if attempt > 0 and moved < _CLOSE_ENOUGH_PX:
             break
-    return RefinedQuadrangle(
-        corners=corners,
-        covariance=covariance,
-        contrast=edges.light - edges.dark,
-        dark=edges.dark,
-        light=edges.light,
-        blur_px=edges.blur,
-        rest=edges.rest,
-        pixels=edges.pixels,
-        support=edges.support,
-    )
+    return RefinedQuadrangle(corners, covariance, edges)
+
+
+@njit(cache=True, error_model="numpy")
+def _intersect(
+    corners: FloatArray,
+    edges: EdgeFits,
+    refined: FloatArray,
+    covariance: FloatArray,
+) -> bool:
+    """Intersections of the fitted edges (4, 2), and their covariances (4, 2, 2) in pixels squared.
+
+    The edges' offsets are relative to the lines between `corners`. Returns whether all intersect.
+    """
+    normal = np.empty((4, 2))
+    level = np.empty(4)
+    for k in range(4):
+        p0 = corners[k]
+        p1 = corners[(k + 1) % 4]
+        length = math.hypot(p1[0] - p0[0], p1[1] - p0[1])
+        tx, ty = (p1[0] - p0[0]) / length, (p1[1] - p0[1]) / length
+        # Outward normal (ty, -tx); the fitted line runs through the shifted ends.
+        b0 = edges.offset[k] - edges.turn[k]
+        b1 = edges.offset[k] + edges.turn[k]
+        ax, ay = p0[0] + b0 * ty, p0[1] - b0 * tx
+        bx, by = p1[0] + b1 * ty, p1[1] - b1 * tx
+        span = math.hypot(bx - ax, by - ay)
+        normal[k, 0] = (by - ay) / span
+        normal[k, 1] = -(bx - ax) / span
+        level[k] = normal[k, 0] * ax + normal[k, 1] * ay
+    for k in range(4):
+        j = (k + 3) % 4
+        determinant = normal[j, 0] * normal[k, 1] - normal[j, 1] * normal[k, 0]
+        if abs(determinant) < 0.05:
+            return False
+        x = (level[j] * normal[k, 1] - level[k] * normal[j, 1]) / determinant
+        y = (normal[j, 0] * level[k] - normal[k, 0] * level[j]) / determinant
+        refined[k, 0] = x
+        refined[k, 1] = y
+        # Each line's variance at the corner moves it along the other line.
+        covariance[k] = 0.0
+        for which in range(2):
+            e = j if which == 0 else k
+            o = k if which == 0 else j
+            q0 = corners[e]
+            q1 = corners[(e + 1) % 4]
+            length = math.hypot(q1[0] - q0[0], q1[1] - q0[1])
+            s = ((x - q0[0]) * (q1[0] - q0[0]) + (y - q0[1]) * (q1[1] - q0[1])) / length / (
+                0.5 * length
+            ) - 1.0
+            variance = edges.var_offset[e] + 2.0 * s * edges.covar[e] + s * s * edges.var_turn[e]
+            mx = normal[o, 1] / determinant
+            my = -normal[o, 0] / determinant
+            covariance[k, 0, 0] += variance * mx * mx
+            covariance[k, 0, 1] += variance * mx * my
+            covariance[k, 1, 1] += variance * my * my
+        covariance[k, 1, 0] = covariance[k, 0, 1]
+    return True

@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 import functools
+import itertools
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from detect.markers.dictionaries import MarkerDictionary, marker_dictionary
+from detect.markers.settings import MarkerSettings
 
 FloatArray = NDArray[np.float64]
 
 #: A random pattern is one of the dictionary's with a probability of 2 to the power of minus this:
 #: in strong dictionaries, and in weak ones.
 _STRONG_BITS, _WEAK_BITS = 24.0, 14.0
+
+#: Size of the cells and the margin of a specimen.
+_CELL_PX, _MARGIN_PX = 5, 20
 
 #: Blurs for which templates are kept, in cells.
 _BLURS_CELLS = (0.2, 0.35, 0.5, 0.7, 1.0)
@@ -66,19 +72,17 @@ class Templates:
     first: int
     border: float
 
+    @property
+    def grid(self) -> slice:
+        """Rows, and columns, of the grid among the cells between the lines."""
+        return slice(self.first, self.first + self.dictionary.patterns.shape[-1])
+
     def blackness(self, template: int) -> FloatArray:
         """(L - 1, L - 1) pattern of a template between the lines, 1 for black."""
         side = self.dictionary.patterns.shape[-1]
         result = np.ones((len(self.lines) - 1,) * 2)
-        inner = slice(self.first, self.first + side)
-        result[inner, inner] = 1.0 - self.cells[template].reshape(side, side)
+        result[self.grid, self.grid] = 1.0 - self.cells[template].reshape(side, side)
         return result
-
-    def grid_of(self, between_lines: FloatArray) -> FloatArray:
-        """(G * G,) the grid's part of values given for all cells between the lines."""
-        side = self.dictionary.patterns.shape[-1]
-        inner = slice(self.first, self.first + side)
-        return np.ascontiguousarray(between_lines[inner, inner]).ravel()
 
     def nearest_blur(self, blur_cells: float) -> NDArray[np.float32]:
         """The normalised templates of the blur next to the given one."""
@@ -177,18 +181,12 @@ def _decoys(
     varied = np.asarray(dictionary.patterns.any(axis=0))
     rows, columns = np.flatnonzero(varied.any(axis=1)), np.flatnonzero(varied.any(axis=0))
     top, left, height, width = rows[0], columns[0], len(rows), len(columns)
-    inner = [np.zeros((height, width), bool), np.ones((height, width), bool)]
-    for begin in range(width):
-        for end in range(begin + 1, width + 1):
-            bar = np.zeros((height, width), bool)
-            bar[:, begin:end] = True
-            inner += [bar, ~bar]
-    for begin in range(height):
-        for end in range(begin + 1, height + 1):
-            bar = np.zeros((height, width), bool)
-            bar[begin:end] = True
-            inner += [bar, ~bar]
     j, i = np.indices((height, width))
+    inner = [np.zeros((height, width), bool), np.ones((height, width), bool)]
+    for place, count in ((i, width), (j, height)):
+        for begin, end in itertools.combinations(range(count + 1), 2):
+            bar = (place >= begin) & (place < end)
+            inner += [bar, ~bar]
     for thick in range(1, max(2, width // 2)):
         for shift in range(thick):
             column, row = (i + shift) // thick % 2 == 0, (j + shift) // thick % 2 == 0
@@ -215,3 +213,14 @@ def _border(dictionary: MarkerDictionary, first_edge: float) -> float:
     ):  # fmt: skip
         rings += 1
     return first_edge + rings * dictionary.cell
+
+
+def specimen_image(settings: MarkerSettings) -> NDArray[np.uint8]:
+    """A grey image of one of the expected markers on white, seen from the front."""
+    templates = templates_of(settings.dictionary, settings.ids)
+    widths = np.diff(templates.lines) / templates.dictionary.cell
+    pixels = np.maximum(1, np.rint(widths * _CELL_PX)).astype(np.intp)
+    black = np.repeat(np.repeat(templates.blackness(0), pixels, axis=0), pixels, axis=1)
+    grey = np.where(np.pad(black, _MARGIN_PX) > 0.5, 40.0, 200.0)
+    # Soft edges, as all images have them.
+    return np.asarray(np.rint(cv2.blur(grey, (3, 3))), np.uint8)

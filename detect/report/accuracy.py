@@ -6,10 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from detect.comparison.lines_result import LineComparison
-from detect.comparison.report import lean_text, levelling_text
-from detect.comparison.result import Comparison, NormalisedError
-from detect.comparison.tables import number
+from detect.comparison.report import lean_text, levelling_text, number
+from detect.comparison.result import Comparison, LineComparison, NormalisedError
 from detect.report.figures import (
     distance_figure,
     errors_figure,
@@ -29,7 +27,7 @@ from detect.report.statistics import (
     line_residuals,
     normality,
 )
-from detect.tune.curve import knee
+from detect.tune.table import knee
 
 _CURVE_POINTS = 41
 _TABLE_POINTS = 5

@@ -12,7 +12,7 @@ from detect.comparison.result import DiscPairs, DistanceBin
 from detect.drawing.inputs import SeenRows
 from detect.report.plot import BAND, DATA, MARK, REFERENCE, SECOND, plotted
 from detect.report.statistics import RateCurve, Residuals, normality
-from detect.tune.curve import knee, pareto_front
+from detect.tune.table import knee, pareto_front
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

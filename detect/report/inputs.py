@@ -9,8 +9,7 @@ from functools import cached_property
 
 from detect.comparison.circles import Sight, beside_reference, compare_frames
 from detect.comparison.lines import compare_line_frames
-from detect.comparison.lines_result import LineCompareOptions, LineComparison
-from detect.comparison.result import CompareOptions, Comparison
+from detect.comparison.result import CompareOptions, Comparison, LineCompareOptions, LineComparison
 from detect.drawing.inputs import SeenFiles, SeenRows, find_files, open_rows
 from detect.errors import DetectError, FrameError
 from detect.report.statistics import FramePair

@@ -4,26 +4,37 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import fields
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 
 from detect.comparison.circles import FLOOR_GATE_M
-from detect.comparison.tables import number
+from detect.comparison.report import number
 from detect.drawing.inputs import picture_name
 from detect.line_settings import LineSettings
 from detect.markers.settings import MarkerSettings
 from detect.report.accuracy import disc_parts, line_parts
 from detect.report.figures import counts_figure, tilt_figure
 from detect.report.inputs import ReportInputs
-from detect.report.parts import Part, Section, data_address, figure_part, scaled
-from detect.report.template import PAGE, STYLE
+from detect.report.parts import PAGE, STYLE, Part, Section, data_address, figure_part, scaled
 from detect.settings import CircleSettings
 
 #: An image of a frame (JPEG), its width and height; or why there is none.
 Picture = tuple[bytes, int, int] | str
+
+
+class Gallery(NamedTuple):
+    """Cut-outs round discs that are "missed" or "extra": a JPEG, and how many of how many discs."""
+
+    fate: str
+    content: bytes
+    width: int
+    height: int
+    shown: int
+    of: int
+
 
 _NAMES = {"circles": "Discs", "lines": "Verticals", "markers": "Markers", "tilt": "Tilt"}
 _FATES = {"missed": "reference rows that are missing", "extra": "rows that fit no reference row"}
@@ -35,7 +46,7 @@ def report_page(
     version: str,
     worst: int,
     picture_of: Callable[[str], Picture],
-    galleries: Sequence[tuple[str, bytes, int, int, int, int]] = (),
+    galleries: Sequence[Gallery] = (),
 ) -> bytes:
     """The whole page, UTF-8; the same inputs give the same bytes.
 
@@ -48,9 +59,7 @@ def report_page(
         How many of the worst frames are shown.
     picture_of : callable
         Gives the picture of a frame, by its prefix.
-    galleries : sequence
-        Of cut-outs: "missed" or "extra", a JPEG, its width and height, how many discs are shown,
-        and how many there are.
+    galleries : sequence of Gallery
     """
     sections = [Section("summary", "What was found", _summary(inputs))]
     if "circles" in inputs.files.detected:
@@ -58,13 +67,13 @@ def report_page(
         sections[-1].parts.extend(
             Part(
                 "figure",
-                f"{shown} of the {count} {_FATES[fate]}, evenly over the run; the outline is "
-                "wider than the disc.",
-                data_address(content, "jpeg"),
-                width,
-                height,
+                f"{each.shown} of the {each.of} {_FATES[each.fate]}, evenly over the run; the "
+                "outline is wider than the disc.",
+                data_address(each.content, "jpeg"),
+                each.width,
+                each.height,
             )
-            for fate, content, width, height, shown, count in galleries
+            for each in galleries
         )
     if "lines" in inputs.files.detected:
         sections.append(Section("verticals", "Verticals against the reference", line_parts(inputs)))
@@ -180,36 +189,16 @@ def _frames(
 
 def _worst(inputs: ReportInputs, count: int) -> Iterator[tuple[str, str, list[tuple[str, ...]]]]:
     """What, the unit of its errors, and a row of a table for each of the worst frames."""
-    if inputs.discs is not None:
-        yield (
-            "discs",
-            "mm",
-            [
-                (
-                    s.name,
-                    str(s.matched),
-                    str(s.missed),
-                    str(s.extra),
-                    scaled(s.largest_error_m, 1e3, 1),
-                )
-                for s in inputs.discs.worst_frames(count)
-            ],
-        )
-    if inputs.lines is not None:
-        yield (
-            "verticals",
-            "deg",
-            [
-                (
-                    s.name,
-                    str(s.matched),
-                    str(s.missed),
-                    str(s.extra),
-                    number(s.largest_error_deg, 3),
-                )
-                for s in inputs.lines.worst_frames(count)
-            ],
-        )
+    for what, unit, comparison, factor, decimals in (
+        ("discs", "mm", inputs.discs, 1e3, 1),
+        ("verticals", "deg", inputs.lines, 1.0, 3),
+    ):
+        if comparison is not None:
+            yield what, unit, [
+                (s.name, str(s.matched), str(s.missed), str(s.extra),
+                 scaled(s.largest_error, factor, decimals))
+                for s in comparison.worst_frames(count)
+            ]  # fmt: skip
 
 
 def _tilt(inputs: ReportInputs) -> list[Part]:

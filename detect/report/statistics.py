@@ -11,8 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from detect.comparison.circles import pair_discs
 from detect.comparison.lines import joined_lines, pair_lines
-from detect.comparison.lines_result import LineCompareOptions
-from detect.comparison.result import CompareOptions, DiscPairs
+from detect.comparison.result import CompareOptions, DiscPairs, LineCompareOptions
 from detect.seen import FrameView
 from landmarks import (
     CircleLandmark,
@@ -42,8 +41,6 @@ class Residuals:
 
     Attributes
     ----------
-    distance_m : (N,) float64
-        Of the reference disc from the robot's origin; NaN for verticals.
     bearing_rad : (N,) float64
         Of the reference row: 0 forward, positive to the left.
     error : (N,) float64
@@ -54,7 +51,6 @@ class Residuals:
         if the covariances are right.
     """
 
-    distance_m: FloatArray
     bearing_rad: FloatArray
     error: FloatArray
     whitened: FloatArray
@@ -87,7 +83,6 @@ def disc_residuals(pairs: DiscPairs) -> Residuals:
     factor = np.linalg.cholesky(pairs.covariance[usable])
     whitened = np.linalg.solve(factor, offset[usable][:, :, None])[:, :, 0]
     return Residuals(
-        distance_m=np.hypot(xy[:, 0], xy[:, 1]),
         bearing_rad=np.arctan2(xy[:, 0], -xy[:, 1]),
         error=np.hypot(offset[:, 0], offset[:, 1]),
         whitened=whitened.ravel(),
@@ -109,7 +104,6 @@ def line_residuals(
     sigma = np.array([row.sigma for row in rows], dtype=np.float64)
     usable = sigma >= _LEAST_SIGMA_RAD
     return Residuals(
-        distance_m=np.full(len(rows), np.nan),
         bearing_rad=bearing,
         error=np.abs(error),
         whitened=error[usable] / sigma[usable],

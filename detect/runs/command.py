@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from detect import __version__
-from detect.drawing.head import read_head
+from detect.drawing.inputs import read_head
 from detect.errors import EXIT_FRAMES_FAILED, DetectError, FrameError, WorkerError
 from detect.options import All, Circles, DetectorFlags, DiscIdOptions, Lines, Markers
 from detect.run import ImageRun, Run, read_image

@@ -309,7 +309,7 @@ def rehearse(plan: FramePlan) -> None:
     tables = tables_of(plan)
     if plan.markers is not None:
         from detect.markers.detect import detect_markers
-        from detect.markers.specimen import specimen_image
+        from detect.markers.templates import specimen_image
 
         detect_markers(specimen_image(plan.markers), plan.markers)
     if plan.camera is None:

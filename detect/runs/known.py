@@ -15,8 +15,7 @@ import numpy as np
 
 from detect.discs.identity import MappedDisc
 from detect.errors import DetectError
-from detect.sources.image_names import image_name
-from detect.sources.name_index import NameIndex
+from detect.sources.image_names import NameIndex, image_name
 from landmarks import (
     CircleLandmark,
     Frame,

@@ -312,7 +312,7 @@ def _drawn(
     """The pictures of a plan, by name."""
     if plan.drawing is None and not plan.draw_response:
         return
-    from detect.drawing.detections import draw_circles
+    from detect.drawing.frame import draw_circles
     from detect.drawing.lines import draw_lines, draw_response, draw_tracks
     from detect.verticals.response import line_response
 

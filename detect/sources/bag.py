@@ -9,36 +9,31 @@ from __future__ import annotations
 
 from collections.abc import Generator
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from detect.errors import DetectError, FrameError
 from detect.sources.bag_camera import BASE_FRAME, recorded_calibration
-from detect.sources.bag_images import compressed_content, pixels_of_message
 from detect.sources.bag_messages import (
     LONGEST_NAME,
     chosen_topic,
+    compressed_content,
     messages,
     opened_bag,
+    pixels_of_message,
     stamp_s,
     understood,
 )
 from detect.sources.gray import gray_of_pixels, significant_bits
 from detect.sources.interface import (
-    FARTHEST,
     Calibration,
-    PoseStream,
+    Source,
     SourceImage,
-    TimedPose,
     numbered_prefix,
     only_calibration,
 )
-from detect.sources.tum import heading_rad
+from detect.sources.poses import FARTHEST, PoseStream, TimedPose, heading_rad
 from storage.messages import one_line
-
-if TYPE_CHECKING:
-    pass
 
 #: Endings of bags that are one file.
 BAG_SUFFIXES = frozenset({".bag", ".mcap", ".db3"})
@@ -50,7 +45,7 @@ _ODOMETRY = "nav_msgs/msg/Odometry"
 _PLANAR = np.ix_([0, 1, 5], [0, 1, 5])
 
 
-class Bag:
+class Bag(Source):
     """Images of a bag, named ``<bag>.0000`` and so on.
 
     Parameters
@@ -70,8 +65,6 @@ class Bag:
         If the package is not installed, the bag cannot be read, or has no such images.
     """
 
-    ships_images = True
-
     def __init__(
         self,
         path: Path,
@@ -89,12 +82,7 @@ class Bag:
             self.topic = chosen_topic(
                 reader, path, (_IMAGE, _COMPRESSED), image_topic, "images", "--image-topic"
             )
-            self._count = sum(c.msgcount for c in reader.connections if c.topic == self.topic)
-
-    @property
-    def expected(self) -> int | None:
-        """How many images there are."""
-        return self._count
+            self.expected = sum(c.msgcount for c in reader.connections if c.topic == self.topic)
 
     def images(self) -> Generator[SourceImage, None, None]:
         """The images of the topic: raw ones as grey values, compressed ones unchanged."""

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from camera import Camera
 from camera.calibration.floor import with_pose
@@ -22,7 +23,7 @@ from camera.formats.ros import camera_from_message
 from detect.errors import DetectError
 from detect.sources.bag_messages import LONGEST_NAME, messages, opened_bag, understood
 from detect.sources.interface import Calibration
-from detect.sources.steps import DATASET_FROM_ROBOTICS
+from detect.sources.poses import DATASET_FROM_ROBOTICS
 from storage.messages import one_line
 
 if TYPE_CHECKING:
@@ -40,7 +41,57 @@ _STATIC = "/tf_static"
 Matrix = NDArray[np.float64]
 
 
-def info_topic(reader: AnyReader, image_topic: str) -> str | None:
+def recorded_calibration(path: Path, image_topic: str, base: str) -> Calibration | None:
+    """The calibration that a bag holds of the camera of a topic; None if there is none.
+
+    Parameters
+    ----------
+    path : path
+        The bag.
+    image_topic : str
+        The camera's images.
+    base : str
+        The frame of the robot's base, on the floor.
+
+    Returns
+    -------
+    Calibration or None
+
+    Raises
+    ------
+    DetectError
+        If the bag cannot be read, the message is for part of the image only, or the model cannot
+        approximate the lens.
+    camera.CameraError
+        If there can be no such camera.
+    """
+    with opened_bag(path) as reader:
+        topic = _info_topic(reader, image_topic)
+        if topic is None:
+            return None
+        name = f"{path}: {one_line(topic, LONGEST_NAME)}"
+        found = next(messages(reader, path, topic), None)
+        with understood(name):
+            # Drivers that are not calibrated publish a matrix of zeros.
+            if found is None or not np.any(_field(found[2], "k")):
+                return None
+            message = found[2]
+            optical = str(message.header.frame_id)
+        transforms = static_transforms(reader, path)
+    pose = pose_in_dataset(transforms, base, optical)
+    why_not = (
+        f"{name} says nothing of the camera's pose above the floor, and no static "
+        f"transforms lead from {base!r} to {optical!r}: name a .cam file by --camera (`camera "
+        "convert` and `camera floor` make one), or the robot's base on the floor by --base-frame"
+    )
+    with understood(name):
+        camera = _camera_of_info(message, name)
+        return (
+            Calibration(camera, why_not) if pose is None else Calibration(with_pose(camera, pose))
+        )
+
+
+def _info_topic(reader: AnyReader, image_topic: str) -> str | None:
     """The camera_info of an image topic: that of its namespace, or the only one."""
     topics = sorted({c.topic for c in reader.connections if c.msgtype == _INFO})
     raw = image_topic.removesuffix("/compressed")
@@ -50,30 +101,8 @@ def info_topic(reader: AnyReader, image_topic: str) -> str | None:
     return topics[0] if len(topics) == 1 else None
 
 
-def calibration_of_info(message: Any, name: str, pose: Matrix | None, why_not: str) -> Calibration:
-    """The calibration of a camera_info message.
-
-    Parameters
-    ----------
-    message : sensor_msgs/CameraInfo
-    name : str
-        What messages call it.
-    pose : (3, 4) float64 or None
-        `robot_from_camera`.
-    why_not : str
-        Why there is none.
-
-    Returns
-    -------
-    Calibration
-
-    Raises
-    ------
-    DetectError
-        If it is for part of the image only, or the model cannot approximate the lens.
-    camera.CameraError
-        If there can be no such camera.
-    """
+def _camera_of_info(message: Any, name: str) -> Camera:
+    """The camera of a whole image's camera_info, without its pose, in the project's model."""
     part = message.roi.width or message.roi.height
     if part or max(message.binning_x, message.binning_y) > 1:
         raise DetectError(f"{name}: binning or roi is set: name a calibration by --camera")
@@ -89,14 +118,7 @@ def calibration_of_info(message: Any, name: str, pose: Matrix | None, why_not: s
             "one with a wider --limit-px)"
         )
     assert isinstance(converted.camera, Camera)
-    if pose is None:
-        return Calibration(converted.camera, why_not)
-    return Calibration(with_pose(converted.camera, pose))
-
-
-def is_calibrated(message: Any) -> bool:
-    """Whether a camera_info says anything: uncalibrated drivers publish a matrix of zeros."""
-    return bool(np.any(_field(message, "k")))
+    return converted.camera
 
 
 def static_transforms(reader: AnyReader, path: Path) -> dict[str, tuple[str, Matrix]]:
@@ -154,61 +176,11 @@ def rotation_of(qx: float, qy: float, qz: float, qw: float) -> Matrix:
     largest = np.abs(q).max()
     if not 0.0 < largest < np.inf:
         raise ValueError(f"a rotation of {qx:g}, {qy:g}, {qz:g}, {qw:g}")
-    q = q / largest  # squares of very large or small numbers overflow or underflow
-    x, y, z, w = q / np.linalg.norm(q)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    # Squares of very large or small numbers overflow or underflow.
+    return np.asarray(Rotation.from_quat(q / largest).as_matrix())
 
 
 def _field(message: Any, letter: str) -> NDArray[np.float64]:
     """The numbers of a field of camera_info, which ROS 1 calls by a capital letter."""
     name = letter.upper() if hasattr(message, letter.upper()) else letter
     return np.array(getattr(message, name), dtype=np.float64)
-
-
-def recorded_calibration(path: Path, image_topic: str, base: str) -> Calibration | None:
-    """The calibration that a bag holds of the camera of a topic; None if there is none.
-
-    Parameters
-    ----------
-    path : path
-        The bag.
-    image_topic : str
-        The camera's images.
-    base : str
-        The frame of the robot's base, on the floor.
-
-    Returns
-    -------
-    Calibration or None
-
-    Raises
-    ------
-    DetectError, camera.CameraError
-        As `calibration_of_info`, or if the bag cannot be read.
-    """
-    with opened_bag(path) as reader:
-        topic = info_topic(reader, image_topic)
-        if topic is None:
-            return None
-        name = f"{path}: {one_line(topic, LONGEST_NAME)}"
-        found = next(messages(reader, path, topic), None)
-        with understood(name):
-            if found is None or not is_calibrated(found[2]):
-                return None
-            message = found[2]
-            optical = str(message.header.frame_id)
-        transforms = static_transforms(reader, path)
-    pose = pose_in_dataset(transforms, base, optical)
-    why_not = (
-        f"{name} says nothing of the camera's pose above the floor, and no static "
-        f"transforms lead from {base!r} to {optical!r}: name a .cam file by --camera (`camera "
-        "convert` and `camera floor` make one), or the robot's base on the floor by --base-frame"
-    )
-    with understood(name):
-        return calibration_of_info(message, name, pose, why_not)

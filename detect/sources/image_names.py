@@ -6,16 +6,17 @@ A run may have a million frames: the memory per frame is the name of its image, 
 from __future__ import annotations
 
 import fnmatch
+import hashlib
 import os
 import re
 import stat
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from detect.errors import DetectError, FrameError
-from detect.sources.name_index import NameIndex
 from storage.inside import leads_out, link_out
 from storage.messages import excerpt
 
@@ -25,6 +26,8 @@ IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".pgm", ".ppm", ".tif", ".t
 FileStamp = tuple[int, int]
 
 _DIGITS = re.compile(r"[0-9]+")
+#: Longer names are known by their digest, bytes.
+_LONGEST = 64
 
 
 def image_name(prefix: str) -> str:
@@ -161,3 +164,43 @@ def _natural_order(name: str) -> str:
 
     begins_with_number = "1" if name[0].isdigit() else "0"
     return f"{begins_with_number}{_DIGITS.sub(by_value, name)}\0\0/{name}"
+
+
+class NameIndex:
+    """Finds the place of a name in a sequence; costs the width of the longest name and 4 bytes.
+
+    Parameters
+    ----------
+    names : iterable of bytes
+        Without NUL; longer ones than 64 bytes are known by their digest. Of equal ones the last
+        counts.
+    """
+
+    def __init__(self, names: Iterable[bytes]) -> None:
+        keys: NDArray[np.bytes_] = np.array([_key(name) for name in names], dtype=np.bytes_)
+        order = np.argsort(keys, kind="stable")
+        self._keys = keys[order]
+        self._places = order.astype(np.uint32)
+        self._next = 0  # in a run, after a name mostly comes its successor
+
+    def __len__(self) -> int:
+        return len(self._keys)
+
+    def find(self, name: bytes) -> int | None:
+        """The place of a name in the sequence; None if it is not there."""
+        key = _key(name)
+        keys = self._keys
+        # For a wider needle numpy would copy the whole haystack to its width.
+        if not len(keys) or len(key) > keys.itemsize:
+            return None
+        after = self._next + 1
+        if after >= len(keys) or keys.item(after - 1) != key or keys.item(after) == key:
+            after = int(keys.searchsorted(np.bytes_(key), side="right"))
+            if not after or keys.item(after - 1) != key:
+                return None
+        self._next = after
+        return self._places.item(after - 1)
+
+
+def _key(name: bytes) -> bytes:
+    return name if len(name) < _LONGEST else hashlib.sha256(name).hexdigest().encode()

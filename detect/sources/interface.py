@@ -1,21 +1,19 @@
-"""Interface of sources of images."""
+"""What all sources of images have in common."""
 
 from __future__ import annotations
 
 import re
+from abc import ABC, abstractmethod
 from collections.abc import Generator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera, read_camera
 from detect.errors import DetectError
-
-#: Limit of distances from the start (m), such that products of two remain finite.
-FARTHEST = 1e12
+from detect.sources.poses import PoseStream
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,35 +59,38 @@ class Calibration:
     why_no_pose: str | None = None
 
 
-class PoseStream(Protocol):
-    """Poses of the robot over time, as recorded; iterating again starts over."""
+class Source(ABC):
+    """Images in order.
 
-    #: What messages call it.
+    Attributes
+    ----------
+    name : str
+        What messages call it.
+    output_base : path
+        Results are called this, with an ending of their own.
+    ships_images : bool
+        Whether it gives contents of images, not files.
+    expected : int or None
+        Approximate number of images; None if unknown.
+    size : (int, int) or None
+        Width and height of the images, where they are known beforehand.
+    times_own : bool
+        Whether images have times by themselves; of others, they can be named.
+    has_times : bool
+        Whether the times of images are known.
+    """
+
     name: str
-    #: The file that it is read from, which heads of files name.
-    path: Path
-
-    def __iter__(self) -> Generator[TimedPose, None, None]: ...
-
-
-class Source(Protocol):
-    """Images in order."""
-
-    #: What messages call it.
-    name: str
-    #: Results are called this, with an ending of their own.
     output_base: Path
-    #: Whether it gives contents of images, not files.
-    ships_images: bool
+    ships_images = True
+    expected: int | None = None
+    size: tuple[int, int] | None = None
+    times_own = True
+    has_times = True
 
-    @property
-    def expected(self) -> int | None:
-        """Approximate number of images; None if unknown."""
-        ...
-
+    @abstractmethod
     def images(self) -> Generator[SourceImage, None, None]:
         """The images, from the first one (of a live camera: from now)."""
-        ...
 
     def calibration(self) -> Calibration | None:
         """The calibration beside it, or that it holds; None if there is none.
@@ -101,7 +102,7 @@ class Source(Protocol):
         camera.CameraError
             If it cannot be read.
         """
-        ...
+        return None
 
     def poses(self, topic: str | None) -> PoseStream | None:
         """The odometry that it has itself: of a topic, or the only one; None if there is none.
@@ -111,29 +112,9 @@ class Source(Protocol):
         DetectError
             If there is no such topic, or there are several to choose from.
         """
-        ...
-
-
-@dataclass(frozen=True, slots=True)
-class TimedPose:
-    """Where a robot was: X forward, Y left, counterclockwise, in a fixed frame.
-
-    Attributes
-    ----------
-    time_s : float
-    x, y : float
-        Metres.
-    theta : float
-        Radians.
-    covariance : (3, 3) float64 or None
-        Of (x, y, theta) in the fixed frame, since the start; None if nothing is known.
-    """
-
-    time_s: float
-    x: float
-    y: float
-    theta: float
-    covariance: NDArray[np.float64] | None = None
+        if topic is not None:
+            raise DetectError(f"{self.name}: holds no topic {topic}: only bags do")
+        return None
 
 
 def frame_prefix(name: str) -> str:

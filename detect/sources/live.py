@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from detect.errors import DetectError
 from detect.sources.gray import gray_of_pixels
-from detect.sources.interface import Calibration, PoseStream, SourceImage, numbered_prefix
+from detect.sources.interface import Source, SourceImage, numbered_prefix
 from detect.sources.video import quiet_opencv
 
 _log = logging.getLogger("redetect")
@@ -41,7 +41,7 @@ class Capture(Protocol):
     def release(self) -> None: ...
 
 
-class LiveCamera:
+class LiveCamera(Source):
     """Images of a camera as they come, named ``camera0.0000`` and so on; times are UNIX time.
 
     Parameters
@@ -50,18 +50,11 @@ class LiveCamera:
         OpenCV's number of the camera.
     """
 
-    ships_images = True
-
     def __init__(self, index: int) -> None:
         self.name = f"camera:{index}"
         self.output_base = Path(f"camera{index}.detected")
         self._index = index
         _open_camera(index).release()
-
-    @property
-    def expected(self) -> int | None:
-        """Unknown."""
-        return None
 
     def images(self) -> Generator[SourceImage, None, None]:
         """The camera's images from now on, until it is interrupted or gone."""
@@ -73,16 +66,6 @@ class LiveCamera:
                 gray = gray_of_pixels(pixels, prefix)
                 yield SourceImage(prefix, time_s, content=gray)
                 number += 1
-
-    def calibration(self) -> Calibration | None:
-        """There is none: it is named."""
-        return None
-
-    def poses(self, topic: str | None) -> PoseStream | None:
-        """There are none."""
-        if topic is not None:
-            raise DetectError(f"{self.name}: holds no topic {topic}: only bags do")
-        return None
 
 
 class _Newest:

@@ -8,9 +8,15 @@ from pathlib import Path
 
 from detect.errors import DetectError
 from detect.run import Frames, RunFrame
-from detect.sources.interface import PoseStream, Source, SourceImage, TimedPose
-from detect.sources.name_index import NameIndex
-from detect.sources.steps import movement_between, pose_between, step_of
+from detect.sources.image_names import NameIndex
+from detect.sources.interface import Source, SourceImage
+from detect.sources.poses import (
+    PoseStream,
+    TimedPose,
+    movement_between,
+    pose_between,
+    step_of,
+)
 from landmarks import Step, iterate_prefixes, iterate_steps
 
 #: Between poses farther apart than this (s), nothing is made up.

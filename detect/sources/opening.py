@@ -58,12 +58,7 @@ def open_calibrated(
     camera.CameraError, landmarks.LandmarkFileError
         If the calibration or the odometry cannot be read.
     """
-    options = SourceOptions() if options is None else options
-    if _is_plain_folder(name, options):
-        run: ImageRun = open_run(name, camera_path, bits=options.bits or None)
-        run = _shortened(run, options.frames)
-    else:
-        run = _open(name, camera_path, options, posed=True)
+    run = _open(name, camera_path, options or SourceOptions(), posed=True)
     if isinstance(run, Run):
         return run
     raise DetectError(
@@ -92,11 +87,7 @@ def open_source(
     DetectError, camera.CameraError, landmarks.LandmarkFileError
         As `open_calibrated`, except for a missing calibration.
     """
-    options = SourceOptions() if options is None else options
-    if _is_plain_folder(name, options):
-        run = open_images(name, camera_path, bits=options.bits or None)
-        return _shortened(run, options.frames)
-    return _open(name, camera_path, options, posed=False)
+    return _open(name, camera_path, options or SourceOptions(), posed=False)
 
 
 def demand_recording(name: Path) -> None:
@@ -116,8 +107,11 @@ def demand_recording(name: Path) -> None:
 
 def _open(name: Path, camera_path: Path | None, options: SourceOptions, *, posed: bool) -> ImageRun:
     """Open any source, with a calibration where there is one; `posed`: one with a pose."""
+    if name.is_dir() and not _is_ros2_bag(name) and options.plain:
+        # A run folder as the data set has them, with nothing more to be said of it.
+        opened = open_run if posed else open_images
+        return _shortened(opened(name, camera_path, bits=options.bits or None), options.frames)
     from detect.sources.interface import Calibration
-    from detect.sources.pictures import ImageFiles
 
     source = _source(name, options)
     calibration = (
@@ -134,15 +128,10 @@ def _open(name: Path, camera_path: Path | None, options: SourceOptions, *, posed
         frames,
         odometry,
         source.output_base,
-        has_times=not isinstance(source, ImageFiles) or source.has_times,
+        has_times=source.has_times,
     )
     run = _shortened(run, options.frames)
     return run if camera is None else run.calibrated(camera)
-
-
-def _is_plain_folder(name: Path, options: SourceOptions) -> bool:
-    """Whether this is a run folder as the data set has them, with nothing more to be said of it."""
-    return name.is_dir() and not _is_ros2_bag(name) and options.plain
 
 
 def _source(name: Path, options: SourceOptions) -> Source:
@@ -186,11 +175,10 @@ def _source(name: Path, options: SourceOptions) -> Source:
 def _frames(source: Source, options: SourceOptions) -> tuple[SourceFrames, Path | None]:
     """The frames of a source with the odometry that is wanted, and the file of that."""
     from detect.sources.odometry import FramesAlongPoses, FramesAlongRows, SourceFrames
-    from detect.sources.pictures import ImageFiles
-    from detect.sources.tum import TumTrajectory
+    from detect.sources.poses import TumTrajectory
 
     wanted = options.odometry
-    if options.times and not isinstance(source, ImageFiles):
+    if options.times and source.times_own:
         raise DetectError(f"{source.name}: --times {options.times}: its images have their own")
     if wanted == "none":
         return SourceFrames(source), None
@@ -204,7 +192,7 @@ def _frames(source: Source, options: SourceOptions) -> tuple[SourceFrames, Path 
         poses = source.poses(None)
     if poses is None:
         return SourceFrames(source), None
-    if isinstance(source, ImageFiles) and not source.has_times:
+    if not source.has_times:
         raise DetectError(
             f"{source.name}: no times of the images: a trajectory needs them: "
             "name a file of rows 'prefix seconds' by --times"
@@ -223,9 +211,7 @@ def _shortened(run: ImageRun, count: int) -> ImageRun:
 
 def _demand_size(source: Source, camera: Camera) -> None:
     """Refuse a video of another size at once: none of its frames could be worked on."""
-    from detect.sources.video import VideoFile
-
-    if isinstance(source, VideoFile) and source.size != (camera.width, camera.height):
+    if source.size is not None and source.size != (camera.width, camera.height):
         raise DetectError(
             f"{source.name}: is {source.size[0]}x{source.size[1]} px: expected "
             f"{camera.width}x{camera.height}, the calibration's size: "

@@ -10,7 +10,7 @@ from detect.sources.gray import significant_bits_of_file
 from detect.sources.image_names import IMAGE_SUFFIXES, ImageNames
 from detect.sources.interface import (
     Calibration,
-    PoseStream,
+    Source,
     SourceImage,
     frame_prefix,
     only_calibration,
@@ -23,7 +23,7 @@ WILDCARDS = frozenset("*?[")
 _LOOKED_AT = 5
 
 
-class ImageFiles:
+class ImageFiles(Source):
     """Images in natural order of their names.
 
     Parameters
@@ -41,6 +41,7 @@ class ImageFiles:
     """
 
     ships_images = False
+    times_own = False
 
     def __init__(
         self,
@@ -55,13 +56,9 @@ class ImageFiles:
         self.has_times = times is not None
         self._home = home
         self._names = names
+        self.expected = len(names)
         self._times = times
         self._bits = bits if bits is not None else bits_of_images(names)
-
-    @property
-    def expected(self) -> int | None:
-        """How many images there are."""
-        return len(self._names)
 
     def images(self) -> Generator[SourceImage, None, None]:
         """The images, by the names of their files."""
@@ -73,12 +70,6 @@ class ImageFiles:
     def calibration(self) -> Calibration | None:
         """The ``.cam`` file in the folder, or in the one above ``images/``."""
         return only_calibration(self._home, self._home.resolve().name)
-
-    def poses(self, topic: str | None) -> PoseStream | None:
-        """There are none in image files."""
-        if topic is not None:
-            raise DetectError(f"{self.name}: holds no topic {topic}: only bags do")
-        return None
 
 
 def matching_images(pattern: str) -> ImageNames:

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from detect.errors import DetectError
-from detect.sources.name_index import NameIndex
+from detect.sources.image_names import NameIndex
 
 #: The head of a file of times.
 TIMES_HEAD = "Times of the frames: <image> <seconds>, as their source gives them."
@@ -53,27 +53,39 @@ def format_time(prefix: str, time_s: float) -> str:
     return f"{prefix} {time_s:.6f}"
 
 
-def _rows(path: Path) -> Iterator[tuple[str, float]]:
+def text_rows(path: Path, what: str, errors: str = "strict") -> Iterator[tuple[int, list[str]]]:
+    """Number and words of each row of a text file, between blanks or commas, ``#`` comments.
+
+    Raises
+    ------
+    DetectError
+        If it cannot be read, or, with `errors` strict, is no text; `what` was expected.
+    """
     try:
-        with path.open(encoding="utf-8-sig", errors="surrogateescape") as stream:
+        with path.open(encoding="utf-8-sig", errors=errors) as stream:
             for number, line in enumerate(stream, start=1):
                 words = line[:_LARGEST_ROW].partition("#")[0].replace(",", " ").split()
-                if not words:
-                    continue
-                try:
-                    prefix, seconds = words[0], float(words[1])
-                except (IndexError, ValueError):
-                    prefix, seconds = "", math.nan
-                if len(words) != 2 or not math.isfinite(seconds):
-                    raise DetectError(
-                        f"{path}:{number}: {' '.join(words)[:60]!a}: "
-                        "expected an image's prefix and seconds"
-                    )
-                yield prefix, seconds
+                if words:
+                    yield number, words
     except FileNotFoundError:
-        raise DetectError(f"{path}: no such file of times") from None
+        raise DetectError(f"{path}: no such {what}") from None
+    except UnicodeDecodeError:
+        raise DetectError(f"{path}: is no text: expected a {what}") from None
     except OSError as error:
         raise DetectError(f"{path}: cannot be read: {error.strerror}") from None
+
+
+def _rows(path: Path) -> Iterator[tuple[str, float]]:
+    for number, words in text_rows(path, "file of times", "surrogateescape"):
+        try:
+            prefix, seconds = words[0], float(words[1])
+        except (IndexError, ValueError):
+            prefix, seconds = "", math.nan
+        if len(words) != 2 or not math.isfinite(seconds):
+            raise DetectError(
+                f"{path}:{number}: {' '.join(words)[:60]!a}: expected an image's prefix and seconds"
+            )
+        yield prefix, seconds
 
 
 def _bytes(text: str) -> bytes:

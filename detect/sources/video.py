@@ -8,7 +8,7 @@ import os
 from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 
@@ -16,14 +16,11 @@ from detect.errors import DetectError
 from detect.sources.gray import gray_of_pixels
 from detect.sources.interface import (
     Calibration,
-    PoseStream,
+    Source,
     SourceImage,
     numbered_prefix,
     only_calibration,
 )
-
-if TYPE_CHECKING:
-    import cv2
 
 _log = logging.getLogger("redetect")
 
@@ -31,7 +28,7 @@ _log = logging.getLogger("redetect")
 _SILENT = 0
 
 
-class VideoFile:
+class VideoFile(Source):
     """Frames of a video file, named ``<stem>.0000`` and so on; times count from its beginning.
 
     Parameters
@@ -44,8 +41,6 @@ class VideoFile:
         If OpenCV cannot read a video from it.
     """
 
-    ships_images = True
-
     def __init__(self, path: Path) -> None:
         self.path = path
         self.name = str(path)
@@ -56,12 +51,7 @@ class VideoFile:
                 int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)),
                 int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT)),
             )
-        self._count = int(count) if math.isfinite(count) and 0 < count < 2**31 else None
-
-    @property
-    def expected(self) -> int | None:
-        """How many frames the file says it has."""
-        return self._count
+        self.expected = int(count) if math.isfinite(count) and 0 < count < 2**31 else None
 
     def images(self) -> Generator[SourceImage, None, None]:
         """The frames as grey values, with their presentation times."""
@@ -79,18 +69,12 @@ class VideoFile:
                 gray = gray_of_pixels(pixels, f"{self.name}: {prefix}")
                 yield SourceImage(prefix, time_s, content=gray)
                 number, last_s = number + 1, time_s
-        if self._count is not None and number < self._count:
-            _log.info(f"{self.name}: only {number} of {self._count} frames can be read")
+        if self.expected is not None and number < self.expected:
+            _log.info(f"{self.name}: only {number} of {self.expected} frames can be read")
 
     def calibration(self) -> Calibration | None:
         """The ``.cam`` file beside it: of its name, or the only one."""
         return only_calibration(self.path.parent, self.path.stem)
-
-    def poses(self, topic: str | None) -> PoseStream | None:
-        """There are none in a video."""
-        if topic is not None:
-            raise DetectError(f"{self.name}: holds no topic {topic}: only bags do")
-        return None
 
 
 @contextmanager

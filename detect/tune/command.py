@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from detect import __version__
-from detect.comparison.lines_result import LineCompareOptions
-from detect.drawing.selection import select_frames
+from detect.comparison.result import LineCompareOptions
+from detect.drawing.inputs import select_frames
 from detect.errors import EXIT_FRAMES_FAILED, DetectError
 from detect.line_settings import PRESETS, LineSettings
 from detect.runs.known import FramesByImage, TiltsByImage

@@ -12,8 +12,7 @@ from pathlib import Path
 
 from detect.comparison.circles import compare_frames
 from detect.comparison.lines import compare_line_frames
-from detect.comparison.lines_result import LineCompareOptions
-from detect.comparison.result import CompareOptions
+from detect.comparison.result import CompareOptions, LineCompareOptions
 from detect.line_settings import LineSettings
 from detect.run import Run, RunFrame
 from detect.runs.dispatch import Workers, detect_chunks

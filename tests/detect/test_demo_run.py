@@ -11,8 +11,7 @@ import pytest
 
 from detect.comparison.circles import compare_runs
 from detect.comparison.lines import compare_line_runs
-from detect.comparison.lines_result import LineComparison
-from detect.comparison.result import CompareOptions, Comparison
+from detect.comparison.result import CompareOptions, Comparison, LineComparison
 from detect.line_settings import LineSettings
 from detect.run import open_run
 from detect.runs.conduct import Conduct

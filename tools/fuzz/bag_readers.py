@@ -15,7 +15,7 @@ from detect.errors import DetectError
 from detect.sources import bag_messages
 from detect.sources.bag import Bag
 from detect.sources.bag_camera import pose_in_dataset, static_transforms
-from detect.sources.steps import movement_between, step_of
+from detect.sources.poses import movement_between, step_of
 from tools.fuzz.bag_cells import bag_with_edits
 from tools.fuzz.bag_types import known_types, opened_once
 from tools.fuzz.reader import Reader

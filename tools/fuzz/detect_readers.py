@@ -15,21 +15,20 @@ from numpy.typing import NDArray
 
 from camera import CameraError, parse_camera
 from camera.calibration.images import read_grey
-from detect.drawing.head import read_head
+from detect.drawing.inputs import read_head
 from detect.errors import DetectError, FrameError
 from detect.runs.journal import digest_of, left_journal
 from detect.runs.run_log import demand_log_place
-from detect.sources.bag_images import pixels_of_message
+from detect.sources.bag_messages import pixels_of_message
 from detect.sources.gray import (
     DEEP_SUFFIXES,
+    bounded_content,
     decode_gray,
     gray_of_pixels,
     significant_bits_of_file,
 )
-from detect.sources.image_bounds import bounded_content
-from detect.sources.steps import movement_between, step_of
+from detect.sources.poses import TumTrajectory, movement_between, step_of
 from detect.sources.times import TimesByImage
-from detect.sources.tum import TumTrajectory
 from lut.cache import cached_vertical_table
 from storage import OutputExistsError
 from storage.image_header import claimed_size

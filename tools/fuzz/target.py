@@ -18,7 +18,7 @@ import atheris  # type: ignore[import-untyped,import-not-found,unused-ignore]
 with atheris.instrument_imports(
     include=[
         "camera",
-        "detect.drawing.head",
+        "detect.drawing.inputs",
         "detect.runs.journal",
         "detect.sources",
         "landmarks",

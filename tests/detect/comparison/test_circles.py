@@ -12,10 +12,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from detect.comparison.circles import Beside, compare_frames, compare_runs, image_name
-from detect.comparison.report import format_json, format_text
+from detect.comparison.circles import Beside, compare_frames, compare_runs
+from detect.comparison.report import format_json
 from detect.comparison.result import CompareError, CompareOptions, Comparison, unmet_demands
+from detect.sources.image_names import image_name
 from landmarks import CircleLandmark, Frame, LandmarkFileError, Step, write_frames
+from tests.detect.comparison.formatting import format_text
 
 STANDARD = CompareOptions()
 

@@ -15,7 +15,7 @@ from camera import Camera
 from detect.circles import CircleDetections
 from detect.cli import main
 from detect.comparison.circles import Sight, compare_frames
-from detect.comparison.report import format_json, format_text
+from detect.comparison.report import format_json
 from detect.comparison.result import CompareOptions, Comparison
 from detect.levelling import level_positions, levelled
 from detect.seen import image_positions, level_seen
@@ -30,6 +30,7 @@ from landmarks import (
     write_frames,
 )
 from storage import write_whole
+from tests.detect.comparison.formatting import format_text
 
 FloatArray = NDArray[np.float64]
 

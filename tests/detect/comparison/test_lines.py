@@ -16,9 +16,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from detect.comparison.lines import compare_line_frames, compare_line_runs
-from detect.comparison.lines_report import format_line_json, format_line_text
-from detect.comparison.lines_result import LineCompareOptions, LineComparison
-from detect.comparison.result import CompareError, unmet_demands
+from detect.comparison.report import format_json
+from detect.comparison.result import CompareError, LineCompareOptions, LineComparison, unmet_demands
 from landmarks import (
     CircleLandmark,
     Frame,
@@ -28,6 +27,7 @@ from landmarks import (
     Step,
     write_frames,
 )
+from tests.detect.comparison.formatting import format_text
 
 STANDARD = LineCompareOptions()
 
@@ -225,7 +225,7 @@ def test_sigmas_that_say_nothing_are_left_out_and_counted(sigma_deg: float) -> N
     error = found.normalised_error
     assert (error.dof, error.left_out) == (1, 1)
     assert error.per_dof == pytest.approx(4)
-    text = " ".join(format_line_text(found).split())  # without line breaks
+    text = " ".join(format_text(found).split())  # without line breaks
     assert "1 without a positive sigma left out" in text
 
 
@@ -277,10 +277,10 @@ def test_no_matches_give_clear_results(
     assert (found.matched, found.joined) == (0, 0)
     assert found.recall == (0 if found.reference else None)
     assert found.precision == (0 if found.detected else None)
-    figures = json.loads(format_line_json(found))
+    figures = json.loads(format_json(found))
     for name in ("bearing_median_deg", "bearing_95_deg", "ends_median", "beta_median_deg"):
         assert figures[name] is None
-    assert "median - deg, 95 % - deg" in format_line_text(found)
+    assert "median - deg, 95 % - deg" in format_text(found)
 
 
 def test_demands_are_met_or_named() -> None:
@@ -293,8 +293,8 @@ def test_demands_are_met_or_named() -> None:
 
 
 def test_json_has_the_figures_in_a_fixed_order() -> None:
-    found = json.loads(format_line_json(compare(REFERENCE, DETECTED)))
-    assert list(found) == list(json.loads(format_line_json(compare([], []))))
+    found = json.loads(format_json(compare(REFERENCE, DETECTED)))
+    assert list(found) == list(json.loads(format_json(compare([], []))))
     assert (found["matched"], found["joined"], found["found"]) == (4, 0, 4)
     assert (found["missed"], found["extra"], found["frames"]) == (1, 1, 2)
     assert found["recall"] == pytest.approx(0.8)
@@ -305,7 +305,7 @@ def test_json_has_the_figures_in_a_fixed_order() -> None:
 
 
 def test_text_shows_the_figures_plainly() -> None:
-    text = format_line_text(compare(REFERENCE, DETECTED))
+    text = format_text(compare(REFERENCE, DETECTED))
     lines = [" ".join(row.split()) for row in text.splitlines()]
     assert "recall 0.8000" in lines
     assert (
@@ -375,7 +375,7 @@ def test_rows_are_accounted_for_whatever_they_are(
     assert 0 <= found.matched <= min(found.reference, found.detected)
     assert 0 <= found.missed <= found.reference - found.matched
     assert found.joined == 0 or found.matched > 0
-    json.loads(format_line_json(found))
+    json.loads(format_json(found))
     # Turning the robot changes no difference, so none larger than the widest gate appears.
     turned = [
         [replace(r, alpha=r.alpha + turn_rad) for r in rows] for rows in (reference, detected)

@@ -12,12 +12,9 @@ from numpy.typing import NDArray
 from camera import Camera
 from detect.circles import CircleDetections
 from detect.cli import main
-from detect.comparison.lines_result import LineCompareOptions
-from detect.comparison.result import CompareOptions
+from detect.comparison.result import CompareOptions, LineCompareOptions
 from detect.drawing.frame import draw_rows, line_curves, sigma_bars
-from detect.drawing.head import read_head
-from detect.drawing.inputs import SeenRows
-from detect.drawing.selection import select_frames
+from detect.drawing.inputs import SeenRows, read_head, select_frames
 from detect.errors import DetectError
 from detect.levelling import level_positions
 from detect.run import open_images
@@ -135,7 +132,7 @@ def test_matched_extra_and_missed_have_colours_of_their_own(
 def test_without_reference_nothing_is_missed_or_extra(
     image: NDArray[np.uint8], published_camera: Camera
 ) -> None:
-    from detect.drawing.detections import draw_circles
+    from detect.drawing.frame import draw_circles
 
     rows = SeenRows(circles=discs((0.2, -1.3)))
     canvas = draw_rows(image, published_camera, rows, SETTINGS, GATE, LINE_GATE)

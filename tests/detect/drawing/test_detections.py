@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from camera import Camera
 from detect.circles import CircleDetections
-from detect.drawing.detections import draw_circles
+from detect.drawing.frame import draw_circles
 from detect.settings import CircleSettings
 from lut import ring
 

@@ -10,7 +10,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from detect.markers.homography_kernels import inverse_3x3, square_homography
+from detect.markers.homography import inverse_3x3, square_homography
 from detect.markers.templates import templates_of
 
 FloatArray = NDArray[np.float64]

@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from camera import Camera
 from detect.errors import DetectError, FrameError
+from detect.markers import candidates as regions
 from detect.markers import identification as identities
-from detect.markers import quadrangle, refinement, regions
+from detect.markers import quadrangle, refinement
 from detect.markers.detect import detect_markers
 from detect.markers.detections import MarkerDetections
 from detect.markers.dictionaries import dictionary_names, marker_dictionary

@@ -18,7 +18,7 @@ import pytest
 from camera import Camera
 from detect.errors import FrameError
 from detect.run import RunFrame, read_image
-from detect.sources.image_bounds import bounded_content, demand_bounded
+from detect.sources.gray import bounded_content, demand_bounded
 from landmarks import Step
 from storage.image_header import MOST_PIXELS, claimed_size
 

@@ -20,7 +20,7 @@ from camera import Camera, write_camera
 from detect.cli import main
 from detect.errors import DetectError, FrameError
 from detect.run import read_image
-from detect.sources.bag_images import pixels_of_message
+from detect.sources.bag_messages import pixels_of_message
 from detect.sources.gray import gray_of_pixels
 from detect.sources.opening import open_source
 from detect.sources.options import SourceOptions

@@ -9,8 +9,7 @@ from pathlib import Path
 from hypothesis import given
 from hypothesis import strategies as st
 
-from detect.sources.image_names import ImageNames
-from detect.sources.name_index import NameIndex
+from detect.sources.image_names import ImageNames, NameIndex
 
 # Short alphabets make names that begin alike; long names are known by their digest.
 NAMES = st.lists(

@@ -13,12 +13,10 @@ from hypothesis import strategies as st
 from detect.cli import main
 from detect.errors import DetectError
 from detect.run import RunFrames
-from detect.sources.interface import TimedPose
 from detect.sources.opening import open_source
 from detect.sources.options import SourceOptions
-from detect.sources.steps import movement_between, pose_between
+from detect.sources.poses import TimedPose, TumTrajectory, movement_between, pose_between
 from detect.sources.times import TimesByImage, format_time
-from detect.sources.tum import TumTrajectory
 from groundtruth.trajectories.streams import read_times
 from landmarks import read_frames
 

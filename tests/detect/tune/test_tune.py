@@ -26,10 +26,9 @@ from detect.runs.dispatch import Workers
 from detect.runs.frame import FramePlan
 from detect.runs.workers import local_workers
 from detect.settings import CircleSettings
-from detect.tune.curve import f1_score, knee, pareto_front
 from detect.tune.grid import combinations, parameter_values, settings_with
 from detect.tune.run import Trial, tune_run
-from detect.tune.table import curve_picture, trial_records
+from detect.tune.table import curve_picture, f1_score, knee, pareto_front, trial_records
 from landmarks import read_frames
 from tests.detect.conftest import SMALL_RUN_DISCS
 from tests.detect.test_cli import assert_refused

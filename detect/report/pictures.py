@@ -1,19 +1,26 @@
-"""Cut-outs of images round rows that were missed, or that are extra."""
+"""Pictures of a report: frames with their rows, and cut-outs round missed and extra discs."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from camera import Camera
 from detect.comparison.circles import pair_discs
+from detect.drawing.frame import draw_rows
 from detect.drawing.strokes import Colour, draw_curve
+from detect.errors import FrameError
 from detect.report.inputs import ReportInputs
+from detect.report.page import Gallery, Picture
+from detect.run import Run, read_image
 from detect.seen import circle_on_floor, image_positions
+from detect.settings import CircleSettings
 from landmarks import circle_arrays
 
+_JPEG_QUALITY = 88
 _MOST, _IN_A_ROW = 18, 6
 _HALF_PX = (48, 32)
 _TIMES = 3
@@ -24,40 +31,64 @@ _WIDER = 1.6
 _COLOUR: dict[str, Colour] = {"missed": (60, 60, 255), "extra": (255, 60, 255)}
 
 
-def gallery(
-    inputs: ReportInputs, fate: str, image_of: Callable[[str], NDArray[np.uint8] | None]
-) -> tuple[NDArray[np.uint8], int, int] | None:
+def frame_picture(inputs: ReportInputs, prefix: str) -> Picture:
+    """The picture of a frame as JPEG, its width and height; or why there is none."""
+    frame = next((f for f in inputs.run.frames if f.step.prefix == prefix), None)
+    if frame is None:
+        return "no such frame in the run"
+    camera = _camera(inputs)
+    try:
+        image = read_image(frame, camera)
+    except FrameError as error:
+        return str(error)
+    head = inputs.files.heads.get("circles")
+    settings = CircleSettings() if head is None else head.circle_settings
+    rows = inputs.rows[inputs.names.index(prefix)]
+    return _jpeg(draw_rows(image, camera, rows, settings, inputs.gate, inputs.line_gate))
+
+
+def gallery(inputs: ReportInputs, fate: str) -> Gallery | None:
     """Cut-outs of some of a run's missed or extra discs, evenly over the run.
 
     Parameters
     ----------
     inputs : ReportInputs
     fate : {"missed", "extra"}
-    image_of : callable
-        The grey image of a frame; None where it cannot be read.
 
     Returns
     -------
-    picture, shown, all : (H, W, 3) uint8, int, int
-        In OpenCV's order of colours, with how many there are in it and in all; None without any.
+    Gallery or None
+        None without any that can be read.
     """
     rows = list(_rows(inputs, fate))
     if not rows:
         return None
+    frames = {frame.step.prefix: frame for frame in inputs.run.frames}
     chosen = np.unique(np.linspace(0, len(rows) - 1, min(_MOST, len(rows))).round().astype(int))
     tiles = []
     for k in chosen:
         prefix, edge = rows[k]
-        image = image_of(prefix)
-        if image is not None:
-            tiles.append(_tile(image, edge, _COLOUR[fate]))
+        try:
+            image = read_image(frames[prefix], _camera(inputs))
+        except FrameError:
+            continue
+        tiles.append(_tile(image, edge, _COLOUR[fate]))
     if not tiles:
         return None
     shown = len(tiles)
     blank = np.full_like(tiles[0], 255)
     tiles += [blank] * (-len(tiles) % _IN_A_ROW)
     lines = [np.hstack(tiles[k : k + _IN_A_ROW]) for k in range(0, len(tiles), _IN_A_ROW)]
-    return np.vstack(lines), shown, len(rows)
+    return Gallery(fate, *_jpeg(np.vstack(lines)), shown, len(rows))
+
+
+def _camera(inputs: ReportInputs) -> Camera | None:
+    return inputs.run.camera if isinstance(inputs.run, Run) else None
+
+
+def _jpeg(picture: NDArray[np.uint8]) -> tuple[bytes, int, int]:
+    _, encoded = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
+    return encoded.tobytes(), picture.shape[1], picture.shape[0]
 
 
 def _rows(inputs: ReportInputs, fate: str) -> Iterator[tuple[str, NDArray[np.float64]]]:

@@ -1,4 +1,4 @@
-"""Compiled measures of the residuals of a marker's fit: each cell's own whiteness, correlation."""
+"""Measures of the residuals of a marker's fit: each cell's own whiteness, correlation."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from detect.markers.pattern_model_kernels import (
+from detect.markers.pattern_model import (
     BLACK_AT,
     WHITE_AT,
     Pattern,
@@ -17,24 +17,9 @@ from detect.markers.pattern_model_kernels import (
     light_level,
     place_on_marker,
 )
+from detect.markers.pattern_pixels import Samples
 
-
-class Samples(NamedTuple):
-    """Pixels to which a marker is fitted, row by row.
-
-    Attributes
-    ----------
-    pixel : (N, 2) int32
-        u, v.
-    straight : (N, 2) float64
-        Their positions without distortion, pixels.
-    grey : (N,) float64
-        Grey values.
-    """
-
-    pixel: NDArray[np.int32]
-    straight: NDArray[np.float64]
-    grey: NDArray[np.float64]
+FloatArray = NDArray[np.float64]
 
 
 class MarkerFrame(NamedTuple):
@@ -50,8 +35,8 @@ class MarkerFrame(NamedTuple):
         Distance of the farthest corner from the centre, pixels: the unit of the light's slopes.
     """
 
-    homography: NDArray[np.float64]
-    inverse: NDArray[np.float64]
+    homography: FloatArray
+    inverse: FloatArray
     centre_x: float
     centre_y: float
     size: float
@@ -70,10 +55,10 @@ class Residuals(NamedTuple):
         Working memory of `blurred_blackness`.
     """
 
-    residual: NDArray[np.float64]
-    weight: NDArray[np.float64]
-    rows: NDArray[np.float64]
-    profiles: NDArray[np.float64]
+    residual: FloatArray
+    weight: FloatArray
+    rows: FloatArray
+    profiles: FloatArray
 
 
 @njit(cache=True, error_model="numpy")
@@ -81,10 +66,10 @@ def cell_values(
     samples: Samples,
     pattern: Pattern,
     frame: MarkerFrame,
-    p: NDArray[np.float64],
+    p: FloatArray,
     left: Residuals,
     variance: float,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[FloatArray, FloatArray]:
     """Whiteness of each cell by a matched filter on the residuals: all the others as fitted.
 
     Unlike the geometry's, these sums do not spare outliers: a cell that is not what it should be

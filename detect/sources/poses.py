@@ -1,26 +1,71 @@
-"""From poses in a fixed frame to the STEP rows of the data set.
+"""Poses of the robot over time, and what becomes of them: the STEP rows of the data set.
 
 A pose (x, y, theta) has the robot's X forward and Y left, as in ROS; a STEP its X left and Y
-backward, in the robot's frame before it. Turning by the same angle is the same in both.
+backward, in the robot's frame before it. Turning by the same angle is the same in both. Poses may
+come from TUM trajectories, rows ``t x y z qx qy qz qw``: seconds, metres, unit quaternions. The
+robot moves on the floor: of its attitude the heading is taken, of its position x and y.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Generator
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.sources.interface import TimedPose
+from detect.errors import DetectError
+from detect.sources.options import Axes
+from detect.sources.times import text_rows
 from landmarks import Step, wrap_angle
 
 FloatArray = NDArray[np.float64]
 
+#: Limit of distances from the start (m), such that products of two remain finite.
+FARTHEST = 1e12
 #: Takes (forward, left, turn) to (left, backward, turn).
 DATASET_FROM_ROBOTICS: FloatArray = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
 # A covariance of a step that is less definite than this, against that of the pose, is none.
 _INDEFINITE = 1e-9
+# Columns of a TUM trajectory, and how far its quaternions may be from unit length.
+_COLUMNS, _UNIT = 8, 1e-2
+
+
+@dataclass(frozen=True, slots=True)
+class TimedPose:
+    """Where a robot was: X forward, Y left, counterclockwise, in a fixed frame.
+
+    Attributes
+    ----------
+    time_s : float
+    x, y : float
+        Metres.
+    theta : float
+        Radians.
+    covariance : (3, 3) float64 or None
+        Of (x, y, theta) in the fixed frame, since the start; None if nothing is known.
+    """
+
+    time_s: float
+    x: float
+    y: float
+    theta: float
+    covariance: NDArray[np.float64] | None = None
+
+
+class PoseStream(Protocol):
+    """Poses of the robot over time, as recorded; iterating again starts over."""
+
+    #: What messages call it.
+    name: str
+    #: The file that it is read from, which heads of files name.
+    path: Path
+
+    def __iter__(self) -> Generator[TimedPose, None, None]: ...
 
 
 @dataclass(frozen=True)
@@ -100,3 +145,49 @@ def step_of(prefix: str, movement: Movement | None) -> Step:
     dx, dy, dphi = (float(value) for value in movement.pose)
     entries = (c[0, 0], c[0, 1], c[1, 1], c[0, 2], c[1, 2], c[2, 2])
     return Step(prefix, dx, dy, dphi, *(float(value) for value in entries))
+
+
+class TumTrajectory:
+    """A TUM trajectory, read on demand.
+
+    Parameters
+    ----------
+    path : path
+    axes : {"robotics", "dataset"}
+        The robot's: X forward and Y left, or X left and Y backward.
+    """
+
+    def __init__(self, path: Path, axes: Axes = "robotics") -> None:
+        self.path = path
+        self.name = str(path)
+        self._axes = axes
+
+    def __iter__(self) -> Generator[TimedPose, None, None]:
+        for number, words in text_rows(self.path, "TUM trajectory"):
+            yield self._pose(words, number)
+
+    def _pose(self, words: list[str], number: int) -> TimedPose:
+        try:
+            values = [float(word) for word in words]
+        except ValueError:
+            values = []
+        if len(values) != _COLUMNS or not all(map(math.isfinite, values)):
+            raise DetectError(
+                f"{self.path}:{number}: {' '.join(words)[:60]!r}: "
+                "expected 8 numbers: t x y z qx qy qz qw"
+            )
+        time_s, x, y, _, *quaternion = values
+        if max(abs(x), abs(y)) > FARTHEST:
+            raise DetectError(f"{self.path}:{number}: expected x and y of at most {FARTHEST:g} m")
+        if abs(math.hypot(*quaternion) - 1.0) > _UNIT:
+            raise DetectError(f"{self.path}:{number}: qx qy qz qw: expected a unit quaternion")
+        theta = heading_rad(*quaternion)
+        if self._axes == "dataset":
+            # Only the robot's own axes differ; the fixed frame is the trajectory's, whatever it is.
+            theta -= 0.5 * math.pi
+        return TimedPose(time_s, x, y, theta)
+
+
+def heading_rad(qx: float, qy: float, qz: float, qw: float) -> float:
+    """The heading of a quaternion: where the robot's X axis points, seen from above (rad)."""
+    return math.atan2(2.0 * (qw * qz + qx * qy), qw**2 + qx**2 - qy**2 - qz**2)

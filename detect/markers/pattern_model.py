@@ -1,4 +1,4 @@
-"""Compiled model of a marker: the grey values of a pattern, blurred and lit.
+"""Model of a marker: the grey values of a pattern, blurred and lit.
 
 A pattern of black and white cells on the marker's plane is seen through a homography, blurred by a
 Gaussian of any shape (optics, motion and the pixel itself) and lit unevenly. The blurred pattern is
@@ -15,6 +15,8 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
+
+from detect.markers.homography import project
 
 #: Parameters: 8 of the homography, 6 of white and 6 of black (level, along x, along y, x^2, xy,
 #: y^2), 3 of the blur's covariance (uu, uv, vv; px^2), 1 of the tone curve.
@@ -79,17 +81,9 @@ class MarkerPlace(NamedTuple):
     correlation: float
 
 
-@njit(cache=True, error_model="numpy")
 def corner_signs(black: NDArray[np.float64]) -> NDArray[np.float64]:
     """(n + 1, n + 1) mixed differences of a pattern (n, n): what its corners weigh."""
-    n = black.shape[0]
-    padded = np.zeros((n + 2, n + 2))
-    padded[1 : n + 1, 1 : n + 1] = black
-    result = np.empty((n + 1, n + 1))
-    for j in range(n + 1):
-        for i in range(n + 1):
-            result[j, i] = padded[j, i] - padded[j, i + 1] - padded[j + 1, i] + padded[j + 1, i + 1]
-    return result
+    return np.diff(np.diff(np.pad(black, 1), axis=0), axis=1)
 
 
 @njit(cache=True, error_model="numpy", inline="always")
@@ -219,9 +213,7 @@ def place_on_marker(
     inverse: NDArray[np.float64], x: float, y: float, p: NDArray[np.float64]
 ) -> MarkerPlace:
     """Where a straight position (x, y) is on the marker, by the inverse of its homography."""
-    q = inverse[2, 0] * x + inverse[2, 1] * y + inverse[2, 2]
-    mx = (inverse[0, 0] * x + inverse[0, 1] * y + inverse[0, 2]) / q
-    my = (inverse[1, 0] * x + inverse[1, 1] * y + inverse[1, 2]) / q
+    mx, my, q = project(inverse, x, y)
     ax = (inverse[0, 0] - mx * inverse[2, 0]) / q
     ay = (inverse[0, 1] - mx * inverse[2, 1]) / q
     bx = (inverse[1, 0] - my * inverse[2, 0]) / q

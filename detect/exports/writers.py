@@ -1,15 +1,21 @@
-"""Rows as messages of ROS 2 in an MCAP file, by the package ``rosbags``: no ROS is needed.
+"""Tables in other programs' formats: CSV, Parquet, and messages of ROS 2 in an MCAP file.
 
-There is a message for each frame and table. The messages' definitions follow from the tables'
-columns (`message_definitions`) and are in the file, so that readers need none of this project's.
+CSV is comma separated, with a line of names at the top, numbers as Python prints them: the shortest
+text that gives the same float64; unknown values are empty; several identifiers are separated by
+blanks. Columns of Parquet (package ``pyarrow``) have units and descriptions. MCAP (package
+``rosbags``; no ROS is needed) has a message for each frame and table; the messages' definitions
+follow from the tables' columns (`message_definitions`) and are in the file, so that readers need
+none of this project's.
 """
 
 from __future__ import annotations
 
+import csv
+import io
 import shutil
 import tempfile
 from collections.abc import Iterable, Iterator
-from itertools import groupby
+from itertools import groupby, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
@@ -17,10 +23,12 @@ import numpy as np
 
 from detect.errors import DetectError
 from detect.exports.rows import TableRow
-from landmarks.columns import FRAME_COLUMNS, TABLES, Column, TableName
+from landmarks.columns import FRAME_COLUMNS, TABLES, Column, TableName, Value
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
+
+_ROWS_AT_ONCE = 20_000
 
 #: The robot frame of the data set, X left and Y backward: not ROS's base_link.
 FRAME_ID = "robot_left_backward"
@@ -40,6 +48,121 @@ _TYPES = {
     "whole number": "int64",
     "whole numbers": "int64[]",
 }
+
+
+def write_csv(stream: BinaryIO, table: TableName, rows: Iterable[TableRow]) -> int:
+    """Write a table.
+
+    Parameters
+    ----------
+    stream : binary stream
+    table : str
+        Which table; rows of others are passed over.
+    rows : iterable of TableRow
+
+    Returns
+    -------
+    int
+        How many rows were written.
+    """
+
+    def write(lines: Iterable[Iterable[str]]) -> None:
+        text = io.StringIO()
+        csv.writer(text, lineterminator="\n").writerows(lines)
+        stream.write(text.getvalue().encode("utf-8", "surrogateescape"))
+
+    write([[column.name for column in TABLES[table]]])
+    count = 0
+    for part in _parts(table, rows):
+        write([[_text(value) for value in row] for row in part])
+        count += len(part)
+    return count
+
+
+def _parts(table: TableName, rows: Iterable[TableRow]) -> Iterator[list[tuple[Value, ...]]]:
+    """The values of a table's rows, many at once."""
+    own = (row.all_values for row in rows if row.table == table)
+    while part := list(islice(own, _ROWS_AT_ONCE)):
+        yield part
+
+
+def _text(value: Value) -> str:
+    if value is None:
+        return ""
+    if isinstance(value, tuple):
+        return " ".join(map(str, value))
+    return repr(value) if isinstance(value, float) else str(value)
+
+
+def demand_pyarrow() -> None:
+    """Refuse to begin where the package is not installed.
+
+    Raises
+    ------
+    DetectError
+        If it is not.
+    """
+    try:
+        import pyarrow.parquet  # type: ignore[import-untyped]  # noqa: F401
+    except ImportError:
+        raise DetectError(
+            "Parquet is written by the package pyarrow: install it by "
+            "pip install 'redetect[parquet]', or write --to csv"
+        ) from None
+
+
+def write_parquet(stream: BinaryIO, table: TableName, rows: Iterable[TableRow], source: str) -> int:
+    """Write a table; parameters as those of `write_csv`.
+
+    Parameters
+    ----------
+    stream, table, rows
+        See there.
+    source : str
+        Where the rows come from, for the file's own description.
+
+    Returns
+    -------
+    int
+        How many rows were written.
+
+    Raises
+    ------
+    DetectError
+        If an image's name is no Unicode.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    types: dict[str, Any] = {
+        "text": pa.string(),
+        "number": pa.float64(),
+        "whole number": pa.int64(),
+        "whole numbers": pa.list_(pa.int64()),
+    }
+    fields = [
+        pa.field(
+            column.name,
+            types[column.kind],
+            metadata={"unit": column.unit, "meaning": column.meaning},
+        )
+        for column in TABLES[table]
+    ]
+    schema = pa.schema(fields, metadata={"table": table, "source": source})
+    count = 0
+    with pq.ParquetWriter(stream, schema) as writer:
+        for part in _parts(table, rows):
+            try:
+                arrays = [pa.array(c, f.type) for c, f in zip(zip(*part), fields)]
+            except UnicodeEncodeError:
+                raise DetectError(
+                    f"{source}: the name of an image is no Unicode: Parquet cannot hold it"
+                ) from None
+            writer.write_table(pa.Table.from_arrays(arrays, schema=schema))
+            count += len(part)
+        if not count:
+            writer.write_table(schema.empty_table())
+    return count
 
 
 def message_definitions(table: TableName) -> dict[str, str]:

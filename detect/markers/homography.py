@@ -1,4 +1,4 @@
-"""Compiled homographies between the unit square of a marker and its image.
+"""Homographies between the unit square of a marker and its image.
 
 The marker's square is (0, 0) top left, (1, 0) top right, (1, 1) bottom right, (0, 1) bottom left.
 """
@@ -64,6 +64,17 @@ def inverse_3x3(m: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(r / determinant)
 
 
+@njit(cache=True, error_model="numpy", inline="always")
+def project(h: NDArray[np.float64], x: float, y: float) -> tuple[float, float, float]:
+    """Where a homography (3, 3) takes (x, y), and its denominator there."""
+    w = h[2, 0] * x + h[2, 1] * y + h[2, 2]
+    return (
+        (h[0, 0] * x + h[0, 1] * y + h[0, 2]) / w,
+        (h[1, 0] * x + h[1, 1] * y + h[1, 2]) / w,
+        w,
+    )
+
+
 @njit(cache=True, error_model="numpy")
 def corners_by_homography(homography: NDArray[np.float64]) -> NDArray[np.float64]:
     """(8, 8) d(x0, y0, x1 ... y3) / d(h00, h01, h02, h10, h11, h12, h20, h21)."""
@@ -71,9 +82,7 @@ def corners_by_homography(homography: NDArray[np.float64]) -> NDArray[np.float64
     for k in range(4):
         x = 1.0 if k == 1 or k == 2 else 0.0
         y = 1.0 if k >= 2 else 0.0
-        w = homography[2, 0] * x + homography[2, 1] * y + 1.0
-        u = (homography[0, 0] * x + homography[0, 1] * y + homography[0, 2]) / w
-        v = (homography[1, 0] * x + homography[1, 1] * y + homography[1, 2]) / w
+        u, v, w = project(homography, x, y)
         result[2 * k, 0] = x / w
         result[2 * k, 1] = y / w
         result[2 * k, 2] = 1.0 / w

@@ -1,0 +1,188 @@
+"""Where on the floor two sets of rows put the same discs.
+
+Their differences over distance, and the one tilt and height of the camera that explains them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import isfinite
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from camera import Camera
+from detect.comparison.figures import disc_normalised_error, quantile
+from detect.comparison.result import CommonLean, DiscPairs, FloorBin, FloorDifference
+from detect.seen import image_positions, level_seen
+
+FloatArray = NDArray[np.float64]
+
+#: Huber's constant: 95 % efficient where errors are normal.
+_HUBER = 1.345
+_LEAST_PAIRS = 4
+#: With fewer frames, their scatter does not determine the uncertainty of the lean.
+_LEAST_FRAMES = 10
+_LARGEST_CONDITION = 1e10
+
+
+class Lean(NamedTuple):
+    """Pitch, roll and height that turn reference positions into detected ones.
+
+    Attributes
+    ----------
+    pitch_rad, roll_rad : float
+        As those of a tilt (`landmarks.FrameTilt`).
+    raised_m : float
+        How much higher the camera is.
+    sigma : (float, float, float)
+        Standard deviations of the three, from how frames differ (errors within a frame may be
+        common to its rows).
+    """
+
+    pitch_rad: float
+    roll_rad: float
+    raised_m: float
+    sigma: tuple[float, float, float]
+
+
+def common_lean(
+    camera: Camera,
+    reference_xy: FloatArray,
+    detected_xy: FloatArray,
+    frame: NDArray[np.int64],
+) -> Lean | None:
+    """Fit the lean to matched rows: robust least squares of their differences in the image.
+
+    There all rows are known about equally well; on the floor, far ones would outweigh all others.
+
+    Parameters
+    ----------
+    camera : Camera
+    reference_xy, detected_xy : (N, 2) float64
+        Positions of matched rows, metres.
+    frame : (N,) int64
+        Which frame each pair is of.
+
+    Returns
+    -------
+    Lean or None
+        None if the rows are too few or do not determine it.
+    """
+    seen = image_positions(camera, reference_xy)
+    usable = np.isfinite(seen).all(axis=1) & np.isfinite(image_positions(camera, detected_xy)).all(
+        axis=1
+    )
+    if usable.sum() < _LEAST_PAIRS:
+        return None
+    seen, detected_xy, frame = seen[usable], detected_xy[usable], frame[usable]
+
+    def differences(lean: FloatArray) -> FloatArray:
+        again = image_positions(camera, detected_xy, (lean[0], lean[1]), lean[2])
+        return np.nan_to_num(again - seen, nan=1e3).ravel()
+
+    start = least_squares(differences, np.zeros(3), loss="soft_l1", x_scale=(0.01, 0.01, 0.01))
+    scale = _HUBER * max(1.4826 * float(np.median(np.abs(start.fun))), 1e-3)
+    found = least_squares(
+        differences, start.x, loss="huber", f_scale=scale, x_scale=(0.01, 0.01, 0.01)
+    )
+    residual = differences(found.x)
+    # The solver's Jacobian is scaled by its loss.
+    by = np.stack(
+        [(differences(found.x + s) - differences(found.x - s)) / 2e-6 for s in 1e-6 * np.eye(3)],
+        axis=1,
+    )
+    weight = np.minimum(1.0, scale / np.maximum(np.abs(residual), 1e-12))
+    normal = by.T @ (weight[:, None] * by)
+    if not np.linalg.cond(normal) < _LARGEST_CONDITION:
+        return None
+    inverse = np.linalg.inv(normal)
+    _, of = np.unique(frame, return_inverse=True)
+    frames = int(of.max()) + 1
+    if frames >= _LEAST_FRAMES:
+        pull = np.zeros((frames, 3))
+        np.add.at(pull, np.repeat(of, 2), (weight * residual)[:, None] * by)
+        covariance = inverse @ (pull.T @ pull) @ inverse * frames / (frames - 1)
+    else:
+        freedom = max(len(residual) - 3, 1)
+        covariance = inverse * float((weight * residual**2).sum()) / freedom
+    pitch, roll, raised = found.x.tolist()
+    sigma_p, sigma_r, sigma_h = np.sqrt(np.diag(covariance)).tolist()
+    return Lean(pitch, roll, raised, (sigma_p, sigma_r, sigma_h))
+
+
+def floor_pairs(
+    camera: Camera | None,
+    reference_xy: FloatArray,
+    detected_xy: FloatArray,
+    covariance: FloatArray,
+    frame: NDArray[np.int64],
+) -> tuple[Lean | None, DiscPairs]:
+    """Matched rows on the floor, before and after their common lean (None without a camera).
+
+    Parameters as of `common_lean`; `covariance` (N, 2, 2) is what errors are measured in, m^2.
+    """
+    offset = detected_xy - reference_xy
+    left, lean, centre = offset, None, np.zeros(2)
+    if camera is not None:
+        centre = camera.centre[:2]
+        lean = common_lean(camera, reference_xy, detected_xy, frame)
+        if lean is not None:
+            tilt = (lean.pitch_rad, lean.roll_rad)
+            left = detected_xy - level_seen(camera, reference_xy, tilt, lean.raised_m)
+    away = reference_xy - centre
+    away = away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)
+    return lean, DiscPairs(reference_xy, offset, left, covariance, away)
+
+
+def stated_lean(lean: Lean | None, pairs: DiscPairs) -> CommonLean | None:
+    """A lean in degrees, with what it leaves of the differences; None for none."""
+    if lean is None:
+        return None
+    sigma_p, sigma_r, sigma_h = lean.sigma
+    seen = np.isfinite(pairs.left).all(axis=1)
+    return CommonLean(
+        pitch_deg=float(np.degrees(lean.pitch_rad)),
+        pitch_sigma_deg=float(np.degrees(sigma_p)),
+        roll_deg=float(np.degrees(lean.roll_rad)),
+        roll_sigma_deg=float(np.degrees(sigma_r)),
+        raised_m=lean.raised_m,
+        raised_sigma_m=sigma_h,
+        left=_difference(pairs.left, pairs.away),
+        normalised_error=disc_normalised_error(pairs.left[seen], pairs.covariance[seen]),
+    )
+
+
+def floor_bins(
+    pairs: DiscPairs, lean: Lean | None, ranges_m: Sequence[tuple[float, float]]
+) -> tuple[FloorBin, ...]:
+    """Differences at ranges of forward distances, before and after the lean."""
+    forward = -pairs.reference_xy[:, 1]
+    bins = []
+    for from_m, to_m in ranges_m:
+        here = (from_m <= forward) & (forward < to_m)
+        bins.append(
+            FloorBin(
+                from_m if isfinite(from_m) else None,
+                to_m if isfinite(to_m) else None,
+                _difference(pairs.offset[here], pairs.away[here]),
+                None if lean is None else _difference(pairs.left[here], pairs.away[here]),
+            )
+        )
+    return tuple(bins)
+
+
+def _difference(offset: FloatArray, away: FloatArray) -> FloorDifference:
+    seen = np.isfinite(offset).all(axis=1)
+    offset, away = offset[seen], away[seen]
+    size = np.asarray(np.linalg.norm(offset, axis=1), dtype=np.float64)
+    return FloorDifference(
+        pairs=len(offset),
+        median_m=quantile(size, 0.5),
+        most_m=quantile(size, 0.95),
+        along_m=quantile((offset * away).sum(axis=1), 0.5),
+        # Forward is -Y and left is X: left of a direction is it turned from -Y to X.
+        across_m=quantile(away[:, 0] * offset[:, 1] - away[:, 1] * offset[:, 0], 0.5),
+    )
