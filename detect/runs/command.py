@@ -31,7 +31,6 @@ from detect.runs.stream import detect_run, make_folder
 from detect.runs.workers import cluster_workers, default_jobs, local_workers
 from detect.settings import CircleSettings
 from detect.sources.opening import open_calibrated, open_source
-from storage.kernel_loading import load_kernels_alone
 
 #: Approximate number of images from which the radius of the discs is estimated.
 _RADIUS_IMAGES = 12
@@ -226,14 +225,10 @@ def _workers(command: DetectorFlags, job: _Job) -> Workers:
     if command.cluster is not None:
         if command.jobs is not None:
             raise WorkerError("--jobs and --cluster: expected one of them")
-        workers = cluster_workers(command.cluster, large=large)
-    else:
-        expected = frames.expected
-        jobs = command.jobs if command.jobs is not None else default_jobs(expected or 0)
-        workers = local_workers(jobs, large=large, camera=job.plan.camera, frames=expected)
-    if not workers.tell_of_tables:  # this process makes the tables, at least
-        load_kernels_alone()
-    return workers
+        return cluster_workers(command.cluster, large=large)
+    expected = frames.expected
+    jobs = command.jobs if command.jobs is not None else default_jobs(expected or 0)
+    return local_workers(jobs, large=large, camera=job.plan.camera, frames=expected)
 
 
 def _tell_results(job: _Job, summary: RunSummary) -> None:

@@ -19,13 +19,17 @@ from multiprocessing.connection import wait
 from multiprocessing.synchronize import Event, Lock
 from typing import TYPE_CHECKING, NamedTuple, ParamSpec, TypeVar, cast
 
-from detect.announcing import announce_compiling, announcements_are_shown, show_announcements
+from detect.announcing import (
+    announce_compiling,
+    announcements_are_shown,
+    on_first_compilation,
+    show_announcements,
+)
 from detect.errors import WorkerError
 from detect.interrupts import interrupts_deferred
 from detect.runs.dispatch import Workers
 from detect.runs.frame import FramePlan, import_detectors, rehearse, tables_of
 from detect.runs.rows import PIXELS_AT_ONCE
-from storage.kernel_loading import load_kernels_alone, waiting_before_compiling
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -229,15 +233,14 @@ def _begin(plan: FramePlan, beginning: _Beginning, show: bool) -> None:
     import cv2
 
     cv2.setNumThreads(1)
-    announce_compiling()
     with suppress(Exception):  # any error recurs, and is reported, with the first task
         _rehearse_together(plan, beginning)
 
 
 def _rehearse_together(plan: FramePlan, beginning: _Beginning) -> None:
     if beginning.first.acquire(block=False):
+        announce_compiling()
         try:
-            load_kernels_alone()
             tables_of(plan)
             beginning.tables.set()
             rehearse(plan)
@@ -245,10 +248,11 @@ def _rehearse_together(plan: FramePlan, beginning: _Beginning) -> None:
             beginning.tables.set()
             beginning.kernels.set()
         return
-    with waiting_before_compiling(beginning.kernels.wait) as waits:
-        import_detectors(plan)
-        (beginning.tables if waits else beginning.kernels).wait()
-        rehearse(plan)
+    # All kernels but the one that is met first are loaded then: the first process has kept them.
+    on_first_compilation(beginning.kernels.wait)
+    import_detectors(plan)
+    beginning.tables.wait()
+    rehearse(plan)
 
 
 def _end_with_parent() -> None:

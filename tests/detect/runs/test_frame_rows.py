@@ -53,14 +53,12 @@ def test_frames_have_the_same_rows_together_and_alone(
 REHEARSAL = """
 import sys
 from pathlib import Path
-from storage.kernel_loading import load_kernels_alone
 from detect.line_settings import LineSettings
 from detect.run import open_run
 from detect.runs.frame import FramePlan, FrameTask, rehearse, tables_of
 from detect.runs.rows import rows_of_frames
 from detect.settings import CircleSettings
 
-load_kernels_alone()
 run = open_run(Path(sys.argv[1]))
 plan = FramePlan(run.camera, lines=LineSettings(), circles=CircleSettings())
 rehearse(plan)
