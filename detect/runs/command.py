@@ -23,10 +23,9 @@ from detect.runs.conduct import Conduct
 from detect.runs.dispatch import Workers
 from detect.runs.frame import Drawing, FramePlan
 from detect.runs.known import FramesByImage, Known, MapByImage, TiltsByImage
-from detect.runs.outputs import frames_tilt_place
+from detect.runs.outputs import frames_tilt_place, log_place
 from detect.runs.progress import print_failures, progress_bar
 from detect.runs.rows import RunSummary
-from detect.runs.run_log import log_place
 from detect.runs.stream import detect_run, make_folder
 from detect.runs.workers import cluster_workers, default_jobs, local_workers
 from detect.settings import CircleSettings
