@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -9,11 +10,11 @@ from pathlib import Path
 from detect.drawing.head import FileHead, read_head
 from detect.errors import DetectError
 from detect.run import ImageRun
-from detect.runs.known import FramesByImage, TiltsByImage
+from detect.runs.known import FramesByImage
 from detect.seen import Tilt
 from detect.sources.image_names import image_name
 from detect.viewing_options import RowFiles
-from landmarks import CircleLandmark, FrameTilt, LineLandmark, MarkerLandmark
+from landmarks import CircleLandmark, FrameTilt, LineLandmark, MarkerLandmark, read_tilts
 
 KINDS = ("circles", "lines", "markers", "tilt")
 
@@ -82,7 +83,7 @@ class RowSource:
 
     files: SeenFiles
     _frames: dict[str, FramesByImage] = field(default_factory=dict)
-    _tilts: TiltsByImage | None = None
+    _tilts: Mapping[str, FrameTilt] | None = None
 
     def of(self, prefix: str) -> SeenRows:
         """The rows of an image, by the prefix of its STEP."""
@@ -164,7 +165,7 @@ def open_rows(files: SeenFiles) -> RowSource:
     return RowSource(
         files,
         {kind: FramesByImage(path) for kind, path in frames.items()},
-        None if tilt is None else TiltsByImage(tilt),
+        None if tilt is None else read_tilts(tilt),
     )
 
 

@@ -19,17 +19,17 @@ from detect.drawing.head import read_head
 from detect.errors import EXIT_FRAMES_FAILED, DetectError, FrameError, WorkerError
 from detect.options import All, Circles, DetectorFlags, DiscIdOptions, Lines, Markers
 from detect.run import ImageRun, Run, read_image
-from detect.runs.conduct import Conduct
 from detect.runs.dispatch import Workers
 from detect.runs.frame import Drawing, FramePlan
-from detect.runs.known import FramesByImage, Known, MapByImage, TiltsByImage
-from detect.runs.outputs import frames_tilt_place, log_place
+from detect.runs.known import FramesByImage, Known, MapByImage
+from detect.runs.outputs import Conduct, frames_tilt_place, log_place
 from detect.runs.progress import print_failures, progress_bar
 from detect.runs.rows import RunSummary
 from detect.runs.stream import detect_run, make_folder
 from detect.runs.workers import cluster_workers, default_jobs, local_workers
 from detect.settings import CircleSettings
 from detect.sources.opening import open_calibrated, open_source
+from landmarks import read_tilts
 
 #: Approximate number of images from which the radius of the discs is estimated.
 _RADIUS_IMAGES = 12
@@ -56,7 +56,9 @@ def perform(command: DetectorFlags) -> int:
     job = _job_of(command)
     log = log_place(job.named_after or next(iter(job.places.values())))
     name = type(command).__name__.lower()
-    conduct = Conduct(__version__, command.force, job.crlf, log, name, command.conduct)
+    conduct = Conduct(
+        __version__, command.force, job.crlf, log, name, command.strict, command.resume
+    )
     with progress_bar(job.label, job.run.frames.expected) as advance:
         summary = detect_run(
             job.run,
@@ -208,7 +210,7 @@ def _known(
     if discs.ids_from_map is not None and discs.path is not None:
         mapped = MapByImage(discs.ids_from_map, discs.path)
     return Known(
-        tilts=None if tilts is None else TiltsByImage(tilts),
+        tilts=None if tilts is None else read_tilts(tilts),
         lines=None if lines is None else FramesByImage(lines),
         discs=None if discs.ids_from is None else FramesByImage(discs.ids_from),
         discs_level=discs.ids_from is not None and read_head(discs.ids_from).level,

@@ -23,9 +23,8 @@ import cv2
 import numpy as np
 
 from detect.run import RunFrame
-from detect.runs.conduct import Conduct
 from detect.runs.frame import FramePlan, FrameTask
-from detect.runs.outputs import Output
+from detect.runs.outputs import Conduct, Output
 from detect.runs.rows import FrameRows
 from storage.parts import is_at, named, new_locked, old_locked
 

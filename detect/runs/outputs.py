@@ -17,7 +17,6 @@ from typing import Any
 
 from detect.errors import EXIT_FRAMES_FAILED
 from detect.run import ImageRun
-from detect.runs.conduct import Conduct
 from detect.runs.frame import FramePlan
 from detect.runs.rows import RunSummary
 from detect.sources.times import TIMES_HEAD
@@ -44,6 +43,37 @@ _TILT_ROWS = (
     "  rotation vector (pitch, roll, 0) about the robot's X (left) and Y (backward), radians:",
     "  it turns directions measured with the calibrated mounting level; its covariance;",
 )
+
+
+@dataclass(frozen=True)
+class Conduct:
+    """How a run is carried out, apart from what is detected.
+
+    Attributes
+    ----------
+    version : str
+        The program's version, for the heads of files.
+    overwrite : bool
+        Whether existing files may be replaced.
+    crlf : bool
+        Whether the lines of files of landmarks end with CR and LF.
+    log : path or None
+        Where the log goes. A run with a log can be resumed (see `detect.runs.journal`).
+    command : str
+        What the log calls the run.
+    strict : bool
+        Whether the first frame that cannot be worked on ends the run.
+    resume : bool
+        Whether the frames that an unfinished run kept are taken over.
+    """
+
+    version: str = ""
+    overwrite: bool = False
+    crlf: bool = False
+    log: Path | None = None
+    command: str = ""
+    strict: bool = False
+    resume: bool = False
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,6 @@ from pathlib import Path
 from types import TracebackType
 
 from detect.errors import DetectError
-from detect.runs.conduct import Conduct
 from detect.runs.frame import FramePlan, FrameTask
 from detect.runs.journal import (
     Journal,
@@ -38,7 +37,15 @@ from detect.runs.journal import (
     task_digest,
     unnamed_journal,
 )
-from detect.runs.outputs import LOG, Output, demand_log_place, log_failure, log_head, log_tail
+from detect.runs.outputs import (
+    LOG,
+    Conduct,
+    Output,
+    demand_log_place,
+    log_failure,
+    log_head,
+    log_tail,
+)
 from detect.runs.rows import FrameRows, RunSummary
 from storage import OutputExistsError
 from storage.parts import PartFile, folder_locked, left_part, new_part
@@ -146,7 +153,7 @@ class RunFiles:
         """Complete, take over, or remove what an interrupted run left."""
         head, parts = left.head(), left.parts()
         fits = head is not None and head.made_by == self._made_by
-        resume = self._conduct.faults.resume and head is not None
+        resume = self._conduct.resume and head is not None
         if head is not None and parts is not None and len(parts) == len(self._outputs):
             _log.info("the files of a run that was killed at its very end take their places")
             for output, number in zip(self._outputs, parts):
@@ -204,7 +211,7 @@ class RunFiles:
             if task is None or frame.task != task_digest(task):
                 beyond = [] if task is None else [task]
                 break
-            if frame.error is not None and self._conduct.faults.strict:
+            if frame.error is not None and self._conduct.strict:
                 raise FailedFrameError(frame.error)
             self._frames += 1
             count(frame.frame_rows())
@@ -234,7 +241,7 @@ class RunFiles:
         assert self._journal is not None
         for task, rows in frames:
             if rows.error is not None:
-                if self._conduct.faults.strict:
+                if self._conduct.strict:
                     self._journal.remove()
                     raise FailedFrameError(rows.error)
                 failure = log_failure(self._frames, task.frame.step.prefix, rows.error)
