@@ -9,7 +9,6 @@ the same result removes it. While one is being written, the next partial file is
 from __future__ import annotations
 
 import contextlib
-import errno
 import io
 import os
 import stat
@@ -250,36 +249,11 @@ def _place_new(temporary: Path, path: Path) -> None:
     except FileExistsError:
         if not path.is_file() or not temporary.samefile(path):
             raise OutputExistsError(path) from None
-        temporary.unlink(missing_ok=True)  # a process was killed after it had placed the file
-    except OSError:  # a file system without hard links
-        _rename_new(temporary, path)
-    else:
-        temporary.unlink(missing_ok=True)
-
-
-def _rename_new(temporary: Path, path: Path) -> None:
-    """Rename the file unless its new name is taken: in one step where the system can."""
-    if sys.platform == "win32":
+        # Else a process was killed after it had placed the file.
+    except OSError:  # a file system without hard links: the name is taken first
         try:
-            temporary.rename(path)
+            os.close(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL))
         except FileExistsError:
             raise OutputExistsError(path) from None
-        return
-    failed = _rename_without_replacing(temporary, path)
-    if failed == errno.EEXIST or (failed and os.path.lexists(path)):
-        raise OutputExistsError(path) from None
-    if failed:  # another process can still create the file here
         temporary.replace(path)
-
-
-def _rename_without_replacing(old: Path, new: Path) -> int:
-    """Linux's renameat2: 0, or the error number, also where the system does not have it."""
-    import ctypes
-
-    rename = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
-    if rename is None:
-        return errno.ENOSYS
-    here, without_replacing = -100, 1  # AT_FDCWD, RENAME_NOREPLACE
-    places = os.fsencode(old), os.fsencode(new)
-    done = rename(here, places[0], here, places[1], ctypes.c_uint(without_replacing))
-    return 0 if done == 0 else ctypes.get_errno()
+    temporary.unlink(missing_ok=True)

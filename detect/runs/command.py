@@ -227,9 +227,8 @@ def _workers(command: DetectorFlags, job: _Job) -> Workers:
         if command.jobs is not None:
             raise WorkerError("--jobs and --cluster: expected one of them")
         return cluster_workers(command.cluster, large=large)
-    expected = frames.expected
-    jobs = command.jobs if command.jobs is not None else default_jobs(expected or 0)
-    return local_workers(jobs, large=large, camera=job.plan.camera, frames=expected)
+    jobs = command.jobs if command.jobs is not None else default_jobs(frames.expected or 0)
+    return local_workers(jobs, large=large)
 
 
 def _tell_results(job: _Job, summary: RunSummary) -> None:

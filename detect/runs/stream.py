@@ -93,7 +93,7 @@ def detect_run(
         make_folder(pictures)
     if workers is None:
         large = pictures is not None or run.frames.ships_images
-        workers = local_workers(1, large=large, camera=plan.camera)
+        workers = local_workers(1, large=large)
     _demand_possible(plan, workers)
     summary = RunSummary()
 

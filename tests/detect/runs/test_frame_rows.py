@@ -6,12 +6,15 @@ import pickle
 import shutil
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from detect.run import RunFrame, open_run
-from detect.runs.frame import FramePlan, FrameTask, tables_of
+from detect.runs import rows as rows_module
+from detect.runs.frame import FrameDetections, FramePlan, FrameTask, detect_batch, tables_of
 from detect.runs.journal import (
     JournalFrame,
     JournalHead,
@@ -55,6 +58,23 @@ def test_frames_have_the_same_rows_together_and_alone(
         circles = rows.rows["circles"]
         assert circles.startswith(f"STEP {task.frame.step.prefix} ".encode())
         assert rows.found.get("discs", 0) == circles.count(b"LANDMARK_C")
+
+
+def test_no_more_images_are_in_memory_than_agreed(
+    tasks_and_plan: tuple[list[FrameTask], FramePlan], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tasks, plan = tasks_and_plan
+    assert plan.camera is not None
+    sizes = []
+
+    def noted(batch: Sequence[FrameTask], *others: Any) -> list[FrameDetections]:
+        sizes.append(len(batch))
+        return detect_batch(batch, *others)
+
+    monkeypatch.setattr(rows_module, "detect_batch", noted)
+    monkeypatch.setattr(rows_module, "PIXELS_AT_ONCE", 5 * plan.camera.width * plan.camera.height)
+    rows_of_frames(tasks, plan, tables_of(plan))
+    assert sizes == [5, 5, 2]
 
 
 REHEARSAL = """
