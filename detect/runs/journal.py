@@ -75,17 +75,19 @@ class Journal:
         self._handle, self._result = handle, result
         self._check, self._end = "", 0
 
-    def write(self, record: Sequence[Any]) -> None:
-        """Write a line behind those that are there."""
-        line = self._line(_JSON.encode(record).encode())
+    def write(self, *records: Sequence[Any]) -> None:
+        """Write lines behind those that are there."""
+        lines = []
+        for record in records:
+            lines.append(self._line(_JSON.encode(record).encode()))
+            self._check = lines[-1][:_DIGITS].decode()
         try:
             os.lseek(self._handle, 0, os.SEEK_END)
-            left = memoryview(line)
+            left = memoryview(b"".join(lines))
             while left:
                 left = left[os.write(self._handle, left) :]
         except OSError as error:
             raise named(error, self._result) from None
-        self._check = line[:_DIGITS].decode()
 
     def complete(self, parts: Sequence[int]) -> None:
         """Note that the results are on the disk, in these parts, and only have to be renamed."""

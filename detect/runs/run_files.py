@@ -28,6 +28,7 @@ from detect.errors import DetectError
 from detect.runs.frame import FramePlan, FrameTask
 from detect.runs.journal import (
     Journal,
+    JournalFrame,
     JournalHead,
     journal_place,
     left_journal,
@@ -239,15 +240,18 @@ class RunFiles:
             If one of them could not be worked on, and every frame is demanded.
         """
         assert self._journal is not None
+        records: list[JournalFrame] = []
         for task, rows in frames:
             if rows.error is not None:
                 if self._conduct.strict:
                     self._journal.remove()
                     raise FailedFrameError(rows.error)
-                failure = log_failure(self._frames, task.frame.step.prefix, rows.error)
+                place = self._frames + len(records)
+                failure = log_failure(place, task.frame.step.prefix, rows.error)
                 rows = rows._replace(rows={**rows.rows, LOG: failure})
-            self._journal.write(record_of(task, rows, self._kinds))
-            self._frames += 1
+            records.append(record_of(task, rows, self._kinds))
+        self._journal.write(*records)
+        self._frames += len(records)
 
     # -- ending -----------------------------------------------------------------------------
 
