@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import random
 import shutil
@@ -15,6 +16,7 @@ from detect.runs.frame import FrameTask
 from detect.runs.journal import digest_of
 from detect.runs.rows import FrameRows
 from detect.runs.run_files import RunFiles
+from storage.parts import PartFile
 from tests.detect.interrupted_runs import (
     FRAMES,
     PREVIOUS,
@@ -171,6 +173,30 @@ def test_resuming_what_was_never_begun(
 ) -> None:
     assert resumed(run_folder, output, capsys) == 0
     assert results(output) == undisturbed
+
+
+@pytest.mark.parametrize("step", ["sync", "place"])
+def test_results_that_cannot_be_written_are_written_by_the_next_run(
+    run_folder: Path, output: Path, undisturbed: dict[str, bytes], capsys: Captured, step: str
+) -> None:
+    """All frames are done, and then the disk is full, or a file cannot take its place."""
+    count = [0]
+    plain = getattr(PartFile, step)
+
+    def fail(part: PartFile, **how: bool) -> None:
+        count[0] += 1
+        if count[0] == 3:
+            raise OSError(errno.ENOSPC, "No space left on device", str(part.path))
+        plain(part, **how)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(PartFile, step, fail)
+        assert main(command(run_folder, output)) == 1
+    assert "No space left on device: '" in capsys.readouterr().err
+    assert ".detected.journal" in hidden(output)
+    assert resumed(run_folder, output, capsys) == (FRAMES if step == "sync" else 0)
+    assert results(output) == undisturbed
+    assert hidden(output) == set()
 
 
 def test_pictures_of_the_frame_under_way(run_folder: Path, tmp_path: Path) -> None:
