@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import sys
+from collections.abc import Callable
 from functools import cache
 
 _log = logging.getLogger("redetect")
@@ -36,15 +37,20 @@ def announcements_are_shown() -> bool:
 @cache
 def announce_compiling() -> None:
     """Have it announced when the first kernel is compiled instead of loaded."""
+    on_first_compilation(lambda: _log.info("compiling kernels, once: about a minute"))
+
+
+def on_first_compilation(call: Callable[[], object]) -> None:
+    """Have something called before this process compiles its first kernel."""
     from numba.core import event
 
     class FirstCompilation(event.Listener):
-        said = False
+        called = False
 
         def on_start(self, _: object) -> None:
-            if not self.said:
-                self.said = True
-                _log.info("compiling kernels, once: about a minute")
+            if not self.called:
+                self.called = True
+                call()
 
         def on_end(self, _: object) -> None:
             pass

@@ -11,7 +11,6 @@ in the floor plane and refines the position.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
@@ -40,7 +39,6 @@ from detect.discs.rim_network import RimNetwork, rim_network
 from detect.discs.search_kernels import DiscSearch, search_discs
 from detect.discs.second_look import second_looks
 from detect.errors import FrameError
-from detect.latest import kept_for_latest
 from detect.noise import estimate_noise
 from detect.settings import CircleSettings
 from lut import DiscShape, DiscTable
@@ -185,7 +183,7 @@ def candidates_of(
     votes = NO_VOTES
     if _looks_twice(settings):
         votes = Votes(_vote_step(weakest), math.ceil(_VOTES * table.samples))
-    centres = _looked_at(table)(settings)
+    centres = _looked_at(table, settings)
     return scored_centres(
         image, centres.table, settings.threshold, settings.polarity, centres.rank, votes
     )
@@ -286,12 +284,12 @@ def _without_fit(
     return CircleDetections(pixels, floor_xy, covariance, quality, np.full(len(pixels), np.nan))
 
 
-@kept_for_latest
-def _looked_at(table: DiscTable) -> Callable[[CircleSettings], CentreRows]:
-    return kept_for_latest(lambda settings: rows_to_look_at(table, settings))
+@lru_cache(maxsize=4)
+def _looked_at(table: DiscTable, settings: CircleSettings) -> CentreRows:
+    return rows_to_look_at(table, settings)
 
 
-@kept_for_latest
+@lru_cache(maxsize=4)
 def _disc_search(settings: CircleSettings) -> DiscSearch:
     return DiscSearch(
         radius=settings.radius_m,
@@ -373,7 +371,6 @@ class _KernelCamera(NamedTuple):
     blur_ratio: float
 
 
-@kept_for_latest
 @lru_cache(maxsize=4)
 def _kernel_camera(camera: Camera) -> _KernelCamera:
     pinhole = [camera.scale_x, camera.scale_y, camera.offset_x, camera.offset_y]

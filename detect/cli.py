@@ -29,14 +29,7 @@ from detect.settings import PRESETS as CIRCLE_PRESETS
 from detect.settings import CircleSettings
 from detect.viewing_options import Draw, Report, Tune, View
 from storage.command_line import Program
-from storage.exit_codes import say_error, say_interrupted
-
-# Numba's words where neither the program's folder nor the user's cache can be written to.
-_NO_KERNEL_CACHE = "no locator available"
-_WHERE_KERNELS_GO = (
-    "compiled kernels cannot be kept, neither beside the program nor in the user's cache folder: "
-    "set the environment variable NUMBA_CACHE_DIR to a folder"
-)
+from storage.exit_codes import of_kernel_cache, say_error, say_interrupted
 
 Command = Circles | Lines | Markers | All | Compare | Export | Draw | View | Report | Tune
 
@@ -71,8 +64,8 @@ def main(arguments: list[str] | None = None) -> int:
                 return say_error(error)
         except BaseException as error:
             if not interrupted.is_set():
-                if _NO_KERNEL_CACHE in str(error):
-                    return say_error(_WHERE_KERNELS_GO)
+                if of_kernel_cache(error):
+                    return say_error(error)
                 raise
     code = say_interrupted()
     if arguments is None:

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from camera import Camera
 from detect.circles import CircleDetections
 from detect.discs.levelling import level_discs
-from detect.latest import kept_for_latest
 from landmarks import FrameTilt
 
 FloatArray = NDArray[np.float64]
@@ -103,7 +102,6 @@ def level_covariances(
     )[1]
 
 
-@kept_for_latest
 @lru_cache(maxsize=4)
 def _centre_of(camera: Camera) -> FloatArray:
     """In memory of its own: a camera that came from another process has arrays of another kind."""

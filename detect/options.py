@@ -25,7 +25,6 @@ from detect.flags import (
 )
 from detect.line_settings import LineSettings
 from detect.markers.settings import MarkerSettings
-from detect.runs.conduct import ConductOptions
 from detect.settings import CircleSettings, Levelling
 from detect.sources.options import SourceOptions
 from storage.bounds import NOT_NEGATIVE, demand
@@ -48,13 +47,18 @@ class DetectorFlags(RunFlags):
         frames, at most as many as there are cores. What is written is the same.
     cluster : str
         Address of a dask scheduler (tcp://host:8786) whose workers do the work instead.
+    strict : bool
+        Stop at the first frame that cannot be worked on, with exit code 1 and nothing written.
+    resume : bool
+        Take over the frames that an unfinished run of the same command kept, and go on after them.
     """
 
     preset: Preset = "default"
     jobs: MaybeInt = None
     cluster: MaybeStr = None
     source: OmitArgPrefixes[SourceOptions] = field(default_factory=SourceOptions)
-    conduct: OmitArgPrefixes[ConductOptions] = field(default_factory=ConductOptions)
+    strict: bool = False
+    resume: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,10 +13,10 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Generator
+from collections.abc import Generator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,15 +56,6 @@ class RunFrame:
     bits: int = 16
     failure: str | None = None
     stamp: FileStamp | None = field(default=None, compare=False, repr=False)
-
-    def __reduce__(self) -> tuple[Callable[..., RunFrame], tuple[object, ...]]:
-        # One travels to a worker with every frame: a dataclass's own way takes longer.
-        image = None if self.image is None else os.fspath(self.image)
-        return _frame, (self.step, image, self.content, self.time_s, self.bits, self.failure)
-
-
-def _frame(step: Step, image: str | None, *others: Any) -> RunFrame:
-    return RunFrame(step, None if image is None else Path(image), *others)
 
 
 class Frames(Protocol):

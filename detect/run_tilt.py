@@ -18,7 +18,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize
 
 from detect.run_tilt_kernels import smooth_axis
 from landmarks import FrameTilt
@@ -175,6 +174,8 @@ def _part(values: FloatArray, sigma: FloatArray) -> tuple[FloatArray, FloatArray
 
 def _learned(values: FloatArray, sigma: FloatArray) -> AxisModel:
     """The constants of the largest likelihood, and how well the lean among them is known."""
+    from scipy.optimize import minimize  # takes as long as a hundred frames
+
     unit = math.radians(0.1)
 
     def cost(unknowns: FloatArray) -> float:

@@ -36,7 +36,6 @@ PROGRAM = Program(
         Validate: "groundtruth.commands.validate",
         Report: "groundtruth.commands.report",
     },
-    compiled=(Lasers, Laser, Sync, Fuse, Validate),
 )
 
 main, parsed = PROGRAM.main, PROGRAM.parsed

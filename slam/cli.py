@@ -24,7 +24,6 @@ PROGRAM = Program(
         Export: "slam.commands.export",
         Import: "slam.commands.export",
     },
-    compiled=(Map, Localize, Ekf, Associate),
 )
 
 main, parsed = PROGRAM.main, PROGRAM.parsed

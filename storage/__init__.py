@@ -5,17 +5,13 @@ All packages write their files with `write_whole`.
 
 from __future__ import annotations
 
-import io
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO
+from typing import BinaryIO
 
-from storage.parts import OutputExistsError, named, new_part
-
-if TYPE_CHECKING:
-    from _typeshed import ReadableBuffer
+from storage.parts import OutputExistsError, new_part
 
 __all__ = ["OutputExistsError", "write_whole"]
 
@@ -50,26 +46,7 @@ def write_whole(path: str | os.PathLike[str], *, overwrite: bool) -> Iterator[Bi
     path = Path(path)
     if not overwrite and os.path.lexists(path):
         raise OutputExistsError(path)
-    part = new_part(path)
-    try:
-        with io.BufferedWriter(_NamedFile(part.fileno(), path)) as stream:
-            yield stream
-            stream.flush()
+    with new_part(path) as part:
+        yield part.stream
         part.sync()
         part.place(overwrite=overwrite)
-    finally:
-        part.discard()
-
-
-class _NamedFile(io.FileIO):
-    """A descriptor for writing whose errors name the result."""
-
-    def __init__(self, handle: int, path: Path) -> None:
-        super().__init__(handle, "wb", closefd=False)
-        self._path = path
-
-    def write(self, content: ReadableBuffer, /) -> int:
-        try:
-            return super().write(content)
-        except OSError as error:
-            raise named(error, self._path) from None

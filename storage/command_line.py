@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from importlib import import_module
 from typing import Annotated, Any, Union
 
@@ -16,7 +16,6 @@ import tyro
 from tyro.conf import arg, subcommand
 
 from storage.exit_codes import exit_code_of
-from storage.kernel_loading import load_kernels_alone
 from storage.version import __version__
 
 
@@ -32,14 +31,11 @@ class Program:
     performed_by : mapping
         Dataclasses of flags, one for each command, which has the class's name in small letters; and
         the module whose `perform` carries it out.
-    compiled : tuple of type
-        Commands that run compiled kernels.
     """
 
     name: str
     description: str
     performed_by: Mapping[type, str]
-    compiled: tuple[type, ...] = field(default=())
 
     def main(self, arguments: list[str] | None = None) -> int:
         """Run the command line; returns the exit code."""
@@ -77,7 +73,5 @@ class Program:
 
     def carry_out(self, command: Any) -> int:
         """Carry out a command; returns the exit code."""
-        if isinstance(command, self.compiled):
-            load_kernels_alone()
         code: int = import_module(self.performed_by[type(command)]).perform(command)
         return code

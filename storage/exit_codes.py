@@ -18,6 +18,12 @@ EXIT_INTERRUPTED = 130
 #: The reader of its output has gone (``| head``); the code that system tools exit with then.
 EXIT_UNREAD = 141
 
+_NUMBAS_CACHING = os.path.join("numba", "core", "caching.py")  # noqa: PTH118 - part of a path
+_WHERE_KERNELS_GO = (
+    "free some disk space, delete those of another version of this program (*.nbi in __pycache__), "
+    "or set the environment variable NUMBA_CACHE_DIR to another folder"
+)
+
 
 def exit_code_of(work: Callable[[], int]) -> int:
     """Run a command and report its errors on one line.
@@ -45,6 +51,10 @@ def exit_code_of(work: Callable[[], int]) -> int:
         return say_interrupted()
     except (ValueError, OSError) as error:
         return say_error(error)
+    except Exception as error:
+        if of_kernel_cache(error):
+            return say_error(error)
+        raise
 
 
 def say_error(error: BaseException | str) -> int:
@@ -87,15 +97,18 @@ def _said(error: BaseException | str) -> str:
         folder = Path(error.filename).parent
         if not folder.is_dir():
             return f"{error.filename}: no such folder: {folder}: make it first, or name another"
-    if isinstance(error, OSError) and _while_kernels_were_kept(error):
+    if isinstance(error, BaseException) and of_kernel_cache(error):
         return (
-            f"compiled kernels cannot be kept: {error}: free some disk space, or set the "
-            "environment variable NUMBA_CACHE_DIR to another folder"
+            f"compiled kernels cannot be {'kept' if isinstance(error, OSError) else 'loaded'}: "
+            f"{error}: {_WHERE_KERNELS_GO}"
         )
     return str(error)
 
 
-def _while_kernels_were_kept(error: OSError) -> bool:
-    """Whether Numba raised it while it wrote its cache: it names no file."""
-    frames = traceback.walk_tb(error.__traceback__)
-    return any(frame.f_globals.get("__name__") == "numba.core.caching" for frame, _ in frames)
+def of_kernel_cache(error: BaseException) -> bool:
+    """Whether Numba raised it over its cache of compiled kernels, here or in a worker.
+
+    There is no folder for it, no room in it, or its index names classes of another version of the
+    program: Numba's own words are no help.
+    """
+    return _NUMBAS_CACHING in "".join(traceback.format_exception(error))

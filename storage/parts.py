@@ -9,13 +9,17 @@ the same result removes it. While one is being written, the next partial file is
 from __future__ import annotations
 
 import contextlib
-import errno
+import io
 import os
 import stat
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from _typeshed import ReadableBuffer
 
 #: Number of names of partial files that are checked for leftovers of killed processes.
 _PLACES_LOOKED_AT = 8
@@ -40,69 +44,37 @@ class NotAFileError(OSError):
 
 
 class PartFile:
-    """A result while it grows: locked, and removed unless it is kept or takes its place.
+    """A result while it is written: locked, and removed by `discard` unless it took its place.
 
     Attributes
     ----------
     path : path
         Where the result will be.
     temporary : path
-        Where it grows.
+        Where it is written.
     number : int
         Which of the parts of this result it is; 0 unless others were being written.
+    stream : binary stream
+        What is written to it becomes the result. Its errors name the result, not the part.
     """
 
     def __init__(self, path: Path, number: int, handle: int) -> None:
         self.path = path
         self.number = number
         self.temporary = part_place(path, number)
-        self._handle = handle
+        self.stream = io.BufferedWriter(_NamedFile(handle, path))
 
-    def fileno(self) -> int:
-        """The descriptor, for reading and truncating the file."""
-        return self._handle
+    def __enter__(self) -> PartFile:
+        return self
 
-    def write(self, content: bytes) -> None:
-        """Write at once, all of it.
-
-        Raises
-        ------
-        OSError
-            That names the result, not the part.
-        """
-        try:
-            write_all(self._handle, content)
-        except OSError as error:
-            raise named(error, self.path) from None
-
-    def read(self, place: int, length: int) -> bytes:
-        """The bytes from an offset; fewer than `length` at the end of the part."""
-        left = max(0, os.fstat(self._handle).st_size - place)
-        os.lseek(self._handle, place, os.SEEK_SET)
-        wanted = min(length, left)
-        pieces = []
-        while wanted and (piece := os.read(self._handle, wanted)):
-            pieces.append(piece)
-            wanted -= len(piece)
-        return b"".join(pieces)
-
-    def cut(self, size: int) -> None:
-        """Cut it off; it grows on from there."""
-        os.ftruncate(self._handle, size)
-        os.lseek(self._handle, size, os.SEEK_SET)
-
-    def rewind(self) -> None:
-        """Read on from the beginning."""
-        os.lseek(self._handle, 0, os.SEEK_SET)
-
-    def to_end(self) -> None:
-        """Grow on at the end."""
-        os.lseek(self._handle, 0, os.SEEK_END)
+    def __exit__(self, *_: object) -> None:
+        self.discard()
 
     def sync(self) -> None:
         """Have it on the disk."""
+        self.stream.flush()
         try:
-            os.fsync(self._handle)
+            os.fsync(self.stream.fileno())
         except OSError as error:
             raise named(error, self.path) from None
 
@@ -128,23 +100,29 @@ class PartFile:
 
     def discard(self) -> None:
         """Remove it, unless it took its place."""
-        if self._handle >= 0:
-            if _is_at(self._handle, self.temporary):
+        if not self.stream.closed:
+            if is_at(self.stream.fileno(), self.temporary):
                 self.temporary.unlink(missing_ok=True)
             self.close()
 
     def close(self) -> None:
         """Leave it where it is, and take the lock off."""
-        if self._handle >= 0:
-            os.close(self._handle)
-            self._handle = -1
+        with contextlib.suppress(OSError):  # what is written but not flushed goes with it
+            self.stream.close()
 
 
-def write_all(handle: int, content: bytes) -> None:
-    """Write to a descriptor, which may take less than it is given at once."""
-    written = os.write(handle, content) if content else 0
-    while written < len(content):
-        written += os.write(handle, content[written:])
+class _NamedFile(io.FileIO):
+    """A descriptor for writing whose errors name the result."""
+
+    def __init__(self, handle: int, path: Path) -> None:
+        super().__init__(handle, "wb")
+        self._path = path
+
+    def write(self, content: ReadableBuffer, /) -> int:
+        try:
+            return super().write(content)
+        except OSError as error:
+            raise named(error, self._path) from None
 
 
 def new_part(path: Path) -> PartFile:
@@ -163,7 +141,8 @@ def new_part(path: Path) -> PartFile:
         while (handle := new_locked(part_place(path, number))) is None:
             number += 1
         for other in range(number + 1, _PLACES_LOOKED_AT):
-            remove_left_part(path, other)
+            if os.path.lexists(part_place(path, other)) and (left := left_part(path, other)):
+                left.discard()
     except OSError as error:
         raise named(error, path) from None
     return PartFile(path, number, handle)
@@ -179,14 +158,6 @@ def left_part(path: Path, number: int = 0) -> PartFile | None:
     """The part of a result that an ended process left; None if there is none or it is in use."""
     handle = old_locked(part_place(path, number))
     return None if handle is None else PartFile(path, number, handle)
-
-
-def remove_left_part(path: Path, number: int = 0) -> None:
-    """Remove the part of a result that an ended process left, if there is one."""
-    if os.path.lexists(part_place(path, number)):
-        left = left_part(path, number)
-        if left is not None:
-            left.discard()
 
 
 def part_place(path: Path, number: int) -> Path:
@@ -231,7 +202,7 @@ def new_locked(place: Path) -> int | None:
             place.unlink(missing_ok=True)
             os.close(left)
             continue
-        if _lock(handle) is not False and _is_at(handle, place):
+        if _lock(handle) is not False and is_at(handle, place):
             return handle
         os.close(handle)  # mistaken for a leftover file before it was locked
 
@@ -242,7 +213,7 @@ def old_locked(place: Path) -> int | None:
         handle = os.open(place, _OLD)
     except OSError:
         return None
-    if stat.S_ISREG(os.fstat(handle).st_mode) and _lock(handle) and _is_at(handle, place):
+    if stat.S_ISREG(os.fstat(handle).st_mode) and _lock(handle) and is_at(handle, place):
         return handle  # no process writes it any more
     os.close(handle)
     return None
@@ -263,7 +234,8 @@ def _lock(handle: int) -> bool | None:
     return True
 
 
-def _is_at(handle: int, place: Path) -> bool:
+def is_at(handle: int, place: Path) -> bool:
+    """Whether an open file is the one at a path."""
     try:
         return os.path.samestat(os.fstat(handle), os.lstat(place))
     except OSError:
@@ -277,36 +249,11 @@ def _place_new(temporary: Path, path: Path) -> None:
     except FileExistsError:
         if not path.is_file() or not temporary.samefile(path):
             raise OutputExistsError(path) from None
-        temporary.unlink(missing_ok=True)  # a process was killed after it had placed the file
-    except OSError:  # a file system without hard links
-        _rename_new(temporary, path)
-    else:
-        temporary.unlink(missing_ok=True)
-
-
-def _rename_new(temporary: Path, path: Path) -> None:
-    """Rename the file unless its new name is taken: in one step where the system can."""
-    if sys.platform == "win32":
+        # Else a process was killed after it had placed the file.
+    except OSError:  # a file system without hard links: the name is taken first
         try:
-            temporary.rename(path)
+            os.close(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL))
         except FileExistsError:
             raise OutputExistsError(path) from None
-        return
-    failed = _rename_without_replacing(temporary, path)
-    if failed == errno.EEXIST or (failed and os.path.lexists(path)):
-        raise OutputExistsError(path) from None
-    if failed:  # another process can still create the file here
         temporary.replace(path)
-
-
-def _rename_without_replacing(old: Path, new: Path) -> int:
-    """Linux's renameat2: 0, or the error number, also where the system does not have it."""
-    import ctypes
-
-    rename = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
-    if rename is None:
-        return errno.ENOSYS
-    here, without_replacing = -100, 1  # AT_FDCWD, RENAME_NOREPLACE
-    places = os.fsencode(old), os.fsencode(new)
-    done = rename(here, places[0], here, places[1], ctypes.c_uint(without_replacing))
-    return 0 if done == 0 else ctypes.get_errno()
+    temporary.unlink(missing_ok=True)

@@ -7,7 +7,7 @@ made.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
@@ -16,14 +16,14 @@ from typing import Any
 from detect.errors import DetectError
 from detect.line_settings import LineSettings
 from detect.run import Frames, ImageRun, RunFrame
-from detect.runs.known import FramesByImage, TiltsByImage
+from detect.runs.known import FramesByImage
 from detect.runs.outputs import LEVEL, LEVELLED
 from detect.seen import Tilt
 from detect.settings import CircleSettings
 from detect.sources.image_names import image_name
 from detect.tune.grid import parameter_value
 from detect.viewing_options import RowFiles
-from landmarks import CircleLandmark, FrameTilt, LineLandmark, MarkerLandmark
+from landmarks import CircleLandmark, FrameTilt, LineLandmark, MarkerLandmark, read_tilts
 from storage.messages import excerpt
 
 KINDS = ("circles", "lines", "markers", "tilt")
@@ -99,7 +99,7 @@ class RowSource:
 
     files: SeenFiles
     _frames: dict[str, FramesByImage] = field(default_factory=dict)
-    _tilts: TiltsByImage | None = None
+    _tilts: Mapping[str, FrameTilt] | None = None
 
     def of(self, prefix: str) -> SeenRows:
         """The rows of an image, by the prefix of its STEP."""
@@ -181,7 +181,7 @@ def open_rows(files: SeenFiles) -> RowSource:
     return RowSource(
         files,
         {kind: FramesByImage(path) for kind, path in frames.items()},
-        None if tilt is None else TiltsByImage(tilt),
+        None if tilt is None else read_tilts(tilt),
     )
 
 

@@ -19,19 +19,17 @@ from detect.drawing.inputs import read_head
 from detect.errors import EXIT_FRAMES_FAILED, DetectError, FrameError, WorkerError
 from detect.options import All, Circles, DetectorFlags, DiscIdOptions, Lines, Markers
 from detect.run import ImageRun, Run, read_image
-from detect.runs.conduct import Conduct
 from detect.runs.dispatch import Workers
 from detect.runs.frame import Drawing, FramePlan
-from detect.runs.known import FramesByImage, Known, MapByImage, TiltsByImage
-from detect.runs.outputs import frames_tilt_place
+from detect.runs.known import FramesByImage, Known, MapByImage
+from detect.runs.outputs import Conduct, frames_tilt_place, log_place
 from detect.runs.progress import print_failures, progress_bar
 from detect.runs.rows import RunSummary
-from detect.runs.run_log import log_place
 from detect.runs.stream import detect_run, make_folder
 from detect.runs.workers import cluster_workers, default_jobs, local_workers
 from detect.settings import CircleSettings
 from detect.sources.opening import open_calibrated, open_source
-from storage.kernel_loading import load_kernels_alone
+from landmarks import read_tilts
 
 #: Approximate number of images from which the radius of the discs is estimated.
 _RADIUS_IMAGES = 12
@@ -58,7 +56,9 @@ def perform(command: DetectorFlags) -> int:
     job = _job_of(command)
     log = log_place(job.named_after or next(iter(job.places.values())))
     name = type(command).__name__.lower()
-    conduct = Conduct(__version__, command.force, job.crlf, log, name, command.conduct)
+    conduct = Conduct(
+        __version__, command.force, job.crlf, log, name, command.strict, command.resume
+    )
     with progress_bar(job.label, job.run.frames.expected) as advance:
         summary = detect_run(
             job.run,
@@ -210,7 +210,7 @@ def _known(
     if discs.ids_from_map is not None and discs.path is not None:
         mapped = MapByImage(discs.ids_from_map, discs.path)
     return Known(
-        tilts=None if tilts is None else TiltsByImage(tilts),
+        tilts=None if tilts is None else read_tilts(tilts),
         lines=None if lines is None else FramesByImage(lines),
         discs=None if discs.ids_from is None else FramesByImage(discs.ids_from),
         discs_level=discs.ids_from is not None and read_head(discs.ids_from).level,
@@ -226,14 +226,9 @@ def _workers(command: DetectorFlags, job: _Job) -> Workers:
     if command.cluster is not None:
         if command.jobs is not None:
             raise WorkerError("--jobs and --cluster: expected one of them")
-        workers = cluster_workers(command.cluster, large=large)
-    else:
-        expected = frames.expected
-        jobs = command.jobs if command.jobs is not None else default_jobs(expected or 0)
-        workers = local_workers(jobs, large=large, camera=job.plan.camera, frames=expected)
-    if not workers.tell_of_tables:  # this process makes the tables, at least
-        load_kernels_alone()
-    return workers
+        return cluster_workers(command.cluster, large=large)
+    jobs = command.jobs if command.jobs is not None else default_jobs(frames.expected or 0)
+    return local_workers(jobs, large=large)
 
 
 def _tell_results(job: _Job, summary: RunSummary) -> None:

@@ -17,7 +17,6 @@ from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
-from functools import lru_cache
 from itertools import islice
 
 from detect.errors import WorkerError
@@ -106,14 +105,7 @@ def detect_chunks(
 
 def work_on_chunk(plan: FramePlan, chunk: Chunk) -> list[FrameRows]:
     """Process a task in a worker; its input and output are small."""
-    plan = _known(plan)
     return rows_of_frames(chunk, plan, tables_of(plan))
-
-
-@lru_cache(maxsize=4)
-def _known(plan: FramePlan) -> FramePlan:
-    """The first of equal plans, which come with every task, so that results for it are cached."""
-    return plan
 
 
 class _Crew:

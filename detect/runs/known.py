@@ -1,12 +1,8 @@
-"""Prior data on each frame of a run: tilts, and landmarks with IDs.
-
-Files are read during the run: little of them is in memory.
-"""
+"""Prior data on each frame of a run: tilts, and landmarks with IDs."""
 
 from __future__ import annotations
 
-from array import array
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple, Protocol, TypeVar
@@ -15,7 +11,7 @@ import numpy as np
 
 from detect.discs.identity import MappedDisc
 from detect.errors import DetectError
-from detect.sources.image_names import NameIndex, image_name
+from detect.sources.image_names import image_name
 from landmarks import (
     CircleLandmark,
     Frame,
@@ -23,7 +19,6 @@ from landmarks import (
     LineLandmark,
     Step,
     frames_of_rows,
-    iterate_tilts,
     parse_rows,
     read_rows,
 )
@@ -103,45 +98,11 @@ class Known:
         )
 
 
-class TiltsByImage:
-    """The tilts of a ``.tilt`` file, by image prefix; 44 bytes each, and the prefix.
-
-    Parameters
-    ----------
-    path : path
-        The file.
-
-    Raises
-    ------
-    landmarks.LandmarkFileError
-        If the file cannot be read or a row is malformed; names file and line.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self._numbers = array("d")
-        self._lines = array("l")
-
-        def prefixes() -> Iterator[bytes]:
-            for tilt in iterate_tilts(path):
-                self._numbers.extend((tilt.pitch, tilt.roll, tilt.cpp, tilt.cpr, tilt.crr))
-                self._lines.append(tilt.lines)
-                yield _bytes(tilt.prefix)
-
-        self._index = NameIndex(prefixes())
-
-    def get(self, prefix: str) -> FrameTilt | None:
-        """The tilt of a frame; None if the file has none."""
-        place = self._index.find(_bytes(prefix))
-        if place is None:
-            return None
-        pitch, roll, cpp, cpr, crr = self._numbers[5 * place : 5 * place + 5]
-        return FrameTilt(prefix, pitch, roll, cpp, cpr, crr, self._lines[place])
-
-
 class FramesByImage:
-    """The frames of a landmark file, by the name of their image; 12 bytes each, and the name.
+    """The frames of a landmark file, by the name of their image.
 
-    The file is read once for the offset of each frame, and again there when a frame is requested.
+    The file is read once for the offset of each frame, and again there when a frame is requested:
+    its rows are not kept in memory. Of frames with one name the last counts.
 
     Parameters
     ----------
@@ -156,25 +117,20 @@ class FramesByImage:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._offsets = array("q")
-
-        def names() -> Iterator[bytes]:
-            offset = 0
-            for row in read_rows(path):
-                if isinstance(row.record, Step):
-                    self._offsets.append(offset)
-                    yield _bytes(image_name(row.record.prefix))
-                offset += len(row.source or b"")
-
-        self._index = NameIndex(names())
+        self._offsets: dict[str, int] = {}
+        offset = 0
+        for row in read_rows(path):
+            if isinstance(row.record, Step):
+                self._offsets[image_name(row.record.prefix)] = offset
+            offset += len(row.source or b"")
 
     def get(self, prefix: str) -> Frame | None:
         """A frame; None if the file does not have it."""
-        place = self._index.find(_bytes(image_name(prefix)))
-        if place is None:
+        offset = self._offsets.get(image_name(prefix))
+        if offset is None:
             return None
         with self._path.open("rb") as stream:
-            stream.seek(self._offsets[place])
+            stream.seek(offset)
             return next(frames_of_rows(parse_rows(stream, str(self._path))))
 
 
@@ -216,7 +172,3 @@ class MapByImage:
                 self._discs.ids[near].tolist(), xy[near].tolist(), spread.tolist()
             )
         ]
-
-
-def _bytes(text: str) -> bytes:
-    return text.encode("utf-8", "surrogateescape")

@@ -1,19 +1,27 @@
-"""The files that a run is written to: each its kind, its place, its head, its rows."""
+"""The files that a run is written to: each its kind, its place, its head, its rows.
+
+The log, ``<output>.log.json``, states the program and its settings, the frames that could not be
+processed and why, how much was found, and the size and hash of the other files. Nothing in it
+depends on the time of day or on the workers: the same run writes the same bytes.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Iterable, Mapping
+import os
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from detect.errors import EXIT_FRAMES_FAILED
 from detect.run import ImageRun
-from detect.runs.conduct import Conduct
 from detect.runs.frame import FramePlan
+from detect.runs.rows import RunSummary
 from detect.sources.times import TIMES_HEAD
 from landmarks import format_head
+from storage import OutputExistsError
 
 #: Endings of files of landmarks.
 LANDMARK_SUFFIXES = frozenset({".circles", ".lines", ".markers"})
@@ -22,11 +30,12 @@ LANDMARK_SUFFIXES = frozenset({".circles", ".lines", ".markers"})
 LEVEL = "level robot frame"
 LEVELLED = "corrected for the tilt of the frames that have one"
 
-#: The kind of the log (`detect.runs.run_log`).
+#: The kind of the log.
 LOG = "log"
-#: Files that a second pass makes from those of the first one (`detect.runs.level_run`).
-LATE_KINDS = LEVEL_TILT, LEVEL_CIRCLES = "level tilt", "level circles"
+#: The kind of the tilts that a second pass makes (`detect.runs.level_run`).
+RUN_TILT = "run tilt"
 
+_LOG_BEGIN = b'{\n "program": "redetect",'
 _ROBOT = "Robot frame: origin on the floor, X left, Y backward (forward is -Y), metres, radians."
 _STEP = "STEP <image> <dX> <dY> <dPhi> <cXX> <cXY> <cYY> <cXPhi> <cYPhi> <cPhiPhi>"
 _TILT_ROWS = (
@@ -34,6 +43,37 @@ _TILT_ROWS = (
     "  rotation vector (pitch, roll, 0) about the robot's X (left) and Y (backward), radians:",
     "  it turns directions measured with the calibrated mounting level; its covariance;",
 )
+
+
+@dataclass(frozen=True)
+class Conduct:
+    """How a run is carried out, apart from what is detected.
+
+    Attributes
+    ----------
+    version : str
+        The program's version, for the heads of files.
+    overwrite : bool
+        Whether existing files may be replaced.
+    crlf : bool
+        Whether the lines of files of landmarks end with CR and LF.
+    log : path or None
+        Where the log goes. A run with a log can be resumed (see `detect.runs.journal`).
+    command : str
+        What the log calls the run.
+    strict : bool
+        Whether the first frame that cannot be worked on ends the run.
+    resume : bool
+        Whether the frames that an unfinished run kept are taken over.
+    """
+
+    version: str = ""
+    overwrite: bool = False
+    crlf: bool = False
+    log: Path | None = None
+    command: str = ""
+    strict: bool = False
+    resume: bool = False
 
 
 @dataclass(frozen=True)
@@ -50,9 +90,7 @@ class Output:
     between : bytes
         Text between the rows of two frames.
     crlf : bool
-        Whether rows end with CR and LF, as in the data set's own files.
-    placed : bool
-        Whether it is a result; else it is temporary and removed when others were made from it.
+        Whether lines end with CR and LF, as in the data set's own files.
     """
 
     path: Path
@@ -61,11 +99,6 @@ class Output:
     tail: bytes = b""
     between: bytes = b""
     crlf: bool = False
-    placed: bool = True
-
-    def ended(self, rows: bytes) -> bytes:
-        """Rows with the ends that lines have in this file."""
-        return rows.replace(b"\n", b"\r\n") if self.crlf else rows
 
 
 def outputs_of(
@@ -94,18 +127,14 @@ def outputs_of(
         path = frames_tilt_place(places["tilt"]) if by_run else places["tilt"]
         outputs.append(Output(path, "tilt", _head(_tilt_text(conduct.version, by_run=by_run))))
     if "lines" in places:
-        head = _head(_lines_text(run, plan, conduct.version), crlf=crlf)
+        head = _head(_lines_text(run, plan, conduct.version))
         outputs.append(Output(places["lines"], "lines", head, crlf=crlf))
+    if "tilt" in places and "circles" in places and by_run:
+        head = _head(_run_tilt_text(conduct.version))
+        outputs.append(Output(places["tilt"], RUN_TILT, head))
     if "circles" in places:
-        path = places["circles"]
-        head = _head(_circles_text(run, plan, conduct.version, levelled=levelled), crlf=crlf)
-        if by_run:
-            raw = path.with_name(f"{path.stem}.raw.circles")
-            outputs.append(Output(raw, "circles", head, placed=False))
-            tilt_head = _head(_level_tilt_text(conduct.version))
-            outputs.append(Output(places["tilt"], LEVEL_TILT, tilt_head))
-        kind = LEVEL_CIRCLES if by_run else "circles"
-        outputs.append(Output(path, kind, head, crlf=crlf))
+        head = _head(_circles_text(run, plan, conduct.version, levelled=levelled))
+        outputs.append(Output(places["circles"], "circles", head, crlf=crlf))
     if "markers" in places:
         head = _head(_markers_text(run, plan, conduct.version))
         outputs.append(Output(places["markers"], "markers", head))
@@ -183,7 +212,7 @@ def _tilt_text(version: str, *, by_run: bool) -> list[str]:
     ]
 
 
-def _level_tilt_text(version: str) -> list[str]:
+def _run_tilt_text(version: str) -> list[str]:
     return [
         f"Pitch and roll that the discs of each frame were levelled by, by redetect {version}:",
         "  the constant lean of the run and the frame's estimated deviation from it",
@@ -221,5 +250,69 @@ def _made_with(plan: FramePlan, settings: Any) -> tuple[str, str]:
     return f"camera {camera}", f"settings {values}"
 
 
-def _head(lines: Iterable[str], *, crlf: bool = False) -> bytes:
-    return format_head("\n".join(lines), "\r\n" if crlf else "\n")
+def _head(lines: Iterable[str]) -> bytes:
+    return format_head("\n".join(lines), "\n")
+
+
+# -- the log --------------------------------------------------------------------------------
+
+
+def log_place(output: Path) -> Path:
+    """Path of the log of a result."""
+    return output.with_name(f"{output.name}.log.json")
+
+
+def demand_log_place(place: Path, *, overwrite: bool) -> None:
+    """Refuse to write a log over a file that is none.
+
+    Raises
+    ------
+    storage.OutputExistsError
+        If there is a file that is no log and must not be overwritten.
+    """
+    if overwrite or not os.path.lexists(place):
+        return
+    if place.is_symlink() or not place.is_file():
+        raise OutputExistsError(place)
+    with place.open("rb") as stream:
+        if stream.read(len(_LOG_BEGIN)) != _LOG_BEGIN:
+            raise OutputExistsError(place)
+
+
+def log_head(plan: FramePlan, conduct: Conduct) -> bytes:
+    """The text before the failures."""
+    settings = {"circles": plan.circles, "lines": plan.lines, "markers": plan.markers}
+    document: dict[str, Any] = {
+        "program": "redetect",
+        "version": conduct.version,
+        "command": conduct.command,
+        "camera": None if plan.camera is None else plan.camera.content_hash,
+        "settings": {
+            name: dataclasses.asdict(values)
+            for name, values in settings.items()
+            if values is not None
+        },
+        "failures": [],
+    }
+    return json.dumps(document, indent=1).rsplit("]", 1)[0].encode()
+
+
+def log_failure(place: int, prefix: str, reason: str) -> bytes:
+    """A frame that could not be worked on: its place in the run, from 0, its name and why."""
+    record = json.dumps({"frame": place, "prefix": prefix, "reason": reason})
+    return f"\n  {record}".encode()
+
+
+def log_tail(found: RunSummary, outputs: Sequence[Mapping[str, object]]) -> bytes:
+    """The text after the failures; of each output the name, the size and the hash."""
+    document = {
+        "frames": found.frames,
+        "failed": found.failed,
+        "images_left_out": found.images_without_step,
+        "found": {kind: found.found[kind] for kind in ("discs", "lines", "tilts", "markers")},
+        "rejected": dict(sorted(found.rejected.items())),
+        "outputs": outputs,
+        "exit_code": EXIT_FRAMES_FAILED if found.failed else 0,
+    }
+    end = "\n ]," if found.failed else "],"
+    return f"{end}{json.dumps(document, indent=1)[1:]}\n".encode()

@@ -18,11 +18,10 @@ from pathlib import Path
 from detect.errors import DetectError
 from detect.markers.templates import templates_of
 from detect.run import ImageRun
-from detect.runs.conduct import Conduct
 from detect.runs.dispatch import Workers, detect_chunks
 from detect.runs.frame import FramePlan, FrameTask, tables_of
 from detect.runs.known import Known
-from detect.runs.outputs import outputs_of
+from detect.runs.outputs import Conduct, outputs_of
 from detect.runs.rows import FrameRows, RunSummary
 from detect.runs.run_files import RunFiles, SecondPass
 from detect.runs.workers import local_workers
@@ -94,7 +93,7 @@ def detect_run(
         make_folder(pictures)
     if workers is None:
         large = pictures is not None or run.frames.ships_images
-        workers = local_workers(1, large=large, camera=plan.camera)
+        workers = local_workers(1, large=large)
     _demand_possible(plan, workers)
     summary = RunSummary()
 

@@ -19,18 +19,19 @@ from multiprocessing.connection import wait
 from multiprocessing.synchronize import Event, Lock
 from typing import TYPE_CHECKING, NamedTuple, ParamSpec, TypeVar, cast
 
-from detect.announcing import announce_compiling, announcements_are_shown, show_announcements
+from detect.announcing import (
+    announce_compiling,
+    announcements_are_shown,
+    on_first_compilation,
+    show_announcements,
+)
 from detect.errors import WorkerError
 from detect.interrupts import interrupts_deferred
 from detect.runs.dispatch import Workers
 from detect.runs.frame import FramePlan, import_detectors, rehearse, tables_of
-from detect.runs.rows import PIXELS_AT_ONCE
-from storage.kernel_loading import load_kernels_alone, waiting_before_compiling
 
 if TYPE_CHECKING:
     from distributed import Client
-
-    from camera import Camera
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -38,12 +39,8 @@ R = TypeVar("R")
 #: Fewer frames than this are not worth another process's start.
 FRAMES_PER_PROCESS = 500
 
-#: A task has at most `_MOST_TOGETHER` frames. One for a process has at least `_PROCESS_CHUNK`, and
-#: more if each process still gets `_TASKS_PER_PROCESS` tasks.
-_MOST_TOGETHER = 128
-_PROCESS_CHUNK = 16
-_TASKS_PER_PROCESS = 32
-_CLUSTER_CHUNK = 16
+#: Frames of a task.
+_TOGETHER = 16
 _WINDOW_PER_WORKER = 3
 _CLUSTER_ANSWER_S = 10.0
 _CLUSTER_PATIENCE_S = 60.0
@@ -59,9 +56,7 @@ def default_jobs(frames: int) -> int:
     return max(1, min(cores, frames // FRAMES_PER_PROCESS))
 
 
-def local_workers(
-    jobs: int, *, large: bool = False, camera: Camera | None = None, frames: int | None = None
-) -> Workers:
+def local_workers(jobs: int, *, large: bool = False) -> Workers:
     """Workers on this machine.
 
     Parameters
@@ -70,10 +65,6 @@ def local_workers(
         How many processes; 1 is this process itself.
     large : bool
         Whether tasks carry images, or bring pictures back: they have one frame each then.
-    camera : Camera, optional
-        Says how large an image is: no more are worked on together than are decoded at once.
-    frames : int, optional
-        How many there are, if that is known: the longer the run, the more are worked on together.
 
     Raises
     ------
@@ -82,12 +73,7 @@ def local_workers(
     """
     if jobs < 1:
         raise WorkerError(f"jobs is {jobs}: expected 1 or more")
-    chunk = _MOST_TOGETHER
-    if jobs > 1:  # few where the last tasks would be waited for
-        chunk = max((frames or 0) // (jobs * _TASKS_PER_PROCESS), _PROCESS_CHUNK)
-    if camera is not None:
-        chunk = min(chunk, PIXELS_AT_ONCE // (camera.width * camera.height))
-    chunk = 1 if large else max(1, min(chunk, _MOST_TOGETHER))
+    chunk = 1 if large else _TOGETHER
     if jobs == 1:
         return Workers(_in_process, chunk, window=lambda: 1)
     window = 2 + _WINDOW_PER_WORKER * jobs
@@ -123,7 +109,7 @@ def cluster_workers(address: str, *, large: bool = False) -> Workers:
     size = _ClusterSize()
     return Workers(
         lambda plan: _cluster(address, size),
-        chunk=1 if large else _CLUSTER_CHUNK,
+        chunk=1 if large else _TOGETHER,
         window=size.window,
         died=(KilledWorker,),
     )
@@ -229,15 +215,14 @@ def _begin(plan: FramePlan, beginning: _Beginning, show: bool) -> None:
     import cv2
 
     cv2.setNumThreads(1)
-    announce_compiling()
     with suppress(Exception):  # any error recurs, and is reported, with the first task
         _rehearse_together(plan, beginning)
 
 
 def _rehearse_together(plan: FramePlan, beginning: _Beginning) -> None:
     if beginning.first.acquire(block=False):
+        announce_compiling()
         try:
-            load_kernels_alone()
             tables_of(plan)
             beginning.tables.set()
             rehearse(plan)
@@ -245,10 +230,11 @@ def _rehearse_together(plan: FramePlan, beginning: _Beginning) -> None:
             beginning.tables.set()
             beginning.kernels.set()
         return
-    with waiting_before_compiling(beginning.kernels.wait) as waits:
-        import_detectors(plan)
-        (beginning.tables if waits else beginning.kernels).wait()
-        rehearse(plan)
+    # All kernels but the one that is met first are loaded then: the first process has kept them.
+    on_first_compilation(beginning.kernels.wait)
+    import_detectors(plan)
+    beginning.tables.wait()
+    rehearse(plan)
 
 
 def _end_with_parent() -> None:

@@ -11,7 +11,7 @@ from detect.comparison.result import LineCompareOptions
 from detect.drawing.inputs import select_frames
 from detect.errors import EXIT_FRAMES_FAILED, DetectError
 from detect.line_settings import PRESETS, LineSettings
-from detect.runs.known import FramesByImage, TiltsByImage
+from detect.runs.known import FramesByImage
 from detect.runs.progress import print_failures, progress_bar
 from detect.runs.workers import default_jobs, local_workers
 from detect.settings import PUBLISHED, CircleSettings
@@ -20,7 +20,7 @@ from detect.tune.grid import combinations, settings_with
 from detect.tune.run import Settings, tune_run
 from detect.tune.table import curve_picture, records_csv, records_json, trial_records
 from detect.viewing_options import Tune
-from landmarks import LandmarkFileError
+from landmarks import LandmarkFileError, read_tilts
 from storage import OutputExistsError, write_whole
 
 
@@ -78,7 +78,7 @@ def perform(options: Tune) -> int:
                 settings,
                 gate,
                 local_workers(jobs),
-                tilts=None if options.tilt is None else TiltsByImage(options.tilt),
+                tilts=None if options.tilt is None else read_tilts(options.tilt),
                 on_progress=advance,
             )
         )

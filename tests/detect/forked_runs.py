@@ -103,7 +103,7 @@ class Room:
     def __call__(self) -> None:
         from detect.runs import workers
 
-        workers._MOST_TOGETHER = 8
+        workers._TOGETHER = 8
         resource.setrlimit(resource.RLIMIT_FSIZE, (self.size, resource.RLIM_INFINITY))
 
 

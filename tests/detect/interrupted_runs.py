@@ -12,8 +12,6 @@ from detect.cli import main
 Captured = pytest.CaptureFixture[str]
 
 KINDS = ("lines", "tilt", "circles", "log.json")
-#: Files that grow, hidden, while a run goes on; levelled rows are written in the end.
-GROWING = (*KINDS, "frames.tilt", "raw.circles")
 FRAMES = 24
 PREVIOUS = b"what was there before\n"
 

@@ -14,9 +14,9 @@ from detect.comparison.lines import compare_line_runs
 from detect.comparison.result import CompareOptions, Comparison, LineComparison
 from detect.line_settings import LineSettings
 from detect.run import open_run
-from detect.runs.conduct import Conduct
 from detect.runs.frame import FramePlan
 from detect.runs.known import FramesByImage, Known
+from detect.runs.outputs import Conduct
 from detect.runs.rows import RunSummary
 from detect.runs.stream import detect_run
 from detect.settings import PUBLISHED, REPORT, CircleSettings

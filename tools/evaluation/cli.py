@@ -436,8 +436,8 @@ def _print_tilt_errors(run: Path, tilts: dict[str, FrameTilt]) -> None:
 def _detect_lines(run: Path, settings: LineSettings, output: Path) -> None:
     from detect import __version__
     from detect.run import open_run
-    from detect.runs.conduct import Conduct
     from detect.runs.frame import FramePlan
+    from detect.runs.outputs import Conduct
     from detect.runs.stream import detect_run
 
     opened = open_run(run)
@@ -453,9 +453,9 @@ def _detect(
 ) -> None:
     from detect import __version__
     from detect.run import open_run
-    from detect.runs.conduct import Conduct
     from detect.runs.frame import FramePlan
     from detect.runs.known import Known
+    from detect.runs.outputs import Conduct
     from detect.runs.stream import detect_run
 
     opened = open_run(run)

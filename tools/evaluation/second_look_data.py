@@ -215,10 +215,11 @@ def _add_disturbed(
         if changed is not None:
             gathering.add(changed, view, place, _NOWHERE, (_DISTURBED_WEIGHT, 0.0), source)
         kind = str(rng.choice(LOOK_ALIKES))
-        other = replaced(image, view[1].floor_xy, at, _RADIUS, kind, rng)
+        bare = replaced(image, view[1].floor_xy, at, _RADIUS, kind, rng)
+        other: NDArray[np.uint8] | None = bare
         if rng.random() < 0.5:
             kind = str(rng.choice(list(DISTURBANCES)))
-            other = disturbed(other, view[1].floor_xy, at, _RADIUS, kind, rng)
+            other = disturbed(bare, view[1].floor_xy, at, _RADIUS, kind, rng)
         if other is not None:
             gathering.add(other, view, _NOWHERE, place, (0.0, _DISTURBED_WEIGHT), source, only=True)
 

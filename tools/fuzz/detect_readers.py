@@ -18,7 +18,7 @@ from camera.calibration.images import read_grey
 from detect.drawing.inputs import read_head
 from detect.errors import DetectError, FrameError
 from detect.runs.journal import digest_of, left_journal
-from detect.runs.run_log import demand_log_place
+from detect.runs.outputs import demand_log_place
 from detect.sources.bag_messages import pixels_of_message
 from detect.sources.gray import (
     DEEP_SUFFIXES,
@@ -129,11 +129,10 @@ def _head(path: Path) -> object:
 
 
 def _journal(path: Path) -> object:
-    journal = left_journal(path)
+    journal = left_journal(path, path)
     assert journal is not None
     try:
-        journal.is_complete()
-        return journal.head(), list(journal.frames())
+        return journal.head(), journal.parts(), [frame.frame_rows() for frame in journal.frames()]
     finally:
         journal.close()
 
@@ -266,8 +265,8 @@ DETECT_READERS: tuple[Reader, ...] = (
         _journal,
         (),
         (
-            _journal_of(b'["ab",[0],false]', b'[[10],"c","d",{"discs":1},{},null]', b'"complete"'),
-            _journal_of(b'["ab",[],true]', b'[[],"c","d",{},{"size":2},"no image"]'),
+            _journal_of(b'["ab",false]', b'["d",{"a":"b"},{"c":1},{},null]', b'["complete",[0]]'),
+            _journal_of(b'["ab",true]', b'["d",{},{},{"size":2},"no image"]'),
         ),
         (b"[", b"]", b",", b'"', b"null", b"true", b"-1", b"1" * 30, b"1e999", b"NaN", b"{}"),
     ),

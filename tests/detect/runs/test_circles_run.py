@@ -13,8 +13,8 @@ import pytest
 
 from camera import Camera
 from detect.run import Run, open_run
-from detect.runs.conduct import Conduct
 from detect.runs.frame import FramePlan
+from detect.runs.outputs import Conduct
 from detect.runs.rows import RunSummary
 from detect.runs.stream import detect_run
 from detect.settings import PUBLISHED, CircleSettings

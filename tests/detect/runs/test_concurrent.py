@@ -8,8 +8,6 @@ import os
 import shutil
 import subprocess
 import sys
-import time
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -73,17 +71,6 @@ def folder_of(path: Path) -> Path:
     return path
 
 
-def wait_until(condition: Callable[[], bool]) -> None:
-    end = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.01)
-
-
-def parts_in(output: Path) -> set[str]:
-    return {path.name for path in output.glob(".*.part")}
-
-
 def assert_one_run_wrote_all(folder: Path) -> None:
     """Every file is the one that the log names by its hash."""
     log = json.loads((folder / "detected.log.json").read_text())
@@ -144,13 +131,13 @@ def test_of_two_runs_that_may_overwrite_one_is_the_last(
         runs.started(arguments, StopAfter(LONG_FRAMES // 10)) as first,
     ):
         first.wait_until_stopped()
-        own = parts_in(output)
         others = [
             started([*arguments, "--circles.threshold", "0.5", "--lines.alpha", "published"])
             for _ in range(2)
         ]
-        # At work, or done already where this process was not given any time.
-        wait_until(lambda: len(parts_in(output)) > len(own) or others[0].poll() is not None)
+        for process in others:  # at work, and neither resumes
+            assert process.stderr is not None
+            assert "another run is writing" in process.stderr.readline()
         first.go_on()
         assert first.wait() == 0, first.said()
         for process in others:

@@ -6,15 +6,25 @@ import pickle
 import shutil
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from detect.run import RunFrame, open_run
-from detect.runs.frame import FramePlan, FrameTask, tables_of
-from detect.runs.journal import Journal, JournalFrame, JournalHead, left_journal, new_journal
+from detect.runs import rows as rows_module
+from detect.runs.frame import FrameDetections, FramePlan, FrameTask, detect_batch, tables_of
+from detect.runs.journal import (
+    JournalFrame,
+    JournalHead,
+    left_journal,
+    new_journal,
+    record_of,
+    unnamed_journal,
+)
 from detect.runs.known import KnownOfFrame
-from detect.runs.rows import rows_of_frames
+from detect.runs.rows import FrameRows, rows_of_frames
 from detect.settings import PUBLISHED
 from landmarks import FrameTilt
 
@@ -50,17 +60,32 @@ def test_frames_have_the_same_rows_together_and_alone(
         assert rows.found.get("discs", 0) == circles.count(b"LANDMARK_C")
 
 
+def test_no_more_images_are_in_memory_than_agreed(
+    tasks_and_plan: tuple[list[FrameTask], FramePlan], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tasks, plan = tasks_and_plan
+    assert plan.camera is not None
+    sizes = []
+
+    def noted(batch: Sequence[FrameTask], *others: Any) -> list[FrameDetections]:
+        sizes.append(len(batch))
+        return detect_batch(batch, *others)
+
+    monkeypatch.setattr(rows_module, "detect_batch", noted)
+    monkeypatch.setattr(rows_module, "PIXELS_AT_ONCE", 5 * plan.camera.width * plan.camera.height)
+    rows_of_frames(tasks, plan, tables_of(plan))
+    assert sizes == [5, 5, 2]
+
+
 REHEARSAL = """
 import sys
 from pathlib import Path
-from storage.kernel_loading import load_kernels_alone
 from detect.line_settings import LineSettings
 from detect.run import open_run
 from detect.runs.frame import FramePlan, FrameTask, rehearse, tables_of
 from detect.runs.rows import rows_of_frames
 from detect.settings import CircleSettings
 
-load_kernels_alone()
 run = open_run(Path(sys.argv[1]))
 plan = FramePlan(run.camera, lines=LineSettings(), circles=CircleSettings())
 rehearse(plan)
@@ -101,37 +126,54 @@ def test_tasks_travel_whole(tasks_and_plan: tuple[list[FrameTask], FramePlan]) -
 
 
 FRAMES_OF_JOURNAL = (
-    JournalFrame([120, 0], "ab", "cd", {"discs": 3, "lines": 21, "tilts": 1}, {}, None),
-    JournalFrame([0, 7], "ab", "cd", {"markers": 2}, {"size": 4, "ink": 1}, None),
-    JournalFrame([1, 1], "", "", {}, {}, '"e.0003": cannot be decoded:\n expected \\ \udcff'),
+    JournalFrame("cd", {"circles": "STEP\nLANDMARK_C\n"}, {"discs": 3, "lines": 21}, {}, None),
+    JournalFrame("cd", {}, {"markers": 2}, {"size": 4, "ink": 1}, None),
+    JournalFrame("", {"tilt": "\udcff"}, {}, {}, '"e.0003": cannot be decoded:\n \\ \udcff'),
 )
 
 
 def test_a_journal_gives_back_what_was_noted(tmp_path: Path) -> None:
-    journal = new_journal(tmp_path / ".a.journal")
-    assert isinstance(journal, Journal)
-    head = JournalHead("program", [0, 1], overwrite=False)
-    journal.write([head, *FRAMES_OF_JOURNAL[:2]])
-    journal.write(FRAMES_OF_JOURNAL[2:])
-    assert (journal.head(), tuple(journal.frames())) == (head, FRAMES_OF_JOURNAL)
-    assert not journal.is_complete()
-    journal.remove()
+    result = tmp_path / "a"
+    for journal in (new_journal(tmp_path / ".a.journal", result), unnamed_journal(result)):
+        assert journal is not None
+        head = JournalHead("program", overwrite=False)
+        for record in (head, *FRAMES_OF_JOURNAL):
+            journal.write(record)
+        assert (journal.head(), tuple(journal.frames())) == (head, FRAMES_OF_JOURNAL)
+        assert journal.parts() is None
+        journal.remove()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_rows_come_back_as_bytes(
+    tasks_and_plan: tuple[list[FrameTask], FramePlan], tmp_path: Path
+) -> None:
+    task = tasks_and_plan[0][0]
+    rows = FrameRows({"lines": b"a\xff\n", "tilt": b"", "times": b"1\n"}, {"lines": 1})
+    journal = unnamed_journal(tmp_path / "a")
+    journal.write(JournalHead("program", overwrite=False))
+    journal.write(record_of(task, rows, ["lines", "tilt"]))
+    (frame,) = journal.frames()
+    journal.close()
+    assert frame.frame_rows() == FrameRows({"lines": b"a\xff\n"}, {"lines": 1})
 
 
 def test_a_journal_goes_on_behind_what_is_taken_over(tmp_path: Path) -> None:
     first, second, third = FRAMES_OF_JOURNAL
-    journal = new_journal(tmp_path / ".a.journal")
+    place, result = tmp_path / ".a.journal", tmp_path / "a"
+    journal = new_journal(place, result)
     assert journal is not None
-    journal.write([JournalHead("program", [0], overwrite=True), first, second])
+    for record in (JournalHead("program", overwrite=True), first, second):
+        journal.write(record)
     journal.close()
-    left = left_journal(tmp_path / ".a.journal")
+    left = left_journal(place, result)
     assert left is not None
     for frame in left.frames():
         if frame == second:
             break
     left.cut()
-    left.write([third])
-    left.complete()
-    assert left.is_complete()
+    left.write(third)
+    left.complete([0, 1])
+    assert left.parts() == [0, 1]
     assert list(left.frames()) == [first, third]
     left.remove()

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from detect.runs.known import FramesByImage, Known, TiltsByImage
-from landmarks import LandmarkFileError, read_frames, read_tilts
+from detect.runs.known import FramesByImage, Known
+from landmarks import LandmarkFileError, read_frames
 
 LINES = """\
 # IDs by hand
@@ -23,14 +23,6 @@ STEP k.0003  0.1 0 0 1 0 1 0 0 1
 LANDMARK_L 0 -0.6 0 0.3 1.25 0 0 0.003 3
 STEP k.0003  0.1 0 0 1 0 1 0 0 1
 LANDMARK_L 0 -0.6 0 0.3 1.5 0 0 0.003 4
-"""
-
-TILTS = """\
-# pitch and roll
-TILT k.0001 0.010000 -0.020000 1e-06 2e-08 3e-06 12
-NOTILT k.0002 1
-TILT k.0000 0.030000 0.001000 4e-06 0 5e-06 3
-TILT k.0001 0.040000 0.001000 4e-06 0 5e-06 4
 """
 
 
@@ -51,20 +43,8 @@ def test_lines_are_those_of_the_frame(tmp_path: Path, line_end: str, mark: bytes
     assert found.of("k.0004").lines == ()
 
 
-def test_tilts_are_those_of_the_whole_file(tmp_path: Path) -> None:
-    path = tmp_path / "k.tilt"
-    path.write_text(TILTS)
-    whole, found = read_tilts(path), TiltsByImage(path)
-    assert sorted(whole) == ["k.0000", "k.0001"]
-    for prefix in ("k.0000", "k.0001", "k.0002", "k.0003"):
-        assert found.get(prefix) == whole.get(prefix)
-
-
 def test_malformed_files_are_named(tmp_path: Path) -> None:
     path = tmp_path / "k"
-    path.write_text(TILTS + "TILT k.0005 0.1\n")
-    with pytest.raises(LandmarkFileError, match="k:6: "):
-        TiltsByImage(path)
     path.write_text(LINES + "LANDMARK_L 0 0\n")
     with pytest.raises(LandmarkFileError, match="k:14: "):
         FramesByImage(path)

@@ -25,41 +25,38 @@ DISC = "LANDMARK_C 0.5 -2.5 0.9 1e-06 0 1e-06 7\n"
 
 def level(camera: Camera, frames: int) -> dict[str, bytes]:
     rng = np.random.default_rng(5)
-    tilts, circles = "# head\n", "# head\n"
+    seen = []
     for k in range(frames):
         pitch, roll = np.array(LEAN) + 1e-4 * rng.standard_normal(2)
-        tilts += f"TILT {k} {pitch:.6f} {roll:.6f} 1e-8 0 1e-8 9\n" if k else "NOTILT 0 2\n"
-        circles += STEP.format(k) + DISC
-    written = {"level tilt": b"", "level circles": b""}
-    files = {"tilt": io.BytesIO(tilts.encode()), "circles": io.BytesIO(circles.encode())}
-    for kind, rows in level_run(camera, 0.0, RunSummary(), files):
-        written[kind] += rows
-    return written
+        tilt = f"TILT {k} {pitch:.6f} {roll:.6f} 1e-8 0 1e-8 9\n" if k else "NOTILT 0 2\n"
+        seen.append({"tilt": tilt.encode(), "circles": (STEP.format(k) + DISC).encode()})
+    written = list(level_run(camera, 0.0, RunSummary(), lambda: seen))
+    return {kind: b"".join(rows[kind] for rows in written) for kind in ("run tilt", "circles")}
 
 
 def test_discs_come_out_level_also_in_a_frame_without_verticals(published_camera: Camera) -> None:
     written = level(published_camera, 3 * LEAST_FRAMES)
 
     expected = level_positions(published_camera, np.array([[0.5, -2.5]]), *LEAN)[0]
-    frames = list(frames_of_rows(parse_rows(io.BytesIO(written["level circles"]))))
+    frames = list(frames_of_rows(parse_rows(io.BytesIO(written["circles"]))))
     assert len(frames) == 3 * LEAST_FRAMES
     for frame in frames:
         (disc,) = frame.circles
         assert (disc.px, disc.py) == pytest.approx(expected, abs=2e-3)
         assert disc.ids == (7,)
         assert frame.levelled_by == pytest.approx(LEAN, abs=5e-4)
-    assert written["level tilt"].count(b"TILT ") == 3 * LEAST_FRAMES
-    assert b"NOTILT" not in written["level tilt"]
+    assert written["run tilt"].count(b"TILT ") == 3 * LEAST_FRAMES
+    assert b"NOTILT" not in written["run tilt"]
 
 
 def test_few_frames_are_levelled_each_by_itself(published_camera: Camera) -> None:
     written = level(published_camera, 4)
 
-    first, *others = frames_of_rows(parse_rows(io.BytesIO(written["level circles"])))
+    first, *others = frames_of_rows(parse_rows(io.BytesIO(written["circles"])))
     assert first.levelled_by is None
     assert (first.circles[0].px, first.circles[0].py) == (0.5, -2.5)
     assert all(frame.levelled_by is not None for frame in others)
-    assert written["level tilt"].startswith(b"NOTILT 0 2\n")
+    assert written["run tilt"].startswith(b"NOTILT 0 2\n")
 
 
 @pytest.mark.parametrize("way", ["frame", "run"])

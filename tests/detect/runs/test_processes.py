@@ -8,14 +8,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from camera import Camera
 from detect.cli import main
 from detect.run import open_run
 from detect.runs.frame import FramePlan
-from detect.runs.rows import PIXELS_AT_ONCE
 from detect.runs.stream import detect_run
 from detect.runs.workers import local_workers
 from detect.settings import CircleSettings
@@ -70,35 +66,6 @@ def test_an_interrupt_while_the_program_is_imported(project_root: Path) -> None:
         project_root,
     )
     assert said == "130\n"
-
-
-# -- how many frames they work on together ----------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("jobs", "frames", "together"),
-    [(2, None, 16), (2, 80, 16), (2, 2000, 31), (2, 10**6, 128), (64, 10**4, 16)],
-)
-def test_tasks_are_larger_where_there_are_many(
-    jobs: int, frames: int | None, together: int
-) -> None:
-    assert local_workers(jobs, frames=frames).chunk == together
-
-
-@given(
-    jobs=st.integers(1, 200),
-    frames=st.none() | st.integers(0, 10**7),
-    width=st.integers(1, 30_000),
-)
-def test_no_more_than_are_decoded_at_once(
-    published_camera: Camera, jobs: int, frames: int | None, width: int
-) -> None:
-    camera = replace(
-        published_camera, width=width, scale_x=width, offset_x=0.5 * width, coef=(0.0,) * 5
-    )
-    chunk = local_workers(jobs, frames=frames, camera=camera).chunk
-    assert 1 <= chunk <= 128
-    assert chunk == 1 or chunk * width * camera.height <= PIXELS_AT_ONCE
 
 
 # -- what they begin with -----------------------------------------------------------------------

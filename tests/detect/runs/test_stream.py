@@ -14,12 +14,12 @@ import pytest
 from detect.line_settings import LineSettings
 from detect.run import RunFrame, open_run
 from detect.runs.frame import FramePlan
-from detect.runs.known import FramesByImage, Known, TiltsByImage
+from detect.runs.known import FramesByImage, Known
 from detect.runs.rows import KEPT_FAILURES, RunSummary
 from detect.runs.stream import detect_run
 from detect.runs.workers import local_workers
 from detect.settings import CircleSettings
-from landmarks import read_frames
+from landmarks import read_frames, read_tilts
 
 LIGHT = CircleSettings(polarity="light")
 FRAMES = 7
@@ -58,7 +58,7 @@ def in_folder(folder: Path, *kinds: str) -> dict[str, Path]:
 
 def in_two_passes(run: Path, output: Path) -> None:
     detect(run, in_folder(output, "lines", "tilt"), lines=LineSettings())
-    tilts = Known(tilts=TiltsByImage(output / "detected.tilt"))
+    tilts = Known(tilts=read_tilts(output / "detected.tilt"))
     detect(run, in_folder(output, "circles"), known=tilts, circles=LIGHT)
 
 
@@ -126,7 +126,7 @@ def all_there_is(run: Path, output: Path, jobs: int) -> dict[str, bytes]:
         "json": output / "level.json",
         "pictures": pictures["discs"],
     }
-    known = Known(tilts=TiltsByImage(plain["tilt"]))
+    known = Known(tilts=read_tilts(plain["tilt"]))
     detect(run, places, jobs, known, circles=LIGHT, drawing="discs")
     return files_in(output)
 

@@ -29,7 +29,6 @@ from detect.runs.frame import FramePlan
 from detect.runs.stream import detect_run
 from detect.runs.workers import FRAMES_PER_PROCESS, cluster_workers, default_jobs, local_workers
 from detect.settings import CircleSettings
-from tests.detect.interrupted_runs import GROWING
 
 KINDS = ("lines", "tilt", "circles")
 FRAMES = 48
@@ -175,7 +174,7 @@ def test_an_interrupt_ends_everything(run_folder: Path, jobs: int, delay_s: floa
     make_long(run_folder)
     before = sorted(path.name for path in run_folder.iterdir())
     with started(run_folder, jobs, mark) as process:
-        wait_until(lambda: bool(list(run_folder.glob(".*.part"))), "the run to begin")
+        wait_until(lambda: bool(list(run_folder.glob(".*.journal"))), "the run to begin")
         time.sleep(delay_s)
         os.killpg(process.pid, signal.SIGINT)
         out, err = process.communicate(timeout=PATIENCE_S)
@@ -184,8 +183,10 @@ def test_an_interrupt_ends_everything(run_folder: Path, jobs: int, delay_s: floa
     assert err.splitlines()[-1] == "interrupted"
     assert "Traceback" not in err
     left = {path.name for path in run_folder.iterdir()} - set(before)
-    kept = {f".detected.{kind}.part" for kind in GROWING} | {".detected.journal"}
-    assert left in (set(), kept)  # whether a frame was done: `--resume` goes on after it
+    assert left in (
+        set(),
+        {".detected.journal"},
+    )  # whether a frame was done: `--resume` goes on after it
     assert ("--resume" in err) == bool(left)
     wait_until(lambda: not processes_with(mark), "its processes to end")
 

@@ -1,0 +1,62 @@
+"""Compiled kernels: what is said where they cannot be loaded, and of the first that is compiled."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+PAIRED = """
+from typing import NamedTuple
+from numba import njit
+
+class {name}(NamedTuple):
+    first: float
+    second: float
+
+@njit(cache=True)
+def total(pair):
+    return pair.first + pair.second
+
+def of(first, second):
+    return total({name}(first, second))
+"""
+
+PROGRAM = """
+import sys
+from detect.announcing import on_first_compilation
+from storage.exit_codes import exit_code_of
+from kernels import of
+
+on_first_compilation(lambda: print("compiles"))
+sys.exit(exit_code_of(lambda: print(of(1.0, 2.0), of(1, 2)) or 0))
+"""
+
+
+def run(folder: Path) -> subprocess.CompletedProcess[str]:
+    root = Path(__file__).resolve().parents[2]
+    return subprocess.run(
+        [sys.executable, "-c", PROGRAM],
+        env={
+            **os.environ,
+            "PYTHONPATH": os.pathsep.join([str(root), str(folder)]),
+            "NUMBA_CACHE_DIR": str(folder / "cache"),
+        },
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+def test_kernels_are_kept_and_those_of_other_classes_are_named(tmp_path: Path) -> None:
+    (tmp_path / "kernels.py").write_text(PAIRED.format(name="Pair"))
+    assert run(tmp_path).stdout == "compiles\n3.0 3\n"
+    assert run(tmp_path).stdout == "3.0 3\n"
+    # Another version of the program: the index names a class that it does not have.
+    (tmp_path / "kernels.py").write_text(PAIRED.format(name="Couple"))
+    refused = run(tmp_path)
+    assert (refused.returncode, refused.stdout) == (1, "")
+    (line,) = refused.stderr.splitlines()
+    assert line.startswith("error: compiled kernels cannot be loaded: ")
+    assert "NUMBA_CACHE_DIR" in line
