@@ -145,66 +145,35 @@ def sum_of(numbers: NDArray[np.float32]) -> float:
     return total
 
 
-class _Place(NamedTuple):
-    """Where an edge is expected: whole columns, and what is left, in [-0.5, 0.5).
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _place(column: int, part: float) -> tuple[int, float]:
+    """Whole columns, and what is left, in [-0.5, 0.5).
 
     Whole columns change seldom: a processor that foresees them works on the next rows before it
     knows where in this one the edge is.
     """
-
-    column: int
-    part: float
-
-
-@njit(cache=True, error_model="numpy", forceinline=True)
-def _place(column: int, part: float) -> _Place:
-    """A column and any offset from it."""
     if part < -0.5 or part >= 0.5:
         whole = math.floor(part + 0.5)
-        return _Place(column + whole, part - whole)
-    return _Place(column, part)
+        return column + whole, part - whole
+    return column, part
 
 
 @njit(cache=True, error_model="numpy")
 def _evaluate(response: StripResponse, c: int, v: int, direction: int) -> None:
-    """Evaluate the response at row v of three verticals and at some rows further on."""
-    height = response.value.shape[1]
-    for near in range(c - 1, c + 2):
-        known = response.known[near]
-        if known[0] <= v < known[1]:
-            continue
-        begin = max(v - (_AHEAD - 1 if direction < 0 else 0), 0)
-        end = min(v + (_AHEAD - 1 if direction > 0 else 0), height - 1) + 1
-        if known[0] < known[1] and v < known[0]:
-            end = known[0]
-        elif known[0] < known[1]:
-            begin = known[1]
-        extend(response, near, begin, end)
+    """Evaluate the response of vertical c at row v and at some rows further on."""
+    known, height = response.known[c], response.value.shape[1]
+    begin = max(v - (_AHEAD - 1 if direction < 0 else 0), 0)
+    end = min(v + (_AHEAD - 1 if direction > 0 else 0), height - 1) + 1
+    if known[0] < known[1] and v < known[0]:
+        end = known[0]
+    elif known[0] < known[1]:
+        begin = known[1]
+    extend(response, c, begin, end)
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _point(
-    response: StripResponse, sign: np.float32, v: int, j: int, direction: int, threshold: float
-) -> tuple[bool, float, np.float32]:
-    """Whether there is a maximum near column j, its offset from there, and its height."""
-    value, known = response.value, response.known
-    if not (
-        known[j - 1, 0] <= v < known[j - 1, 1]
-        and known[j, 0] <= v < known[j, 1]
-        and known[j + 1, 0] <= v < known[j + 1, 1]
-    ):
-        _evaluate(response, j, v, direction)
-    left, centre, right = sign * value[j - 1, v], sign * value[j, v], sign * value[j + 1, v]
-    off = 0.0
-    # A fourth neighbour, if the highest of three is not the one in the middle.
-    if left > centre and left > right:
-        _evaluate(response, j - 1, v, direction)
-        off, right, centre, left = -1.0, centre, left, sign * value[j - 2, v]
-    elif right > centre:
-        _evaluate(response, j + 1, v, direction)
-        off, left, centre, right = 1.0, centre, right, sign * value[j + 2, v]
-    there = centre >= threshold and centre >= left and centre >= right
-    return there, off + _top_of_parabola(left, centre, right), centre
+def _is_known(known: NDArray[np.int32], c: int, v: int) -> bool:
+    return known[c, 0] <= v and v < known[c, 1]
 
 
 @njit(cache=True, error_model="numpy")
@@ -218,14 +187,16 @@ def _follow(
     0 if there is none in the first row. Points are written from the middle of the results on, in
     this direction.
     """
+    # Numba counts references to arrays in tuples wherever they are taken out of these.
+    value, known = response.value, response.known
+    point_row, point_column, point_score = points.row, points.column, points.score
     width, height = rise.shape
-    border, pull = following.border, following.pull
+    border, pull, threshold = following.border, following.pull, following.threshold
     v = start[0]
-    place = _place(0, start[1])
+    j, part = _place(0, start[1])
     n = 0
     gap = 0
     while gap <= following.max_gap:
-        j, part = place
         if n > 0:
             v += direction
             if v < border or v > height - 1 - border or j < 1 or j > width - 2:
@@ -237,24 +208,38 @@ def _follow(
             j, part = _place(j, part + moved)
         if j < 2 or j > width - 3:
             break
-        there, off, score = _point(response, sign, v, j, direction, following.threshold)
-        off -= part
+        for c in range(j - 1, j + 2):
+            if not _is_known(known, c, v):
+                _evaluate(response, c, v, direction)
+        left, centre, right = sign * value[j - 1, v], sign * value[j, v], sign * value[j + 1, v]
+        off = -part
+        # A fourth neighbour, if the highest of three is not the one in the middle.
+        if left > centre and left > right:
+            if not _is_known(known, j - 2, v):
+                _evaluate(response, j - 2, v, direction)
+            off, right, centre, left = off - 1.0, centre, left, sign * value[j - 2, v]
+        elif right > centre:
+            if not _is_known(known, j + 2, v):
+                _evaluate(response, j + 2, v, direction)
+            off, left, centre, right = off + 1.0, centre, right, sign * value[j + 2, v]
+        seen = centre >= threshold and centre >= left and centre >= right
+        if seen:
+            off += _top_of_parabola(left, centre, right)
         # A start is known to a column only.
-        if there and (n == 0 or abs(off) <= following.reach):
+        if seen and (n == 0 or abs(off) <= following.reach):
             at = height + direction * n
-            points.row[at] = v
-            points.column[at] = j + (part + off)
-            points.score[at] = score
+            point_row[at] = v
+            point_column[at] = j + (part + off)
+            point_score[at] = centre
             # The start counts as the expected position, not as a point that confirms it.
             yielding = max(pull, 1.0 / (n + 1.0)) if n > 0 else 1.0
-            part += yielding * off
+            j, part = _place(j, part + yielding * off)
             n += 1
             gap = 0
         elif n == 0:
             break
         else:
             gap += 1
-        place = _place(j, part)
     return n
 
 
@@ -289,11 +274,16 @@ def _follow_both_ways(
 
 
 @njit(cache=True, error_model="numpy")
-def _mark(followed: NDArray[np.bool_], lowest: int, row: int, column: float) -> None:
-    """Mark the three columns round a point as followed, on rows on which there are starts."""
-    if 0 <= row - lowest < followed.shape[0]:
-        j = math.floor(column + 0.5)
-        followed[row - lowest, max(0, j - 1) : j + 2] = True
+def _mark(
+    followed: NDArray[np.bool_], lowest: int, row: NDArray[np.int32], column: FloatArray
+) -> None:
+    """Mark the three columns round points as followed, on rows on which there are starts."""
+    rows, width = followed.shape
+    for i in range(len(row)):
+        if 0 <= row[i] - lowest < rows:
+            j = math.floor(column[i] + 0.5)
+            for k in range(max(0, j - 1), min(width, j + 2)):
+                followed[row[i] - lowest, k] = True
 
 
 @njit(cache=True, error_model="numpy")
@@ -350,8 +340,7 @@ def follow_edges(
         found.row[n:after] = own.row[begin:end]
         found.column[n:after] = own.column[begin:end]
         found.score[n:after] = own.score[begin:end]
-        for i in range(begin, end):
-            _mark(marks, lowest, own.row[i], own.column[i])
+        _mark(marks, lowest, own.row[begin:end], own.column[begin:end])
         sign[tracks] = polarity
         tracks += 1
         bounds[tracks] = after
