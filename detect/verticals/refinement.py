@@ -102,18 +102,22 @@ class LineFits(NamedTuple):
 
 
 class StepFilters(NamedTuple):
-    """The steps of the refinement, and tables of their filters, one behind the other, each once.
+    """The steps of the refinement, and tables of their filters.
+
+    A filter at a position in pixels i to i + 1 covers ``2 half`` pixels, from i - half + 1; for
+    `SUBPIXELS` positions each there is a row of weights, of the sum 0.
 
     Attributes
     ----------
-    half : (K + 2,) int64
-        The filter at a position in pixels i to i + 1 covers ``2 half`` pixels, from i - half + 1.
-        The last two are those whose contrasts are compared, a fine and a coarse one.
-    begin : (K + 2,) int64
-        Where each filter's weights begin.
-    weights : (N,) float32
-        For each filter `SUBPIXELS` rows of ``2 half`` for the step's height, then for its first and
-        second derivative times sigma^2; each row has the sum 0.
+    half : (K,) int64
+        See above, of each step.
+    begin : (K,) int64
+        Where its weights begin; equal steps share them.
+    derivatives : (N,) float32
+        Weights of the first derivative of the step's height, times sigma^2, for all positions, then
+        those of the second.
+    heights : (2, SUBPIXELS, 2 half) float32
+        Weights of the height itself, at the fine and the coarse scale that are compared.
     farthest : (K,) float64
         Largest displacement of the middle of a line by a step, pixels; a larger step is not made,
         nor any after it. Without steps the lines stay as tracked.
@@ -121,7 +125,8 @@ class StepFilters(NamedTuple):
 
     half: NDArray[np.int64]
     begin: NDArray[np.int64]
-    weights: NDArray[np.float32]
+    derivatives: NDArray[np.float32]
+    heights: NDArray[np.float32]
     farthest: FloatArray
 
 
@@ -129,36 +134,38 @@ class StepFilters(NamedTuple):
 def refinement_of(settings: LineSettings, steps: int | None = None) -> StepFilters:
     """Filters of the settings' (first) steps and of the two contrasts; how far a step may go."""
     some = settings.refine_steps_px[:steps]
-    scales = (*(scale for scale, _ in some), settings.fine_scale_px, settings.coarse_scale_px)
-    return step_filters(scales, tuple(distance for _, distance in some))
-
-
-def step_filters(sigmas_px: tuple[float, ...], farthest_px: tuple[float, ...]) -> StepFilters:
-    """Tables for Gaussians of some widths, pixels, in this order."""
-    halves, tables = [], []
+    sigmas = [sigma for sigma, _ in some]
     # Equal ones share a table.
-    widths = list(dict.fromkeys(sigmas_px))
-    for sigma in widths:
-        half = 4 * math.ceil(_REACH * sigma / 4.0)
-        halves.append(half)
-        position = (np.arange(SUBPIXELS)[:, None] + 0.5) / SUBPIXELS
-        d = np.arange(-half + 1, half + 1) - position
-        q = (d / sigma) ** 2
-        gaussian = np.exp(-0.5 * q)
-        weights = np.stack(
-            [d / sigma**2 * gaussian, (q - 1.0) * gaussian, (q - 3.0) * d / sigma**2 * gaussian]
-        )
-        # Windows that are cut off must not depend on the image's brightness.
-        weights -= weights.mean(axis=-1, keepdims=True)
-        tables.append(weights.reshape(-1))
-    begins = np.cumsum([0, *(len(table) for table in tables)])
-    which = [widths.index(sigma) for sigma in sigmas_px]
+    tables = {sigma: gaussian_steps(sigma, _half(sigma))[1:] for sigma in sigmas}
+    begins = dict(zip(tables, np.cumsum([0, *(table.size for table in tables.values())])))
+    scales = settings.fine_scale_px, settings.coarse_scale_px
+    half = max(_half(sigma) for sigma in scales)
+    flat = [np.empty(0), *(table.reshape(-1) for table in tables.values())]
     return StepFilters(
-        half=np.array(halves, np.int64)[which],
-        begin=begins.astype(np.int64)[which],
-        weights=np.concatenate(tables).astype(np.float32),
-        farthest=np.array(farthest_px, np.float64),
+        half=np.array([_half(sigma) for sigma in sigmas], np.int64),
+        begin=np.array([begins[sigma] for sigma in sigmas], np.int64),
+        derivatives=np.concatenate(flat).astype(np.float32),
+        heights=np.stack([gaussian_steps(s, half)[0] for s in scales]).astype(np.float32),
+        farthest=np.array([distance for _, distance in some], np.float64),
     )
+
+
+def _half(sigma: float) -> int:
+    """Half the number of pixels that a filter covers; a number that is whole in vectors."""
+    return 4 * math.ceil(_REACH * sigma / 4.0)
+
+
+def gaussian_steps(sigma: float, half: int) -> FloatArray:
+    """(3, SUBPIXELS, 2 half) weights of a step's height, and of its derivatives times sigma^2."""
+    position = (np.arange(SUBPIXELS)[:, None] + 0.5) / SUBPIXELS
+    d = np.arange(-half + 1, half + 1) - position
+    q = (d / sigma) ** 2
+    gaussian = np.exp(-0.5 * q)
+    weights = np.stack(
+        [d / sigma**2 * gaussian, (q - 1.0) * gaussian, (q - 3.0) * d / sigma**2 * gaussian]
+    )
+    # Windows that are cut off must not depend on the image's brightness.
+    return np.asarray(weights - weights.mean(axis=-1, keepdims=True))
 
 
 @njit(cache=True, error_model="numpy")
@@ -318,16 +325,20 @@ def fit_eigenlines(
     return Eigenlines(reference, pixel, line, scatter_px, middle, spread, rise, off)
 
 
-class _Crossings(NamedTuple):
-    """Where a line crosses the rows of its track: columns, NaN for none, and their derivatives."""
+class Crossings(NamedTuple):
+    """Where a line crosses the N rows of its track: columns, NaN for none, and their derivatives.
+
+    `seen`, (3, N or more), is for what filters see there.
+    """
 
     row: NDArray[np.int32]
     column: FloatArray
     by_a: FloatArray
     by_b: FloatArray
+    seen: FloatArray
 
 
-class _Newton(NamedTuple):
+class NewtonStep(NamedTuple):
     """A step of Newton's method: how a and b change, and their covariance after that."""
 
     change_a: float
@@ -360,13 +371,13 @@ def _turns(
 @njit(cache=True, error_model="numpy")
 def _cross_rows(
     strip: Strip, tracks: LineTracks, lines: Eigenlines, t: int, scratch: FloatArray
-) -> _Crossings:
+) -> Crossings:
     """Where the line through track t crosses its rows."""
     begin, end = tracks.bounds[t], tracks.bounds[t + 1]
     n = end - begin
     turn, height = scratch[0, :n], scratch[1, :n]
-    crossings = _Crossings(
-        tracks.row[begin:end], scratch[2, :n], scratch[3, :n], scratch[4, :n]
+    crossings = Crossings(
+        tracks.row[begin:end], scratch[2, :n], scratch[3, :n], scratch[4, :n], scratch[6:]
     )
     rise = lines.rise[begin:end]
     _turns(lines.line[t, 0], lines.line[t, 1], rise, turn, height, crossings.by_a)
@@ -386,7 +397,7 @@ def _cross_rows(
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _cross_verticals(
     bearing: FloatArray, column: NDArray[np.float32], near: FloatArray, place: FloatArray,
-    height: FloatArray, crossings: _Crossings,
+    height: FloatArray, crossings: Crossings,
 ) -> None:  # fmt: skip
     """Columns of the image of points at bearings `place` between two verticals of the strip."""
     row, crossing, by_a, by_b = crossings.row, crossings.column, crossings.by_a, crossings.by_b
@@ -420,25 +431,78 @@ def _weighted_sums(
     return one, other
 
 
+@njit(cache=True, error_model="numpy")
+def _see_rows(
+    image: NDArray[np.uint8], row: NDArray[np.int32], crossing: FloatArray,
+    weights: NDArray[np.float32], seen: FloatArray,
+) -> int:  # fmt: skip
+    """What two filters see where a line crosses its rows; 0 where windows leave the image.
+
+    Parameters
+    ----------
+    image : (H, W) uint8
+        Grey values.
+    row, crossing : (N,) int32, float64
+        Rows and columns.
+    weights : (2, SUBPIXELS, 2 half) float32
+        Of the filters.
+    seen : (3, N) float64
+        Sums of both filters; distances of the crossings from the positions they are tabulated for.
+
+    Returns
+    -------
+    int
+        The number of rows whose windows are in the image.
+    """
+    one, other, off = seen[0], seen[1], seen[2]
+    first, second = weights[0], weights[1]
+    half = weights.shape[2] // 2
+    rightmost = image.shape[1] - 1 - half
+    used = 0
+    for i in range(len(row)):
+        x = crossing[i]
+        one[i] = other[i] = off[i] = 0.0
+        if x > half and x < rightmost:
+            j = int(x)
+            node = int((x - j) * SUBPIXELS)
+            grey = image[row[i], j - half + 1 : j + half + 1]
+            one[i], other[i] = _weighted_sums(grey, first[node], second[node])
+            off[i] = x - j - (node + 0.5) / SUBPIXELS
+            used += 1
+    return used
+
+
 @njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"}, forceinline=True)
-def _weighted_sum(grey: NDArray[np.uint8], weights: NDArray[np.float32]) -> np.float32:
-    total = np.float32(0.0)
-    for k in range(len(grey)):
-        total += weights[k] * (np.float32(grey[k]) - MIDDLE_GREY)
-    return total
+def _newton_sums(
+    slope: FloatArray, bend: FloatArray, off: FloatArray, by_a: FloatArray, by_b: FloatArray
+) -> tuple[float, float, float, float, float, float, float, float]:
+    """Gradient, Hessian, and the sum of the rows' own gradients' products, by a and b."""
+    g_a = g_b = h_aa = h_ab = h_bb = m_aa = m_ab = m_bb = 0.0
+    for i in range(len(slope)):
+        own = slope[i] + off[i] * bend[i]
+        own_a, own_b = own * by_a[i], own * by_b[i]
+        g_a += own_a
+        g_b += own_b
+        h_aa += bend[i] * by_a[i] * by_a[i]
+        h_ab += bend[i] * by_a[i] * by_b[i]
+        h_bb += bend[i] * by_b[i] * by_b[i]
+        m_aa += own_a * own_a
+        m_ab += own_a * own_b
+        m_bb += own_b * own_b
+    return g_a, g_b, h_aa, h_ab, h_bb, m_aa, m_ab, m_bb
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@njit(cache=True, error_model="numpy")
 def newton_step(
-    image: NDArray[np.uint8], crossings: _Crossings, weights: NDArray[np.float32], sign: float
-) -> _Newton:
+    image: NDArray[np.uint8], crossings: Crossings, weights: NDArray[np.float32], sign: float
+) -> NewtonStep:
     """The step to where a line's rows have the largest response together.
 
     Parameters
     ----------
     image : (H, W) uint8
         Grey values.
-    crossings : _Crossings
+    crossings : Crossings
         Where the line crosses its rows.
     weights : (2, SUBPIXELS, 2 half) float32
         Of the response's first and second derivative.
@@ -447,45 +511,23 @@ def newton_step(
 
     Returns
     -------
-    _Newton
+    NewtonStep
         NaN where there is no maximum at this scale.
     """
-    row, crossing, by_a, by_b = crossings.row, crossings.column, crossings.by_a, crossings.by_b
-    slopes, bends = weights[0], weights[1]
-    half = weights.shape[2] // 2
-    rightmost = image.shape[1] - 1 - half
-    # Hessian, gradient, and the sum of the rows' own gradients' products.
-    h_aa = h_ab = h_bb = g_a = g_b = m_aa = m_ab = m_bb = 0.0
-    used = 0
-    for i in range(len(row)):
-        if not (crossing[i] > half and crossing[i] < rightmost):
-            continue
-        j = int(crossing[i])
-        part = crossing[i] - j
-        node = int(part * SUBPIXELS)
-        grey = image[row[i], j - half + 1 : j + half + 1]
-        first, second = _weighted_sums(grey, slopes[node], bends[node])
-        bend = sign * second
-        slope = sign * first + (part - (node + 0.5) / SUBPIXELS) * bend
-        a, b = by_a[i], by_b[i]
-        h_aa += bend * a * a
-        h_ab += bend * a * b
-        h_bb += bend * b * b
-        g_a += slope * a
-        g_b += slope * b
-        m_aa += slope * a * slope * a
-        m_ab += slope * a * slope * b
-        m_bb += slope * b * slope * b
-        used += 1
+    seen, n = crossings.seen, len(crossings.row)
+    used = _see_rows(image, crossings.row, crossings.column, weights, seen)
+    g_a, g_b, h_aa, h_ab, h_bb, m_aa, m_ab, m_bb = _newton_sums(
+        seen[0, :n], seen[1, :n], seen[2, :n], crossings.by_a, crossings.by_b
+    )
     determinant = h_aa * h_bb - h_ab * h_ab
-    if used < 5 or not (h_aa < 0.0 and determinant > 1e-12 * h_aa * h_bb):
-        return _Newton(np.nan, np.nan, np.nan, np.nan, np.nan)
+    if used < 5 or not (sign * h_aa < 0.0 and determinant > 1e-12 * h_aa * h_bb):
+        return NewtonStep(np.nan, np.nan, np.nan, np.nan, np.nan)
     i_aa, i_ab, i_bb = h_bb / determinant, -h_ab / determinant, h_aa / determinant
     # Two parameters were fitted to the same rows.
     scale = used / (used - 2.0)
     left_aa, left_ab = i_aa * m_aa + i_ab * m_ab, i_aa * m_ab + i_ab * m_bb
     left_ba, left_bb = i_ab * m_aa + i_bb * m_ab, i_ab * m_ab + i_bb * m_bb
-    return _Newton(
+    return NewtonStep(
         -(i_aa * g_a + i_ab * g_b),
         -(i_ab * g_a + i_bb * g_b),
         scale * (left_aa * i_aa + left_ab * i_ab),
@@ -495,39 +537,7 @@ def newton_step(
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
-def heights(
-    image: NDArray[np.uint8], crossings: _Crossings, fine: NDArray[np.float32],
-    coarse: NDArray[np.float32],
-) -> tuple[float, float, int]:  # fmt: skip
-    """Heights of the step that a line's rows show to two filters, summed up; number of rows."""
-    row, crossing = crossings.row, crossings.column
-    near, far = fine.shape[1] // 2, coarse.shape[1] // 2
-    margin = max(near, far)
-    rightmost = image.shape[1] - 1 - margin
-    fine_sum = coarse_sum = 0.0
-    used = 0
-    for i in range(len(row)):
-        if not (crossing[i] > margin and crossing[i] < rightmost):
-            continue
-        j = int(crossing[i])
-        node = int((crossing[i] - j) * SUBPIXELS)
-        grey = image[row[i]]
-        fine_sum += _weighted_sum(grey[j - near + 1 : j + near + 1], fine[node])
-        coarse_sum += _weighted_sum(grey[j - far + 1 : j + far + 1], coarse[node])
-        used += 1
-    return fine_sum, coarse_sum, used
-
-
-@njit(cache=True, error_model="numpy")
-def filter_of(filters: StepFilters, step: int) -> NDArray[np.float32]:
-    """(3, SUBPIXELS, 2 half) weights of a step: of the height, its first and second derivative."""
-    taps = 2 * filters.half[step]
-    begin = filters.begin[step]
-    return filters.weights[begin : begin + 3 * SUBPIXELS * taps].reshape(3, SUBPIXELS, taps)
-
-
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _move(crossings: _Crossings, change_a: float, change_b: float) -> float:
+def _move(crossings: Crossings, change_a: float, change_b: float) -> float:
     """Move crossings as the line does; return how far the one that moves most does, pixels."""
     column, by_a, by_b = crossings.column, crossings.by_a, crossings.by_b
     largest = 0.0
@@ -540,9 +550,9 @@ def _move(crossings: _Crossings, change_a: float, change_b: float) -> float:
 
 @njit(cache=True, error_model="numpy")
 def _climb(
-    image: NDArray[np.uint8], crossings: _Crossings, filters: StepFilters, sign: float,
+    image: NDArray[np.uint8], crossings: Crossings, filters: StepFilters, sign: float,
     middle: float, pixel: float,
-) -> _Newton:  # fmt: skip
+) -> NewtonStep:  # fmt: skip
     """All steps of a line together, as far as they lead, and its covariance after the last."""
     a = b = 0.0
     aa = ab = bb = np.nan
@@ -551,7 +561,9 @@ def _climb(
         again = step > 0 and filters.begin[step] == filters.begin[step - 1]
         if again and moved_px <= _STILL_PX:
             continue
-        newton = newton_step(image, crossings, filter_of(filters, step)[1:], sign)
+        taps, begin = 2 * filters.half[step], filters.begin[step]
+        weights = filters.derivatives[begin : begin + 2 * SUBPIXELS * taps]
+        newton = newton_step(image, crossings, weights.reshape(2, SUBPIXELS, taps), sign)
         # Where there is no maximum at this scale, the result of the coarser ones is kept.
         change = abs(newton.change_a + newton.change_b * middle)
         if not change <= filters.farthest[step] * pixel:
@@ -560,7 +572,7 @@ def _climb(
         b += newton.change_b
         aa, ab, bb = newton.aa, newton.ab, newton.bb
         moved_px = _move(crossings, newton.change_a, newton.change_b)
-    return _Newton(a, b, aa, ab, bb)
+    return NewtonStep(a, b, aa, ab, bb)
 
 
 @njit(cache=True, error_model="numpy")
@@ -597,8 +609,7 @@ def refine_lines(
     shift_px = np.full(count, np.nan)
     contrast = np.full(count, np.nan)
     sharpness = np.ones(count)
-    scratch = np.empty((6, len(image)))
-    fine, coarse = len(filters.farthest), len(filters.farthest) + 1
+    scratch = np.empty((9, len(image)))
     for t in range(count):
         if not math.isfinite(lines.line[t, 0]):
             continue
@@ -613,10 +624,11 @@ def refine_lines(
         covariance[t, 0, 1] = covariance[t, 1, 0] = steps.ab
         covariance[t, 1, 1] = steps.bb
         shift_px[t] = abs(steps.change_a + steps.change_b * middle) / pixel
-        fine_sum, coarse_sum, rows = heights(
-            image, crossings, filter_of(filters, fine)[0], filter_of(filters, coarse)[0]
-        )
-        contrast[t] = sign * fine_sum / rows if rows > 0 else 0.0
-        sharp = fine_sum / coarse_sum if sign * coarse_sum > 0.0 else 1.0
+        seen = crossings.seen
+        rows = _see_rows(image, crossings.row, crossings.column, filters.heights, seen)
+        n = len(crossings.row)
+        fine, coarse = seen[0, :n].sum(), seen[1, :n].sum()
+        contrast[t] = sign * fine / rows if rows > 0 else 0.0
+        sharp = fine / coarse if sign * coarse > 0.0 else 1.0
         sharpness[t] = min(max(sharp, 0.0), 1.0)
     return line, covariance, shift_px, contrast, sharpness

@@ -53,6 +53,8 @@ class LineFilter(NamedTuple):
         s: the window along the line covers s rows on either side.
     along : (L,) float32
         Along the line, of sum 1: 2s + 1 weights, and behind them zeros.
+    along_sums : (L + 1,) float32
+        Sums of these up to each.
     regulariser : float32
         Added to the variance in the window (grey values squared).
     """
@@ -61,6 +63,7 @@ class LineFilter(NamedTuple):
     across: NDArray[np.float32]
     half_length: int
     along: NDArray[np.float32]
+    along_sums: NDArray[np.float32]
     regulariser: np.float32
 
 
@@ -147,12 +150,15 @@ def line_filter(settings: LineSettings) -> LineFilter:
     left = np.pad(weights, [(0, 0), (0, 1)])
     step = np.pad(weights, [(0, 0), (1, 0)]) - left
     along = gaussian_window(settings.sigma_along_rows)
+    s = len(along) // 2
+    along = np.pad(along, (0, -len(along) % _VECTOR))
     across = np.stack([left[0], step[0], left[1], step[1]])
     return LineFilter(
         reach=weights.shape[1] // 2,
         across=np.pad(across, [(0, 0), (0, -across.shape[1] % _VECTOR)]).astype(np.float32),
-        half_length=len(along) // 2,
-        along=np.pad(along, (0, -len(along) % _VECTOR)).astype(np.float32),
+        half_length=s,
+        along=along.astype(np.float32),
+        along_sums=np.cumsum([0.0, *along]).astype(np.float32),
         regulariser=np.float32(settings.regulariser),
     )
 
@@ -207,8 +213,7 @@ def whole_response(
     """(W, H) response of all verticals."""
     response = strip_response(pixels, strip, window)
     width, height = response.value.shape
-    for c in range(width):
-        extend(response, c, 0, height)
+    extend(response, (0, width), (0, height))
     return response.value
 
 
@@ -229,32 +234,55 @@ def strip_response(pixels: NDArray[np.uint8], strip: Strip, window: LineFilter) 
 
 
 @njit(cache=True, error_model="numpy")
-def extend(response: StripResponse, c: int, begin: int, end: int) -> None:
-    """Evaluate vertical c from row `begin` to before row `end`, next to the rows that are known."""
-    window, known, column = response.window, response.known[c], response.column[c]
-    moments, value = response.moments[c], response.value[c]
-    seen = response.first_row[c], response.last_row[c] + 1
-    # Moments are known as far round the known rows as the windows along the vertical go.
-    above, below = window.half_length, len(window.along) - window.half_length - 1
-    first, after = begin - above, end + below
-    if known[0] == known[1]:
-        known[0], known[1] = begin, end
-    elif end <= known[0]:
-        after = known[0] - above
-        known[0] = begin
-    else:
-        first = known[1] + below
-        known[1] = end
-    rows = max(first, seen[0]), min(after, seen[1])
-    width, reach = len(response.known), window.reach
-    _take_moments(response.pixels, width, column, window.across, reach, rows, moments)
-    rows = max(begin, seen[0]), min(end, seen[1])
-    _correlate(moments, window.along, window.half_length, window.regulariser, rows, seen, value)
-    # No window leaves the image, and there is none where the vertical is not seen.
-    leftmost, rightmost = np.float32(reach), np.float32(width - 1 - reach)
-    for v in range(begin, end):
-        x = column[v]
-        value[v] = value[v] if (x >= leftmost) & (x < rightmost) else np.float32(0.0)
+def extend(
+    response: StripResponse, verticals: tuple[int, int], rows: tuple[int, int]
+) -> None:
+    """Evaluate verticals in some rows, as far as these are not known, and in all rows between.
+
+    Parameters
+    ----------
+    response : StripResponse
+        Changed.
+    verticals, rows : (int, int)
+        The first, and the one after the last.
+    """
+    pixels, window, column, known = (
+        response.pixels, response.window, response.column, response.known
+    )  # fmt: skip
+    moments, value = response.moments, response.value
+    across, along, sums = window.across, window.along, window.along_sums
+    width, above = len(known), window.half_length
+    below = len(along) - above - 1
+    leftmost, rightmost = np.float32(window.reach), np.float32(width - 1 - window.reach)
+    for c in range(verticals[0], verticals[1]):
+        begin, end = rows
+        # Moments are known as far round the known rows as the windows along the vertical go.
+        first, after = begin - above, end + below
+        if known[c, 0] == known[c, 1]:
+            known[c, 0], known[c, 1] = begin, end
+        elif begin < known[c, 0]:
+            end = known[c, 0]
+            after = end - above
+            known[c, 0] = begin
+        elif end > known[c, 1]:
+            begin = known[c, 1]
+            first = begin + below
+            known[c, 1] = end
+        else:
+            continue
+        top, bottom = response.first_row[c], response.last_row[c] + 1
+        own_column, own_moments, own_value = column[c], moments[c], value[c]
+        span = max(first, top), min(after, bottom)
+        _take_moments(pixels, width, own_column, across, window.reach, span, own_moments)
+        span = max(begin, top), min(end, bottom)
+        _correlate_along(
+            own_moments, along, sums, above, window.regulariser, span, (top, bottom), own_value
+        )
+        # A window that leaves the image has no response, nor has a vertical that is not seen.
+        for v in range(begin, end):
+            x = own_column[v]
+            if not (x >= leftmost and x < rightmost):
+                own_value[v] = np.float32(0.0)
 
 
 # Kernels with loops take arrays one by one: Numba counts references to arrays in tuples.
@@ -283,20 +311,26 @@ def _take_moments(
         moments[2, v] = square
 
 
-@njit(cache=True, error_model="numpy")
-def _correlate(
-    moments: NDArray[np.float32], along: NDArray[np.float32], half_length: int, noise: np.float32,
-    rows: tuple[int, int], seen: tuple[int, int], value: NDArray[np.float32],
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def _correlate_along(
+    moments: NDArray[np.float32], along: NDArray[np.float32], sums: NDArray[np.float32],
+    half_length: int, noise: np.float32, rows: tuple[int, int], seen: tuple[int, int],
+    value: NDArray[np.float32],
 ) -> None:  # fmt: skip
     """Responses in some rows from the moments in the rows round them on which it is seen."""
-    mean, cov, square = moments[0], moments[1], moments[2]
+    means, covs, squares = moments[0], moments[1], moments[2]
     for v in range(rows[0], rows[1]):
         begin = v - half_length
         first, after = max(begin, seen[0]), min(begin + len(along), seen[1])
         weights = along[first - begin : after - begin]
-        value[v] = _squared_correlation(
-            weights, mean[first:after], cov[first:after], square[first:after], noise
+        mean, cov, square = _weighted_sums(
+            weights, means[first:after], covs[first:after], squares[first:after]
         )
+        scale = np.float32(1.0) / (sums[after - begin] - sums[first - begin])
+        mean *= scale
+        cov *= scale
+        # Rounding can make a vanishing variance negative.
+        value[v] = cov * abs(cov) / (abs(square * scale - mean * mean) + noise)
 
 
 # Sums in any order become vectors; inlined, their order is that of the kernel that has them.
@@ -318,18 +352,13 @@ def _moments_across(
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"}, forceinline=True)
-def _squared_correlation(
-    weights: NDArray[np.float32], means: NDArray[np.float32], covs: NDArray[np.float32],
-    squares: NDArray[np.float32], noise: np.float32,
-) -> np.float32:
-    """Response from the moments in the rows of a window, as far as these are on the vertical."""
-    share = mean = cov = square = np.float32(0.0)
+def _weighted_sums(
+    weights: NDArray[np.float32], one: NDArray[np.float32], two: NDArray[np.float32],
+    three: NDArray[np.float32],
+) -> tuple[np.float32, np.float32, np.float32]:  # fmt: skip
+    first = second = third = np.float32(0.0)
     for k in range(len(weights)):
-        share += weights[k]
-        mean += weights[k] * means[k]
-        cov += weights[k] * covs[k]
-        square += weights[k] * squares[k]
-    mean /= share
-    cov /= share
-    # Rounding can make a vanishing variance negative.
-    return cov * abs(cov) / (abs(square / share - mean * mean) + noise)
+        first += weights[k] * one[k]
+        second += weights[k] * two[k]
+        third += weights[k] * three[k]
+    return first, second, third

@@ -222,13 +222,13 @@ def _interpolate(
     for row in range(rows):
         # Apart from what follows, which then becomes vectors.
         where = pixel[row]
-        for c in range(width):
+        for c in range(len(where)):
             place = np.uint64(where[c])
             on_left[c] = pixels[place]
             on_right[c] = pixels[place + np.uint64(1)]
         of_left, of_right = left[row], right[row]
         grey, square = between[row, :width], between[row, width:]
-        for c in range(width):
+        for c in range(len(grey)):
             a = np.float32(on_left[c]) - MIDDLE_GREY
             b = np.float32(on_right[c]) - MIDDLE_GREY
             grey[c] = of_left[c] * a + of_right[c] * b

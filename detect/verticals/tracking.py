@@ -160,15 +160,12 @@ def _place(column: int, part: float) -> tuple[int, float]:
 
 @njit(cache=True, error_model="numpy")
 def _evaluate(response: StripResponse, c: int, v: int, direction: int) -> None:
-    """Evaluate the response of vertical c at row v and at some rows further on."""
-    known, height = response.known[c], response.value.shape[1]
-    begin = max(v - (_AHEAD - 1 if direction < 0 else 0), 0)
-    end = min(v + (_AHEAD - 1 if direction > 0 else 0), height - 1) + 1
-    if known[0] < known[1] and v < known[0]:
-        end = known[0]
-    elif known[0] < known[1]:
-        begin = known[1]
-    extend(response, c, begin, end)
+    """Evaluate the response of verticals c - 1 to c + 1 at row v and at some rows further on."""
+    height = response.value.shape[1]
+    if direction > 0:
+        extend(response, (c - 1, c + 2), (v, min(v + _AHEAD, height)))
+    else:
+        extend(response, (c - 1, c + 2), (max(v - _AHEAD + 1, 0), v + 1))
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
@@ -208,19 +205,20 @@ def _follow(
             j, part = _place(j, part + moved)
         if j < 2 or j > width - 3:
             break
-        for c in range(j - 1, j + 2):
-            if not _is_known(known, c, v):
-                _evaluate(response, c, v, direction)
+        if not (
+            _is_known(known, j - 1, v) and _is_known(known, j, v) and _is_known(known, j + 1, v)
+        ):
+            _evaluate(response, j, v, direction)
         left, centre, right = sign * value[j - 1, v], sign * value[j, v], sign * value[j + 1, v]
         off = -part
         # A fourth neighbour, if the highest of three is not the one in the middle.
         if left > centre and left > right:
             if not _is_known(known, j - 2, v):
-                _evaluate(response, j - 2, v, direction)
+                _evaluate(response, j - 1, v, direction)
             off, right, centre, left = off - 1.0, centre, left, sign * value[j - 2, v]
         elif right > centre:
             if not _is_known(known, j + 2, v):
-                _evaluate(response, j + 2, v, direction)
+                _evaluate(response, j + 1, v, direction)
             off, left, centre, right = off + 1.0, centre, right, sign * value[j + 2, v]
         seen = centre >= threshold and centre >= left and centre >= right
         if seen:
