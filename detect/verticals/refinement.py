@@ -236,9 +236,7 @@ def _arctan_series(x: float) -> float:
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"}, forceinline=True)
-def _sums_in_chart(
-    off: FloatArray, rise: FloatArray
-) -> tuple[float, float, float, float, float]:
+def _sums_in_chart(off: FloatArray, rise: FloatArray) -> tuple[float, float, float, float, float]:
     """Sums of X, Z, X^2, X Z and Z^2 of points."""
     sum_x = sum_z = sum_xx = sum_xz = sum_zz = 0.0
     wide = 0

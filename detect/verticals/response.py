@@ -234,9 +234,7 @@ def strip_response(pixels: NDArray[np.uint8], strip: Strip, window: LineFilter) 
 
 
 @njit(cache=True, error_model="numpy")
-def extend(
-    response: StripResponse, verticals: tuple[int, int], rows: tuple[int, int]
-) -> None:
+def extend(response: StripResponse, verticals: tuple[int, int], rows: tuple[int, int]) -> None:
     """Evaluate verticals in some rows, as far as these are not known, and in all rows between.
 
     Parameters
