@@ -30,6 +30,7 @@ from detect.verticals.refinement import (
     regression_covariance,
 )
 from detect.verticals.response import Strip
+from detect.verticals.starts import Maxima
 from detect.verticals.tilt import (
     ConsensusSettings,
     TiltEstimate,
@@ -37,7 +38,6 @@ from detect.verticals.tilt import (
     agreed_tilt,
 )
 from detect.verticals.tilt_error import descending
-from detect.verticals.starts import Maxima
 from detect.verticals.tracking import LineTracks, sum_of
 
 FloatArray = NDArray[np.float64]
@@ -176,8 +176,9 @@ def fit_and_judge(
 ) -> tuple[Judgement, Verticals, NDArray[np.int64]]:  # fmt: skip
     """Fit lines to tracks, select them one by one, and estimate the tilt on which most agree.
 
-    The tilt's covariance is that of least squares. Also returned is what `detect.verticals.tilt.with_error` needs for another one: what the
-    accepted tracks say about the tilt, and one of them for each, the same for all of an edge.
+    The tilt's covariance is that of least squares. Also returned is what
+    `detect.verticals.tilt.with_error` needs for another one: what the accepted tracks say about
+    the tilt, and one of them for each, the same for all of an edge.
     """
     fits = fit_lines(image, strip, tracks, filters, limits.least_points, limits.least_score)
     evidence, fate = judge_each(strip, tracks, fits, limits)

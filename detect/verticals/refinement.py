@@ -263,7 +263,7 @@ def _sums_in_chart(off: FloatArray, rise: FloatArray) -> tuple[float, float, flo
     return sum_x, sum_z, sum_xx, sum_xz, sum_zz
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@njit(cache=True, error_model="numpy", fastmath={"contract"}, forceinline=True)
 def _place_in_chart(
     bearing: FloatArray, elevation: NDArray[np.float32], row: NDArray[np.int32],
     column: FloatArray, off: FloatArray, rise: FloatArray,
@@ -282,7 +282,7 @@ def _place_in_chart(
     return origin
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def fit_eigenlines(
     strip: Strip, tracks: LineTracks, least_points: int, least_score: float
 ) -> Eigenlines:
@@ -346,7 +346,7 @@ class NewtonStep(NamedTuple):
     bb: float
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@njit(cache=True, error_model="numpy", fastmath={"contract"}, forceinline=True)
 def _turns(
     a: float, b: float, rise: FloatArray, turn: FloatArray, height: FloatArray, by_a: FloatArray
 ) -> None:
@@ -366,7 +366,7 @@ def _turns(
             turn[i] = math.atan(a + b * height[i])
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _cross_rows(
     strip: Strip, tracks: LineTracks, lines: Eigenlines, t: int, scratch: FloatArray
 ) -> Crossings:
@@ -392,7 +392,7 @@ def _cross_rows(
     return crossings
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@njit(cache=True, error_model="numpy", fastmath={"contract"}, forceinline=True)
 def _cross_verticals(
     bearing: FloatArray, column: NDArray[np.float32], near: FloatArray, place: FloatArray,
     height: FloatArray, crossings: Crossings,
@@ -429,7 +429,7 @@ def _weighted_sums(
     return one, other
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _see_rows(
     image: NDArray[np.uint8], row: NDArray[np.int32], crossing: FloatArray,
     weights: NDArray[np.float32], seen: FloatArray,
@@ -490,7 +490,7 @@ def _newton_sums(
     return g_a, g_b, h_aa, h_ab, h_bb, m_aa, m_ab, m_bb
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def newton_step(
     image: NDArray[np.uint8], crossings: Crossings, weights: NDArray[np.float32], sign: float
 ) -> NewtonStep:
@@ -534,7 +534,7 @@ def newton_step(
     )
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@njit(cache=True, error_model="numpy", fastmath={"contract"}, forceinline=True)
 def _move(crossings: Crossings, change_a: float, change_b: float) -> float:
     """Move crossings as the line does; return how far the one that moves most does, pixels."""
     column, by_a, by_b = crossings.column, crossings.by_a, crossings.by_b
@@ -546,7 +546,7 @@ def _move(crossings: Crossings, change_a: float, change_b: float) -> float:
     return largest
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _climb(
     image: NDArray[np.uint8], crossings: Crossings, filters: StepFilters, sign: float,
     middle: float, pixel: float,
@@ -573,7 +573,7 @@ def _climb(
     return NewtonStep(a, b, aa, ab, bb)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def refine_lines(
     image: NDArray[np.uint8], strip: Strip, tracks: LineTracks, lines: Eigenlines,
     filters: StepFilters,

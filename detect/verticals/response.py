@@ -233,7 +233,7 @@ def strip_response(pixels: NDArray[np.uint8], strip: Strip, window: LineFilter) 
     )
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def extend(response: StripResponse, verticals: tuple[int, int], rows: tuple[int, int]) -> None:
     """Evaluate verticals in some rows, as far as these are not known, and in all rows between.
 
@@ -286,7 +286,7 @@ def extend(response: StripResponse, verticals: tuple[int, int], rows: tuple[int,
 # Kernels with loops take arrays one by one: Numba counts references to arrays in tuples.
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _take_moments(
     pixels: NDArray[np.uint8], width: int, column: NDArray[np.float32],
     weights: NDArray[np.float32], reach: int, rows: tuple[int, int], moments: NDArray[np.float32],
@@ -309,7 +309,7 @@ def _take_moments(
         moments[2, v] = square
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@njit(cache=True, error_model="numpy", fastmath={"contract"}, forceinline=True)
 def _correlate_along(
     moments: NDArray[np.float32], along: NDArray[np.float32], sums: NDArray[np.float32],
     half_length: int, noise: np.float32, rows: tuple[int, int], seen: tuple[int, int],

@@ -1,7 +1,7 @@
 """Starts of tracks: maxima of the response on rows parallel to the horizon.
 
-The horizon, or the anchor that replaces it (`lut.verticals`), is crossed by every vertical. On a few
-rows round it the response is evaluated at all columns, with the filter applied to the strip itself:
+Every vertical crosses the horizon, or the anchor that replaces it (`lut.verticals`). On a few rows
+round it the response is evaluated at all columns, with the filter applied to the strip itself:
 there the strip's columns are a pixel wide, and it hardly matters whether moments are taken in the
 image and interpolated, or grey values and their squares are interpolated first. The latter is
 separable: first along the verticals, then across.
@@ -179,7 +179,7 @@ def _typical_spacing(x: FloatArray, seen: NDArray[np.bool_]) -> float:
     return float(np.median(np.abs(np.diff(x)[both]))) if both.any() else 1.0
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def band_response(
     pixels: NDArray[np.uint8], band: StartBand, regulariser: np.float32
 ) -> NDArray[np.float32]:
@@ -209,7 +209,7 @@ def band_response(
     return response
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@njit(cache=True, error_model="numpy", fastmath={"contract"}, forceinline=True)
 def _interpolate(
     pixels: NDArray[np.uint8], pixel: NDArray[np.int32], left: NDArray[np.float32],
     right: NDArray[np.float32],
@@ -236,7 +236,7 @@ def _interpolate(
     return between
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@njit(cache=True, error_model="numpy", fastmath={"contract"}, forceinline=True)
 def _average_along(
     between: NDArray[np.float32], along: NDArray[np.float32], sums: NDArray[np.float32]
 ) -> None:
@@ -248,7 +248,7 @@ def _average_along(
             sums[i] += weight * row[i]
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@njit(cache=True, error_model="numpy", fastmath={"contract"}, forceinline=True)
 def _correlate_across(
     means: NDArray[np.float32], scale: NDArray[np.float32], across: NDArray[np.float32],
     sums: NDArray[np.float32],
@@ -269,7 +269,7 @@ def _correlate_across(
             square[c] += weight * squares[c]
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@njit(cache=True, error_model="numpy", fastmath={"contract"}, forceinline=True)
 def _respond(
     sums: NDArray[np.float32], regulariser: np.float32, visible: NDArray[np.bool_],
     response: NDArray[np.float32],

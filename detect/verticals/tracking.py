@@ -158,7 +158,7 @@ def _place(column: int, part: float) -> tuple[int, float]:
     return column, part
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _evaluate(response: StripResponse, c: int, v: int, direction: int) -> None:
     """Evaluate the response of verticals c - 1 to c + 1 at row v and at some rows further on."""
     height = response.value.shape[1]
@@ -173,7 +173,7 @@ def _is_known(known: NDArray[np.int32], c: int, v: int) -> bool:
     return known[c, 0] <= v and v < known[c, 1]
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _follow(
     response: StripResponse, rise: NDArray[np.float32], columns_per_rise: FloatArray,
     sign: np.float32, start: tuple[int, float], direction: int, following: Following,
@@ -205,21 +205,22 @@ def _follow(
             j, part = _place(j, part + moved)
         if j < 2 or j > width - 3:
             break
-        if not (
-            _is_known(known, j - 1, v) and _is_known(known, j, v) and _is_known(known, j + 1, v)
-        ):
-            _evaluate(response, j, v, direction)
-        left, centre, right = sign * value[j - 1, v], sign * value[j, v], sign * value[j + 1, v]
-        off = -part
-        # A fourth neighbour, if the highest of three is not the one in the middle.
-        if left > centre and left > right:
-            if not _is_known(known, j - 2, v):
-                _evaluate(response, j - 1, v, direction)
-            off, right, centre, left = off - 1.0, centre, left, sign * value[j - 2, v]
-        elif right > centre:
-            if not _is_known(known, j + 2, v):
-                _evaluate(response, j + 1, v, direction)
-            off, left, centre, right = off + 1.0, centre, right, sign * value[j + 2, v]
+        near = j
+        while True:
+            if not (
+                _is_known(known, near - 1, v)
+                and _is_known(known, near, v)
+                and _is_known(known, near + 1, v)
+            ):
+                _evaluate(response, near, v, direction)
+            left = sign * value[near - 1, v]
+            centre = sign * value[near, v]
+            right = sign * value[near + 1, v]
+            # Once to the side if the highest of the three is not the one in the middle.
+            if near != j or not (left > centre or right > centre):
+                break
+            near += -1 if left > centre and left > right else 1
+        off = near - j - part
         seen = centre >= threshold and centre >= left and centre >= right
         if seen:
             off += _top_of_parabola(left, centre, right)
@@ -253,25 +254,31 @@ def _with_points(points: _Points, n: int, capacity: int) -> _Points:
     return _Points(row, column, score)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _follow_both_ways(
     response: StripResponse, rise: NDArray[np.float32], columns_per_rise: FloatArray,
     sign: np.float32, start: tuple[int, int], following: Following, points: _Points,
 ) -> tuple[int, int]:  # fmt: skip
     """Follow an edge up and down; its points are from the first place to before the second."""
     middle = rise.shape[1]
-    v, column = start[0], float(start[1])
-    up = _follow(response, rise, columns_per_rise, sign, (v, column), -1, following, points)
-    # Starts were searched less thoroughly.
-    if up == 0:
-        return middle, middle
-    column = points.column[middle]
-    down = _follow(response, rise, columns_per_rise, sign, (v, column), 1, following, points)
-    # The start lies on both halves.
-    return middle + 1 - up, middle + max(down, 1)
+    begin = end = middle
+    column = float(start[1])
+    for direction in (-1, 1):
+        n = _follow(
+            response, rise, columns_per_rise, sign, (start[0], column), direction, following, points
+        )
+        # Starts were searched less thoroughly.
+        if n == 0:
+            break
+        if direction < 0:
+            begin, end = middle + 1 - n, middle + 1
+            column = points.column[middle]
+        else:
+            end = middle + n
+    return begin, end
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _mark(
     followed: NDArray[np.bool_], lowest: int, row: NDArray[np.int32], column: FloatArray
 ) -> None:
