@@ -21,7 +21,7 @@ from detect.verticals.response import FloatArray, Strip, StripResponse, extend
 from detect.verticals.starts import LineStarts
 
 #: Rows that are filtered ahead of a track.
-_AHEAD = 16
+_AHEAD = 8
 
 
 class LineTracks(NamedTuple):
