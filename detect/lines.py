@@ -20,14 +20,13 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from detect.errors import FrameError
-from detect.interrupts import interrupts_deferred_in
 from detect.line_settings import DEFAULT, LineSettings
 from detect.verticals.blur import median_sharpness, widened, width_for
 from detect.verticals.detections import LineDetections
@@ -37,34 +36,29 @@ from detect.verticals.judgement import (
     Judgement,
     JudgementLimits,
     fit_and_judge,
-    judge_tracks,
     limits_of,
     tilt_of_chains,
 )
-from detect.verticals.refinement import StepFilters, refinement_of
+from detect.verticals.refinement import LineFits, StepFilters, refinement_of
 from detect.verticals.response import (
     LineFilter,
-    StartBand,
     Strip,
     line_filter,
-    padded_pixels,
-    response_on_demand,
-    start_band,
     strip_of,
+    strip_response,
 )
-from detect.verticals.response_kernels import band_response
-from detect.verticals.tilt import TiltEstimate, largest_lean, no_tilt, with_error
-from detect.verticals.tracking import (
-    Following,
-    LineTracks,
+from detect.verticals.starts import (
+    StartBand,
+    band_response,
     find_maxima,
-    follow_edges,
-    following_of,
     ordered_starts,
+    start_band,
 )
+from detect.verticals.tilt import TiltEstimate, largest_lean, no_tilt, with_error
+from detect.verticals.tracking import Following, LineTracks, follow_edges, following_of
 from lut.verticals import VerticalTable
 
-__all__ = ["ACCEPTED", "JOINED", "LineDetections", "detect_lines", "tilt_beyond_doubt"]
+__all__ = ["ACCEPTED", "JOINED", "LineDetections", "detect_lines"]
 
 #: Fates of tracks that are a line, or part of one.
 ACCEPTED, JOINED = FATES[:2]
@@ -157,11 +151,10 @@ def detect_lines(
             f"image is {image.dtype} of shape {image.shape}: expected uint8 of the table's shape "
             f"{table.column.shape}"
         )
-    image = np.ascontiguousarray(image)
     search = _search(table, settings)
-    pixels = padded_pixels(image, search.window)
-    with interrupts_deferred_in(find_lines):
-        found = LineDetections(*find_lines(image, pixels, search))
+    lines, tracks, fits, judged, tilt, sharpness = find_lines(np.ascontiguousarray(image), search)
+    judgement = Judgement(LineFits(*fits), *judged, TiltEstimate(*tilt))
+    found = LineDetections(Lines(*lines), LineTracks(*tracks), judgement, sharpness)
     if found.sharpness < search.least_sharpness:
         wider = widened(settings, width_for(found.sharpness, settings))
         return detect_lines(image, table, wider)
@@ -202,23 +195,26 @@ def beyond_doubt(tilt: TiltEstimate, least_lines: int) -> bool:
 
 
 @njit(cache=True, error_model="numpy")
-def find_lines(
-    image: NDArray[np.uint8], pixels: NDArray[np.uint8], search: Search
-) -> tuple[Lines, LineTracks, Judgement, float]:
-    """`detect_lines`, compiled; `pixels` see `detect.verticals.response.ResponseOnDemand`.
+def find_lines(image: NDArray[np.uint8], search: Search) -> tuple[Any, ...]:
+    """`detect_lines`, compiled.
 
-    Results as of `detect.verticals.detections.LineDetections`.
+    Returns
+    -------
+    tuple
+        The numbers of `Lines`, of `LineTracks`, of `LineFits`, evidence and fate of each track, the
+        numbers of `TiltEstimate`, and the median sharpness. These are plain tuples: to make named
+        ones, compiled code calls Python, where an interrupt would be lost.
     """
-    strip, band = search.strip, search.band
-    response = band_response(image, band, search.window)
-    maxima = find_maxima(response, band.row, search.free.threshold, band.supported)
+    strip, band, pixels = search.strip, search.band, image.reshape(-1)
+    along_band = band_response(pixels, band, search.window.regulariser)
+    maxima = find_maxima(along_band, band.row, search.free.threshold, band.supported)
     tilt = no_tilt()
     # The band is useless in images that are full of maxima everywhere.
     if search.by_chains and len(maxima.level) <= image.shape[1]:
-        tilt = tilt_of_chains(response, band.row, maxima, strip, search.limits)
-    starts = ordered_starts(response, band.row, maxima)
+        tilt = tilt_of_chains(along_band, band.row, maxima, strip, search.limits)
+    starts = ordered_starts(along_band, band.row, maxima)
 
-    lazy = response_on_demand(pixels, strip, search.window)
+    response = strip_response(pixels, strip, search.window)
     # All by the tilt of the band, if that leaves no doubt about it, and once more if they show
     # another one. Else a few edges, if they leave none; else all; then all by their tilt.
     by_tilt = beyond_doubt(tilt, _CHAINS)
@@ -226,13 +222,13 @@ def find_lines(
     times = 0
     most = 2 if by_tilt else 1
     while True:
-        pitch, roll = 0.0, 0.0
+        expected = (0.0, 0.0)
         following = search.few if few else search.free
         if by_tilt:
-            pitch, roll = tilt.pitch_rad, tilt.roll_rad
+            expected = (tilt.pitch_rad, tilt.roll_rad)
             following = search.guided
             times += 1
-        tracks = follow_edges(lazy, starts, following, pitch, roll)
+        tracks = follow_edges(response, strip, starts, following, expected)
         few = not tracks.complete
         filters = search.few_filters if few else search.filters
         judged, verticals, edge = fit_and_judge(image, strip, tracks, filters, search.limits)
@@ -247,33 +243,14 @@ def find_lines(
         few = False
         if not search.is_guided or np.isnan(tilt.pitch_rad) or times == most:
             break
-        changed = largest_lean(strip.bearing, tilt.pitch_rad - pitch, tilt.roll_rad - roll)
+        changed = largest_lean(
+            strip.bearing, tilt.pitch_rad - expected[0], tilt.roll_rad - expected[1]
+        )
         if by_tilt and changed <= search.lag_rad:
             break
         by_tilt = True
     tilt = with_error(tilt, verticals, edge, search.limits.consensus)
     judged = Judgement(judged.fits, judged.evidence, judged.fate, tilt)
-    return lines_of_tracks(strip, tracks, judged, search.joining), tracks, judged, sharpness
-
-
-def tilt_beyond_doubt(
-    image: NDArray[np.uint8], tracks: LineTracks, table: VerticalTable, settings: LineSettings
-) -> TiltEstimate | None:
-    """Tilt from a few edges, good enough to follow all of them by.
-
-    Parameters
-    ----------
-    image : (H, W) uint8
-        Grey values, in scan order.
-    tracks : LineTracks
-        The few edges.
-    table, settings
-        As for `detect_lines`.
-
-    Returns
-    -------
-    TiltEstimate or None
-        None if it is in doubt. Lines are only partly refined for it.
-    """
-    tilt = judge_tracks(image, tracks, table, settings, steps=_FIRST_STEPS).tilt
-    return tilt if beyond_doubt(tilt, _FIRST_LINES) else None
+    lines = lines_of_tracks(strip, tracks, judged, search.joining)
+    fates = (judged.evidence, judged.fate)
+    return lines[:], tracks[:], judged.fits[:], fates, tilt[:], sharpness

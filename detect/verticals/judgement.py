@@ -27,20 +27,18 @@ from detect.verticals.refinement import (
     StepFilters,
     fit_eigenlines,
     fit_lines,
-    refinement_of,
     regression_covariance,
 )
-from detect.verticals.response import Strip, strip_of
+from detect.verticals.response import Strip
+from detect.verticals.starts import Maxima
 from detect.verticals.tilt import (
     ConsensusSettings,
     TiltEstimate,
     Verticals,
     agreed_tilt,
-    with_error,
 )
 from detect.verticals.tilt_error import descending
-from detect.verticals.tracking import LineTracks, Maxima, sum_of
-from lut.verticals import VerticalTable
+from detect.verticals.tracking import LineTracks, sum_of
 
 FloatArray = NDArray[np.float64]
 
@@ -171,44 +169,16 @@ def limits_of(settings: LineSettings, row_aspect: float) -> JudgementLimits:
     )
 
 
-def judge_tracks(
-    image: NDArray[np.uint8],
-    tracks: LineTracks,
-    table: VerticalTable,
-    settings: LineSettings,
-    *,
-    steps: int | None = None,
-) -> Judgement:
-    """Fit lines to tracks, select them one by one, and estimate the tilt on which most agree.
-
-    Parameters
-    ----------
-    image : (H, W) uint8
-        Grey values, in scan order.
-    tracks : LineTracks
-        The tracks.
-    table : VerticalTable
-        Of the image's camera.
-    settings : LineSettings
-        See there.
-    steps : int, optional
-        Number of the settings' steps that refine lines on the grey values.
-    """
-    limits = limits_of(settings, table.row_aspect)
-    filters = refinement_of(settings, steps)
-    judged, lines, edge = fit_and_judge(image, strip_of(table), tracks, filters, limits)
-    return judged._replace(tilt=with_error(judged.tilt, lines, edge, limits.consensus))
-
-
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def fit_and_judge(
     image: NDArray[np.uint8], strip: Strip, tracks: LineTracks, filters: StepFilters,
     limits: JudgementLimits,
 ) -> tuple[Judgement, Verticals, NDArray[np.int64]]:  # fmt: skip
-    """As `judge_tracks`, except that the tilt's covariance is that of least squares.
+    """Fit lines to tracks, select them one by one, and estimate the tilt on which most agree.
 
-    Also returned is what `detect.verticals.tilt.with_error` needs for another one: what the
-    accepted tracks say about the tilt, and one of them for each, the same for all of an edge.
+    The tilt's covariance is that of least squares. Also returned is what
+    `detect.verticals.tilt.with_error` needs for another one: what the accepted tracks say about
+    the tilt, and one of them for each, the same for all of an edge.
     """
     fits = fit_lines(image, strip, tracks, filters, limits.least_points, limits.least_score)
     evidence, fate = judge_each(strip, tracks, fits, limits)

@@ -21,20 +21,11 @@ from numba import njit
 from numpy.typing import NDArray
 
 from detect.line_settings import LineSettings
-from detect.vector_code import LANES, WORD
-from detect.verticals.refine_vector_kernels import (
-    ROWS,
-    SUBPIXELS,
-    heights,
-    move_crossings,
-    newton_sums,
-)
-from detect.verticals.response import Strip
-from detect.verticals.response_kernels import MARGIN, STEP
-from detect.verticals.tracking import LineTracks
+from detect.verticals.response import MIDDLE_GREY, FloatArray, Strip
+from detect.verticals.tracking import LineTracks, sum_of
 
-FloatArray = NDArray[np.float64]
-
+#: Positions in a pixel for which weights are tabulated; between them the derivative helps out.
+SUBPIXELS = 64
 #: Standard deviations beyond which the Gaussian is negligible.
 _REACH = 4.4
 #: Up to here series of tangents and arc tangents are as good as these.
@@ -111,20 +102,22 @@ class LineFits(NamedTuple):
 
 
 class StepFilters(NamedTuple):
-    """The steps of the refinement, and tables of their filters, one behind the other, each once.
+    """The steps of the refinement, and tables of their filters.
+
+    A filter at a position in pixels i to i + 1 covers ``2 half`` pixels, from i - half + 1; for
+    `SUBPIXELS` positions each there is a row of weights, of the sum 0.
 
     Attributes
     ----------
-    half : (K + 2,) int64
-        The filter at a position in pixels i to i + 1 covers ``2 half`` pixels, from i - half + 1.
-        The last two are those whose contrasts are compared, a fine and a coarse one.
-    begin : (K + 2,) int64
-        Where each filter's weights begin: `SUBPIXELS` rows of ``2 half``, and one of zeros.
-    height : (N,) float32
-        Weights of the step's height; each row has the sum 0.
-    derivatives : (2 N,) float32
-        Those of its derivatives times sigma^2: `WORD` (`detect.vector_code`) of the
-        first, then as many of the second, and so on.
+    half : (K,) int64
+        See above, of each step.
+    begin : (K,) int64
+        Where its weights begin; equal steps share them.
+    derivatives : (N,) float32
+        Weights of the first derivative of the step's height, times sigma^2, for all positions, then
+        those of the second.
+    heights : (2, SUBPIXELS, 2 half) float32
+        Weights of the height itself, at the fine and the coarse scale that are compared.
     farthest : (K,) float64
         Largest displacement of the middle of a line by a step, pixels; a larger step is not made,
         nor any after it. Without steps the lines stay as tracked.
@@ -132,8 +125,8 @@ class StepFilters(NamedTuple):
 
     half: NDArray[np.int64]
     begin: NDArray[np.int64]
-    height: NDArray[np.float32]
     derivatives: NDArray[np.float32]
+    heights: NDArray[np.float32]
     farthest: FloatArray
 
 
@@ -141,42 +134,41 @@ class StepFilters(NamedTuple):
 def refinement_of(settings: LineSettings, steps: int | None = None) -> StepFilters:
     """Filters of the settings' (first) steps and of the two contrasts; how far a step may go."""
     some = settings.refine_steps_px[:steps]
-    scales = (*(scale for scale, _ in some), settings.fine_scale_px, settings.coarse_scale_px)
-    return step_filters(scales, tuple(distance for _, distance in some))
-
-
-def step_filters(sigmas_px: tuple[float, ...], farthest_px: tuple[float, ...]) -> StepFilters:
-    """Tables for Gaussians of some widths, pixels, in this order."""
-    halves, tables = [], []
+    sigmas = [sigma for sigma, _ in some]
     # Equal ones share a table.
-    widths = list(dict.fromkeys(sigmas_px))
-    for sigma in widths:
-        half = 4 * math.ceil(_REACH * sigma / 4.0)
-        halves.append(half)
-        position = (np.arange(SUBPIXELS)[:, None] + 0.5) / SUBPIXELS
-        d = np.arange(-half + 1, half + 1) - position
-        q = (d / sigma) ** 2
-        gaussian = np.exp(-0.5 * q)
-        weights = np.stack(
-            [d / sigma**2 * gaussian, (q - 1.0) * gaussian, (q - 3.0) * d / sigma**2 * gaussian]
-        )
-        # Windows that are cut off must not depend on the image's brightness.
-        weights -= weights.mean(axis=-1, keepdims=True)
-        weights = np.pad(weights, [(0, 0), (0, 1), (0, 0)])
-        tables.append(weights.reshape(3, -1))
-    height, first, second = np.concatenate(tables, axis=-1).astype(np.float32)
-    begins = np.concatenate([[0], np.cumsum([(SUBPIXELS + 1) * 2 * half for half in halves])])
-    which = [widths.index(sigma) for sigma in sigmas_px]
+    tables = {sigma: gaussian_steps(sigma, _half(sigma))[1:] for sigma in sigmas}
+    begins = dict(zip(tables, np.cumsum([0, *(table.size for table in tables.values())])))
+    scales = settings.fine_scale_px, settings.coarse_scale_px
+    half = max(_half(sigma) for sigma in scales)
+    flat = [np.empty(0), *(table.reshape(-1) for table in tables.values())]
     return StepFilters(
-        half=np.array(halves, np.int64)[which],
-        begin=begins.astype(np.int64)[which],
-        height=height,
-        derivatives=np.stack([first.reshape(-1, WORD), second.reshape(-1, WORD)], 1).reshape(-1),
-        farthest=np.array(farthest_px, np.float64),
+        half=np.array([_half(sigma) for sigma in sigmas], np.int64),
+        begin=np.array([begins[sigma] for sigma in sigmas], np.int64),
+        derivatives=np.concatenate(flat).astype(np.float32),
+        heights=np.stack([gaussian_steps(s, half)[0] for s in scales]).astype(np.float32),
+        farthest=np.array([distance for _, distance in some], np.float64),
     )
 
 
-@njit(cache=True, error_model="numpy")
+def _half(sigma: float) -> int:
+    """Half the number of pixels that a filter covers; a number that is whole in vectors."""
+    return 4 * math.ceil(_REACH * sigma / 4.0)
+
+
+def gaussian_steps(sigma: float, half: int) -> FloatArray:
+    """(3, SUBPIXELS, 2 half) weights of a step's height, and of its derivatives times sigma^2."""
+    position = (np.arange(SUBPIXELS)[:, None] + 0.5) / SUBPIXELS
+    d = np.arange(-half + 1, half + 1) - position
+    q = (d / sigma) ** 2
+    gaussian = np.exp(-0.5 * q)
+    weights = np.stack(
+        [d / sigma**2 * gaussian, (q - 1.0) * gaussian, (q - 3.0) * d / sigma**2 * gaussian]
+    )
+    # Windows that are cut off must not depend on the image's brightness.
+    return np.asarray(weights - weights.mean(axis=-1, keepdims=True))
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
 def fit_lines(
     image: NDArray[np.uint8], strip: Strip, tracks: LineTracks, filters: StepFilters,
     least_points: int, least_score: float,
@@ -243,7 +235,54 @@ def _arctan_series(x: float) -> float:
     return x * (1.0 - q * (1.0 / 3.0 - q * (0.2 - q * (1.0 / 7.0 - q * (1.0 / 9.0)))))
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"})
+@njit(cache=True, error_model="numpy")
+def _sums_in_chart(off: FloatArray, rise: FloatArray) -> tuple[float, float, float, float, float]:
+    """Sums of X, Z, X^2, X Z and Z^2 of points."""
+    sum_x = sum_z = sum_xx = sum_xz = sum_zz = 0.0
+    wide = 0
+    for i in range(len(off)):
+        wide += abs(off[i]) > _SMALL
+    # Near the chart's origin in a loop that becomes vectors.
+    near = len(off) if wide == 0 else 0
+    for i in range(near):
+        x, secant = _short_tan_and_secant(off[i])
+        z = rise[i] * secant
+        sum_x += x
+        sum_z += z
+        sum_xx += x * x
+        sum_xz += x * z
+        sum_zz += z * z
+    for i in range(near, len(off)):
+        x = math.tan(off[i])
+        z = rise[i] / math.cos(off[i])
+        sum_x += x
+        sum_z += z
+        sum_xx += x * x
+        sum_xz += x * z
+        sum_zz += z * z
+    return sum_x, sum_z, sum_xx, sum_xz, sum_zz
+
+
+@njit(cache=True, error_model="numpy")
+def _place_in_chart(
+    bearing: FloatArray, elevation: NDArray[np.float32], row: NDArray[np.int32],
+    column: FloatArray, off: FloatArray, rise: FloatArray,
+) -> int:  # fmt: skip
+    """Bearings of points from the chart's origin, and elevations; return the origin's column."""
+    width = len(bearing)
+    mean = 0.0
+    for i in range(len(column)):
+        mean += column[i]
+    origin = min(max(int(mean / len(column) + 0.5), 1), width - 2)
+    for i in range(len(column)):
+        j = min(int(column[i]), width - 2)
+        f = column[i] - j
+        off[i] = (1.0 - f) * bearing[j] + f * bearing[j + 1] - bearing[origin]
+        rise[i] = (1.0 - f) * elevation[j, row[i]] + f * elevation[j + 1, row[i]]
+    return origin
+
+
+@njit(cache=True, error_model="numpy")
 def fit_eigenlines(
     strip: Strip, tracks: LineTracks, least_points: int, least_score: float
 ) -> Eigenlines:
@@ -251,75 +290,23 @@ def fit_eigenlines(
 
     Tracks of fewer points, or of a smaller sum of scores, are left alone.
     """
-    bearing, elevation = strip.bearing, strip.rise
-    bounds, row, column, score = tracks.bounds, tracks.row, tracks.column, tracks.score
+    bearing, bounds = strip.bearing, tracks.bounds
     count = len(bounds) - 1
-    reference = np.empty(count)
-    pixel = np.empty(count)
-    line = np.empty((count, 2))
-    scatter_px = np.empty(count)
-    middle = np.empty(count)
-    spread = np.empty(count)
-    rise = np.empty(len(row))
-    off = np.empty(len(row))
-    width = bearing.shape[0]
-    for t in range(len(bounds) - 1):
-        begin, end = bounds[t], bounds[t + 1]
-        n = end - begin
-        # Views, so that the compiler knows that indices are not negative.
-        own_row = row[begin:end]
-        own_column = column[begin:end]
-        own_score = score[begin:end]
-        own_rise = rise[begin:end]
-        own_off = off[begin:end]
-        mean_column = 0.0
-        total = 0.0
-        for i in range(n):
-            mean_column += own_column[i]
-            total += own_score[i]
-        j = min(max(int(mean_column / n + 0.5), 1), width - 2)
-        phi = bearing[j]
-        reference[t] = phi
+    reference, pixel, line = np.empty(count), np.empty(count), np.full((count, 2), np.nan)
+    scatter_px, middle, spread = np.full((3, count), np.nan)
+    rise, off = np.empty(len(tracks.row)), np.empty(len(tracks.row))
+    for t in range(count):
+        own = slice(bounds[t], bounds[t + 1])
+        n = bounds[t + 1] - bounds[t]
+        j = _place_in_chart(
+            bearing, strip.rise, tracks.row[own], tracks.column[own], off[own], rise[own]
+        )
+        reference[t] = bearing[j]
         pixel[t] = 0.5 * abs(bearing[j + 1] - bearing[j - 1])
-        line[t, 0] = np.nan
-        line[t, 1] = np.nan
-        scatter_px[t] = np.nan
-        middle[t] = np.nan
-        spread[t] = np.nan
-        if n < least_points or total < least_score:
+        if n < least_points or sum_of(tracks.score[own]) < least_score:
             continue
-        sum_x = 0.0
-        sum_z = 0.0
-        sum_xx = 0.0
-        sum_xz = 0.0
-        sum_zz = 0.0
-        wide = 0
-        for i in range(n):
-            j = min(int(own_column[i]), width - 2)
-            f = own_column[i] - j
-            own_off[i] = (1.0 - f) * bearing[j] + f * bearing[j + 1] - phi
-            own_rise[i] = (1.0 - f) * elevation[j, own_row[i]] + f * elevation[j + 1, own_row[i]]
-            wide += abs(own_off[i]) > _SMALL
-        # Near the chart's origin in a loop that becomes vectors.
-        near = n if wide == 0 else 0
-        for i in range(near):
-            x, secant = _short_tan_and_secant(own_off[i])
-            z = own_rise[i] * secant
-            sum_x += x
-            sum_z += z
-            sum_xx += x * x
-            sum_xz += x * z
-            sum_zz += z * z
-        for i in range(near, n):
-            x = math.tan(own_off[i])
-            z = own_rise[i] / math.cos(own_off[i])
-            sum_x += x
-            sum_z += z
-            sum_xx += x * x
-            sum_xz += x * z
-            sum_zz += z * z
-        mean_x = sum_x / n
-        mean_z = sum_z / n
+        sum_x, sum_z, sum_xx, sum_xz, sum_zz = _sums_in_chart(off[own], rise[own])
+        mean_x, mean_z = sum_x / n, sum_z / n
         xx = sum_xx / n - mean_x * mean_x
         xz = sum_xz / n - mean_x * mean_z
         zz = sum_zz / n - mean_z * mean_z
@@ -336,7 +323,257 @@ def fit_eigenlines(
     return Eigenlines(reference, pixel, line, scatter_px, middle, spread, rise, off)
 
 
+class Crossings(NamedTuple):
+    """Where a line crosses the N rows of its track: columns, NaN for none, and their derivatives.
+
+    `seen`, (3, N or more), is for what filters see there.
+    """
+
+    row: NDArray[np.int32]
+    column: FloatArray
+    by_a: FloatArray
+    by_b: FloatArray
+    seen: FloatArray
+
+
+class NewtonStep(NamedTuple):
+    """A step of Newton's method: how a and b change, and their covariance after that."""
+
+    change_a: float
+    change_b: float
+    aa: float
+    ab: float
+    bb: float
+
+
+@njit(cache=True, error_model="numpy")
+def _turns(
+    a: float, b: float, rise: FloatArray, turn: FloatArray, height: FloatArray, by_a: FloatArray
+) -> None:
+    """Bearings of a line's points from the chart's origin, their Z, and derivatives by a."""
+    wide = 0
+    for i in range(len(rise)):
+        # Z depends on X in second order only: one repetition settles it.
+        x = a + b * rise[i]
+        z = rise[i] * math.sqrt(1.0 + x * x)
+        x = a + b * z
+        wide += abs(x) > _SMALL
+        turn[i] = _arctan_series(x)
+        height[i] = z
+        by_a[i] = 1.0 / (1.0 + x * x)
+    if wide > 0:
+        for i in range(len(rise)):
+            turn[i] = math.atan(a + b * height[i])
+
+
+@njit(cache=True, error_model="numpy")
+def _cross_rows(
+    strip: Strip, tracks: LineTracks, lines: Eigenlines, t: int, scratch: FloatArray
+) -> Crossings:
+    """Where the line through track t crosses its rows."""
+    begin, end = tracks.bounds[t], tracks.bounds[t + 1]
+    n = end - begin
+    turn, height = scratch[0, :n], scratch[1, :n]
+    crossings = Crossings(
+        tracks.row[begin:end], scratch[2, :n], scratch[3, :n], scratch[4, :n], scratch[6:]
+    )
+    rise = lines.rise[begin:end]
+    _turns(lines.line[t, 0], lines.line[t, 1], rise, turn, height, crossings.by_a)
+    # To a hundredth of a column: that decides between which columns it is.
+    bearing = strip.bearing
+    j = min(max(int(tracks.column[begin]), 1), len(bearing) - 2)
+    columns_per_rad = 2.0 / (bearing[j + 1] - bearing[j - 1])
+    near = scratch[5, :n]
+    for i in range(n):
+        moved = (turn[i] - lines.off[begin + i]) * columns_per_rad
+        near[i] = tracks.column[begin + i] + moved
+        turn[i] += lines.reference[t]
+    _cross_verticals(bearing, strip.column, near, turn, height, crossings)
+    return crossings
+
+
+@njit(cache=True, error_model="numpy")
+def _cross_verticals(
+    bearing: FloatArray, column: NDArray[np.float32], near: FloatArray, place: FloatArray,
+    height: FloatArray, crossings: Crossings,
+) -> None:  # fmt: skip
+    """Columns of the image of points at bearings `place` between two verticals of the strip."""
+    row, crossing, by_a, by_b = crossings.row, crossings.column, crossings.by_a, crossings.by_b
+    last = len(bearing) - 1
+    for i in range(len(row)):
+        j = min(max(int(near[i]), 0), last - 1) if near[i] >= 0.0 else 0
+        columns_per_rad = 1.0 / (bearing[j + 1] - bearing[j])
+        on_left = column[j, row[i]]
+        du_dc = column[j + 1, row[i]] - on_left
+        # Beside it a vertical may have ended.
+        shown = near[i] >= 0.0 and near[i] <= last and abs(du_dc) < np.inf
+        crossing[i] = on_left + (place[i] - bearing[j]) * columns_per_rad * du_dc
+        by_a[i] *= du_dc * columns_per_rad
+        by_b[i] = by_a[i] * height[i]
+        if not shown:
+            crossing[i] = np.nan
+            by_a[i] = 0.0
+            by_b[i] = 0.0
+
+
 @njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"}, forceinline=True)
+def _weighted_sums(
+    grey: NDArray[np.uint8], first: NDArray[np.float32], second: NDArray[np.float32]
+) -> tuple[np.float32, np.float32]:
+    """Grey values by two sets of weights of sum 0."""
+    one = other = np.float32(0.0)
+    for k in range(len(grey)):
+        value = np.float32(grey[k]) - MIDDLE_GREY
+        one += first[k] * value
+        other += second[k] * value
+    return one, other
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _see_rows(
+    image: NDArray[np.uint8], row: NDArray[np.int32], crossing: FloatArray,
+    weights: NDArray[np.float32], seen: FloatArray,
+) -> int:  # fmt: skip
+    """What two filters see where a line crosses its rows; 0 where windows leave the image.
+
+    Parameters
+    ----------
+    image : (H, W) uint8
+        Grey values.
+    row, crossing : (N,) int32, float64
+        Rows and columns.
+    weights : (2, SUBPIXELS, 2 half) float32
+        Of the filters.
+    seen : (3, N) float64
+        Sums of both filters; distances of the crossings from the positions they are tabulated for.
+
+    Returns
+    -------
+    int
+        The number of rows whose windows are in the image.
+    """
+    one, other, off = seen[0], seen[1], seen[2]
+    first, second = weights[0], weights[1]
+    half = weights.shape[2] // 2
+    rightmost = image.shape[1] - 1 - half
+    used = 0
+    for i in range(len(row)):
+        x = crossing[i]
+        one[i] = other[i] = off[i] = 0.0
+        if x > half and x < rightmost:
+            j = int(x)
+            node = int((x - j) * SUBPIXELS)
+            grey = image[row[i], j - half + 1 : j + half + 1]
+            one[i], other[i] = _weighted_sums(grey, first[node], second[node])
+            off[i] = x - j - (node + 0.5) / SUBPIXELS
+            used += 1
+    return used
+
+
+@njit(cache=True, error_model="numpy")
+def _newton_sums(
+    slope: FloatArray, bend: FloatArray, off: FloatArray, by_a: FloatArray, by_b: FloatArray
+) -> tuple[float, float, float, float, float, float, float, float]:
+    """Gradient, Hessian, and the sum of the rows' own gradients' products, by a and b."""
+    g_a = g_b = h_aa = h_ab = h_bb = m_aa = m_ab = m_bb = 0.0
+    for i in range(len(slope)):
+        own = slope[i] + off[i] * bend[i]
+        own_a, own_b = own * by_a[i], own * by_b[i]
+        g_a += own_a
+        g_b += own_b
+        h_aa += bend[i] * by_a[i] * by_a[i]
+        h_ab += bend[i] * by_a[i] * by_b[i]
+        h_bb += bend[i] * by_b[i] * by_b[i]
+        m_aa += own_a * own_a
+        m_ab += own_a * own_b
+        m_bb += own_b * own_b
+    return g_a, g_b, h_aa, h_ab, h_bb, m_aa, m_ab, m_bb
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def newton_step(
+    image: NDArray[np.uint8], crossings: Crossings, weights: NDArray[np.float32], sign: float
+) -> NewtonStep:
+    """The step to where a line's rows have the largest response together.
+
+    Parameters
+    ----------
+    image : (H, W) uint8
+        Grey values.
+    crossings : Crossings
+        Where the line crosses its rows.
+    weights : (2, SUBPIXELS, 2 half) float32
+        Of the response's first and second derivative.
+    sign : float
+        1 where the image is brighter on the right, else -1.
+
+    Returns
+    -------
+    NewtonStep
+        NaN where there is no maximum at this scale.
+    """
+    seen, n = crossings.seen, len(crossings.row)
+    used = _see_rows(image, crossings.row, crossings.column, weights, seen)
+    g_a, g_b, h_aa, h_ab, h_bb, m_aa, m_ab, m_bb = _newton_sums(
+        seen[0, :n], seen[1, :n], seen[2, :n], crossings.by_a, crossings.by_b
+    )
+    determinant = h_aa * h_bb - h_ab * h_ab
+    if used < 5 or not (sign * h_aa < 0.0 and determinant > 1e-12 * h_aa * h_bb):
+        return NewtonStep(np.nan, np.nan, np.nan, np.nan, np.nan)
+    i_aa, i_ab, i_bb = h_bb / determinant, -h_ab / determinant, h_aa / determinant
+    # Two parameters were fitted to the same rows.
+    scale = used / (used - 2.0)
+    left_aa, left_ab = i_aa * m_aa + i_ab * m_ab, i_aa * m_ab + i_ab * m_bb
+    left_ba, left_bb = i_ab * m_aa + i_bb * m_ab, i_ab * m_ab + i_bb * m_bb
+    return NewtonStep(
+        -(i_aa * g_a + i_ab * g_b),
+        -(i_ab * g_a + i_bb * g_b),
+        scale * (left_aa * i_aa + left_ab * i_ab),
+        scale * (left_aa * i_ab + left_ab * i_bb),
+        scale * (left_ba * i_ab + left_bb * i_bb),
+    )
+
+
+@njit(cache=True, error_model="numpy")
+def _move(crossings: Crossings, change_a: float, change_b: float) -> float:
+    """Move crossings as the line does; return how far the one that moves most does, pixels."""
+    column, by_a, by_b = crossings.column, crossings.by_a, crossings.by_b
+    largest = 0.0
+    for i in range(len(column)):
+        change = change_a * by_a[i] + change_b * by_b[i]
+        column[i] += change
+        largest = max(largest, abs(change))
+    return largest
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _climb(
+    image: NDArray[np.uint8], crossings: Crossings, filters: StepFilters, sign: float,
+    middle: float, pixel: float,
+) -> NewtonStep:  # fmt: skip
+    """All steps of a line together, as far as they lead, and its covariance after the last."""
+    a = b = 0.0
+    aa = ab = bb = np.nan
+    moved_px = np.inf
+    for step in range(len(filters.farthest)):
+        again = step > 0 and filters.begin[step] == filters.begin[step - 1]
+        if again and moved_px <= _STILL_PX:
+            continue
+        taps, begin = 2 * filters.half[step], filters.begin[step]
+        weights = filters.derivatives[begin : begin + 2 * SUBPIXELS * taps]
+        newton = newton_step(image, crossings, weights.reshape(2, SUBPIXELS, taps), sign)
+        # Where there is no maximum at this scale, the result of the coarser ones is kept.
+        change = abs(newton.change_a + newton.change_b * middle)
+        if not change <= filters.farthest[step] * pixel:
+            break
+        a += newton.change_a
+        b += newton.change_b
+        aa, ab, bb = newton.aa, newton.ab, newton.bb
+        moved_px = _move(crossings, newton.change_a, newton.change_b)
+    return NewtonStep(a, b, aa, ab, bb)
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
 def refine_lines(
     image: NDArray[np.uint8], strip: Strip, tracks: LineTracks, lines: Eigenlines,
     filters: StepFilters,
@@ -364,151 +601,32 @@ def refine_lines(
     line, covariance, shift_px, contrast, sharpness
         See `LineFits`; NaN (sharpness 1) where no step was made.
     """
-    columns_of, bearing = strip.column, strip.bearing
-    sign, bounds, row, column = tracks.polarity, tracks.bounds, tracks.row, tracks.column
-    reference, pixel, middle, rise = lines.reference, lines.pixel, lines.middle, lines.rise
-    point_off, tracked_line = lines.off, lines.line
-    half, begin_of, farthest = filters.half, filters.begin, filters.farthest
-    height_weights, derivatives = filters.height, filters.derivatives
-    count = len(sign)
+    count = len(tracks.polarity)
     line = np.full((count, 2), np.nan)
     covariance = np.full((count, 2, 2), np.nan)
     shift_px = np.full(count, np.nan)
     contrast = np.full(count, np.nan)
     sharpness = np.ones(count)
-    height, width = image.shape
-    grey_values = image.reshape(-1)
-    # Up to a whole number of vectors, behind the last row.
-    crossing = np.empty(height + ROWS)
-    by_a = np.empty(height + ROWS)
-    by_b = np.empty(height + ROWS)
-    row_begin = np.empty(height + ROWS, np.int32)
-    near = np.empty(height, np.int32)
-    turn = np.empty(height)
-    height_of = np.empty(height)
-    turn_by_a = np.empty(height)
-    bearings = np.empty(height)
-    next_bearings = np.empty(height)
-    columns = np.empty(height, np.float32)
-    next_columns = np.empty(height, np.float32)
-    for t in range(len(sign)):
-        begin, end = bounds[t], bounds[t + 1]
-        a = tracked_line[t, 0]
-        b = tracked_line[t, 1]
-        refined = False
-        if not math.isfinite(a):
+    scratch = np.empty((9, len(image)))
+    for t in range(count):
+        if not math.isfinite(lines.line[t, 0]):
             continue
-        phi = reference[t]
-        n = end - begin
-        # Views, so that the compiler knows that indices are not negative.
-        own_row = row[begin:end]
-        own_column = column[begin:end]
-        own_rise = rise[begin:end]
-        own_off = point_off[begin:end]
-        # In loops that become vectors, all but one; that is why it is counted, not maximised.
-        wide = 0
-        for i in range(n):
-            # Z depends on X in second order only: one repetition settles it.
-            x = a + b * own_rise[i]
-            z = own_rise[i] * math.sqrt(1.0 + x * x)
-            x = a + b * z
-            wide += abs(x) > _SMALL
-            turn[i] = _arctan_series(x)
-            height_of[i] = z
-            turn_by_a[i] = 1.0 / (1.0 + x * x)
-        if wide > 0:
-            for i in range(n):
-                turn[i] = math.atan(a + b * height_of[i])
-        j = min(max(int(own_column[0]), 1), width - 2)
-        columns_about = 2.0 / (bearing[j + 1] - bearing[j - 1])
-        rightmost = np.float64(width - 1)
-        for i in range(n):
-            # To a hundredth of a column; it decides between which columns it is.
-            at = own_column[i] + (turn[i] - own_off[i]) * columns_about
-            inside = (at >= 0.0) & (at <= rightmost)
-            near[i] = np.int32(at if inside else -1.0)
-        for i in range(n):
-            v = own_row[i]
-            row_begin[i] = v * width
-            j = min(max(near[i], 0), width - 2)
-            bearings[i] = bearing[j]
-            next_bearings[i] = bearing[j + 1]
-            group = j // STEP
-            base = min(max(group * STEP - MARGIN, 0), width - LANES)
-            place = (group * height + v) * LANES + j - base
-            columns[i] = columns_of[place]
-            next_columns[i] = columns_of[place + 1]
-        for i in range(n):
-            columns_per_rad = 1.0 / (next_bearings[i] - bearings[i])
-            at = (phi + turn[i] - bearings[i]) * columns_per_rad
-            du_dc = next_columns[i] - columns[i]
-            # Beside it a vertical may have ended.
-            shown = (near[i] >= 0) & (abs(du_dc) < np.inf)
-            crossing[i] = columns[i] + at * du_dc if shown else np.nan
-            moved = du_dc * columns_per_rad * turn_by_a[i]
-            by_a[i] = moved if shown else 0.0
-            by_b[i] = moved * height_of[i] if shown else 0.0
-        blocks = (n + ROWS - 1) // ROWS
-        for i in range(n, blocks * ROWS):
-            row_begin[i] = 0
-            crossing[i] = np.nan
-            by_a[i] = 0.0
-            by_b[i] = 0.0
-        largest_change = math.inf
-        for step in range(len(farthest)):
-            if step > 0 and begin_of[step] == begin_of[step - 1] and largest_change <= _STILL_PX:
-                continue
-            reach = half[step]
-            sums = newton_sums(
-                grey_values, row_begin, crossing, by_a, by_b, blocks, derivatives,
-                2 * begin_of[step], reach, float(reach), float(width - 1 - reach),
-            )  # fmt: skip
-            hessian_aa = sign[t] * sums[0]
-            hessian_ab = sign[t] * sums[1]
-            hessian_bb = sign[t] * sums[2]
-            gradient_a = sign[t] * sums[3]
-            gradient_b = sign[t] * sums[4]
-            meat_aa = sums[5]
-            meat_ab = sums[6]
-            meat_bb = sums[7]
-            used = int(sums[8])
-            determinant = hessian_aa * hessian_bb - hessian_ab * hessian_ab
-            # No maximum here at this scale: the result of the coarser ones is kept.
-            if used < 5 or not (hessian_aa < 0.0 and determinant > 1e-12 * hessian_aa * hessian_bb):
-                break
-            inverse_aa = hessian_bb / determinant
-            inverse_ab = -hessian_ab / determinant
-            inverse_bb = hessian_aa / determinant
-            change_a = -(inverse_aa * gradient_a + inverse_ab * gradient_b)
-            change_b = -(inverse_ab * gradient_a + inverse_bb * gradient_b)
-            if abs(change_a + change_b * middle[t]) > farthest[step] * pixel[t]:
-                break
-            a += change_a
-            b += change_b
-            largest_change = move_crossings(crossing, by_a, by_b, blocks, change_a, change_b)
-            left_aa = inverse_aa * meat_aa + inverse_ab * meat_ab
-            left_ab = inverse_aa * meat_ab + inverse_ab * meat_bb
-            left_ba = inverse_ab * meat_aa + inverse_bb * meat_ab
-            left_bb = inverse_ab * meat_ab + inverse_bb * meat_bb
-            # Two parameters were fitted to the same rows.
-            scale = used / (used - 2.0)
-            covariance[t, 0, 0] = scale * (left_aa * inverse_aa + left_ab * inverse_ab)
-            covariance[t, 0, 1] = scale * (left_aa * inverse_ab + left_ab * inverse_bb)
-            covariance[t, 1, 0] = covariance[t, 0, 1]
-            covariance[t, 1, 1] = scale * (left_ba * inverse_ab + left_bb * inverse_bb)
-            refined = True
-        if not refined:
+        sign, middle, pixel = tracks.polarity[t], lines.middle[t], lines.pixel[t]
+        crossings = _cross_rows(strip, tracks, lines, t, scratch)
+        steps = _climb(image, crossings, filters, sign, middle, pixel)
+        if np.isnan(steps.aa):
             continue
-        line[t, 0] = a
-        line[t, 1] = b
-        moved = a - tracked_line[t, 0] + (b - tracked_line[t, 1]) * middle[t]
-        shift_px[t] = abs(moved) / pixel[t]
-        margin = max(half[-2], half[-1])
-        fine_height, coarse_height, rows = heights(
-            grey_values, row_begin, crossing, blocks, height_weights, begin_of[-2], half[-2],
-            begin_of[-1], half[-1], float(margin), float(width - 1 - margin),
-        )  # fmt: skip
-        contrast[t] = sign[t] * fine_height / rows if rows > 0.0 else 0.0
-        sharp = fine_height / coarse_height if sign[t] * coarse_height > 0.0 else 1.0
+        line[t, 0] = lines.line[t, 0] + steps.change_a
+        line[t, 1] = lines.line[t, 1] + steps.change_b
+        covariance[t, 0, 0] = steps.aa
+        covariance[t, 0, 1] = covariance[t, 1, 0] = steps.ab
+        covariance[t, 1, 1] = steps.bb
+        shift_px[t] = abs(steps.change_a + steps.change_b * middle) / pixel
+        seen = crossings.seen
+        rows = _see_rows(image, crossings.row, crossings.column, filters.heights, seen)
+        n = len(crossings.row)
+        fine, coarse = seen[0, :n].sum(), seen[1, :n].sum()
+        contrast[t] = sign * fine / rows if rows > 0 else 0.0
+        sharp = fine / coarse if sign * coarse > 0.0 else 1.0
         sharpness[t] = min(max(sharp, 0.0), 1.0)
     return line, covariance, shift_px, contrast, sharpness

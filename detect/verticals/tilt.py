@@ -136,11 +136,6 @@ def known(tilt: TiltEstimate) -> TiltEstimate | None:
     return None if math.isnan(tilt.pitch_rad) else tilt
 
 
-def level_rotation(pitch_rad: float, roll_rad: float) -> FloatArray:
-    """(3, 3) rotation exp([pitch, roll, 0]x) that turns measured directions level."""
-    return np.asarray(level_matrix(pitch_rad, roll_rad))
-
-
 @njit(cache=True, error_model="numpy")
 def no_tilt() -> TiltEstimate:
     """The value in compiled code for no estimate."""

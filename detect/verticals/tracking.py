@@ -1,4 +1,4 @@
-"""Tracking: starts at maxima of the response near the horizon, and edges followed from there.
+"""Tracking: edges followed up and down from where they cross the horizon.
 
 In each row the expected position of an edge moves as verticals do in a camera of the given tilt;
 the highest of the three responses round it, and the parabola through this and its neighbours, give
@@ -17,65 +17,11 @@ from numba import njit
 from numpy.typing import NDArray
 
 from detect.line_settings import LineSettings
-from detect.uncounted import uncounted_contracting
-from detect.vector_code import LANES
-from detect.verticals.response import (
-    ResponseOnDemand,
-    line_filter,
-    padded_pixels,
-    response_on_demand,
-    start_response,
-    strip_of,
-)
-from detect.verticals.response_kernels import MARGIN, STEP, respond
-from detect.verticals.tilt import TiltEstimate
-from lut.verticals import VerticalTable
+from detect.verticals.response import FloatArray, Strip, StripResponse, extend
+from detect.verticals.starts import LineStarts
 
-FloatArray = NDArray[np.float64]
-
-#: A line's starts on neighbouring rows of the band are no more columns apart.
-SUPPORT = 2
-#: Maxima are flagged in vectors of bytes, of which this many are scanned at a time.
-_WORD = 8
-#: Number of classes into which scores are sorted first, before they are sorted within each.
-_CLASSES = 512
 #: Rows that are filtered ahead of a track.
-_AHEAD = 12
-
-
-class Maxima(NamedTuple):
-    """Maxima of the response along the rows of the band, row by row from the left.
-
-    Attributes
-    ----------
-    level, column : (N,) int32
-        Rows of the band, and columns of the strip.
-    sign : (N,) float32
-        1 where the response is positive, else -1.
-    """
-
-    level: NDArray[np.int32]
-    column: NDArray[np.int32]
-    sign: NDArray[np.float32]
-
-
-class LineStarts(NamedTuple):
-    """Where tracks start: maxima of the response near the horizon, the highest first.
-
-    Attributes
-    ----------
-    row, column : (N,) int32
-        Strip pixels.
-    polarity : (N,) float32
-        1 where the image is brighter on the right, -1 on the left.
-    score : (N,) float32
-        Absolute response there.
-    """
-
-    row: NDArray[np.int32]
-    column: NDArray[np.int32]
-    polarity: NDArray[np.float32]
-    score: NDArray[np.float32]
+_AHEAD = 8
 
 
 class LineTracks(NamedTuple):
@@ -183,187 +129,6 @@ def following_of(
     )
 
 
-def line_starts(
-    image: NDArray[np.uint8], table: VerticalTable, settings: LineSettings
-) -> LineStarts:
-    """Maxima of the response on the horizon and on rows near it.
-
-    Parameters
-    ----------
-    image : (H, W) uint8
-        Grey values.
-    table : VerticalTable
-        Of the image's camera.
-    settings : LineSettings
-        Band round the horizon, threshold; the filter.
-
-    Returns
-    -------
-    LineStarts
-        The highest first.
-    """
-    response, band = start_response(image, table, settings)
-    maxima = find_maxima(response, band.row, settings.threshold, band.supported)
-    return ordered_starts(response, band.row, maxima)
-
-
-def line_tracks(
-    image: NDArray[np.uint8] | ResponseOnDemand,
-    starts: LineStarts,
-    table: VerticalTable,
-    settings: LineSettings,
-    tilt: TiltEstimate | None = None,
-    enough: int = ALL_EDGES,
-) -> LineTracks:
-    """Follow the edges through the starts up and down.
-
-    Parameters
-    ----------
-    image : (H, W) uint8 or ResponseOnDemand
-        Grey values, or the response to them as far as it has been evaluated; that is extended.
-    starts : LineStarts
-        Where to start; those on an edge already followed are left out.
-    table : VerticalTable
-        Of the image's camera.
-    settings : LineSettings
-        Threshold, gaps, border.
-    tilt : TiltEstimate, optional
-        If given, edges are only followed along the verticals that it predicts; else in any
-        direction.
-    enough : int, optional
-        No more edges are followed once this many could be lines by their length and response.
-
-    Returns
-    -------
-    LineTracks
-        One for each edge.
-    """
-    if not isinstance(image, ResponseOnDemand):
-        window = line_filter(settings)
-        image = response_on_demand(padded_pixels(image, window), strip_of(table), window)
-    following = following_of(settings, table.row_aspect, tilt is not None, enough)
-    pitch, roll = (0.0, 0.0) if tilt is None else (tilt.pitch_rad, tilt.roll_rad)
-    return follow_edges(image, starts, following, float(pitch), float(roll))
-
-
-@njit(cache=True, error_model="numpy")
-def find_maxima(
-    response: NDArray[np.float32], band_row: NDArray[np.int32], threshold: float, supported: bool
-) -> Maxima:
-    """Maxima of the response along rows parallel to the horizon.
-
-    Parameters
-    ----------
-    response : (K, W) float32
-        See `detect.verticals.response.start_response`.
-    band_row : (K, W) int32
-        Image rows of these; -1 where tracks may not start.
-    threshold : float
-        Least absolute response.
-    supported : bool
-        Leave out maxima beside which there is none of the same sign on either neighbouring row.
-    """
-    levels, width = response.shape
-    least = np.float32(threshold)
-    inner = max(width - 2, 0)
-    # Column c of row k has its byte at [k + 1, c + SUPPORT]: 1 for positive maxima, 2 for others.
-    length = -(-(width + 2 * SUPPORT) // _WORD) * _WORD
-    kinds = np.zeros((levels + 2, length), np.uint8)
-    for k in range(levels if inner > 0 else 0):
-        lefts = response[k, :inner]
-        heres = response[k, 1 : inner + 1]
-        rights = response[k, 2 : inner + 2]
-        allowed = band_row[k, 1 : inner + 1]
-        own = kinds[k + 1, SUPPORT + 1 : SUPPORT + 1 + inner]
-        for i in range(inner):
-            left = lefts[i]
-            here = heres[i]
-            right = rights[i]
-            rising = (here >= least) & (left < here) & (right <= here) & (allowed[i] >= 0)
-            falling = (here <= -least) & (left > here) & (right >= here) & (allowed[i] >= 0)
-            own[i] = np.uint8(rising) | (np.uint8(falling) << np.uint8(1))
-    near = np.zeros((levels + 2, length), np.uint8)
-    if supported:
-        for k in range(1, levels + 1):
-            wide = near[k, SUPPORT : SUPPORT + width]
-            for shift in range(2 * SUPPORT + 1):
-                beside = kinds[k, shift : shift + width]
-                for i in range(width):
-                    wide[i] |= beside[i]
-    level = np.empty(levels * width, np.int32)
-    column = np.empty(len(level), np.int32)
-    sign = np.empty(len(level), np.float32)
-    n = 0
-    for k in range(1, levels + 1):
-        if supported:
-            own = kinds[k]
-            above = near[k - 1]
-            below = near[k + 1]
-            # `near` of this row is not needed any more but by the next one.
-            for i in range(length):
-                own[i] &= above[i] | below[i]
-        words = kinds[k].view(np.uint64)
-        for word in range(len(words)):
-            if words[word] == 0:
-                continue
-            for i in range(_WORD * word, _WORD * word + _WORD):
-                kind = kinds[k, i]
-                if kind:
-                    level[n] = k - 1
-                    column[n] = i - SUPPORT
-                    sign[n] = 1.0 if kind == 1 else -1.0
-                    n += 1
-    return Maxima(level[:n], column[:n], sign[:n])
-
-
-@njit(cache=True, error_model="numpy")
-def strongest_first(score: NDArray[np.float32]) -> NDArray[np.int32]:
-    """Indices of scores from 0 to 1, the largest first; of equal ones the first is first."""
-    count = len(score)
-    begin = np.zeros(_CLASSES + 1, np.int32)
-    kind = np.empty(count, np.int32)
-    for i in range(count):
-        share = np.float32(1.0) - score[i]
-        kind[i] = min(max(int(share * np.float32(_CLASSES)), 0), _CLASSES - 1)
-        begin[kind[i] + 1] += 1
-    for k in range(_CLASSES):
-        begin[k + 1] += begin[k]
-    order = np.empty(count, np.int32)
-    filled = begin.copy()
-    for i in range(count):
-        at = filled[kind[i]]
-        filled[kind[i]] += 1
-        while at > begin[kind[i]] and score[order[at - 1]] < score[i]:
-            order[at] = order[at - 1]
-            at -= 1
-        order[at] = i
-    return order
-
-
-@njit(cache=True, error_model="numpy")
-def ordered_starts(
-    response: NDArray[np.float32], band_row: NDArray[np.int32], maxima: Maxima
-) -> LineStarts:
-    """Maxima, the highest first."""
-    level, column, sign = maxima
-    count = len(level)
-    score = np.empty(count, np.float32)
-    for i in range(count):
-        score[i] = abs(response[level[i], column[i]])
-    order = strongest_first(score)
-    row_of = np.empty(count, np.int32)
-    column_of = np.empty(count, np.int32)
-    sign_of = np.empty(count, np.float32)
-    score_of = np.empty(count, np.float32)
-    for k in range(count):
-        i = order[k]
-        row_of[k] = band_row[level[i], column[i]]
-        column_of[k] = column[i]
-        sign_of[k] = sign[i]
-        score_of[k] = score[i]
-    return LineStarts(row_of, column_of, sign_of, score_of)
-
-
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _top_of_parabola(left: np.float32, centre: np.float32, right: np.float32) -> float:
     """Offset of the maximum of the parabola through three neighbours."""
@@ -371,46 +136,61 @@ def _top_of_parabola(left: np.float32, centre: np.float32, right: np.float32) ->
     return float(0.5 * (left - right) / bend) if bend < 0.0 else 0.0
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
-def _index(number: int) -> np.uint64:
-    """An index that the compiler need not compare with 0."""
-    return np.uint64(number)
-
-
-@njit(cache=True, error_model="numpy", fastmath={"reassoc"})
+@njit(cache=True, error_model="numpy")
 def sum_of(numbers: NDArray[np.float32]) -> float:
-    """The sum, in double precision; additions need not wait for each other."""
+    """The sum, in double precision."""
     total = 0.0
     for i in range(len(numbers)):
         total += numbers[i]
     return total
 
 
-@uncounted_contracting
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _place(column: int, part: float) -> tuple[int, float]:
+    """Whole columns, and what is left, in [-0.5, 0.5).
+
+    Whole columns change seldom: a processor that foresees them works on the next rows before it
+    knows where in this one the edge is.
+    """
+    if part < -0.5 or part >= 0.5:
+        whole = math.floor(part + 0.5)
+        return column + whole, part - whole
+    return column, part
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _evaluate(response: StripResponse, c: int, v: int, direction: int) -> None:
+    """Evaluate the response of verticals c - 1 to c + 1 at row v and at some rows further on."""
+    height = response.value.shape[1]
+    if direction > 0:
+        extend(response, (c - 1, c + 2), (v, min(v + _AHEAD, height)))
+    else:
+        extend(response, (c - 1, c + 2), (max(v - _AHEAD + 1, 0), v + 1))
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _is_known(known: NDArray[np.int32], c: int, v: int) -> bool:
+    return known[c, 0] <= v and v < known[c, 1]
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _follow(
-    lazy: ResponseOnDemand,
-    columns_per_rise: FloatArray,
-    sign: np.float32,
-    row: int,
-    column: float,
-    direction: int,
-    following: Following,
+    response: StripResponse, rise: NDArray[np.float32], columns_per_rise: FloatArray,
+    sign: np.float32, start: tuple[int, float], direction: int, following: Following,
     points: _Points,
-) -> int:
-    """Follow an edge from a row on, that one included; return how many points were written.
+) -> int:  # fmt: skip
+    """Follow an edge from a row and column on, and return how many points there are.
 
     0 if there is none in the first row. Points are written from the middle of the results on, in
     this direction.
     """
-    rise, response, known = lazy.strip.rise, lazy.response, lazy.known
+    # Numba counts references to arrays in tuples wherever they are taken out of these.
+    value, known = response.value, response.known
+    point_row, point_column, point_score = points.row, points.column, points.score
     width, height = rise.shape
-    border = following.border
-    pull = following.pull
-    v = row
-    # The expected position is j + part. Whole columns change seldom: a processor that foresees it
-    # works on the next rows before it knows where in this one the edge is.
-    j = math.floor(column + 0.5)
-    part = column - j
+    border, pull, threshold = following.border, following.pull, following.threshold
+    v = start[0]
+    j, part = _place(0, start[1])
     n = 0
     gap = 0
     while gap <= following.max_gap:
@@ -419,173 +199,160 @@ def _follow(
             if v < border or v > height - 1 - border or j < 1 or j > width - 2:
                 break
             # A vertical leans in the strip of a tilted camera.
-            moved = columns_per_rise[_index(j)] * (
-                rise[_index(j), _index(v)] - rise[_index(j), _index(v - direction)]
-            )
+            moved = columns_per_rise[j] * (rise[j, v] - rise[j, v - direction])
             if not math.isfinite(moved):
                 break
-            part += moved
-            if part < -0.5 or part >= 0.5:
-                whole = math.floor(part + 0.5)
-                j += whole
-                part -= whole
+            j, part = _place(j, part + moved)
         if j < 2 or j > width - 3:
             break
-        group = j // STEP
-        if not known[_index(group), 0] <= v < known[_index(group), 1]:
-            begin = max(v - (_AHEAD - 1 if direction < 0 else 0), 0)
-            end = min(v + (_AHEAD - 1 if direction > 0 else 0), height - 1) + 1
-            if known[group, 0] < known[group, 1]:
-                if v < known[group, 0]:
-                    end = known[group, 0]
-                else:
-                    begin = known[group, 1]
-                known[group, 0] = min(begin, known[group, 0])
-                known[group, 1] = max(end, known[group, 1])
-            else:
-                known[group, 0] = begin
-                known[group, 1] = end
-            respond(lazy, group, begin, end)
-        base = min(max(group * STEP - MARGIN, 0), width - LANES)
-        at = (group * height + v) * LANES + j - base
-        left = sign * response[_index(at - 1)]
-        centre = sign * response[_index(at)]
-        right = sign * response[_index(at + 1)]
-        off = -part
-        # A fourth neighbour, if the highest of three is not the one in the middle.
-        if left > centre and left > right:
-            off -= 1.0
-            right = centre
-            centre = left
-            left = sign * response[_index(at - 2)]
-        elif right > centre:
-            off += 1.0
-            left = centre
-            centre = right
-            right = sign * response[_index(at + 2)]
-        seen = False
-        if centre >= following.threshold and centre >= left and centre >= right:
+        near = j
+        while True:
+            if not (
+                _is_known(known, near - 1, v)
+                and _is_known(known, near, v)
+                and _is_known(known, near + 1, v)
+            ):
+                _evaluate(response, near, v, direction)
+            left = sign * value[near - 1, v]
+            centre = sign * value[near, v]
+            right = sign * value[near + 1, v]
+            # Once to the side if the highest of the three is not the one in the middle.
+            if near != j or not (left > centre or right > centre):
+                break
+            near += -1 if left > centre and left > right else 1
+        off = near - j - part
+        seen = centre >= threshold and centre >= left and centre >= right
+        if seen:
             off += _top_of_parabola(left, centre, right)
-            # A start is known to a column only.
-            seen = n == 0 or abs(off) <= following.reach
-            if seen:
-                place = _index(height + direction * n)
-                points.row[place] = v
-                points.column[place] = j + (part + off)
-                points.score[place] = centre
-                # The start counts as the expected position, not as a point that confirms it.
-                yielding = pull if pull * (n + 1.0) >= 1.0 else 1.0 / (n + 1.0)
-                part += (yielding if n > 0 else 1.0) * off
-                if part < -0.5 or part >= 0.5:
-                    whole = math.floor(part + 0.5)
-                    j += whole
-                    part -= whole
-                n += 1
-        if n == 0:
+        # A start is known to a column only.
+        if seen and (n == 0 or abs(off) <= following.reach):
+            at = height + direction * n
+            point_row[at] = v
+            point_column[at] = j + (part + off)
+            point_score[at] = centre
+            # The start counts as the expected position, not as a point that confirms it.
+            yielding = max(pull, 1.0 / (n + 1.0)) if n > 0 else 1.0
+            j, part = _place(j, part + yielding * off)
+            n += 1
+            gap = 0
+        elif n == 0:
             break
-        gap = 0 if seen else gap + 1
+        else:
+            gap += 1
     return n
 
 
 @njit(cache=True, error_model="numpy")
+def _with_points(points: _Points, n: int, capacity: int) -> _Points:
+    """The first n points, and room for more."""
+    row = np.empty(capacity, np.int32)
+    column = np.empty(capacity, np.float64)
+    score = np.empty(capacity, np.float32)
+    row[:n] = points.row[:n]
+    column[:n] = points.column[:n]
+    score[:n] = points.score[:n]
+    return _Points(row, column, score)
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _follow_both_ways(
+    response: StripResponse, rise: NDArray[np.float32], columns_per_rise: FloatArray,
+    sign: np.float32, start: tuple[int, int], following: Following, points: _Points,
+) -> tuple[int, int]:  # fmt: skip
+    """Follow an edge up and down; its points are from the first place to before the second."""
+    middle = rise.shape[1]
+    begin = end = middle
+    column = float(start[1])
+    for direction in (-1, 1):
+        n = _follow(
+            response, rise, columns_per_rise, sign, (start[0], column), direction, following, points
+        )
+        # Starts were searched less thoroughly.
+        if n == 0:
+            break
+        if direction < 0:
+            begin, end = middle + 1 - n, middle + 1
+            column = points.column[middle]
+        else:
+            end = middle + n
+    return begin, end
+
+
+@njit(cache=True, error_model="numpy")
+def _mark(
+    followed: NDArray[np.bool_], lowest: int, row: NDArray[np.int32], column: FloatArray
+) -> None:
+    """Mark the three columns round points as followed, on rows on which there are starts."""
+    rows, width = followed.shape
+    for i in range(len(row)):
+        if 0 <= row[i] - lowest < rows:
+            j = math.floor(column[i] + 0.5)
+            for k in range(max(0, j - 1), min(width, j + 2)):
+                followed[row[i] - lowest, k] = True
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
 def follow_edges(
-    lazy: ResponseOnDemand, starts: LineStarts, following: Following, pitch: float, roll: float
-) -> LineTracks:
+    response: StripResponse, strip: Strip, starts: LineStarts, following: Following,
+    tilt_rad: tuple[float, float],
+) -> LineTracks:  # fmt: skip
     """Follow edges up and down from starts; a start on an edge already followed is left out.
 
     Parameters
     ----------
-    lazy : ResponseOnDemand
-        The response.
+    response : StripResponse
+        The response; it is evaluated wherever edges go.
+    strip : Strip
+        The table.
     starts : LineStarts
         Where to start, in this order.
     following : Following
         How.
-    pitch, roll : float
-        Tilt that the edges are expected to show (rad); 0 for none.
+    tilt_rad : (float, float)
+        Pitch and roll that the edges are expected to show; 0 for none.
     """
-    strip = lazy.strip
-    start_row, start_column, start_sign = starts.row, starts.column, starts.polarity
     width, height = strip.rise.shape
-    columns_per_rise = pitch * strip.lean_by_pitch + roll * strip.lean_by_roll
-    lowest = height
-    highest = 0
-    for v in start_row:
-        lowest = min(lowest, v)
-        highest = max(highest, v)
-    # Only rows on which there are starts matter.
-    followed = np.zeros((2, max(highest - lowest + 1, 0), width), np.bool_)
-    capacity = 16 * height
-    row = np.empty(capacity, np.int32)
-    column = np.empty(capacity, np.float64)
-    score = np.empty(capacity, np.float32)
-    sign = np.empty(len(start_row), np.float64)
-    bounds = np.zeros(len(start_row) + 1, np.int64)
-    # One track; its start is in the middle.
-    own_row = np.empty(2 * height + 1, np.int32)
-    own_column = np.empty(2 * height + 1, np.float64)
-    own_score = np.empty(2 * height + 1, np.float32)
-    own = _Points(own_row, own_column, own_score)
+    columns_per_rise = tilt_rad[0] * strip.lean_by_pitch + tilt_rad[1] * strip.lean_by_roll
+    count = len(starts.row)
+    lowest = starts.row.min() if count > 0 else 0
+    highest = starts.row.max() if count > 0 else -1
+    # By polarity; only rows on which there are starts matter.
+    followed = np.zeros((2, highest - lowest + 1, width), np.bool_)
+    empty = _Points(np.empty(0, np.int32), np.empty(0), np.empty(0, np.float32))
+    own = _with_points(empty, 0, 2 * height + 1)
+    found = _with_points(empty, 0, 16 * height)
+    sign = np.empty(count)
+    bounds = np.zeros(count + 1, np.int64)
     tracks = 0
-    n = 0
     counting = 0
     complete = True
-    for start in range(len(start_row)):
+    for start in range(count):
         if counting >= following.enough:
             complete = False
             break
-        v = start_row[start]
-        polarity = start_sign[start]
-        layer = 0 if polarity > 0.0 else 1
-        if followed[layer, v - lowest, start_column[start]]:
+        v, c, polarity = starts.row[start], starts.column[start], starts.polarity[start]
+        marks = followed[0 if polarity > 0.0 else 1]
+        if marks[v - lowest, c]:
             continue
-        begin = height
-        end = height
-        near = float(start_column[start])
-        for direction in range(-1, 2, 2):
-            count = _follow(lazy, columns_per_rise, polarity, v, near, direction, following, own)
-            if count == 0:
-                break
-            if direction < 0:
-                begin = height + 1 - count
-                end = height + 1
-                near = float(own_column[height])
-            else:
-                end = height + count
+        begin, end = _follow_both_ways(
+            response, strip.rise, columns_per_rise, polarity, (v, c), following, own
+        )
         if begin == end:
-            # Starts were searched less thoroughly.
             continue
-        if n + height > capacity:
-            capacity *= 2
-            grown_row = np.empty(capacity, np.int32)
-            grown_row[:n] = row[:n]
-            row = grown_row
-            grown_column = np.empty(capacity, np.float64)
-            grown_column[:n] = column[:n]
-            column = grown_column
-            grown_score = np.empty(capacity, np.float32)
-            grown_score[:n] = score[:n]
-            score = grown_score
-        # Views, so that the compiler knows that indices are not negative.
-        points = end - begin
-        seen_row = own_row[begin:end]
-        seen_column = own_column[begin:end]
-        seen_score = own_score[begin:end]
-        to_row = row[n : n + points]
-        to_column = column[n : n + points]
-        to_score = score[n : n + points]
-        for i in range(points):
-            to_row[i] = seen_row[i]
-            to_column[i] = seen_column[i]
-            to_score[i] = seen_score[i]
-        n += points
-        for i in range(points):
-            if lowest <= seen_row[i] <= highest:
-                j = math.floor(seen_column[i] + 0.5)
-                for k in range(max(0, j - 1), min(width, j + 2)):
-                    followed[layer, _index(seen_row[i] - lowest), _index(k)] = True
+        n, after = bounds[tracks], bounds[tracks] + end - begin
+        if after > len(found.row):
+            found = _with_points(found, n, 2 * len(found.row) + height)
+        found.row[n:after] = own.row[begin:end]
+        found.column[n:after] = own.column[begin:end]
+        found.score[n:after] = own.score[begin:end]
+        _mark(marks, lowest, own.row[begin:end], own.column[begin:end])
         sign[tracks] = polarity
         tracks += 1
-        bounds[tracks] = n
-        counting += points >= following.least_points and sum_of(seen_score) >= following.least_score
-    return LineTracks(sign[:tracks], bounds[: tracks + 1], row[:n], column[:n], score[:n], complete)
+        bounds[tracks] = after
+        score = sum_of(own.score[begin:end])
+        counting += end - begin >= following.least_points and score >= following.least_score
+    n = bounds[tracks]
+    return LineTracks(
+        sign[:tracks], bounds[: tracks + 1], found.row[:n], found.column[:n], found.score[:n],
+        complete,
+    )  # fmt: skip

@@ -11,11 +11,12 @@ from camera import Camera
 from detect.line_settings import DEFAULT
 from detect.lines import detect_lines
 from detect.verticals.judgement import chain_maxima, limits_of, tilt_of_chains
-from detect.verticals.response import start_response, strip_of
+from detect.verticals.response import strip_of
+from detect.verticals.starts import find_maxima, strongest_first
 from detect.verticals.tilt import TiltEstimate, known
-from detect.verticals.tracking import find_maxima, strongest_first
 from lut.verticals import build_vertical_table
 from tests.detect.line_scene import Edge, pinhole, render, tilted
+from tests.detect.verticals.stages import start_response
 
 CAMERA = pinhole(320, 160, 200.0, pitch_deg=10.0, roll_deg=1.0, row_aspect=2.0)
 TABLE = build_vertical_table(CAMERA)

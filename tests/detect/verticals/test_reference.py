@@ -10,10 +10,12 @@ from numpy.typing import NDArray
 
 from detect.line_settings import DEFAULT, PUBLISHED, LineSettings
 from detect.verticals.refinement import fit_eigenlines
-from detect.verticals.response import line_response, start_response, strip_of
-from detect.verticals.tracking import LineStarts, LineTracks, line_tracks
+from detect.verticals.response import line_response, strip_of
+from detect.verticals.starts import LineStarts
+from detect.verticals.tracking import LineTracks
 from lut.verticals import build_vertical_table
 from tests.detect.line_scene import Edge, pinhole, render, tilted
+from tests.detect.verticals.stages import line_tracks, start_response
 from tests.reference import verticals as reference
 
 CAMERA = pinhole(200, 130, 150.0, pitch_deg=12.0, roll_deg=2.0, coef=(0.0, -0.1, 0.0, 0.0, 0.0))

@@ -21,7 +21,7 @@ from detect.verticals.tilt import (
     agree_on_tilt,
     consensus,
     largest_lean,
-    level_rotation,
+    level_matrix,
 )
 from lut.verticals import build_vertical_table
 from tests.detect.line_scene import Edge, pinhole, render, tilted
@@ -41,7 +41,7 @@ def seen_normals(
     bearing = rng.uniform(-0.7, 0.7, count)
     level = np.stack([np.cos(bearing), np.sin(bearing), np.zeros(count)], axis=-1)
     real = level + rng.normal(0.0, 1.0, (count, 1)) * deviation_rad[:, None] * [0.0, 0.0, 1.0]
-    measured = real @ level_rotation(*tilt_rad)
+    measured = real @ level_matrix(*tilt_rad)
     return np.asarray(measured / np.linalg.norm(measured, axis=1, keepdims=True))
 
 
@@ -229,7 +229,7 @@ def test_blurred_edges_among_texture_do_not_overstate_the_tilt(narrow: bool) -> 
 def test_lean_is_what_a_tilted_camera_sees() -> None:
     bearing, pitch, roll = 0.4, 0.01, -0.02
     level = np.array([np.cos(bearing), np.sin(bearing), 0.0])
-    measured = level @ level_rotation(pitch, roll)
+    measured = level @ level_matrix(pitch, roll)
     # In the chart X = a + b Z the plane's normal is (left - a ahead, -b).
     seen = largest_lean(np.array([bearing]), pitch, roll)
     assert abs(measured[2]) == pytest.approx(seen, abs=3e-4)

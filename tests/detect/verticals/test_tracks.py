@@ -11,22 +11,12 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from detect.line_settings import DEFAULT, PUBLISHED, LineSettings
-from detect.vector_code import LANES
-from detect.verticals.band_vector_kernels import RUN, TILE
-from detect.verticals.response import (
-    gaussian_window,
-    line_filter,
-    line_response,
-    padded_pixels,
-    response_on_demand,
-    start_band,
-    start_response,
-    strip_of,
-)
+from detect.verticals.response import gaussian_window, line_response
+from detect.verticals.starts import find_maxima, ordered_starts, start_band
 from detect.verticals.tilt import TiltEstimate
-from detect.verticals.tracking import find_maxima, line_starts, line_tracks, ordered_starts
 from lut.verticals import build_vertical_table
 from tests.detect.line_scene import Edge, pinhole, render, tilted
+from tests.detect.verticals.stages import line_starts, line_tracks, response_to, start_response
 
 CAMERA = pinhole(96, 64, 110.0)
 TABLE = build_vertical_table(CAMERA)
@@ -230,12 +220,11 @@ def test_tracks_see_the_same_response_at_the_borders() -> None:
 def test_what_was_filtered_before_gives_the_same_tracks() -> None:
     image = render(CAMERA, [Edge(0.1, 80.0), Edge(-0.15, -60.0)], grey=100.0)
     starts = line_starts(image, TABLE, DEFAULT)
-    window = line_filter(DEFAULT)
-    lazy = response_on_demand(padded_pixels(image, window), strip_of(TABLE), window)
+    response = response_to(image, TABLE, DEFAULT)
     tilt = TiltEstimate(0.01, -0.02, np.eye(2), 3)
     fresh = line_tracks(image, starts, TABLE, DEFAULT, tilt)
-    line_tracks(lazy, starts, TABLE, DEFAULT)
-    again = line_tracks(lazy, starts, TABLE, DEFAULT, tilt)
+    line_tracks(response, starts, TABLE, DEFAULT)
+    again = line_tracks(response, starts, TABLE, DEFAULT, tilt)
     for name in ("row", "column", "score", "bounds", "polarity"):
         np.testing.assert_array_equal(getattr(again, name), getattr(fresh, name))
 
@@ -256,26 +245,3 @@ def test_response_of_the_starts_is_that_of_the_whole_strip(preset: LineSettings)
         k, c = np.nonzero(band.row >= 0)
         np.testing.assert_allclose(response[k, c], whole[band.row[k, c], c], atol=limit)
         assert np.abs(response).max() > 0.4
-
-
-@pytest.mark.parametrize("width", [240, 237])
-def test_runs_of_neighbours_are_the_pixels_of_the_band(width: int) -> None:
-    camera = pinhole(width, 160, 200.0, pitch_deg=8.0, roll_deg=3.0)
-    band = start_band(build_vertical_table(camera), DEFAULT)
-    assert band.pixel.shape[2] == TILE
-    runs = band.runs.astype(np.int64)
-    assert runs.min() >= 0
-    assert runs.max() + RUN < width * 160
-    lane = np.arange(RUN)
-    which = (lane >= band.lengths[:, :1]).astype(int) + (lane >= band.lengths[:, 1:])
-    told = (np.take_along_axis(runs, which, axis=1) + lane).reshape(-1)
-    pixel = band.pixel.reshape(-1)
-    # Most are such runs: that is what makes it fast.
-    assert len(band.odd) < 0.3 * pixel.size / LANES
-    for at in band.odd:
-        told[at : at + LANES] = pixel[at : at + LANES]
-    np.testing.assert_array_equal(told, pixel)
-    for tile in range(len(band.pixel)):
-        odd = band.odd[band.odd_bounds[tile] : band.odd_bounds[tile + 1]]
-        np.testing.assert_array_equal(odd // band.pixel[0].size, tile)
-    assert band.odd_bounds[-1] == len(band.odd)
