@@ -43,7 +43,7 @@ _RIM_SLACK = 0.07
 _RIM_RADIUS = 0.98
 #: Log-odds by the network that make a disc: its training sees discs and others as they were
 #: gathered, not as often as they occur.
-_TAKEN = 0.5
+_TAKEN = -0.04
 #: Features of the rim, in the order of the network's weights.
 FEATURES = ("rim", "runs", "scatter", "radius", "radius_2", "size", "score")
 
