@@ -132,7 +132,7 @@ def test_steps_of_the_refinement_are_those_of_the_reference(step: int, sign: flo
     change, covariance = reference.newton_step(image, row, at, by, sigma, half, sign)
     # In pixels: weights are tabulated at 64 positions in a pixel, and straight between them.
     moved = by @ np.array([found.change_a, found.change_b])
-    np.testing.assert_allclose(moved, by @ change, atol=5e-3)
+    np.testing.assert_allclose(moved, by @ change, rtol=5e-3, atol=5e-3)
     expected = covariance[[0, 0, 1], [0, 1, 1]]
     off = np.abs(np.array([found.aa, found.ab, found.bb]) - expected)
     assert off.max() <= 0.02 * np.trace(covariance)
