@@ -153,7 +153,8 @@ def detect_lines(
         )
     search = _search(table, settings)
     lines, tracks, fits, judged, tilt, sharpness = find_lines(np.ascontiguousarray(image), search)
-    judgement = Judgement(LineFits(*fits), *judged, TiltEstimate(*tilt))
+    evidence, fate = judged
+    judgement = Judgement(LineFits(*fits), evidence, fate, TiltEstimate(*tilt))
     found = LineDetections(Lines(*lines), LineTracks(*tracks), judgement, sharpness)
     if found.sharpness < search.least_sharpness:
         wider = widened(settings, width_for(found.sharpness, settings))

@@ -30,7 +30,7 @@ from detect.runs.frame import (
 )
 from detect.runs.known import KnownOfFrame
 from detect.sources.times import format_time
-from detect.verticals.identity import carry_ids
+from detect.verticals.detections import carry_ids
 from landmarks import (
     format_levelling,
     format_no_tilt,

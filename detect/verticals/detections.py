@@ -1,8 +1,9 @@
-"""Detections in one image: lines, their tilt, and the tracks behind them."""
+"""Detections in one image: lines, their tilt, the tracks behind them, and IDs of known lines."""
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from functools import cached_property
 from itertools import pairwise
 
@@ -14,9 +15,12 @@ from detect.verticals.judgement import FATES, Judgement
 from detect.verticals.refinement import LineFits
 from detect.verticals.tilt import TiltEstimate, known
 from detect.verticals.tracking import LineTracks
-from landmarks import LineLandmark
+from landmarks import LineLandmark, wrap_angle
 
 FloatArray = NDArray[np.float64]
+
+#: A reference line is the same as a detected one within this bearing, or two standard deviations.
+_SAME_LINE_RAD = np.radians(0.5)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -108,3 +112,38 @@ class LineDetections:
             )
             for xtop, ytop, xbottom, ybottom, alpha, beta, sigma, _ in self.line_numbers.T.tolist()
         )
+
+
+def carry_ids(
+    rows: Sequence[LineLandmark], reference: Sequence[LineLandmark]
+) -> tuple[LineLandmark, ...]:
+    """Give detected lines the IDs of the reference rows that are theirs beyond doubt.
+
+    A reference row whose bearing fits exactly one detected line (within half a degree or two
+    standard deviations) gives that line its IDs; a joined line can get several.
+
+    Parameters
+    ----------
+    rows : sequence of LineLandmark
+        Detected lines of one frame.
+    reference : sequence of LineLandmark
+        The same frame's rows with IDs.
+
+    Returns
+    -------
+    tuple of LineLandmark
+        In the order of `rows`; without an ID (-1) where none fits.
+    """
+    if not rows or not reference:
+        return tuple(rows)
+    alpha = np.array([row.alpha for row in rows])
+    reach = np.maximum(_SAME_LINE_RAD, 2.0 * np.array([row.sigma for row in rows]))
+    ids: list[list[int]] = [[] for _ in rows]
+    for row in reference:
+        fits = np.flatnonzero(np.abs(wrap_angle(alpha - row.alpha)) <= reach)
+        if len(fits) == 1:
+            ids[fits[0]] += [i for i in row.ids if i >= 0]
+    return tuple(
+        dataclasses.replace(row, ids=tuple(dict.fromkeys(own)) if own else (-1,))
+        for row, own in zip(rows, ids)
+    )

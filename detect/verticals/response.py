@@ -34,6 +34,8 @@ FloatArray = NDArray[np.float64]
 
 #: Grey values about 0 keep small variances exact in single precision.
 MIDDLE_GREY = np.float32(128.0)
+#: Verticals whose moments are kept: more than a track needs side by side.
+_PLACES = 16
 #: Weights are padded with zeros to a multiple of this: whole vectors.
 _VECTOR = 8
 
@@ -112,8 +114,12 @@ class StripResponse(NamedTuple):
         Responses, in [-1, 1]; positive where the image is brighter on the right.
     known : (W, 2) int32
         First of the rows in which each vertical has them, and the one after the last.
-    moments : (W, 3, H) float32
-        Means, covariances and mean squares across each vertical.
+    moments : (S, 3, H) float32
+        Means, covariances and mean squares across the verticals evaluated last: few, so that they
+        stay in the cache. That of number c has place c modulo S.
+    taken : (S, 3) int32
+        Number of the vertical in each place, -1 for none; the first row for which there are
+        moments, and the one after the last.
     """
 
     pixels: NDArray[np.uint8]
@@ -124,6 +130,7 @@ class StripResponse(NamedTuple):
     value: NDArray[np.float32]
     known: NDArray[np.int32]
     moments: NDArray[np.float32]
+    taken: NDArray[np.int32]
 
 
 def gaussian_window(sigma: float) -> FloatArray:
@@ -229,7 +236,8 @@ def strip_response(pixels: NDArray[np.uint8], strip: Strip, window: LineFilter) 
         window,
         np.empty((width, height), np.float32),
         np.zeros((width, 2), np.int32),
-        np.empty((width, 3, height), np.float32),
+        np.empty((_PLACES, 3, height), np.float32),
+        np.full((_PLACES, 3), -1, np.int32),
     )
 
 
@@ -244,37 +252,43 @@ def extend(response: StripResponse, verticals: tuple[int, int], rows: tuple[int,
     verticals, rows : (int, int)
         The first, and the one after the last.
     """
-    pixels, window, column, known = (
-        response.pixels, response.window, response.column, response.known
-    )  # fmt: skip
-    moments, value = response.moments, response.value
+    pixels, window, column = response.pixels, response.window, response.column
+    value, known, moments = response.value, response.known, response.moments
     across, along, sums = window.across, window.along, window.along_sums
-    width, above = len(known), window.half_length
-    below = len(along) - above - 1
+    width, half_length = len(known), window.half_length
     leftmost, rightmost = np.float32(window.reach), np.float32(width - 1 - window.reach)
     for c in range(verticals[0], verticals[1]):
         begin, end = rows
-        # Moments are known as far round the known rows as the windows along the vertical go.
-        first, after = begin - above, end + below
         if known[c, 0] == known[c, 1]:
             known[c, 0], known[c, 1] = begin, end
         elif begin < known[c, 0]:
             end = known[c, 0]
-            after = end - above
             known[c, 0] = begin
         elif end > known[c, 1]:
             begin = known[c, 1]
-            first = begin + below
             known[c, 1] = end
         else:
             continue
         top, bottom = response.first_row[c], response.last_row[c] + 1
-        own_column, own_moments, own_value = column[c], moments[c], value[c]
-        span = max(first, top), min(after, bottom)
-        _take_moments(pixels, width, own_column, across, window.reach, span, own_moments)
+        own_column, own_value = column[c], value[c]
+        own_moments, taken = moments[c % _PLACES], response.taken[c % _PLACES]
+        first = max(begin - half_length, top)
+        after = min(end - half_length + len(along) - 1, bottom)
+        if taken[0] != c or first > taken[2] or after < taken[1]:
+            taken[0], taken[1], taken[2] = c, first, first
+        for span in ((first, min(after, taken[1])), (max(first, taken[2]), after)):
+            _take_moments(pixels, width, own_column, across, window.reach, span, own_moments)
+        taken[1], taken[2] = min(taken[1], first), max(taken[2], after)
         span = max(begin, top), min(end, bottom)
         _correlate_along(
-            own_moments, along, sums, above, window.regulariser, span, (top, bottom), own_value
+            own_moments,
+            along,
+            sums,
+            half_length,
+            window.regulariser,
+            span,
+            (top, bottom),
+            own_value,
         )
         # A window that leaves the image has no response, nor has a vertical that is not seen.
         for v in range(begin, end):

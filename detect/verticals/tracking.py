@@ -170,7 +170,7 @@ def _evaluate(response: StripResponse, c: int, v: int, direction: int) -> None:
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _is_known(known: NDArray[np.int32], c: int, v: int) -> bool:
-    return known[c, 0] <= v and v < known[c, 1]
+    return bool(known[c, 0] <= v and v < known[c, 1])
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
@@ -272,7 +272,7 @@ def _follow_both_ways(
             break
         if direction < 0:
             begin, end = middle + 1 - n, middle + 1
-            column = points.column[middle]
+            column = float(points.column[middle])
         else:
             end = middle + n
     return begin, end

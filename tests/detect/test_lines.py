@@ -297,7 +297,7 @@ def test_one_call_goes_the_path_of_the_steps() -> None:
             assert judged.tilt is not None
             tracks = line_tracks(image, starts, TABLE, preset, judged.tilt)
             judged = judge_tracks(image, tracks, TABLE, preset)
-        # Compiled by itself or into another kernel, a sum of single precision has another last digit.
+        # By itself or inside another kernel, a sum of single precision has another last digit.
         for name in tracks._fields[:-1]:
             np.testing.assert_allclose(
                 getattr(found.tracks, name), getattr(tracks, name), atol=2e-6

@@ -142,6 +142,49 @@ def eigenline(bearing_rad: FloatArray, rise: FloatArray, origin_rad: float) -> F
     return np.array([x - b * z, b])
 
 
+def newton_step(
+    image: NDArray[np.uint8], row: NDArray[np.int32], column: FloatArray, by: FloatArray,
+    sigma: float, half: int, sign: float,
+) -> tuple[FloatArray, FloatArray]:  # fmt: skip
+    """A Newton step of a line's a, b towards the steepest grey values, and their covariance.
+
+    Parameters
+    ----------
+    image : (H, W) uint8
+        Grey values.
+    row, column : (N,) int32, float64
+        Where the line crosses its rows; `column` NaN for none.
+    by : (N, 2) float64
+        Derivatives of the columns by a and b.
+    sigma, half : float, int
+        Width of the Gaussian; half the number of pixels that count.
+    sign : float
+        1 where the image is brighter on the right, else -1.
+
+    Returns
+    -------
+    change : (2,) float64
+        To the maximum of the sum over the rows of H (`detect.verticals.refinement`).
+    covariance : (2, 2) float64
+        Sandwich of the inverse Hessian and the rows' own gradients, for two fitted parameters.
+    """
+    gradients, hessian = [], np.zeros((2, 2))
+    for v, u, direction in zip(row, column, by):
+        if not half < u < image.shape[1] - 1 - half:
+            continue
+        pixels = int(u) + np.arange(-half + 1, half + 1)
+        d = pixels - u
+        q = (d / sigma) ** 2
+        first, second = (q - 1.0) * np.exp(-q / 2.0), (q - 3.0) * d / sigma**2 * np.exp(-q / 2.0)
+        grey = sign * image[v, pixels].astype(np.float64)
+        gradients.append((first - first.mean()) @ grey * direction)
+        hessian += (second - second.mean()) @ grey * np.outer(direction, direction)
+    each = np.array(gradients)
+    inverse = np.linalg.inv(hessian)
+    scale = len(each) / (len(each) - 2.0)
+    return -inverse @ each.sum(axis=0), scale * inverse @ (each.T @ each) @ inverse
+
+
 # -- bearings --------------------------------------------------------------------------------------
 
 

@@ -16,7 +16,7 @@ from detect.line_settings import LineSettings
 from detect.run import open_run
 from detect.runs.frame import FramePlan
 from detect.runs.stream import detect_run
-from detect.verticals.identity import carry_ids
+from detect.verticals.detections import carry_ids
 from landmarks import LineLandmark, read_frames, read_tilts
 from tests.detect.line_scene import pinhole
 

@@ -3,13 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from camera import read_camera
 from detect.line_settings import DEFAULT, PUBLISHED, LineSettings
-from detect.verticals.refinement import fit_eigenlines
+from detect.sources.gray import decode_gray
+from detect.verticals.refinement import (
+    SUBPIXELS,
+    Crossings,
+    fit_eigenlines,
+    newton_step,
+    refinement_of,
+)
 from detect.verticals.response import line_response, strip_of
 from detect.verticals.starts import LineStarts
 from detect.verticals.tracking import LineTracks
@@ -18,6 +27,7 @@ from tests.detect.line_scene import Edge, pinhole, render, tilted
 from tests.detect.verticals.stages import line_tracks, start_response
 from tests.reference import verticals as reference
 
+DEMO = Path(__file__).parents[3] / "images" / "e"
 CAMERA = pinhole(200, 130, 150.0, pitch_deg=12.0, roll_deg=2.0, coef=(0.0, -0.1, 0.0, 0.0, 0.0))
 TABLE = build_vertical_table(CAMERA)
 #: A shorter filter of the published kind: that of the preset is as high as a third of the image.
@@ -100,3 +110,42 @@ def test_lines_through_tracks_are_those_of_the_reference() -> None:
         rise = [np.interp(c, columns, table.elevation_tan[v]) for v, c in zip(row, column)]
         expected = reference.eigenline(bearing, np.array(rise), float(fits.reference[0]))
         np.testing.assert_allclose(fits.line[0], expected, rtol=1e-5, atol=1e-7)
+
+
+@pytest.mark.parametrize("step", [0, 1, 3])
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_steps_of_the_refinement_are_those_of_the_reference(step: int, sign: float) -> None:
+    edge = Edge(0.0, 80.0 * sign)
+    grey = 80.0 if sign > 0.0 else 200.0
+    image = render(CAMERA, [edge], grey=grey, noise=2.0, rng=np.random.default_rng(9))
+    filters = refinement_of(DEFAULT)
+    sigma, _ = DEFAULT.refine_steps_px[step]
+    half, begin = int(filters.half[step]), filters.begin[step]
+    weights = filters.derivatives[begin : begin + 4 * half * SUBPIXELS]
+    row = np.arange(20, 110, dtype=np.int32)
+    nearest = int(np.nanargmin(np.abs(TABLE.bearing_rad)))
+    at = TABLE.column[row, nearest].astype(np.float64) + 0.3
+    at[[5, 17]] = np.nan
+    by = np.stack([np.full(len(row), 150.0), 150.0 * (row - 65.0) / 150.0], axis=1)
+    crossings = Crossings(row, at, by[:, 0].copy(), by[:, 1].copy(), np.empty((3, len(row))))
+    found = newton_step(image, crossings, weights.reshape(2, SUBPIXELS, 2 * half), sign)
+    change, covariance = reference.newton_step(image, row, at, by, sigma, half, sign)
+    # In pixels: weights are tabulated at 64 positions in a pixel, and straight between them.
+    moved = by @ np.array([found.change_a, found.change_b])
+    np.testing.assert_allclose(moved, by @ change, rtol=5e-3, atol=5e-3)
+    expected = covariance[[0, 0, 1], [0, 1, 1]]
+    off = np.abs(np.array([found.aa, found.ab, found.bb]) - expected)
+    assert off.max() <= 0.02 * np.trace(covariance)
+
+
+@pytest.mark.parametrize("number", [3, 40])
+def test_responses_to_frames_of_the_demo_run_are_those_of_the_reference(number: int) -> None:
+    camera = read_camera(DEMO / "e.cam")
+    table = build_vertical_table(camera)
+    image = decode_gray((DEMO / "images" / f"e.{number:04d}.jpg").read_bytes(), number)
+    expected = reference.response(image, table, DEFAULT)
+    np.testing.assert_allclose(line_response(image, table, DEFAULT), expected, atol=2e-4)
+    found, band = start_response(image, table, DEFAULT)
+    level, column = np.nonzero(band.row >= 0)
+    off = np.abs(found[level, column] - expected[band.row[level, column], column])
+    assert np.quantile(off, 0.99) <= 0.05
