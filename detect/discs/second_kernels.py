@@ -3,7 +3,7 @@
 Glare or a sun patch beside a disc raises the total variance of its outlines, a cable across it
 leaves much that the fit of a disc does not explain. A person sees the disc all the same. Here the
 candidates are those centres round which the grey value steps in most directions
-(`detect.discs.quality_kernels`). What the two outlines say about the disturbed directions is
+(`detect.discs.quality`). What the two outlines say about the disturbed directions is
 enough to drop most of the clutter among them; round the others the rim is followed, the levels in
 and outside it are compared direction by direction, and a disc is fitted. All of it together is
 weighed by a logistic regression. Its weights are printed by `python -m tools.evaluation
@@ -20,13 +20,12 @@ from numba import njit
 from numpy.typing import NDArray
 
 from detect.discs import fit
-from detect.discs.candidate_kernels import nearest_pixel, strong_and_alone
+from detect.discs.candidates import strong_and_alone, suppress_neighbours
 from detect.discs.evidence_kernels import evidence_of
 from detect.discs.fit import fit_all
 from detect.discs.patch import FitSettings, floor_steps
-from detect.discs.quality_kernels import suppress_neighbours
 from detect.discs.rim import Rim, follow_rim
-from detect.discs.search_kernels import DiscSearch
+from detect.discs.search import DiscSearch, nearest_pixel
 from detect.discs.sectors import Sectors, about_plane, sector_levels
 
 _DIRECTIONS = 16
@@ -231,7 +230,7 @@ def second_looks(
     floor_xy : (H, W, 2) float32
         Floor position of each pixel, metres.
     pixels, contrast, score : (N, 2) int64, (N,) float32, (N,) float64
-        See `detect.discs.centres.Centres`; the contrast's sign says which discs are looked for.
+        See `detect.discs.candidates.Centres`; the contrast's sign says which discs are looked for.
     found_xy : (M, 2) float64
         Places of discs already found, metres.
     search : DiscSearch

@@ -10,7 +10,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from detect.discs import fit
-from detect.discs.candidate_kernels import middles, nearest_pixel, strong_and_alone, worth_a_look
+from detect.discs.candidates import Centres, middles, strong_and_alone, suppress_neighbours
 from detect.discs.descent import PATIENT, Hope
 from detect.discs.evidence_kernels import (
     CLEAR_EVIDENCE,
@@ -23,9 +23,8 @@ from detect.discs.evidence_kernels import (
 )
 from detect.discs.fit import RESULT, fit_disc
 from detect.discs.model import Disc
-from detect.discs.patch import Candidate, FitSettings
+from detect.discs.patch import Candidate, FitSettings, floor_steps
 from detect.discs.positions import refined_covariances
-from detect.discs.quality_kernels import suppress_neighbours
 from detect.discs.rim import follow_rim
 
 #: Candidates whose first look is this much below the required evidence are not fitted in full; more
@@ -56,6 +55,14 @@ _BY_FIT = 0.5
 _WHOLE_RIM = 0.9
 
 
+#: Candidates of a lower quality than this are kept only if the grey value steps in this share
+#: of the directions, by this share of the contrast.
+CLEAR_QUALITY = 0.55
+_LEAST_STEPS = 0.9
+_LEAST_STEP = 0.25
+_DIRECTIONS = np.array([[math.cos(k * math.pi / 8), math.sin(k * math.pi / 8)] for k in range(16)])
+
+
 class DiscSearch(NamedTuple):
     """What is searched for: see `detect.settings.CircleSettings`."""
 
@@ -81,14 +88,11 @@ class DiscSearch(NamedTuple):
 def search_discs(
     image: NDArray[np.uint8],
     floor_xy: NDArray[np.float32],
-    pixels: NDArray[np.int64],
-    quality: NDArray[np.float64],
-    contrast: NDArray[np.float32],
-    search: DiscSearch,
+    centres: Centres,
     weakest: float,
+    search: DiscSearch,
     settings: FitSettings,
-    camera_numbers: NDArray[np.float64],
-    centre: NDArray[np.float64],
+    camera: tuple[NDArray[np.float64], NDArray[np.float64]],
     work: NDArray[Any],
 ) -> tuple[
     NDArray[np.int64],
@@ -104,14 +108,13 @@ def search_discs(
     image : (H, W) uint8
     floor_xy : (H, W, 2) float32
         Floor position of each pixel, metres.
-    pixels, quality, contrast : (N, 2) int64, (N,) float64, (N,) float32
-        See `detect.discs.centres.best_centres`.
-    search : DiscSearch
+    centres : Centres
     weakest : float
         Least contrast, grey levels.
+    search : DiscSearch
     settings : FitSettings
-    camera_numbers, centre : (K,) float64, (3,) float64
-        See `detect.discs.positions.refined_covariances`.
+    camera : (K,) float64, (3,) float64
+        `camera_numbers` and `centre` of `detect.discs.positions.refined_covariances`.
     work : (1,) WORK
         See `detect.discs.fit.working_space`.
 
@@ -125,6 +128,8 @@ def search_discs(
         Square metres.
     evidence : (M,) float64
     """
+    pixels, quality, contrast = centres.pixels, centres.quality, centres.contrast
+    camera_numbers, centre = camera
     # Each disc has several best centres: of those in the middle of it one is enough.
     near = 0.5 * search.separation
     keep = strong_and_alone(pixels, quality, contrast, floor_xy, weakest, near)
@@ -262,6 +267,111 @@ def _with_rim(
             rim.cov_yy,
         )
     return by_rim
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def nearest_pixel(
+    floor_xy: NDArray[np.float32], u: int, v: int, x: float, y: float
+) -> tuple[int, int]:
+    """The pixel that sees the floor nearest to (x, y), starting from one nearby."""
+    height, width = floor_xy.shape[:2]
+    for _ in range(3):
+        u = min(max(u, 1), width - 2)
+        v = min(max(v, 1), height - 2)
+        xu = 0.5 * (floor_xy[v, u + 1, 0] - floor_xy[v, u - 1, 0])
+        yu = 0.5 * (floor_xy[v, u + 1, 1] - floor_xy[v, u - 1, 1])
+        xv = 0.5 * (floor_xy[v + 1, u, 0] - floor_xy[v - 1, u, 0])
+        yv = 0.5 * (floor_xy[v + 1, u, 1] - floor_xy[v - 1, u, 1])
+        area = xu * yv - xv * yu
+        dx = x - floor_xy[v, u, 0]
+        dy = y - floor_xy[v, u, 1]
+        du = (yv * dx - xv * dy) / area
+        dv = (xu * dy - yu * dx) / area
+        if not (abs(du) < width and abs(dv) < height):
+            return u, v
+        if abs(du) <= 0.5 and abs(dv) <= 0.5:
+            return u, v
+        u += round(du)
+        v += round(dv)
+    return min(max(u, 1), width - 2), min(max(v, 1), height - 2)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def share_of_steps(
+    image: NDArray[np.uint8],
+    floor_xy: NDArray[np.float32],
+    u0: int,
+    v0: int,
+    inner: float,
+    outer: float,
+    contrast: float,
+) -> float:
+    """In what share of directions the grey value steps from a small circle to a large one.
+
+    Clutter (an edge, a corner, texture) can part the grey values of the two circles nearly as well
+    as a disc does, but it does so on some sides only.
+
+    Parameters
+    ----------
+    image : (H, W) uint8
+    floor_xy : (H, W, 2) float32
+        Floor position of each pixel, metres.
+    u0, v0 : int
+        The circles' centre.
+    inner, outer : float
+        Radii, metres: on the floor, which is taken to be seen as a plane by parallel rays.
+    contrast : float
+        Grey levels inside minus outside; a step of the same sign and a quarter of that counts.
+
+    Returns
+    -------
+    float
+        Of the directions in which both circles are in the image; 1 if there are none.
+    """
+    height, width = image.shape
+    xu, yu, xv, yv = floor_steps(floor_xy, u0, v0)
+    area = xu * yv - xv * yu
+    if not abs(area) > 0.0:
+        return 1.0
+    per_area = 1.0 / area
+    seen = 0
+    steps = 0
+    for k in range(len(_DIRECTIONS)):
+        x, y = _DIRECTIONS[k, 0], _DIRECTIONS[k, 1]
+        du = (yv * x - xv * y) * per_area
+        dv = (xu * y - yu * x) * per_area
+        # Half a pixel up, and rounded down: nearest pixels.
+        u1 = math.floor(u0 + inner * du + 0.5)
+        v1 = math.floor(v0 + inner * dv + 0.5)
+        u2 = math.floor(u0 + outer * du + 0.5)
+        v2 = math.floor(v0 + outer * dv + 0.5)
+        if min(u1, u2, v1, v2) < 0 or max(u1, u2) >= width or max(v1, v2) >= height:
+            continue
+        seen += 1
+        difference = float(image[v1, u1]) - float(image[v2, u2])
+        steps += 1 if difference * contrast > _LEAST_STEP * contrast * contrast else 0
+    return steps / seen if seen > 0 else 1.0
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def worth_a_look(
+    image: NDArray[np.uint8],
+    floor_xy: NDArray[np.float32],
+    u: int,
+    v: int,
+    quality: float,
+    contrast: float,
+    inner: float,
+    outer: float,
+) -> bool:
+    """Whether a candidate's quality is clear, or the grey value steps on most sides.
+
+    Parameters are those of `share_of_steps`.
+    """
+    if quality >= CLEAR_QUALITY:
+        return True
+    steps = share_of_steps(image, floor_xy, u, v, inner, outer, contrast)
+    return bool(steps >= _LEAST_STEPS)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

@@ -1,4 +1,8 @@
-"""Compiled: which centres are strong enough, and have no better one nearby."""
+"""The published detector: the best centres of a good quality and contrast, as they are.
+
+It accepts centres of the table by their quality and contrast alone, and keeps the best within a
+disc's width (DLR Spatial Cognition data set report, circle detection).
+"""
 
 from __future__ import annotations
 
@@ -24,7 +28,7 @@ def strong_and_highest(
     Parameters
     ----------
     pixels, quality, contrast : (N, 2) int64, (N,) float64, (N,) float32
-        Centres in scan order (see `detect.discs.centres`).
+        Centres in scan order (see `detect.discs.candidates`).
     floor_xy : (H, W, 2) float32
         Floor position of each pixel, metres.
     threshold : float
