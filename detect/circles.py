@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from camera import Camera
 from camera.distortion import inverse_table
 from camera.kernels import camera_numbers, lens_numbers
-from detect.discs.candidates import NO_VOTES, SIGNS, Centres, Votes, best_centres
+from detect.discs.candidates import NO_VOTES, SIGNS, Centres, Votes, best_centres, chosen
 from detect.discs.centre_rows import CentreRows, every_row, rows_to_look_at
 from detect.discs.fit import blur_ratio_of, fit_settings, working_space
 from detect.discs.positions import published_positions as pixel_positions
@@ -125,7 +125,7 @@ def detect_circles(
     pixels, found_quality, floor_xy, covariance, evidence = search_discs(
         image,
         table.floor_xy,
-        Centres(*(values[good] for values in centres)),
+        chosen(centres, good),
         weakest,
         _disc_search(settings),
         fit_settings(noise, kernel.blur_ratio),

@@ -250,12 +250,11 @@ def build_disc_table(camera: Camera, shape: DiscShape) -> DiscTable:
             filled[:, :number] = np.where(usable[centres], inside[:, centres], 0)
             votes.append(filled)
     fits = (pixels + 1) << ADVANCE_BITS <= np.iinfo(np.uint32).max + 1
+    every_copy = np.concatenate([np.empty(0, np.uint64), *copies])
     numbers_of = np.array(places, np.int32).reshape(-1, 3).T.copy()
     return DiscTable(
         samples=shape.samples,
-        copies=np.concatenate([np.empty(0, np.uint64), *copies]).astype(
-            np.uint32 if fits else np.uint64, copy=False
-        ),
+        copies=every_copy.astype(np.uint32) if fits else every_copy,
         block_copies=_bounds([len(of_block) for of_block in copies]),
         block_row=numbers_of[0],
         block_column=numbers_of[1],

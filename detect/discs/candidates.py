@@ -52,6 +52,13 @@ class Centres(NamedTuple):
     threshold."""
 
 
+def chosen(centres: Centres, which: NDArray[np.bool_]) -> Centres:
+    """Some of the centres."""
+    return Centres(
+        centres.pixels[which], centres.quality[which], centres.contrast[which], centres.score[which]
+    )
+
+
 def best_centres(
     image: NDArray[np.uint8],
     table: DiscTable,

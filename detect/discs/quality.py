@@ -26,6 +26,7 @@ functions in place of operators where Numba would widen numbers to 64 bits.
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -106,8 +107,7 @@ class Memory(NamedTuple):
     dark: NDArray[np.uint8]
 
 
-@intrinsic
-def gather(
+def _gather(
     _typing: Any, pixels: Any, copies: Any, first: Any, end: Any, stride: Any, gathered: Any
 ) -> Any:
     """Carry out the copies of a block, one after the other.
@@ -165,6 +165,10 @@ def gather(
     return result, generate
 
 
+#: `_gather` without its first argument.
+gather: Callable[..., None] = intrinsic(_gather)
+
+
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _product(x: int) -> Any:
     """Return x (255 - x), which is x with its 8 bits turned round."""
@@ -172,7 +176,7 @@ def _product(x: int) -> Any:
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _sum_of_four(rows: NDArray[np.uint8], i: int) -> Any:
+def _sum_of_four(rows: NDArray[np.uint8], i: Any) -> Any:
     return np.add(
         np.add(_U16(rows[i]), _U16(rows[i + _ROW])),
         np.add(_U16(rows[i + _U64(2) * _ROW]), _U16(rows[i + _U64(3) * _ROW])),
@@ -180,7 +184,7 @@ def _sum_of_four(rows: NDArray[np.uint8], i: int) -> Any:
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _products_of_four(rows: NDArray[np.uint8], i: int) -> Any:
+def _products_of_four(rows: NDArray[np.uint8], i: Any) -> Any:
     return np.add(
         np.add(_product(rows[i]), _product(rows[i + _ROW])),
         np.add(_product(rows[i + _U64(2) * _ROW]), _product(rows[i + _U64(3) * _ROW])),
@@ -189,7 +193,7 @@ def _products_of_four(rows: NDArray[np.uint8], i: int) -> Any:
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _add_group(
-    rows: NDArray[np.uint8], first: int, width: int, sums: NDArray[Any], products: NDArray[Any]
+    rows: NDArray[np.uint8], first: Any, width: Any, sums: NDArray[Any], products: NDArray[Any]
 ) -> None:
     """Add 16 rows, from an index on, to their sums and products."""
     for i in range(width):
@@ -248,7 +252,7 @@ def compare(
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _count_steps(
-    gathered: NDArray[np.uint8], higher: int, lower: int, steps: tuple[int, int], width: int,
+    gathered: NDArray[np.uint8], higher: Any, lower: Any, steps: tuple[int, int], width: Any,
     counts: NDArray[np.uint8],
 ) -> None:  # fmt: skip
     """Count where one row of samples exceeds another by a step."""

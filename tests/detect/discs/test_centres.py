@@ -33,7 +33,7 @@ from tests.reference.centres import (
 )
 
 GreyImage = NDArray[np.uint8]
-Found = tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float32]]
+Found = tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float32]] | Centres
 
 PUBLISHED_CAMERA = parse_camera(PUBLISHED_CAM)
 #: An eighth of it: outlines leave the image everywhere.

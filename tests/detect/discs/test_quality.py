@@ -240,7 +240,7 @@ def outlines_of(samples: int, seed: int) -> NDArray[np.int64]:
     x = np.clip(np.rint(level + rng.normal(0.0, 1.0, (2, samples, PITCH)) * scatter), 0, 255)
     x[:, :, :2] = [0.0, 255.0]
     x[0, :, 2], x[1, :, 2] = 255.0, 0.0
-    return x.astype(np.int64)
+    return np.asarray(x, np.int64)
 
 
 @pytest.mark.parametrize("samples", [3, 16, 40, 128])
