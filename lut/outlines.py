@@ -175,6 +175,14 @@ class DiscTable:
         first, stride = np.repeat(self.block_column, widths), np.repeat(self.block_stride, widths)
         return np.repeat(self.block_row, widths).astype(np.int64), first + place * stride
 
+    @cached_property
+    def block_whole(self) -> NDArray[np.bool_]:
+        """(B,) whether all samples of all usable centres of a block vote."""
+        lacking = (self.votes[0] > 0) & np.any(self.votes < self.samples, axis=0)
+        some = np.zeros(len(self.block_row), np.bool_)
+        some[np.repeat(np.arange(len(some)), np.diff(self.block_votes))[lacking]] = True
+        return ~some
+
     def _votes(self, outline: int) -> NDArray[np.uint8]:
         height, width = self.floor_xy.shape[:2]
         map_of_votes = np.zeros((height, width), np.uint8)

@@ -91,6 +91,7 @@ class Blocks(NamedTuple):
     row: NDArray[np.int32]
     column: NDArray[np.int32]
     stride: NDArray[np.int32]
+    whole: NDArray[np.bool_]
     place: NDArray[np.int64]
     votes: NDArray[np.uint8]
 
@@ -220,6 +221,26 @@ def sum_block(memory: Memory, samples: int, width: int) -> None:
         inner, outer = _U64(k * GROUP) * _ROW, _U64((k + groups) * GROUP) * _ROW
         _add_group(memory.gathered, inner, _U64(width), memory.inner, memory.products)
         _add_group(memory.gathered, outer, _U64(width), memory.outer, memory.products)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def compare_whole(memory: Memory, samples: int, width: int, wanted: Wanted) -> None:
+    """As `compare`, where all samples vote: their number is cancelled."""
+    least = _F32(wanted.contrast * _CAUTIOUS) * _F32(samples)
+    share = _F32(wanted.quality * _CAUTIOUS)
+    n, white = _I32(2 * samples), _I32(2 * samples * 255)
+    inner, outer, products, matters = memory.inner, memory.outer, memory.products, memory.matters
+    for i in range(_U64(width)):
+        a, b = _I32(inner[i]), _I32(outer[i])
+        total = np.add(a, b)
+        difference = _F32(np.subtract(a, b))
+        spread = _F32(
+            np.subtract(
+                np.multiply(total, np.subtract(white, total)),
+                np.multiply(n, _I32(products[i])),
+            )
+        )
+        matters[i] = (abs(difference) > least) & (difference * difference > share * spread)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -380,10 +401,12 @@ def find_centres(
             memory.gathered,
         )  # fmt: skip
         sum_block(memory, samples, width)
-        compare(memory, votes, place, width, wanted)
+        if blocks.whole[b]:
+            compare_whole(memory, samples, width, wanted)
+        else:
+            compare(memory, votes, place, width, wanted)
         if wanted.votes > 0:
-            lacking = _some_lack(blocks.votes, place, width, samples)
-            vote(memory, samples, width, wanted, lacking)
+            vote(memory, samples, width, wanted, not blocks.whole[b])
         if count + width > len(found):
             more = np.empty(2 * len(found), CENTRE)
             more[:count] = found[:count]
@@ -400,15 +423,6 @@ def find_centres(
                     found[count].v = blocks.row[b]
                     count += 1
     return found[:count]
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def _some_lack(votes: NDArray[np.uint8], place: int, width: int, samples: int) -> bool:
-    """Whether some usable centre of a block has samples outside the image."""
-    for i in range(place, place + width):
-        if votes[0, i] > 0 and votes[0, i] + votes[1, i] < 2 * samples:
-            return True
-    return False
 
 
 _kept = threading.local()
@@ -452,7 +466,7 @@ def blocks_of(table: DiscTable) -> Blocks:
     """The table as compiled loops take it."""
     return Blocks(
         table.samples, table.copies, table.block_copies, table.block_row, table.block_column,
-        table.block_stride, table.block_votes, table.votes,
+        table.block_stride, table.block_whole, table.block_votes, table.votes,
     )  # fmt: skip
 
 
