@@ -27,6 +27,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from functools import reduce
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -63,6 +64,8 @@ _ROOM = 2048
 _U8, _U16, _U32, _U64, _I32, _F32 = (
     np.uint8, np.uint16, np.uint32, np.uint64, np.int32, np.float32,
 )  # fmt: skip
+#: Centres that are summed at once.
+TILE = 64
 #: From one row of gathered grey values to the next.
 _ROW = np.uint64(PITCH)
 
@@ -108,10 +111,74 @@ class Memory(NamedTuple):
     dark: NDArray[np.uint8]
 
 
+class _Code:
+    """Instructions on the arrays that are arguments of an operation."""
+
+    def __init__(self, context: Any, builder: Any, signature: Any, args: Any) -> None:
+        self.builder, self.args, self.kinds = builder, args, signature.args
+        self.data = [
+            context.make_array(kind)(context, builder, value).data
+            if isinstance(kind, types.Array)
+            else None
+            for kind, value in zip(signature.args, args)
+        ]
+
+    def load(self, argument: int, index: Any, kind: Any) -> Any:
+        """As many numbers as a vector holds, from an index of a contiguous array on."""
+        pointer = self.builder.gep(self.data[argument], [index])
+        value = self.builder.load(self.builder.bitcast(pointer, kind.as_pointer()))
+        value.align = 1
+        return value
+
+    def store(self, argument: int, index: Any, value: Any) -> None:
+        pointer = self.builder.gep(self.data[argument], [index])
+        pointer = self.builder.bitcast(pointer, value.type.as_pointer())
+        self.builder.store(value, pointer).align = 1
+
+    def increase(self, variable: Any, value: Any) -> None:
+        self.builder.store(self.builder.add(self.builder.load(variable), value), variable)
+
+    def carry_out(self, first: Any, count: Any, place: Any) -> None:
+        """Carry out some copies: arguments 0 to 3 are those of `gather`, `place` is a variable."""
+        builder = self.builder
+        done = builder.append_basic_block("done")
+        strides = builder.switch(self.args[2], done)
+        for every in range(1, LARGEST_STRIDE + 1):
+            kept = list(range(0, COPIED, every))
+            kept += [kept[-1]] * ((1 << (len(kept) - 1).bit_length()) - len(kept))
+            these = ir.Constant(ir.VectorType(ir.IntType(32), len(kept)), kept)
+            case = builder.append_basic_block(f"stride_{every}")
+            strides.add_case(_number(every), case)
+            builder.position_at_end(case)
+            with cgutils.for_range(builder, count) as loop:
+                index = builder.add(first, loop.index)
+                copy = builder.load(builder.gep(self.data[1], [index]))
+                if self.kinds[1].dtype.bitwidth < 64:
+                    copy = builder.zext(copy, _I64)
+                source = builder.lshr(copy, _number(ADVANCE_BITS))
+                grey = self.load(0, source, ir.VectorType(ir.IntType(8), COPIED))
+                to = builder.load(place)
+                self.store(3, to, builder.shuffle_vector(grey, grey, these))
+                low = _number((1 << ADVANCE_BITS) - 1)
+                builder.store(builder.add(to, builder.and_(copy, low)), place)
+            builder.branch(done)
+        builder.position_at_end(done)
+
+
+_I64 = ir.IntType(64)
+_BYTES, _SHORTS = (ir.VectorType(ir.IntType(bits), 32) for bits in (8, 16))
+_INTS = ir.VectorType(ir.IntType(32), 16)
+
+
+def _number(value: int) -> Any:
+    return ir.Constant(_I64, value)
+
+
 def _gather(
-    _typing: Any, pixels: Any, copies: Any, first: Any, end: Any, stride: Any, gathered: Any
-) -> Any:
-    """Carry out the copies of a block, one after the other.
+    _typing: Any, pixels: Any, copies: Any, stride: Any, gathered: Any, first: Any, count: Any,
+    to: Any,
+) -> Any:  # fmt: skip
+    """Carry out some copies, one after the other.
 
     As loops these are not turned into vectors: an image and what is gathered from it might overlap.
 
@@ -121,106 +188,124 @@ def _gather(
         The image in scan order, and zeros.
     copies : (N,) uint32 or uint64
         See `lut.DiscTable`.
-    first, end : int64
-        Which of them.
     stride : int64
     gathered : uint8
         Result: rows of 256 grey values, one for each sample; and 64 bytes to spare.
+    first, count : int64
+        Which of the copies.
+    to : int64
+        Index in `gathered` at which they begin.
+
+    Returns
+    -------
+    int64
+        Index at which the next copy begins.
     """
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        data = [
-            context.make_array(kind)(context, builder, value).data if i in (0, 1, 5) else None
-            for i, (kind, value) in enumerate(zip(signature.args, args))
+        place = cgutils.alloca_once_value(builder, args[6])
+        _Code(context, builder, signature, args).carry_out(args[4], args[5], place)
+        return builder.load(place)
+
+    i64 = types.int64
+    return i64(pixels, copies, i64, gathered, i64, i64, i64), generate
+
+
+def _sum_tile(
+    _typing: Any, pixels: Any, copies: Any, stride: Any, gathered: Any, first: Any, each: Any,
+    to: Any, row: Any, groups: Any, column: Any, inner: Any, outer: Any, products: Any,
+) -> Any:  # fmt: skip
+    """Sums for 64 centres, and meanwhile some copies: `each` after every 8 rows.
+
+    One keeps a processor's arithmetic busy, the other its ways to memory, so they take turns.
+    """
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        code = _Code(context, builder, signature, args)
+        place = cgutils.alloca_once_value(builder, args[6])
+        zeros = [ir.Constant(kind, [0] * kind.count) for kind in (_SHORTS, _INTS)]
+        grey = [[cgutils.alloca_once_value(builder, zeros[0]) for _ in range(2)] for _ in range(2)]
+        sums = [[cgutils.alloca_once_value(builder, zeros[1]) for _ in range(2)] for _ in range(2)]
+        turned = ir.Constant(_SHORTS, [255] * 32)
+        halves = [
+            ir.Constant(ir.VectorType(ir.IntType(32), 16), list(range(k, k + 16))) for k in (0, 16)
         ]
-        number, i64, i32 = (ir.IntType(bits) for bits in (signature.args[1].dtype.bitwidth, 64, 32))
-        place = cgutils.alloca_once_value(builder, ir.Constant(i64, 0))
-        low = ir.Constant(i64, (1 << ADVANCE_BITS) - 1)
+        with cgutils.for_range(builder, args[8]) as loop:
+            of_inner = builder.add(
+                builder.add(args[7], args[9]), builder.mul(loop.index, _number(4 * PITCH))
+            )
+            of_outer = builder.add(of_inner, builder.mul(args[8], _number(4 * PITCH)))
+            for outline, begin in enumerate((of_inner, of_outer)):
+                for part in range(2):
+                    x, product = [], []
+                    for k in range(4):
+                        index = builder.add(begin, _number(k * PITCH + 32 * part))
+                        x.append(builder.zext(code.load(3, index, _BYTES), _SHORTS))
+                        product.append(builder.mul(x[k], builder.xor(x[k], turned)))
+                    code.increase(grey[outline][part], reduce(builder.add, x))
+                    four = reduce(builder.add, product)
+                    for half in range(2):
+                        some = builder.shuffle_vector(four, four, halves[half])
+                        code.increase(sums[part][half], builder.zext(some, _INTS))
+            done = builder.add(args[4], builder.mul(loop.index, args[5]))
+            code.carry_out(done, args[5], place)
+        for part in range(2):
+            for outline in range(2):
+                index = builder.add(args[9], _number(32 * part))
+                code.store(10 + outline, index, builder.load(grey[outline][part]))
+            for half in range(2):
+                index = builder.add(args[9], _number(32 * part + 16 * half))
+                code.store(12, index, builder.load(sums[part][half]))
+        return builder.load(place)
 
-        def at(argument: int, index: Any, count: int) -> Any:
-            kind = ir.VectorType(ir.IntType(8), count).as_pointer()
-            return builder.bitcast(builder.gep(data[argument], [index]), kind)
-
-        for every in range(1, LARGEST_STRIDE + 1):
-            kept = list(range(0, COPIED, every))
-            size = 1 << (len(kept) - 1).bit_length()
-            these = ir.Constant(ir.VectorType(i32, size), kept + [kept[-1]] * (size - len(kept)))
-            this_stride = builder.icmp_signed("==", args[4], ir.Constant(i64, every))
-            with (
-                builder.if_then(this_stride),
-                cgutils.for_range(builder, builder.sub(args[3], args[2])) as loop,
-            ):
-                k = builder.add(args[2], loop.index)
-                copy = builder.load(builder.gep(data[1], [k]))
-                copy = copy if number.width == 64 else builder.zext(copy, i64)
-                source = builder.lshr(copy, ir.Constant(i64, ADVANCE_BITS))
-                bytes_of_image = builder.load(at(0, source, COPIED))
-                bytes_of_image.align = 1
-                some = builder.shuffle_vector(bytes_of_image, bytes_of_image, these)
-                to = builder.load(place)
-                builder.store(some, at(5, to, size)).align = 1
-                builder.store(builder.add(to, builder.and_(copy, low)), place)
-        return context.get_dummy_value()
-
-    result = types.void(pixels, copies, types.int64, types.int64, types.int64, gathered)
+    i64 = types.int64
+    result = i64(
+        pixels, copies, i64, gathered, i64, i64, i64, i64, i64, i64, inner, outer, products
+    )
     return result, generate
 
 
-#: `_gather` without its first argument.
-gather: Callable[..., None] = intrinsic(_gather)
-
-
-@njit(cache=True, error_model="numpy", forceinline=True)
-def _product(x: int) -> Any:
-    """Return x (255 - x), which is x with its 8 bits turned round."""
-    return np.multiply(_U16(x), np.bitwise_xor(_U16(x), _U16(255)))
-
-
-@njit(cache=True, error_model="numpy", forceinline=True)
-def _sum_of_four(rows: NDArray[np.uint8], i: Any) -> Any:
-    return np.add(
-        np.add(_U16(rows[i]), _U16(rows[i + _ROW])),
-        np.add(_U16(rows[i + _U64(2) * _ROW]), _U16(rows[i + _U64(3) * _ROW])),
-    )
-
-
-@njit(cache=True, error_model="numpy", forceinline=True)
-def _products_of_four(rows: NDArray[np.uint8], i: Any) -> Any:
-    return np.add(
-        np.add(_product(rows[i]), _product(rows[i + _ROW])),
-        np.add(_product(rows[i + _U64(2) * _ROW]), _product(rows[i + _U64(3) * _ROW])),
-    )
-
-
-@njit(cache=True, error_model="numpy", forceinline=True)
-def _add_group(
-    rows: NDArray[np.uint8], first: Any, width: Any, sums: NDArray[Any], products: NDArray[Any]
-) -> None:
-    """Add 16 rows, from an index on, to their sums and products."""
-    for i in range(width):
-        a = first + i
-        b, c, d = a + _U64(4) * _ROW, a + _U64(8) * _ROW, a + _U64(12) * _ROW
-        sums[i] += np.add(
-            np.add(_sum_of_four(rows, a), _sum_of_four(rows, b)),
-            np.add(_sum_of_four(rows, c), _sum_of_four(rows, d)),
-        )
-        products[i] += np.add(
-            np.add(_U32(_products_of_four(rows, a)), _U32(_products_of_four(rows, b))),
-            np.add(_U32(_products_of_four(rows, c)), _U32(_products_of_four(rows, d))),
-        )
+#: The same without their first arguments.
+gather: Callable[..., int] = intrinsic(_gather)
+_sum_of_tile: Callable[..., int] = intrinsic(_sum_tile)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def sum_block(memory: Memory, samples: int, width: int) -> None:
-    """Sums of x of the inner and of the outer outline, and of x (255 - x) of both."""
-    memory.inner[:width] = 0
-    memory.outer[:width] = 0
-    memory.products[:width] = 0
-    groups = -(-samples // GROUP)
-    for k in range(groups):
-        inner, outer = _U64(k * GROUP) * _ROW, _U64((k + groups) * GROUP) * _ROW
-        _add_group(memory.gathered, inner, _U64(width), memory.inner, memory.products)
-        _add_group(memory.gathered, outer, _U64(width), memory.outer, memory.products)
+def sum_and_gather(
+    memory: Memory, place: int, samples: int, width: int, pixels: NDArray[np.uint8],
+    blocks: Blocks, following: int, to: int,
+) -> None:  # fmt: skip
+    """Sums of x of both outlines, and of x (255 - x), of one block; and gather another.
+
+    One keeps a processor's arithmetic busy, the other its ways to memory, so they take turns.
+
+    Parameters
+    ----------
+    memory : Memory
+    place, to : int
+        Where the one block's grey values begin, and the other's are to.
+    samples, width : int
+        Samples on each outline, and centres of the block that is summed.
+    pixels, blocks
+        As in `find_centres`.
+    following : int
+        Number of the block to be gathered; -1 for none.
+    """
+    fours = -(-samples // GROUP) * (GROUP // 4)
+    first = end = np.int64(0)
+    stride = np.int64(1)
+    if following >= 0:
+        first, end = blocks.bounds[following], blocks.bounds[following + 1]
+        stride = np.int64(blocks.stride[following])
+    tiles = -(-width // TILE)
+    each = (end - first) // (fours * tiles)
+    for tile in range(tiles):
+        to = _sum_of_tile(
+            pixels, blocks.copies, stride, memory.gathered, first, each, to, np.int64(place),
+            fours, np.int64(tile * TILE), memory.inner, memory.outer, memory.products,
+        )  # fmt: skip
+        first += each * fours
+    gather(pixels, blocks.copies, stride, memory.gathered, first, end - first, to)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -286,7 +371,9 @@ def _count_steps(
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def vote(memory: Memory, samples: int, width: int, wanted: Wanted, some_outside: bool) -> None:
+def vote(
+    memory: Memory, place: int, samples: int, width: int, wanted: Wanted, some_outside: bool
+) -> None:
     """Count the directions that vote, and note where there are enough.
 
     Zeros of the outer outline may be outside the image. Then nothing exceeds them (and all else is
@@ -299,7 +386,8 @@ def vote(memory: Memory, samples: int, width: int, wanted: Wanted, some_outside:
     step = wanted.step + 1
     wide = _U64(width)
     for k in range(samples):
-        inner, outer = _U64(k) * _ROW, _U64(k + padded) * _ROW
+        inner = _U64(place) + _U64(k) * _ROW
+        outer = inner + _U64(padded) * _ROW
         if wanted.sign >= 0.0:
             shift = 1 if some_outside else 0
             _count_steps(memory.gathered, inner, outer, (step, shift), wide, light)
@@ -355,7 +443,7 @@ def memory_for(samples: int) -> Memory:
     """Memory for a block."""
     rows = 2 * -(-samples // GROUP) * GROUP
     return Memory(
-        np.empty(rows * PITCH + COPIED, np.uint8),
+        np.empty(2 * (rows * PITCH + COPIED), np.uint8),
         np.empty(PITCH, np.uint16),
         np.empty(PITCH, np.uint16),
         np.empty(PITCH, np.uint32),
@@ -392,21 +480,29 @@ def find_centres(
     of_outer = blocks.votes.shape[1]
     found = np.empty(_ROOM, CENTRE)
     count = 0
-    for b in chosen:
+    half = len(memory.gathered) // 2
+    nothing = np.int64(-1)
+    if len(chosen) > 0:
+        b = chosen[0]
+        gather(
+            pixels, blocks.copies, np.int64(blocks.stride[b]), memory.gathered, blocks.bounds[b],
+            blocks.bounds[b + 1] - blocks.bounds[b], np.int64(0),
+        )  # fmt: skip
+    for n in range(len(chosen)):
+        b = chosen[n]
         place = blocks.place[b]
         width = blocks.place[b + 1] - place
         stride = blocks.stride[b]
-        gather(
-            pixels, blocks.copies, blocks.bounds[b], blocks.bounds[b + 1], np.int64(stride),
-            memory.gathered,
-        )  # fmt: skip
-        sum_block(memory, samples, width)
+        # There are two places for grey values, used alternately.
+        here = (n % 2) * half
+        following = chosen[n + 1] if n + 1 < len(chosen) else nothing
+        sum_and_gather(memory, here, samples, width, pixels, blocks, following, half - here)
         if blocks.whole[b]:
             compare_whole(memory, samples, width, wanted)
         else:
             compare(memory, votes, place, width, wanted)
         if wanted.votes > 0:
-            vote(memory, samples, width, wanted, not blocks.whole[b])
+            vote(memory, here, samples, width, wanted, not blocks.whole[b])
         if count + width > len(found):
             more = np.empty(2 * len(found), CENTRE)
             more[:count] = found[:count]
