@@ -27,6 +27,8 @@ GROUP = 16
 ADVANCE_BITS = 9
 #: Pixels of a row from which a copy takes its bytes, and so pixels behind the image's last one.
 COPIED = 64
+#: Copies are carried out so many at once.
+AT_ONCE = 4
 #: Most pixels from one centre of a block to the next.
 LARGEST_STRIDE = 8
 
@@ -350,7 +352,7 @@ def copies_of_block(
     padded = -(-samples // GROUP) * GROUP
     first, stride, number = block
     span = (COPIED - 1) // stride + 1
-    copies = np.empty(2 * padded * number, np.uint64)
+    copies = np.empty(2 * padded * number + AT_ONCE, np.uint64)
     count = 0
     for k in range(2 * padded):
         outline, sample = k // padded, k % padded
@@ -372,5 +374,8 @@ def copies_of_block(
                 begin = j
                 run = source
         copies[count] = (run << ADVANCE_BITS) | (PITCH - begin)
+        count += 1
+    while count % AT_ONCE != 0:
+        copies[count] = nothing << ADVANCE_BITS
         count += 1
     return copies[:count].copy()

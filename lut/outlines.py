@@ -121,7 +121,8 @@ class DiscTable:
     copies : (N,) uint32, or uint64 for images of more than 8 Mpixel
         See above. `source` is H * W or less: behind the image's last pixel there are 64 zeros.
     block_copies : (B + 1,) int64
-        Block b has the copies ``block_copies[b] : block_copies[b + 1]``. Blocks are in scan order.
+        Block b has the copies ``block_copies[b] : block_copies[b + 1]``, a multiple of 4: those
+        that fill up copy zeros and go no further. Blocks are in scan order.
     block_row, block_column, block_stride : (B,) int32
         First centre of each block, and pixels from one to the next, at most 8.
     block_votes : (B + 1,) int64

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from camera import Camera
 from lut.errors import TableError
-from lut.kernels import ADVANCE_BITS, GROUP, LANES, LARGEST_STRIDE, PITCH
+from lut.kernels import ADVANCE_BITS, AT_ONCE, GROUP, LANES, LARGEST_STRIDE, PITCH
 from lut.outlines import DiscShape, DiscTable
 from lut.verticals import VerticalTable
 
@@ -66,6 +66,7 @@ def check_disc_table(table: DiscTable, camera: Camera, shape: DiscShape) -> None
 
     _demand(len(table.block_copies) == blocks + 1, "block_copies")
     _demand_bounds(table.block_copies, len(table.copies), "block_copies")
+    _demand(bool(np.all(np.diff(table.block_copies) % AT_ONCE == 0)), "block_copies")
     if not blocks:
         return
     _demand(int(table.copies.max()) >> ADVANCE_BITS <= pixels, "copies")

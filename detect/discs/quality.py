@@ -39,7 +39,7 @@ from numpy.typing import NDArray
 
 from detect.errors import FrameError
 from lut import DiscTable
-from lut.kernels import ADVANCE_BITS, COPIED, GROUP, LARGEST_STRIDE, PITCH
+from lut.kernels import ADVANCE_BITS, AT_ONCE, COPIED, GROUP, LARGEST_STRIDE, PITCH
 
 #: A centre that was found.
 CENTRE = np.dtype(
@@ -150,17 +150,19 @@ class _Code:
             case = builder.append_basic_block(f"stride_{every}")
             strides.add_case(_number(every), case)
             builder.position_at_end(case)
-            with cgutils.for_range(builder, count) as loop:
-                index = builder.add(first, loop.index)
-                copy = builder.load(builder.gep(self.data[1], [index]))
-                if self.kinds[1].dtype.bitwidth < 64:
-                    copy = builder.zext(copy, _I64)
-                source = builder.lshr(copy, _number(ADVANCE_BITS))
-                grey = self.load(0, source, ir.VectorType(ir.IntType(8), COPIED))
-                to = builder.load(place)
-                self.store(3, to, builder.shuffle_vector(grey, grey, these))
-                low = _number((1 << ADVANCE_BITS) - 1)
-                builder.store(builder.add(to, builder.and_(copy, low)), place)
+            with cgutils.for_range(builder, builder.udiv(count, _number(AT_ONCE))) as loop:
+                group = builder.add(first, builder.mul(loop.index, _number(AT_ONCE)))
+                # The end of a loop is what a processor foresees least.
+                for k in range(AT_ONCE):
+                    index = builder.add(group, _number(k))
+                    copy = builder.load(builder.gep(self.data[1], [index]))
+                    if self.kinds[1].dtype.bitwidth < 64:
+                        copy = builder.zext(copy, _I64)
+                    source = builder.lshr(copy, _number(ADVANCE_BITS))
+                    grey = self.load(0, source, ir.VectorType(ir.IntType(8), COPIED))
+                    self.store(3, builder.load(place), builder.shuffle_vector(grey, grey, these))
+                    low = _number((1 << ADVANCE_BITS) - 1)
+                    self.increase(place, builder.and_(copy, low))
             builder.branch(done)
         builder.position_at_end(done)
 
@@ -298,7 +300,7 @@ def sum_and_gather(
         first, end = blocks.bounds[following], blocks.bounds[following + 1]
         stride = np.int64(blocks.stride[following])
     tiles = -(-width // TILE)
-    each = (end - first) // (fours * tiles)
+    each = (end - first) // (fours * tiles * AT_ONCE) * AT_ONCE
     for tile in range(tiles):
         to = _sum_of_tile(
             pixels, blocks.copies, stride, memory.gathered, first, each, to, np.int64(place),
