@@ -21,7 +21,7 @@ PITCH = 256
 #: Detectors work on so many centres at once.
 LANES = 32
 #: Size of the groups in which rows of grey values are summed.
-GROUP = 16
+GROUP = 4
 
 #: Low bits of a copy: how far the destination advances.
 ADVANCE_BITS = 9

@@ -107,7 +107,7 @@ class DiscTable:
 
     Centres are processed in *blocks*: up to 256 centres of a row, all of them or every n-th one.
     For each block ``2 R`` rows of 256 grey values are gathered, a column for each centre: R =
-    `samples` rounded up to a multiple of 16 for the inner outline, then R for the outer one; rows
+    `samples` rounded up to a multiple of 4 for the inner outline, then R for the outer one; rows
     that are no samples are 0.
 
     Copies fill these rows one after the other. Each is one number, ``source * 512 + advance``: of

@@ -11,9 +11,8 @@ vote,
     quality    = difference^2 / (n_inner n_outer spread)
     contrast   = difference / (n_inner n_outer)
 
-All of these are whole numbers, so the only rounding is that of the one final division. Squares are
-summed by way of a grey value times its complement, x (255 - x): four of these fit into 16 bits, and
-x^2 = 255 x - x (255 - x).
+All of these are whole numbers, so the only rounding is that of the one final division. Grey values
+are gathered and summed by `detect.discs.gathering`, for squares products x (255 - x).
 
 Something bright or dark beside a disc raises the total variance, and so ruins the quality, but not
 the steps of the grey value from outline to outline. So, if asked to, directions vote: those in
@@ -26,20 +25,16 @@ functions in place of operators where Numba would widen numbers to 64 bits.
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
-from functools import reduce
 from typing import Any, NamedTuple
 
 import numpy as np
-from llvmlite import ir
-from numba import njit, types
-from numba.core import cgutils
-from numba.extending import intrinsic
+from numba import njit
 from numpy.typing import NDArray
 
+from detect.discs.gathering import TILE, Turn, gather, sum_tile
 from detect.errors import FrameError
 from lut import DiscTable
-from lut.kernels import ADVANCE_BITS, AT_ONCE, COPIED, GROUP, LARGEST_STRIDE, PITCH
+from lut.kernels import AT_ONCE, COPIED, GROUP, PITCH
 
 #: A centre that was found.
 CENTRE = np.dtype(
@@ -61,11 +56,7 @@ _CAUTIOUS = 1.0 - 4e-6
 #: Centres for which there is room at first.
 _ROOM = 2048
 
-_U8, _U16, _U32, _U64, _I32, _F32 = (
-    np.uint8, np.uint16, np.uint32, np.uint64, np.int32, np.float32,
-)  # fmt: skip
-#: Centres that are summed at once.
-TILE = 64
+_U8, _U64, _I32, _F32 = np.uint8, np.uint64, np.int32, np.float32
 #: From one row of gathered grey values to the next.
 _ROW = np.uint64(PITCH)
 
@@ -111,175 +102,12 @@ class Memory(NamedTuple):
     dark: NDArray[np.uint8]
 
 
-class _Code:
-    """Instructions on the arrays that are arguments of an operation."""
-
-    def __init__(self, context: Any, builder: Any, signature: Any, args: Any) -> None:
-        self.builder, self.args, self.kinds = builder, args, signature.args
-        self.data = [
-            context.make_array(kind)(context, builder, value).data
-            if isinstance(kind, types.Array)
-            else None
-            for kind, value in zip(signature.args, args)
-        ]
-
-    def load(self, argument: int, index: Any, kind: Any) -> Any:
-        """As many numbers as a vector holds, from an index of a contiguous array on."""
-        pointer = self.builder.gep(self.data[argument], [index])
-        value = self.builder.load(self.builder.bitcast(pointer, kind.as_pointer()))
-        value.align = 1
-        return value
-
-    def store(self, argument: int, index: Any, value: Any) -> None:
-        pointer = self.builder.gep(self.data[argument], [index])
-        pointer = self.builder.bitcast(pointer, value.type.as_pointer())
-        self.builder.store(value, pointer).align = 1
-
-    def increase(self, variable: Any, value: Any) -> None:
-        self.builder.store(self.builder.add(self.builder.load(variable), value), variable)
-
-    def carry_out(self, first: Any, count: Any, place: Any) -> None:
-        """Carry out some copies: arguments 0 to 3 are those of `gather`, `place` is a variable."""
-        builder = self.builder
-        done = builder.append_basic_block("done")
-        strides = builder.switch(self.args[2], done)
-        for every in range(1, LARGEST_STRIDE + 1):
-            kept = list(range(0, COPIED, every))
-            kept += [kept[-1]] * ((1 << (len(kept) - 1).bit_length()) - len(kept))
-            these = ir.Constant(ir.VectorType(ir.IntType(32), len(kept)), kept)
-            case = builder.append_basic_block(f"stride_{every}")
-            strides.add_case(_number(every), case)
-            builder.position_at_end(case)
-            with cgutils.for_range(builder, builder.udiv(count, _number(AT_ONCE))) as loop:
-                group = builder.add(first, builder.mul(loop.index, _number(AT_ONCE)))
-                # The end of a loop is what a processor foresees least.
-                for k in range(AT_ONCE):
-                    index = builder.add(group, _number(k))
-                    copy = builder.load(builder.gep(self.data[1], [index]))
-                    if self.kinds[1].dtype.bitwidth < 64:
-                        copy = builder.zext(copy, _I64)
-                    source = builder.lshr(copy, _number(ADVANCE_BITS))
-                    grey = self.load(0, source, ir.VectorType(ir.IntType(8), COPIED))
-                    self.store(3, builder.load(place), builder.shuffle_vector(grey, grey, these))
-                    low = _number((1 << ADVANCE_BITS) - 1)
-                    self.increase(place, builder.and_(copy, low))
-            builder.branch(done)
-        builder.position_at_end(done)
-
-
-_I64 = ir.IntType(64)
-_BYTES, _SHORTS = (ir.VectorType(ir.IntType(bits), 32) for bits in (8, 16))
-_INTS = ir.VectorType(ir.IntType(32), 16)
-
-
-def _number(value: int) -> Any:
-    return ir.Constant(_I64, value)
-
-
-def _gather(
-    _typing: Any, pixels: Any, copies: Any, stride: Any, gathered: Any, first: Any, count: Any,
-    to: Any,
-) -> Any:  # fmt: skip
-    """Carry out some copies, one after the other.
-
-    As loops these are not turned into vectors: an image and what is gathered from it might overlap.
-
-    Parameters
-    ----------
-    pixels : (H W + 64,) uint8
-        The image in scan order, and zeros.
-    copies : (N,) uint32 or uint64
-        See `lut.DiscTable`.
-    stride : int64
-    gathered : uint8
-        Result: rows of 256 grey values, one for each sample; and 64 bytes to spare.
-    first, count : int64
-        Which of the copies.
-    to : int64
-        Index in `gathered` at which they begin.
-
-    Returns
-    -------
-    int64
-        Index at which the next copy begins.
-    """
-
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        place = cgutils.alloca_once_value(builder, args[6])
-        _Code(context, builder, signature, args).carry_out(args[4], args[5], place)
-        return builder.load(place)
-
-    i64 = types.int64
-    return i64(pixels, copies, i64, gathered, i64, i64, i64), generate
-
-
-def _sum_tile(
-    _typing: Any, pixels: Any, copies: Any, stride: Any, gathered: Any, first: Any, each: Any,
-    to: Any, row: Any, groups: Any, column: Any, inner: Any, outer: Any, products: Any,
-) -> Any:  # fmt: skip
-    """Sums for 64 centres, and meanwhile some copies: `each` after every 8 rows.
-
-    One keeps a processor's arithmetic busy, the other its ways to memory, so they take turns.
-    """
-
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        code = _Code(context, builder, signature, args)
-        place = cgutils.alloca_once_value(builder, args[6])
-        zeros = [ir.Constant(kind, [0] * kind.count) for kind in (_SHORTS, _INTS)]
-        grey = [[cgutils.alloca_once_value(builder, zeros[0]) for _ in range(2)] for _ in range(2)]
-        sums = [[cgutils.alloca_once_value(builder, zeros[1]) for _ in range(2)] for _ in range(2)]
-        turned = ir.Constant(_SHORTS, [255] * 32)
-        halves = [
-            ir.Constant(ir.VectorType(ir.IntType(32), 16), list(range(k, k + 16))) for k in (0, 16)
-        ]
-        with cgutils.for_range(builder, args[8]) as loop:
-            of_inner = builder.add(
-                builder.add(args[7], args[9]), builder.mul(loop.index, _number(4 * PITCH))
-            )
-            of_outer = builder.add(of_inner, builder.mul(args[8], _number(4 * PITCH)))
-            for outline, begin in enumerate((of_inner, of_outer)):
-                for part in range(2):
-                    x, product = [], []
-                    for k in range(4):
-                        index = builder.add(begin, _number(k * PITCH + 32 * part))
-                        x.append(builder.zext(code.load(3, index, _BYTES), _SHORTS))
-                        product.append(builder.mul(x[k], builder.xor(x[k], turned)))
-                    code.increase(grey[outline][part], reduce(builder.add, x))
-                    four = reduce(builder.add, product)
-                    for half in range(2):
-                        some = builder.shuffle_vector(four, four, halves[half])
-                        code.increase(sums[part][half], builder.zext(some, _INTS))
-            done = builder.add(args[4], builder.mul(loop.index, args[5]))
-            code.carry_out(done, args[5], place)
-        for part in range(2):
-            for outline in range(2):
-                index = builder.add(args[9], _number(32 * part))
-                code.store(10 + outline, index, builder.load(grey[outline][part]))
-            for half in range(2):
-                index = builder.add(args[9], _number(32 * part + 16 * half))
-                code.store(12, index, builder.load(sums[part][half]))
-        return builder.load(place)
-
-    i64 = types.int64
-    result = i64(
-        pixels, copies, i64, gathered, i64, i64, i64, i64, i64, i64, inner, outer, products
-    )
-    return result, generate
-
-
-#: The same without their first arguments.
-gather: Callable[..., int] = intrinsic(_gather)
-_sum_of_tile: Callable[..., int] = intrinsic(_sum_tile)
-
-
 @njit(cache=True, error_model="numpy", nogil=True)
 def sum_and_gather(
     memory: Memory, place: int, samples: int, width: int, pixels: NDArray[np.uint8],
     blocks: Blocks, following: int, to: int,
 ) -> None:  # fmt: skip
     """Sums of x of both outlines, and of x (255 - x), of one block; and gather another.
-
-    One keeps a processor's arithmetic busy, the other its ways to memory, so they take turns.
 
     Parameters
     ----------
@@ -293,21 +121,19 @@ def sum_and_gather(
     following : int
         Number of the block to be gathered; -1 for none.
     """
-    fours = -(-samples // GROUP) * (GROUP // 4)
-    first = end = np.int64(0)
-    stride = np.int64(1)
+    fours = -(-samples // GROUP)
+    tiles = -(-width // TILE)
+    first, end, stride = 0, 0, 1
     if following >= 0:
         first, end = blocks.bounds[following], blocks.bounds[following + 1]
-        stride = np.int64(blocks.stride[following])
-    tiles = -(-width // TILE)
+        stride = blocks.stride[following]
     each = (end - first) // (fours * tiles * AT_ONCE) * AT_ONCE
+    sums = memory.inner, memory.outer, memory.products
     for tile in range(tiles):
-        to = _sum_of_tile(
-            pixels, blocks.copies, stride, memory.gathered, first, each, to, np.int64(place),
-            fours, np.int64(tile * TILE), memory.inner, memory.outer, memory.products,
-        )  # fmt: skip
+        turn = Turn(place, fours, tile * TILE, stride, first, each, to)
+        to = sum_tile(pixels, blocks.copies, memory.gathered, sums, turn)
         first += each * fours
-    gather(pixels, blocks.copies, stride, memory.gathered, first, end - first, to)
+    gather(pixels, blocks.copies, memory.gathered, stride, first, end - first, to)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -483,12 +309,12 @@ def find_centres(
     found = np.empty(_ROOM, CENTRE)
     count = 0
     half = len(memory.gathered) // 2
-    nothing = np.int64(-1)
     if len(chosen) > 0:
         b = chosen[0]
+        copies = blocks.bounds[b + 1] - blocks.bounds[b]
         gather(
-            pixels, blocks.copies, np.int64(blocks.stride[b]), memory.gathered, blocks.bounds[b],
-            blocks.bounds[b + 1] - blocks.bounds[b], np.int64(0),
+            pixels, blocks.copies, memory.gathered, np.int64(blocks.stride[b]), blocks.bounds[b],
+            copies, np.int64(0),
         )  # fmt: skip
     for n in range(len(chosen)):
         b = chosen[n]
@@ -497,7 +323,7 @@ def find_centres(
         stride = blocks.stride[b]
         # There are two places for grey values, used alternately.
         here = (n % 2) * half
-        following = chosen[n + 1] if n + 1 < len(chosen) else nothing
+        following = int(chosen[n + 1]) if n + 1 < len(chosen) else -1
         sum_and_gather(memory, here, samples, width, pixels, blocks, following, half - here)
         if blocks.whole[b]:
             compare_whole(memory, samples, width, wanted)

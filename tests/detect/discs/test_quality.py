@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from fractions import Fraction
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,15 +16,16 @@ from numpy.typing import NDArray
 
 from camera import Camera, parse_camera
 from detect.discs.candidates import suppress_neighbours
+from detect.discs.gathering import gather
 from detect.discs.quality import (
     Wanted,
     blocks_of,
     compare,
+    compare_whole,
     find_centres,
-    gather,
     memory_for,
     quality_of_centres,
-    sum_block,
+    sum_and_gather,
     vote,
     with_zeros,
 )
@@ -208,10 +210,10 @@ def test_an_empty_table_finds_nothing() -> None:
 
 @njit(error_model="numpy")
 def _gathered(
-    pixels: GreyImage, copies: NDArray[np.uint32], first: int, end: int, stride: int,
-    gathered: GreyImage,
-) -> None:  # fmt: skip
-    gather(pixels, copies, first, end, stride, gathered)
+    pixels: GreyImage, copies: NDArray[Any], gathered: GreyImage, stride: int, first: int,
+    count: int, to: int,
+) -> int:  # fmt: skip
+    return gather(pixels, copies, gathered, stride, first, count, to)
 
 
 @pytest.mark.parametrize("stride", range(1, LARGEST_STRIDE + 1))
@@ -222,11 +224,11 @@ def test_copies_are_carried_out_one_after_the_other(bits: int, stride: int) -> N
     source, advance = rng.integers(0, 1000 - COPIED, 40), rng.integers(0, 64 // stride, 40)
     copies = ((source << ADVANCE_BITS) | advance).astype(f"uint{bits}")
     expected, gathered = np.full(4000, 7, np.uint8), np.full(4000, 7, np.uint8)
-    place = 0
+    place = 13
     for s, a in zip(source[4:32].tolist(), advance[4:32].tolist()):
         expected[place : place + a] = pixels[s : s + COPIED : stride][:a]
         place += a
-    _gathered(pixels, copies, 4, 32, stride, gathered)
+    assert _gathered(pixels, copies, gathered, stride, 4, 28, 13) == place
     assert np.array_equal(gathered[:place], expected[:place])
     # What is in excess stays within 64 bytes.
     assert np.all(gathered[place + COPIED :] == 7)
@@ -246,24 +248,31 @@ def outlines_of(samples: int, seed: int) -> NDArray[np.int64]:
 @pytest.mark.parametrize("samples", [3, 16, 40, 128])
 @pytest.mark.parametrize("threshold", [1e-6, 0.4, 0.6, 1.0])
 @pytest.mark.parametrize("contrast", [0.0, 5.0])
+@pytest.mark.parametrize("all_vote", [True, False])
 def test_what_may_matter_is_noted_and_hardly_anything_else(
-    samples: int, threshold: float, contrast: float
+    samples: int, threshold: float, contrast: float, all_vote: bool
 ) -> None:
     rng = np.random.default_rng(samples)
     votes = rng.integers((samples + 1) // 2, samples + 1, (2, PITCH))
     votes[:, ::3] = samples
     votes[:, rng.random(PITCH) < 0.2] = 0
+    if all_vote:
+        votes[:] = samples
     x = outlines_of(samples, samples) * (np.arange(samples)[:, None] < votes[:, None])
     memory = memory_for(samples)
     padded = -(-samples // GROUP) * GROUP
     rows = np.zeros((2, padded, PITCH), np.uint8)
     rows[:, :samples] = x
-    memory.gathered[: rows.size] = rows.ravel()
-    sum_block(memory, samples, PITCH)
+    memory.gathered[5 : 5 + rows.size] = rows.ravel()
+    nothing = np.zeros(COPIED, np.uint8)
+    sum_and_gather(memory, 5, samples, PITCH, nothing, blocks_of(TABLE), -1, 0)
     assert np.array_equal([memory.inner, memory.outer], x.sum(axis=1))
     assert np.array_equal(memory.products, (x * (255 - x)).sum(axis=(0, 1)))
     wanted = Wanted(threshold, contrast, 0.0, 0, 0)
-    compare(memory, votes.astype(np.uint8).ravel(), 0, PITCH, wanted)
+    if np.all(votes == samples):
+        compare_whole(memory, samples, PITCH, wanted)
+    else:
+        compare(memory, votes.astype(np.uint8).ravel(), 0, PITCH, wanted)
     noted = memory.matters > 0
     n, total = votes.sum(axis=0), x.sum(axis=(0, 1))
     spread = n * (x**2).sum(axis=(0, 1)) - total**2
@@ -283,12 +292,12 @@ def test_votes_are_counted(some_outside: bool, sign: float) -> None:
     samples, wide = 13, 96
     rng = np.random.default_rng(5)
     memory = memory_for(samples)
-    grey = np.zeros((2, GROUP, PITCH), np.uint8)
+    grey = np.zeros((2, -(-samples // GROUP) * GROUP, PITCH), np.uint8)
     grey[:, :samples] = rng.integers(0, 256, (2, samples, PITCH))
     grey[1, rng.random(grey[1].shape) < 0.2] = 0
     memory.gathered[: grey.size] = grey.ravel()
     memory.matters[:] = 0
-    vote(memory, samples, wide, Wanted(0.5, 0.0, sign, 10, 6), some_outside)
+    vote(memory, 0, samples, wide, Wanted(0.5, 0.0, sign, 10, 6), some_outside)
     inner, outer = grey[:, :samples, :wide].astype(int)
     light = (inner - outer + some_outside > 10) & ((outer > 0) | (not some_outside))
     dark = outer - inner > 10
