@@ -39,6 +39,8 @@ _CLEAR = 6.0
 _WITHIN = 0.75
 #: Looks that came to places nearer than this share of the separation are at the same disc.
 _SAME_DISC = 0.3
+#: In place of an evidence of minus infinity, where nothing is verified.
+_NO_EVIDENCE = -1e9
 #: A blur that reached this share of the most that a patch allows is fitted again in a wider one.
 _AT_BOUND = 0.98
 _MOST_REFITS = 2
@@ -82,6 +84,16 @@ class DiscSearch(NamedTuple):
     """Of the systematic error, pixels squared."""
     tilt_variance: float
     """Of pitch and of roll, radians squared."""
+
+
+class Scene(NamedTuple):
+    """An image, and how it is searched."""
+
+    image: NDArray[np.uint8]
+    floor_xy: NDArray[np.float32]
+    search: DiscSearch
+    settings: FitSettings
+    camera_numbers: NDArray[np.float64]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -134,10 +146,8 @@ def search_discs(
     near = 0.5 * search.separation
     keep = strong_and_alone(pixels, quality, contrast, floor_xy, weakest, near)
     starts = middles(pixels, quality, contrast, floor_xy, weakest, near, keep)
-    results, evidence, found = _fit_all(
-        image, floor_xy, starts, quality[keep], contrast[keep], search, settings,
-        work[0], camera_numbers,
-    )  # fmt: skip
+    scene = Scene(image, floor_xy, search, settings, camera_numbers)
+    results, evidence, found = _fit_all(scene, starts, quality[keep], contrast[keep], work[0])
     if search.verify:
         found = _of_likely_sign(results, evidence, found, search.least_evidence)
     own_pixels = np.empty((len(found), 2), np.int64)
@@ -375,163 +385,160 @@ def worth_a_look(
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _next_to_look_at(
-    image: NDArray[np.uint8],
-    floor_xy: NDArray[np.float32],
-    pixels: NDArray[np.int64],
-    quality: NDArray[np.float64],
-    contrast: NDArray[np.float32],
-    search: DiscSearch,
-    order: NDArray[np.int64],
-    begin: int,
-    clear: NDArray[np.float64],
-) -> int:
-    """The place in the order, from `begin` on, of the next candidate worth a look; or the end.
+def _near_clear(clear: NDArray[np.float64], count: int, x: float, y: float, near: float) -> bool:
+    """Whether a place is nearer than this to one of the first discs that showed clearly."""
+    for k in range(count):
+        dx, dy = clear[k, 0] - x, clear[k, 1] - y
+        if dx * dx + dy * dy < near * near:
+            return True
+    return False
 
-    What lies within a disc that showed clearly need not be fitted.
+
+@njit(cache=True, error_model="numpy")
+def _fit(
+    scene: Scene, candidate: Candidate, start: Disc, look: bool, quality: float, work: Any,
+    result: Any,
+) -> tuple[bool, float]:  # fmt: skip
+    """Fit a disc, or look: whether that came to a result, and the evidence.
+
+    The one call of `fit_disc` here: machine code of it twice takes twice as long to compile.
     """
-    within_2 = (_WITHIN * search.separation) ** 2
-    for at in range(begin, len(order)):
-        i = order[at]
+    search = scene.search
+    hope = PATIENT
+    if search.verify:
+        hope = Hope(_LEAST_SHARE, search.least_evidence - _slack(quality), search.optics_px)
+    fitted = fit_disc(
+        scene.image, scene.floor_xy, candidate, scene.settings, start, look, hope, work, result
+    )
+    return fitted, _evidence(result, search.radius, search.optics_px) if fitted else -math.inf
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _promising(scene: Scene, quality: float, log_odds: float, result: Any) -> bool:
+    """Whether a look is worth a fit."""
+    search = scene.search
+    if log_odds >= search.least_evidence - _FIRST_LOOK_SLACK:
+        return True
+    if log_odds < search.least_evidence - _slack(quality):
+        return False
+    return _shows_rim(scene.image, scene.camera_numbers, search, result)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _look_at_all(
+    scene: Scene, pixels: NDArray[np.int64], quality: NDArray[np.float64],
+    contrast: NDArray[np.float32], work: Any,
+) -> tuple[Any, NDArray[np.float64]]:  # fmt: skip
+    """Look at the candidates, the best first: (N,) RESULT, and what they promise.
+
+    What lies within a disc that showed clearly need not be looked at. The promise is the evidence;
+    minus infinity for what is not worth a fit.
+    """
+    search, floor_xy = scene.search, scene.floor_xy
+    looks = np.zeros(len(pixels), RESULT)
+    promise = np.full(len(pixels), -np.inf)
+    clear = np.empty((len(pixels), 2))
+    clear_count = 0
+    blur = _first_blur(scene)
+    for i in np.argsort(-quality, kind="mergesort"):
         u, v = pixels[i, 0], pixels[i, 1]
-        seen = False
-        for k in range(len(clear)):
-            dx = clear[k, 0] - floor_xy[v, u, 0]
-            dy = clear[k, 1] - floor_xy[v, u, 1]
-            if dx * dx + dy * dy < within_2:
-                seen = True
-                break
-        if not seen and (
-            not search.verify
-            or worth_a_look(
-                image, floor_xy, u, v, quality[i], float(contrast[i]), search.inner, search.outer
-            )
+        x, y = float(floor_xy[v, u, 0]), float(floor_xy[v, u, 1])
+        if _near_clear(clear, clear_count, x, y, _WITHIN * search.separation):
+            continue
+        if search.verify and not worth_a_look(
+            scene.image, floor_xy, u, v, quality[i], float(contrast[i]), search.inner, search.outer
         ):
-            return at
-    return len(order)
+            continue
+        candidate = Candidate(u, v, search.radius, blur)
+        start = Disc(0.0, 0.0, 1.0, math.log(blur))
+        fitted, log_odds = _fit(scene, candidate, start, True, quality[i], work, looks[i])
+        if not search.verify:
+            if fitted:
+                promise[i] = max(log_odds, _NO_EVIDENCE)
+        elif _promising(scene, quality[i], log_odds, looks[i]):
+            promise[i] = log_odds
+            if log_odds >= search.least_evidence + _CLEAR:
+                clear[clear_count, 0], clear[clear_count, 1] = looks[i][fit.X], looks[i][fit.Y]
+                clear_count += 1
+    return looks, promise
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _first_blur(scene: Scene) -> float:
+    return max(scene.settings.blur_px, 0.6 * scene.search.optics_px)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _fit_after_look(
+    scene: Scene, pixel: NDArray[np.int64], quality: float, look: Any, work: Any, result: Any
+) -> tuple[bool, float]:
+    """Fit in full where a look came to: whether it is a disc, and the evidence."""
+    search, floor_xy = scene.search, scene.floor_xy
+    u, v = nearest_pixel(floor_xy, pixel[0], pixel[1], look[fit.X], look[fit.Y])
+    # A look gives the blur but roughly: too small a patch would be gathered again.
+    blur = max(look[fit.BLUR], _first_blur(scene))
+    x, y, radius, log_blur = look[fit.X], look[fit.Y], look[fit.RADIUS], math.log(look[fit.BLUR])
+    enough, log_odds = False, -math.inf
+    for _ in range(1 + _MOST_REFITS):
+        start = Disc(
+            (x - floor_xy[v, u, 0]) / search.radius,
+            (y - floor_xy[v, u, 1]) / search.radius,
+            radius / search.radius,
+            log_blur,
+        )
+        candidate = Candidate(u, v, search.radius, blur)
+        fitted, log_odds = _fit(scene, candidate, start, False, quality, work, result)
+        if search.verify and fitted and log_odds < search.least_evidence + CLEAR_EVIDENCE:
+            log_odds = _with_rim(
+                scene.image, scene.camera_numbers, search, quality, log_odds, result
+            )
+        enough = fitted and (not search.verify or log_odds >= search.least_evidence)
+        if not (enough and result[fit.BLUR] > _AT_BOUND * result[fit.BLUR_BOUND]):
+            break
+        # Too blurred for its patch: once more, in a wider one.
+        blur = result[fit.BLUR_BOUND]
+        x, y, radius = result[fit.X], result[fit.Y], result[fit.RADIUS]
+        log_blur = math.log(result[fit.BLUR])
+    return enough, log_odds
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
 def _fit_all(
-    image: NDArray[np.uint8],
-    floor_xy: NDArray[np.float32],
-    pixels: NDArray[np.int64],
-    quality: NDArray[np.float64],
-    contrast: NDArray[np.float32],
-    search: DiscSearch,
-    settings: FitSettings,
-    work: Any,
-    camera_numbers: NDArray[np.float64],
-) -> tuple[Any, NDArray[np.float64], NDArray[np.int64]]:
-    """Look at the candidates, then fit what the looks left: the results, the evidence, the discs.
-
-    Both are fits, and one call: it is inlined, and machine code of it twice takes twice as long to
-    compile.
-    """
+    scene: Scene, pixels: NDArray[np.int64], quality: NDArray[np.float64],
+    contrast: NDArray[np.float32], work: Any,
+) -> tuple[Any, NDArray[np.float64], NDArray[np.int64]]:  # fmt: skip
+    """Look at all, then fit what the looks left: the results, the evidence, the discs."""
     n = len(pixels)
-    radius = search.radius
-    looks = np.zeros(n, RESULT)
-    results = np.zeros(n, RESULT)
+    search = scene.search
+    looks, promise = _look_at_all(scene, pixels, quality, contrast, work)
+    order = np.flatnonzero(promise > -np.inf)
     place = np.zeros((n, 2))
-    promise = np.full(n, -np.inf)
+    place[:, 0], place[:, 1] = looks[fit.X], looks[fit.Y]
+    order = _apart(order, place, promise, _SAME_DISC * search.separation)
+    results = np.zeros(n, RESULT)
     evidence = np.full(n, -np.inf)
     score = np.full(n, -np.inf)
-    start = Disc(0.0, 0.0, 1.0, 0.0)
-    blur_start = max(settings.blur_px, 0.6 * search.optics_px)
-    hope = PATIENT
-    clear = np.empty((n, 2))
-    clear_count = 0
-    # The best first.
-    order = np.argsort(-quality, kind="mergesort")
-    looking = True
-    at = -1
-    refits = 0
-    i = 0
-    u = v = 0
-    blur = at_x = at_y = 0.0
-    while True:
-        if looking:
-            at = _next_to_look_at(
-                image, floor_xy, pixels, quality, contrast, search, order, at + 1,
-                clear[:clear_count],
-            )  # fmt: skip
-            if at == len(order):
-                looking = False
-                order = np.flatnonzero(promise > -np.inf)
-                if search.separation > 0.0:
-                    order = order[
-                        suppress_neighbours(
-                            place[order], promise[order], _SAME_DISC * search.separation
-                        )
-                    ]
-                at = -1
-        if not looking and refits == 0:
-            at += 1
-            if at == len(order):
-                break
-        i = order[at]
-        result = looks[i] if looking else results[i]
-        if looking:
-            u, v = int(pixels[i, 0]), int(pixels[i, 1])
-            blur = blur_start
-            start = Disc(0.0, 0.0, 1.0, math.log(blur_start))
-        else:
-            before = looks[i] if refits == 0 else results[i]
-            at_x, at_y = before[fit.X], before[fit.Y]
-            if refits == 0:
-                u, v = nearest_pixel(floor_xy, pixels[i, 0], pixels[i, 1], at_x, at_y)
-                # A look gives the blur but roughly: too small a patch would be gathered again.
-                blur = max(before[fit.BLUR], blur_start)
-            else:
-                # Too blurred for its patch: once more, in a wider one.
-                blur = before[fit.BLUR_BOUND]
-            start = Disc(
-                (at_x - floor_xy[v, u, 0]) / radius, (at_y - floor_xy[v, u, 1]) / radius,
-                before[fit.RADIUS] / radius, math.log(before[fit.BLUR]),
-            )  # fmt: skip
-        if search.verify:
-            hope = Hope(_LEAST_SHARE, search.least_evidence - _slack(quality[i]), search.optics_px)
-        fitted = fit_disc(
-            image, floor_xy, Candidate(u, v, radius, blur), settings, start, looking, hope, work,
-            result,
-        )  # fmt: skip
-        log_odds = -math.inf
-        if fitted:
-            log_odds = _evidence(result, radius, search.optics_px)
-        if looking:
-            place[i, 0] = result[fit.X]
-            place[i, 1] = result[fit.Y]
-            if not search.verify:
-                if fitted:
-                    promise[i] = log_odds if log_odds > -math.inf else -1e9
-            elif log_odds >= search.least_evidence - _FIRST_LOOK_SLACK or (
-                log_odds >= search.least_evidence - _slack(quality[i])
-                and _shows_rim(image, camera_numbers, search, result)
-            ):
-                promise[i] = log_odds
-                if log_odds >= search.least_evidence + _CLEAR:
-                    clear[clear_count, 0] = result[fit.X]
-                    clear[clear_count, 1] = result[fit.Y]
-                    clear_count += 1
-            continue
-        if search.verify and fitted and log_odds < search.least_evidence + CLEAR_EVIDENCE:
-            log_odds = _with_rim(image, camera_numbers, search, quality[i], log_odds, result)
+    for i in order:
+        result = results[i]
+        enough, log_odds = _fit_after_look(scene, pixels[i], quality[i], looks[i], work, result)
         evidence[i] = log_odds
-        enough = fitted and (not search.verify or log_odds >= search.least_evidence)
-        again = result[fit.BLUR] > _AT_BOUND * result[fit.BLUR_BOUND]
-        if enough and again and refits < _MOST_REFITS:
-            refits += 1
-            continue
-        refits = 0
-        candidate = floor_xy[pixels[i, 1], pixels[i, 0]]
+        candidate = scene.floor_xy[pixels[i, 1], pixels[i, 0]]
         place[i, 0] = result[fit.X] if search.refine else candidate[0]
         place[i, 1] = result[fit.Y] if search.refine else candidate[1]
         # A fit that wandered off, or turned the disc's contrast round, is about something else.
-        stayed = math.hypot(result[fit.X] - candidate[0], result[fit.Y] - candidate[1]) < radius
+        off = math.hypot(result[fit.X] - candidate[0], result[fit.Y] - candidate[1])
         same_sign = result[fit.CONTRAST] * contrast[i] > 0.0
-        if enough and stayed and same_sign:
-            score[i] = log_odds if log_odds > -math.inf else -1e9 + quality[i]
-    sound = np.flatnonzero(score > -np.inf)
-    if search.separation > 0.0:
-        sound = sound[suppress_neighbours(place[sound], score[sound], search.separation)]
-    return results, evidence, sound
+        if enough and off < search.radius and same_sign:
+            score[i] = log_odds if log_odds > -math.inf else _NO_EVIDENCE + quality[i]
+    found = np.flatnonzero(score > -np.inf)
+    return results, evidence, _apart(found, place, score, search.separation)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _apart(
+    index: NDArray[np.int64], place: NDArray[np.float64], score: NDArray[np.float64], near: float
+) -> NDArray[np.int64]:
+    """Those of some discs that have no better one nearby; all of them if nothing is near."""
+    if near > 0.0:
+        return index[suppress_neighbours(place[index], score[index], near)]
+    return index
