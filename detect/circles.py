@@ -27,8 +27,8 @@ from detect.discs.centre_rows import CentreRows, every_row, rows_to_look_at
 from detect.discs.fit import blur_ratio_of, fit_settings, working_space
 from detect.discs.positions import published_positions as pixel_positions
 from detect.discs.positions import refined_covariances
-from detect.discs.published import strong_and_highest
-from detect.discs.quality import Wanted, blocks_of, find_centres, with_zeros
+from detect.discs.published import published_centres, strong_and_highest
+from detect.discs.quality import Wanted, blocks_of, with_zeros
 from detect.discs.quality import quality_of_centres as quality_of_centres
 from detect.discs.search import DiscSearch, search_discs
 from detect.discs.second_kernels import second_looks
@@ -255,23 +255,17 @@ def _without_fit(
         pixels, quality, contrast, _ = best_centres(
             image, table, settings.threshold, settings.polarity
         )
+        keep = strong_and_highest(
+            pixels, quality, contrast, table.floor_xy, 0.0, weakest, settings.separation_m
+        )
+        pixels, quality = pixels[keep], quality[keep]
     else:
         wanted = Wanted(settings.threshold, weakest, SIGNS[settings.polarity], *NO_VOTES)
-        found = find_centres(
-            with_zeros(image, table), blocks_of(table), every_row(table).blocks, wanted
-        )
-        pixels = np.stack([found["u"], found["v"]], axis=-1)
-        quality, contrast = found["quality"].copy(), found["contrast"].copy()
-    keep = strong_and_highest(
-        pixels,
-        quality,
-        contrast,
-        table.floor_xy,
-        settings.threshold if settings.stride > 0.0 else 0.0,
-        weakest,
-        settings.separation_m,
-    )
-    pixels, quality = pixels[keep], quality[keep]
+        every = every_row(table).blocks
+        pixels, quality = published_centres(
+            with_zeros(image, table), blocks_of(table), every, wanted, table.floor_xy,
+            settings.separation_m,
+        )  # fmt: skip
     floor_xy, covariance = published_positions(camera, pixels)
     return CircleDetections(pixels, floor_xy, covariance, quality, np.full(len(pixels), np.nan))
 

@@ -10,6 +10,32 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from detect.discs.quality import Blocks, Wanted, find_centres
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def published_centres(
+    pixels: NDArray[np.uint8],
+    blocks: Blocks,
+    chosen: NDArray[np.int64],
+    wanted: Wanted,
+    floor_xy: NDArray[np.float32],
+    separation: float,
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Pixels (M, 2) and quality (M,) of the centres that stay: one call for each image.
+
+    Parameters are those of `find_centres` and `strong_and_highest`.
+    """
+    found = find_centres(pixels, blocks, chosen, wanted)
+    places = np.empty((len(found), 2), np.int64)
+    places[:, 0], places[:, 1] = found["u"], found["v"]
+    quality = found["quality"].copy()
+    keep = strong_and_highest(
+        places, quality, found["contrast"].copy(), floor_xy, wanted.quality, wanted.contrast,
+        separation,
+    )  # fmt: skip
+    return places[keep], quality[keep]
+
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def strong_and_highest(
