@@ -21,22 +21,16 @@ from numpy.typing import NDArray
 from camera import Camera
 from camera.distortion import inverse_table
 from camera.kernels import camera_numbers, lens_numbers
-from detect.discs.alone_kernels import strong_and_highest
-from detect.discs.centre_rows import CentreRows, rows_to_look_at
-from detect.discs.centres import (
-    NO_VOTES,
-    Centres,
-    Votes,
-    best_centres,
-    good_centres,
-    scored_centres,
-)
-from detect.discs.centres import quality_of_centres as quality_of_centres
+from detect.discs.candidates import NO_VOTES, SIGNS, Centres, Votes, best_centres, chosen
+from detect.discs.centre_rows import CentreRows, every_row, rows_to_look_at
 from detect.discs.fit import blur_ratio_of, fit_settings, working_space
 from detect.discs.positions import published_positions as pixel_positions
 from detect.discs.positions import refined_covariances
+from detect.discs.published import published_centres, strong_and_highest
+from detect.discs.quality import Wanted, blocks_of, with_zeros
+from detect.discs.quality import quality_of_centres as quality_of_centres
 from detect.discs.rim_network import RimNetwork, rim_network
-from detect.discs.search_kernels import DiscSearch, search_discs
+from detect.discs.search import DiscSearch, search_discs
 from detect.discs.second_look import second_looks
 from detect.errors import FrameError
 from detect.noise import estimate_noise
@@ -132,14 +126,11 @@ def detect_circles(
     pixels, found_quality, floor_xy, covariance, evidence = search_discs(
         image,
         table.floor_xy,
-        centres.pixels[good],
-        centres.quality[good],
-        centres.contrast[good],
-        _first_search(settings),
+        chosen(centres, good),
         weakest,
+        _first_search(settings),
         fit_settings(noise, kernel.blur_ratio),
-        kernel.numbers,
-        kernel.centre,
+        (kernel.numbers, kernel.centre),
         working_space(),
     )
     if _looks_twice(settings):
@@ -183,10 +174,8 @@ def candidates_of(
     votes = NO_VOTES
     if _looks_twice(settings):
         votes = Votes(_vote_step(weakest), math.ceil(_VOTES * table.samples))
-    centres = _looked_at(table, settings)
-    return scored_centres(
-        image, centres.table, settings.threshold, settings.polarity, centres.rank, votes
-    )
+    rows = _looked_at(table, settings)
+    return best_centres(image, table, settings.threshold, settings.polarity, rows, votes)
 
 
 def _vote_step(weakest: float) -> int:
@@ -260,26 +249,25 @@ def _without_fit(
     image: NDArray[np.uint8], camera: Camera, table: DiscTable, settings: CircleSettings
 ) -> CircleDetections:
     """The published detector: centres of the table by their quality and contrast alone."""
+    weakest = settings.least_contrast
+    if settings.noise_floor > 0.0:
+        noise = estimate_noise(image, _NOISE_ROWS)
+        weakest = max(weakest, settings.noise_floor * max(noise, _LEAST_NOISE))
     if settings.stride == 0.0:
-        pixels, quality, contrast = best_centres(
+        pixels, quality, contrast, _ = best_centres(
             image, table, settings.threshold, settings.polarity
         )
+        keep = strong_and_highest(
+            pixels, quality, contrast, table.floor_xy, 0.0, weakest, settings.separation_m
+        )
+        pixels, quality = pixels[keep], quality[keep]
     else:
-        u, v, quality, contrast = good_centres(image, table, settings.threshold, settings.polarity)
-        pixels = np.stack([u, v], axis=-1)
-    weakest = 0.0
-    if settings.noise_floor > 0.0:
-        weakest = settings.noise_floor * max(estimate_noise(image, _NOISE_ROWS), _LEAST_NOISE)
-    keep = strong_and_highest(
-        pixels,
-        quality,
-        contrast,
-        table.floor_xy,
-        settings.threshold if settings.stride > 0.0 else 0.0,
-        max(weakest, settings.least_contrast),
-        settings.separation_m,
-    )
-    pixels, quality = pixels[keep], quality[keep]
+        wanted = Wanted(settings.threshold, weakest, SIGNS[settings.polarity], *NO_VOTES)
+        every = every_row(table).blocks
+        pixels, quality = published_centres(
+            with_zeros(image, table), blocks_of(table), every, wanted, table.floor_xy,
+            settings.separation_m,
+        )  # fmt: skip
     floor_xy, covariance = published_positions(camera, pixels)
     return CircleDetections(pixels, floor_xy, covariance, quality, np.full(len(pixels), np.nan))
 

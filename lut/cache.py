@@ -32,7 +32,7 @@ from lut.verticals import VerticalTable, build_vertical_table
 from storage import write_whole
 
 #: Incremented with every change of the tables' content or computation.
-TABLE_VERSION = 9
+TABLE_VERSION = 12
 
 Made = TypeVar("Made")
 

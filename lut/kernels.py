@@ -1,6 +1,6 @@
 """Compiled loops that build tables: arrays in, arrays out.
 
-`encode_outlines` projects as `camera.kernels.project_floor_point` does, operation by operation, but
+`row_samples` projects as `camera.kernels.project_floor_point` does, operation by operation, but
 without a branch, so that several pixels are processed at once; a test compares the two.
 """
 
@@ -16,18 +16,21 @@ from numpy.typing import NDArray
 from camera.brown_kernels import straightened_point
 from camera.kernels import has_brown, project_floor_point
 
-#: Neighbouring pixels of a row that a detector works on at once; bytes of one copy.
-BLOCK = 64
-
-#: Low bits of a copy: how far the destination advances.
-ADVANCE_BITS = 7
-
-#: Size of the groups in which rows of grey values are summed and copies are made.
+#: Most centres in a block, and bytes from one row of gathered grey values to the next.
+PITCH = 256
+#: Detectors work on so many centres at once.
+LANES = 32
+#: Size of the groups in which rows of grey values are summed.
 GROUP = 4
 
-#: Least number of copies of a block for every two groups of its rows, one of each outline: they
-#: are made while other rows are summed.
-LEAST_COPIES = 16
+#: Low bits of a copy: how far the destination advances.
+ADVANCE_BITS = 9
+#: Pixels of a row from which a copy takes its bytes, and so pixels behind the image's last one.
+COPIED = 64
+#: Copies are carried out so many at once.
+AT_ONCE = 4
+#: Most pixels from one centre of a block to the next.
+LARGEST_STRIDE = 8
 
 
 class Scan(NamedTuple):
@@ -35,8 +38,8 @@ class Scan(NamedTuple):
 
     Attributes
     ----------
-    size : (H, W) float64
-        How far the floor moves from each pixel to the one below, metres.
+    enough : float
+        Samples of each outline that must be inside the image.
     stride : float
         From one centre to the next along a row: this length in pixels of their size, rounded up,
         metres; 0 for every pixel.
@@ -48,7 +51,7 @@ class Scan(NamedTuple):
         moved, the inner one inwards, the outer one outwards.
     """
 
-    size: NDArray[np.float64]
+    enough: float
     stride: float
     pairs: bool
     apart_px: float
@@ -135,10 +138,7 @@ def _nearest_pixels(
     x_robot: NDArray[np.float64],
     y_robot: NDArray[np.float64],
     offset: NDArray[np.float64],
-    begin: int,
-    end: int,
-    height: int,
-    width: int,
+    image_size: tuple[int, int],
     least: float,
     nearest: NDArray[np.float64],
 ) -> None:
@@ -146,9 +146,9 @@ def _nearest_pixels(
 
     What lies left of or above `least` (pixels, before they are rounded) is outside, too.
 
-    `x_robot` and `y_robot` are the centres of a row, of which those from `begin` to `end` are
-    worked on, `offset` is the sample's from its centre, `nearest` the result (whole numbers). That
-    all are contiguous is what lets the compiler work on several centres at once.
+    `x_robot` and `y_robot` are the centres, `offset` is the sample's from its centre, `nearest` the
+    result (whole numbers). That all are contiguous is what lets the compiler work on several
+    centres at once.
     """
     scale_x, scale_y, offset_x, offset_y = numbers[0], numbers[1], numbers[2], numbers[3]
     a2, a3, b1, b2, b3 = numbers[4], numbers[5], numbers[6], numbers[7], numbers[8]
@@ -158,7 +158,8 @@ def _nearest_pixels(
     r20, r21, r22 = numbers[16], numbers[17], numbers[18]
     cx, cy, dz = numbers[19], numbers[20], -numbers[21]
     x_offset, y_offset = offset[0], offset[1]
-    for u in range(begin, end):
+    height, width = image_size
+    for u in range(len(x_robot)):
         dx = x_robot[u] + x_offset - cx
         dy = y_robot[u] + y_offset - cy
         z = r20 * dx + r21 * dy + r22 * dz
@@ -190,10 +191,10 @@ def _sample_apart(
     centre: NDArray[np.float64],
     sample: NDArray[np.float64],
     farther: float,
-    height: int,
-    width: int,
+    image_size: tuple[int, int],
 ) -> float:
     """As `_nearest_pixels`, of one sample that is moved away from its centre, metres."""
+    height, width = image_size
     scale = 1.0 + farther / math.hypot(sample[0], sample[1])
     u, v = project_floor_point(
         numbers, centre[0] + scale * sample[0], centre[1] + scale * sample[1]
@@ -205,180 +206,176 @@ def _sample_apart(
 
 
 @njit(cache=True, error_model="numpy")
-def encode_outlines(
+def row_samples(
     numbers: NDArray[np.float64],
     floor_xy: NDArray[np.float64],
-    candidate: NDArray[np.bool_],
     inner: NDArray[np.float64],
     outer: NDArray[np.float64],
-    enough: float,
+    size: NDArray[np.float64],
+    image_size: tuple[int, int],
     scan: Scan,
-) -> tuple[
-    NDArray[np.uint64],
-    NDArray[np.int64],
-    NDArray[np.int32],
-    NDArray[np.int32],
-    NDArray[np.int32],
-    NDArray[np.uint8],
-]:
-    """Find the usable centres, and write down how the grey values around them are gathered.
+) -> NDArray[np.float64]:
+    """Where the samples of some centres' outlines fall in the image.
 
     Parameters
     ----------
     numbers : (27,) float64
         `camera.kernels.camera_numbers`.
-    floor_xy : (H, W, 2) float64
-        Floor position of each pixel, metres.
-    candidate : (H, W) bool
-        Centres to evaluate.
+    floor_xy : (N, 2) float64
+        Floor positions of the centres, metres.
     inner, outer : (K, 2) float64
         Samples of the outlines relative to their centre, metres.
-    enough : float
-        Samples of each outline that must be inside the image.
+    size : (N,) float64
+        How far the floor moves from each centre to the pixel below, metres.
+    image_size : (int, int)
+        Height and width, pixels.
     scan : Scan
-        Which centres are left out, and whether samples vote in pairs.
 
     Returns
     -------
-    copies, block_copies, block_row, block_column, block_pattern, patterns
-        As in `lut.DiscTable`; copies as uint64.
+    (2 K, N) float64
+        Index of the nearest pixel in scan order, of the inner and then of the outer outline; -1
+        where a sample does not vote.
     """
-    height, width = candidate.shape
-    samples = inner.shape[0]
-    border = 0.0 if scan.pairs else -0.5
-    padded = -(-samples // GROUP) * GROUP
+    samples = len(inner)
+    least = 0.0 if scan.pairs else -0.5
     shifted = has_brown(numbers[22:27])
-    nothing = height * width
-    most_blocks = height * (-(-width // BLOCK))
-
-    block_copies = np.zeros(most_blocks + 1, np.int64)
-    block_row = np.empty(most_blocks, np.int32)
-    block_column = np.empty(most_blocks, np.int32)
-    block_pattern = np.empty(most_blocks, np.int32)
-    patterns = np.zeros((most_blocks + 1, 2, BLOCK), np.uint8)
-    for i in range(BLOCK):
-        patterns[0, 0, i] = patterns[0, 1, i] = samples
-    copies = np.empty(1 << 17, np.uint64)
-    blocks = 0
-    pattern = 1
-    count = 0
-
-    x_robot = np.empty(width)
-    y_robot = np.empty(width)
-    nearest = np.empty((2 * samples, width))
-    votes = np.zeros((2, width), np.int32)
-    usable = np.zeros(width, np.bool_)
-    for v in range(height):
-        begin = width
-        end = 0
-        for u in range(width):
-            if candidate[v, u]:
-                begin = min(begin, u)
-                end = u + 1
-        for u in range(begin, end):
-            x_robot[u] = floor_xy[v, u, 0]
-            y_robot[u] = floor_xy[v, u, 1]
-        for k in range(2 * samples):
-            offset = inner[k] if k < samples else outer[k - samples]
-            if shifted:
-                _nearest_pixels(
-                    numbers, numbers[22:27], x_robot, y_robot, offset,
-                    begin, end, height, width, border, nearest[k],
-                )  # fmt: skip
-            else:
-                _nearest_pixels(
-                    numbers, None, x_robot, y_robot, offset,
-                    begin, end, height, width, border, nearest[k],
-                )  # fmt: skip
-        if scan.pairs:
-            for k in range(samples):
-                for u in range(begin, end):
-                    if nearest[k, u] == nearest[samples + k, u] and nearest[k, u] >= 0.0:
-                        apart = scan.apart_px * scan.size[v, u]
-                        nearest[k, u] = _sample_apart(
-                            numbers, floor_xy[v, u], inner[k], -apart, height, width
-                        )
-                        nearest[samples + k, u] = _sample_apart(
-                            numbers, floor_xy[v, u], outer[k], apart, height, width
-                        )
-                    if nearest[k, u] < 0.0 or nearest[samples + k, u] < 0.0:
-                        nearest[k, u] = nearest[samples + k, u] = -1.0
-        for u in range(begin, end):
-            votes[0, u] = votes[1, u] = 0
-        for k in range(2 * samples):
-            outline = k // samples
-            for u in range(begin, end):
-                votes[outline, u] += 1 if nearest[k, u] >= 0.0 else 0
-        first = width
-        last = 0
-        following = begin
-        for u in range(begin, end):
-            usable[u] = (
-                u >= following
-                and candidate[v, u]
-                and votes[0, u] >= enough
-                and votes[1, u] >= enough
+    x_robot, y_robot = floor_xy[:, 0].copy(), floor_xy[:, 1].copy()
+    nearest = np.empty((2 * samples, len(floor_xy)))
+    for k in range(2 * samples):
+        offset = inner[k] if k < samples else outer[k - samples]
+        if shifted:
+            _nearest_pixels(
+                numbers, numbers[22:27], x_robot, y_robot, offset, image_size, least, nearest[k]
             )
-            if usable[u]:
-                first = min(first, u)
-                last = u + 1
-                following = u + max(1, math.ceil(scan.stride / scan.size[v, u]))
+        else:
+            _nearest_pixels(numbers, None, x_robot, y_robot, offset, image_size, least, nearest[k])
+    if not scan.pairs:
+        return nearest
+    for k in range(samples):
+        in_row, out_row = nearest[k], nearest[samples + k]
+        for u in range(len(floor_xy)):
+            if in_row[u] == out_row[u] and in_row[u] >= 0.0:
+                apart = scan.apart_px * size[u]
+                in_row[u] = _sample_apart(numbers, floor_xy[u], inner[k], -apart, image_size)
+                out_row[u] = _sample_apart(numbers, floor_xy[u], outer[k], apart, image_size)
+            if in_row[u] < 0.0 or out_row[u] < 0.0:
+                in_row[u] = out_row[u] = -1.0
+    return nearest
 
-        needed = count + (2 * padded + LEAST_COPIES) * (width + BLOCK)
-        if needed > len(copies):
-            more = np.empty(2 * needed, np.uint64)
-            for i in range(count):
-                more[i] = copies[i]
-            copies = more
-        for from_u in range(first, last, BLOCK):
-            to_u = min(last, from_u + BLOCK)
-            all_vote = True
-            for i in range(BLOCK):
-                counts = from_u + i < to_u and usable[from_u + i]
-                patterns[pattern, 0, i] = votes[0, from_u + i] if counts else 0
-                patterns[pattern, 1, i] = votes[1, from_u + i] if counts else 0
-                all_vote &= patterns[pattern, 0, i] + patterns[pattern, 1, i] == 2 * samples
-            block_row[blocks] = v
-            block_column[blocks] = from_u
-            # The place of a pattern that is not needed is taken by the next one.
-            block_pattern[blocks] = 0 if all_vote else pattern
-            pattern += 0 if all_vote else 1
-            for k in range(2 * padded):
-                outline = k // padded
-                sample = k - outline * padded
-                if sample >= samples:
-                    copies[count] = (nothing << ADVANCE_BITS) | BLOCK
-                    count += 1
-                    continue
-                here = nearest[outline * samples + sample]
-                # Centres around which the sample has the same offset: `run_source` is the pixel
-                # of the sample for the centre in column `run_u`. Unusable centres change nothing.
-                run_u = from_u
-                run_source = int(here[from_u]) if here[from_u] >= 0.0 else nothing
-                for u in range(from_u + 1, to_u):
-                    along = run_source
-                    if run_source != nothing:
-                        along += u - run_u
-                    if usable[u]:
-                        source = int(here[u]) if here[u] >= 0.0 else nothing
-                        if source != along:
-                            copies[count] = (run_source << ADVANCE_BITS) | (u - run_u)
-                            count += 1
-                            run_u = u
-                            run_source = source
-                copies[count] = (run_source << ADVANCE_BITS) | (from_u + BLOCK - run_u)
+
+@njit(cache=True, error_model="numpy")
+def usable_centres(
+    candidate: NDArray[np.bool_],
+    votes: NDArray[np.int64],
+    size: NDArray[np.float64],
+    scan: Scan,
+) -> NDArray[np.bool_]:
+    """Which of the candidates in a row have samples enough, and keep the stride.
+
+    Parameters
+    ----------
+    candidate : (N,) bool
+    votes : (2, N) int64
+        Samples of each outline inside the image.
+    size : (N,) float64
+        As in `row_samples`.
+    scan : Scan
+    """
+    usable = np.zeros(len(candidate), np.bool_)
+    following = 0
+    for u in range(len(candidate)):
+        if u >= following and candidate[u] and min(votes[0, u], votes[1, u]) >= scan.enough:
+            usable[u] = True
+            following = u + max(1, math.ceil(scan.stride / size[u]))
+    return usable
+
+
+@njit(cache=True, error_model="numpy")
+def blocks_of_row(usable: NDArray[np.bool_], strided: bool) -> NDArray[np.int64]:
+    """Part a row's usable centres into blocks of equal strides.
+
+    Parameters
+    ----------
+    usable : (N,) bool
+    strided : bool
+        Whether centres are left out on purpose; else blocks have the stride 1.
+
+    Returns
+    -------
+    (B, 3) int64
+        First centre, stride and number of centres of each block, in which there may be some that
+        are not usable.
+    """
+    columns = np.flatnonzero(usable)
+    blocks = np.empty((len(columns), 3), np.int64)
+    count = 0
+    i = 0
+    while i < len(columns):
+        apart = columns[i + 1] - columns[i] if strided and i + 1 < len(columns) else 1
+        stride = min(apart, LARGEST_STRIDE)
+        while apart % stride != 0:
+            stride -= 1
+        end = columns[i] + stride * PITCH
+        last = i
+        while last + 1 < len(columns) and columns[last + 1] < end:
+            if strided and columns[last + 1] - columns[last] != apart:
+                break
+            last += 1
+        blocks[count, 0], blocks[count, 1] = columns[i], stride
+        blocks[count, 2] = (columns[last] - columns[i]) // stride + 1
+        count += 1
+        i = last + 1
+    return blocks[:count].copy()
+
+
+@njit(cache=True, error_model="numpy")
+def copies_of_block(
+    nearest: NDArray[np.float64],
+    usable: NDArray[np.bool_],
+    block: NDArray[np.int64],
+    nothing: int,
+) -> NDArray[np.uint64]:
+    """How the grey values of a block are gathered: `lut.DiscTable.copies`.
+
+    Parameters
+    ----------
+    nearest : (2 K, N) float64
+        See `row_samples`.
+    usable : (N,) bool
+    block : (3,) int64
+        See `blocks_of_row`.
+    nothing : int
+        Index of the first pixel behind the image.
+    """
+    samples = len(nearest) // 2
+    padded = -(-samples // GROUP) * GROUP
+    first, stride, number = block
+    span = (COPIED - 1) // stride + 1
+    copies = np.empty(2 * padded * number + AT_ONCE, np.uint64)
+    count = 0
+    for k in range(2 * padded):
+        outline, sample = k // padded, k % padded
+        votes = sample < samples
+        here = nearest[outline * samples + min(sample, samples - 1)]
+        # Centres round which the sample has the same offset: `run` is the pixel of the sample for
+        # the centre `begin`. Other centres than usable ones do not matter.
+        begin = 0
+        run = int(here[first]) if votes and here[first] >= 0.0 else nothing
+        for j in range(1, number):
+            along = min(run + stride * (j - begin), nothing) if run != nothing else nothing
+            source = along
+            if usable[first + stride * j]:
+                pixel = here[first + stride * j]
+                source = int(pixel) if votes and pixel >= 0.0 else nothing
+            if source != along or j - begin == span:
+                copies[count] = (run << ADVANCE_BITS) | (j - begin)
                 count += 1
-            least = block_copies[blocks] + padded // GROUP * LEAST_COPIES
-            while count < least or count % GROUP != 0:
-                copies[count] = nothing << ADVANCE_BITS
-                count += 1
-            blocks += 1
-            block_copies[blocks] = count
-    return (
-        copies[:count].copy(),
-        block_copies[: blocks + 1].copy(),
-        block_row[:blocks].copy(),
-        block_column[:blocks].copy(),
-        block_pattern[:blocks].copy(),
-        patterns[:pattern].copy(),
-    )
+                begin = j
+                run = source
+        copies[count] = (run << ADVANCE_BITS) | (PITCH - begin)
+        count += 1
+    while count % AT_ONCE != 0:
+        copies[count] = nothing << ADVANCE_BITS
+        count += 1
+    return copies[:count].copy()

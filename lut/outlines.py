@@ -6,10 +6,10 @@ the calibration alone, so it is computed ahead of time, for every pixel (DLR Spa
 set report, circle detection).
 
 From one pixel to the next along a row, a sample nearly always moves by one pixel as well: its
-offset from the centre stays the same for some 40 pixels. So the table does not store an offset for
-each centre and sample but a list of *copies*: 64 neighbouring bytes of the image each. Placed one
-after the other, they align the grey values of one sample for consecutive centres. Excess bytes of a
-copy are overwritten by the next.
+offset from the centre stays the same for some 50 pixels. So the table does not store an offset for
+each centre and sample but a list of *copies*: up to 64 bytes of the image each, as far apart as the
+centres are. Placed one after the other, they align the grey values of one sample for consecutive
+centres. Excess bytes of a copy are overwritten by the next.
 
 Samples outside the image do not count: the table takes them from behind the image's last pixel,
 where a detector has zeros. A centre is usable if at least half of each outline's samples are
@@ -29,7 +29,15 @@ from camera import Camera
 from camera.kernels import camera_numbers
 from lut.errors import TableError
 from lut.floor import floor_positions
-from lut.kernels import ADVANCE_BITS, BLOCK, Scan, encode_outlines
+from lut.kernels import (
+    ADVANCE_BITS,
+    LANES,
+    Scan,
+    blocks_of_row,
+    copies_of_block,
+    row_samples,
+    usable_centres,
+)
 from storage.bounds import ABOVE_0, LIMIT, NOT_NEGATIVE, demand, whole
 
 #: Part of an outline's samples that must lie inside the image.
@@ -97,30 +105,31 @@ class DiscTable:
 
     Hashed and compared by identity.
 
-    Centres are processed in *blocks* of 64 neighbouring columns of a row. For each block ``2 R``
-    rows of 64 grey values are gathered, a column for each centre: R = `samples` rounded up to a
-    multiple of 4 for the inner outline, then R for the outer one; rows that are no samples are 0.
+    Centres are processed in *blocks*: up to 256 centres of a row, all of them or every n-th one.
+    For each block ``2 R`` rows of 256 grey values are gathered, a column for each centre: R =
+    `samples` rounded up to a multiple of 4 for the inner outline, then R for the outer one; rows
+    that are no samples are 0.
 
-    Copies fill these rows one after the other. Each is one number, ``source * 128 + advance``: 64
-    bytes of the image are copied, from the pixel with index `source` in scan order, and the next
-    copy goes `advance` bytes further. Each block has a multiple of 4 of them, and at least 4 R;
-    those that fill up copy zeros and go no further.
+    Copies fill these rows one after the other. Each is one number, ``source * 512 + advance``: of
+    64 pixels of the image every n-th one is copied, from the pixel with index `source` in scan
+    order on, and the next copy goes `advance` bytes further.
 
     Attributes
     ----------
     samples : int
         Samples on each of the two outlines.
-    copies : (N,) uint32, or uint64 for images of more than 33 Mpixel
+    copies : (N,) uint32, or uint64 for images of more than 8 Mpixel
         See above. `source` is H * W or less: behind the image's last pixel there are 64 zeros.
     block_copies : (B + 1,) int64
-        Block b has the copies ``block_copies[b] : block_copies[b + 1]``. Blocks are in scan order.
-    block_row, block_column : (B,) int32
-        First pixel of each block.
-    block_pattern : (B,) int32
-        Which of the `patterns` says who votes.
-    patterns : (P, 2, 64) uint8
-        Samples of the inner and of the outer outline inside the image, for the centres of a block;
-        0 for those that are not usable. In the first pattern all samples of all centres vote.
+        Block b has the copies ``block_copies[b] : block_copies[b + 1]``, a multiple of 4: those
+        that fill up copy zeros and go no further. Blocks are in scan order.
+    block_row, block_column, block_stride : (B,) int32
+        First centre of each block, and pixels from one to the next, at most 8.
+    block_votes : (B + 1,) int64
+        The centres of block b are the columns ``block_votes[b] : block_votes[b + 1]`` of `votes`.
+    votes : (2, M) uint8
+        Samples of the inner and of the outer outline inside the image, for the centres of all
+        blocks, of which each has a multiple of 32; 0 for those that are not usable.
     floor_xy : (H, W, 2) float32
         Floor position (robot X, Y in metres) that each pixel sees; NaN above the horizon.
     """
@@ -130,8 +139,9 @@ class DiscTable:
     block_copies: NDArray[np.int64]
     block_row: NDArray[np.int32]
     block_column: NDArray[np.int32]
-    block_pattern: NDArray[np.int32]
-    patterns: NDArray[np.uint8]
+    block_stride: NDArray[np.int32]
+    block_votes: NDArray[np.int64]
+    votes: NDArray[np.uint8]
     floor_xy: NDArray[np.float32]
 
     @cached_property
@@ -158,13 +168,29 @@ class DiscTable:
         """(H, W) samples of the outer outline inside the image, for usable centres."""
         return self._votes(1)
 
+    @cached_property
+    def centres(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Rows and columns of the centres of `votes`; what fills blocks up may be off the image."""
+        widths = np.diff(self.block_votes)
+        place = np.arange(self.votes.shape[1]) - np.repeat(self.block_votes[:-1], widths)
+        first, stride = np.repeat(self.block_column, widths), np.repeat(self.block_stride, widths)
+        return np.repeat(self.block_row, widths).astype(np.int64), first + place * stride
+
+    @cached_property
+    def block_whole(self) -> NDArray[np.bool_]:
+        """(B,) whether all samples of all usable centres of a block vote."""
+        lacking = (self.votes[0] > 0) & np.any(self.votes < self.samples, axis=0)
+        some = np.zeros(len(self.block_row), np.bool_)
+        some[np.repeat(np.arange(len(some)), np.diff(self.block_votes))[lacking]] = True
+        return ~some
+
     def _votes(self, outline: int) -> NDArray[np.uint8]:
         height, width = self.floor_xy.shape[:2]
-        # A row's last block may reach past the image's border.
-        votes = np.zeros((height, width + BLOCK), np.uint8)
-        columns = self.block_column[:, None] + np.arange(BLOCK)
-        votes[self.block_row[:, None], columns] = self.patterns[self.block_pattern, outline]
-        return votes[:, :width]
+        map_of_votes = np.zeros((height, width), np.uint8)
+        rows, columns = self.centres
+        inside = columns < width
+        map_of_votes[rows[inside], columns[inside]] = self.votes[outline, inside]
+        return map_of_votes
 
 
 def ring(radius_m: float, samples: int) -> NDArray[np.float64]:
@@ -205,27 +231,52 @@ def build_disc_table(camera: Camera, shape: DiscShape) -> DiscTable:
         # few digits; by the inverse some samples would fall on other pixels.
         numbers[10:19] = camera.rotation.T.ravel()
         size = _exact_size_down(camera)
-    copies, block_copies, row, column, pattern, patterns = encode_outlines(
-        numbers,
-        floor_xy,
-        _within_limits(size, shape),
-        ring(shape.inner_radius_m, shape.samples),
-        ring(shape.outer_radius_m, shape.samples),
-        shape.least_pairs or MIN_SHARE_INSIDE * shape.samples,
-        Scan(size, shape.stride_m, shape.least_pairs > 0, shape.apart_px),
+    scan = Scan(
+        enough=shape.least_pairs or MIN_SHARE_INSIDE * shape.samples,
+        stride=shape.stride_m,
+        pairs=shape.least_pairs > 0,
+        apart_px=shape.apart_px,
     )
+    inner = ring(shape.inner_radius_m, shape.samples)
+    outer = ring(shape.outer_radius_m, shape.samples)
     pixels = camera.height * camera.width
+    candidate = _within_limits(size, shape)
+    places: list[tuple[int, int, int]] = []
+    copies: list[NDArray[np.uint64]] = []
+    votes: list[NDArray[np.uint8]] = []
+    for row in np.flatnonzero(candidate.any(axis=1)).tolist():
+        nearest = row_samples(
+            numbers, floor_xy[row], inner, outer, size[row], (camera.height, camera.width), scan
+        )
+        inside = np.count_nonzero((nearest >= 0.0).reshape(2, shape.samples, -1), axis=1)
+        usable = usable_centres(candidate[row], inside, size[row], scan)
+        for block in blocks_of_row(usable, scan.stride > 0.0):
+            column, stride, number = block.tolist()
+            places.append((row, column, stride))
+            copies.append(copies_of_block(nearest, usable, block, pixels))
+            centres = column + stride * np.arange(number)
+            filled = np.zeros((2, -(-number // LANES) * LANES), np.uint8)
+            filled[:, :number] = np.where(usable[centres], inside[:, centres], 0)
+            votes.append(filled)
     fits = (pixels + 1) << ADVANCE_BITS <= np.iinfo(np.uint32).max + 1
+    every_copy = np.concatenate([np.empty(0, np.uint64), *copies])
+    numbers_of = np.array(places, np.int32).reshape(-1, 3).T.copy()
     return DiscTable(
         samples=shape.samples,
-        copies=copies.astype(np.uint32) if fits else copies,
-        block_copies=block_copies,
-        block_row=row,
-        block_column=column,
-        block_pattern=pattern,
-        patterns=patterns,
+        copies=every_copy.astype(np.uint32) if fits else every_copy,
+        block_copies=_bounds([len(of_block) for of_block in copies]),
+        block_row=numbers_of[0],
+        block_column=numbers_of[1],
+        block_stride=numbers_of[2],
+        block_votes=_bounds([of_block.shape[1] for of_block in votes]),
+        votes=np.concatenate([np.zeros((2, 0), np.uint8), *votes], axis=1),
         floor_xy=floor_xy.astype(np.float32),
     )
+
+
+def _bounds(lengths: list[int]) -> NDArray[np.int64]:
+    """Where each of some consecutive pieces begins, and where the last one ends."""
+    return np.cumsum([0, *lengths], dtype=np.int64)
 
 
 def _size_down(floor_xy: NDArray[np.float64]) -> NDArray[np.float64]:

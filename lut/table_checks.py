@@ -8,10 +8,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from camera import Camera
 from lut.errors import TableError
-from lut.kernels import ADVANCE_BITS, BLOCK, GROUP, LEAST_COPIES
+from lut.kernels import ADVANCE_BITS, AT_ONCE, GROUP, LANES, LARGEST_STRIDE, PITCH
 from lut.outlines import DiscShape, DiscTable
 from lut.verticals import VerticalTable
 
@@ -41,42 +42,43 @@ def check_disc_table(table: DiscTable, camera: Camera, shape: DiscShape) -> None
         ("block_copies", np.int64, 1),
         ("block_row", np.int32, 1),
         ("block_column", np.int32, 1),
-        ("block_pattern", np.int32, 1),
-        ("patterns", np.uint8, 3),
+        ("block_stride", np.int32, 1),
+        ("block_votes", np.int64, 1),
+        ("votes", np.uint8, 2),
         ("floor_xy", np.float32, 3),
     ):
         _demand_array(getattr(table, name), name, dtype, dimensions)
-    blocks, patterns = len(table.block_row), len(table.patterns)
+    blocks = len(table.block_row)
     _demand(table.floor_xy.shape == (height, width, 2), "floor_xy")
-    _demand(patterns >= 1 and table.patterns.shape[1:] == (2, BLOCK), "patterns")
-    _demand(len(table.block_column) == blocks == len(table.block_pattern), "block_row")
+    _demand(len(table.block_column) == blocks == len(table.block_stride), "block_row")
+    limits = {"row": (0, height), "column": (0, width), "stride": (1, LARGEST_STRIDE + 1)}
+    for name, (least, end) in limits.items():
+        values = getattr(table, f"block_{name}")
+        _demand(bool(np.all((values >= least) & (values < end))), f"block_{name}")
+
+    _demand(len(table.block_votes) == blocks + 1 and table.votes.shape[0] == 2, "block_votes")
+    _demand_bounds(table.block_votes, table.votes.shape[1], "block_votes")
+    widths = np.diff(table.block_votes)
+    _demand(bool(np.all((widths % LANES == 0) & (widths <= PITCH))), "block_votes")
+    _demand(bool(np.all(table.votes <= table.samples)), "votes")
+    # A block may reach past the image's border, but nothing votes there.
+    _demand(not table.votes[:, table.centres[1] >= width].any(), "votes")
+
     _demand(len(table.block_copies) == blocks + 1, "block_copies")
-    for name, length in (
-        ("block_row", height), ("block_column", width), ("block_pattern", patterns),
-    ):  # fmt: skip
-        values = getattr(table, name)
-        _demand(bool(np.all((values >= 0) & (values < length))), name)
-
-    _demand(bool(np.all(table.patterns <= table.samples)), "patterns")
-    _demand(bool(np.all(table.patterns[0] == table.samples)), "patterns")
-    # A row's last block may reach past the image's border, but nothing votes there.
-    past = table.block_column[:, None] + np.arange(BLOCK) >= width
-    block, place = np.nonzero(past)
-    _demand(not table.patterns[table.block_pattern[block], :, place].any(), "patterns")
-
-    padded = -(-table.samples // GROUP) * GROUP
-    first = table.block_copies
-    _demand(first[0] == 0 and first[-1] == len(table.copies), "block_copies")
-    counts = np.diff(first)
-    least = padded // GROUP * LEAST_COPIES
-    _demand(bool(np.all((counts >= least) & (counts % GROUP == 0))), "block_copies")
+    _demand_bounds(table.block_copies, len(table.copies), "block_copies")
+    _demand(bool(np.all(np.diff(table.block_copies) % AT_ONCE == 0)), "block_copies")
     if not blocks:
         return
     _demand(int(table.copies.max()) >> ADVANCE_BITS <= pixels, "copies")
-    advance = (table.copies & ((1 << ADVANCE_BITS) - 1)).astype(np.uint8)
-    _demand(int(advance.max()) <= BLOCK, "copies")
-    filled = np.add.reduceat(advance, first[:-1], dtype=np.int64)
-    _demand(bool(np.all(filled == 2 * padded * BLOCK)), "copies")
+    advance = (table.copies & ((1 << ADVANCE_BITS) - 1)).astype(np.int64)
+    filled = np.add.reduceat(advance, table.block_copies[:-1])
+    padded = -(-table.samples // GROUP) * GROUP
+    _demand(bool(np.all(filled == 2 * padded * PITCH)), "copies")
+
+
+def _demand_bounds(bounds: NDArray[np.int64], end: int, name: str) -> None:
+    """Refuse bounds of consecutive pieces, none of which may be empty, that are no such bounds."""
+    _demand(bool(bounds[0] == 0 and bounds[-1] == end and np.all(np.diff(bounds) > 0)), name)
 
 
 def check_vertical_table(table: VerticalTable, camera: Camera) -> None:

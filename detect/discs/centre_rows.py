@@ -15,22 +15,24 @@ from numpy.typing import NDArray
 
 from detect.settings import CircleSettings
 from lut import DiscTable
-from lut.kernels import BLOCK
+
+#: How far apart rows may be is found from every so many centres.
+_EVERY = 8
 
 
 class CentreRows(NamedTuple):
-    """Some rows of a table's centres.
+    """Some rows of a table's centres."""
 
-    Attributes
-    ----------
-    table : DiscTable
-        With the blocks of these rows alone.
-    rank : (H,) int64
-        Of each row of the image: its number among the rows evaluated. Neighbours differ by 1.
-    """
-
-    table: DiscTable
+    blocks: NDArray[np.int64]
+    """(B,) the table's blocks in these rows, ascending."""
     rank: NDArray[np.int64]
+    """(H,) of each row of the image: its number among those evaluated. Neighbours differ by 1."""
+
+
+@lru_cache(maxsize=4)
+def every_row(table: DiscTable) -> CentreRows:
+    """All rows of a table's centres."""
+    return CentreRows(np.arange(len(table.block_row)), np.arange(len(table.floor_xy)))
 
 
 def rows_to_look_at(table: DiscTable, settings: CircleSettings) -> CentreRows:
@@ -48,7 +50,7 @@ def rows_to_look_at(table: DiscTable, settings: CircleSettings) -> CentreRows:
     CentreRows
     """
     if not (settings.verify and settings.refine):
-        return centre_rows(table, 0.0)
+        return every_row(table)
     to_outline_m = min(
         settings.radius_m - settings.inner_radius_m, settings.outer_radius_m - settings.radius_m
     )
@@ -78,26 +80,7 @@ def centre_rows(table: DiscTable, apart_m: float) -> CentreRows:
     rank = np.cumsum(rank)
     looked_at = np.zeros(height, np.bool_)
     looked_at[rows] = True
-    blocks = np.flatnonzero(looked_at[table.block_row])
-    if len(blocks) == len(table.block_row):
-        return CentreRows(table, rank)
-    first, end = table.block_copies[blocks], table.block_copies[blocks + 1]
-    bounds = np.concatenate([[0], np.cumsum(end - first)])
-    # Copy k of the blocks left is copy k + (where its block began - where it begins now).
-    source = np.arange(bounds[-1]) + np.repeat(first - bounds[:-1], end - first)
-    return CentreRows(
-        DiscTable(
-            samples=table.samples,
-            copies=table.copies[source],
-            block_copies=bounds,
-            block_row=table.block_row[blocks],
-            block_column=table.block_column[blocks],
-            block_pattern=table.block_pattern[blocks],
-            patterns=table.patterns,
-            floor_xy=table.floor_xy,
-        ),
-        rank,
-    )
+    return CentreRows(np.flatnonzero(looked_at[table.block_row]), rank)
 
 
 def _farthest_step(table: DiscTable, apart_m: float) -> NDArray[np.int64]:
@@ -108,8 +91,8 @@ def _farthest_step(table: DiscTable, apart_m: float) -> NDArray[np.int64]:
     if apart_m <= 0.0:
         return step
     flattest = np.full(height, np.inf)
-    column = np.minimum(table.block_column[:, None] + np.arange(0, BLOCK, 8), width - 2)
-    row = np.broadcast_to(np.clip(table.block_row, 1, height - 2)[:, None], column.shape)
+    row, column = (centres[::_EVERY] for centres in table.centres)
+    row, column = np.clip(row, 1, height - 2), np.minimum(column, width - 2)
     column = np.maximum(column, 1)
     by_u = floor[row, column + 1].astype(np.float64) - floor[row, column - 1]
     by_v = floor[row + 1, column].astype(np.float64) - floor[row - 1, column]

@@ -3,7 +3,7 @@
 Glare or a sun patch beside a disc raises the total variance of its outlines, a cable across it
 leaves much that the fit of a disc does not explain, and far away a disc has few pixels. A person
 sees the disc all the same. Here the candidates are those centres round which the grey value steps
-in most directions (`Votes` of the quality). What the two outlines say about the disturbed
+in most directions (`detect.discs.quality`). What the two outlines say about the disturbed
 directions is enough to drop most of the clutter among them; round the others the rim is followed,
 and a small network (`detect.discs.rim_network`) decides by the grey values about it and by the rim.
 """
@@ -16,13 +16,11 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from detect.discs.candidate_kernels import strong_and_alone
-from detect.discs.centres import Centres
+from detect.discs.candidates import Centres, strong_and_alone, suppress_neighbours
 from detect.discs.patch import floor_steps
-from detect.discs.quality_kernels import suppress_neighbours
 from detect.discs.rim import Rim, follow_rim, profiles
 from detect.discs.rim_network import RimNetwork, network_inputs, network_log_odds
-from detect.discs.search_kernels import DiscSearch
+from detect.discs.search import DiscSearch
 
 _DIRECTIONS = 16
 _ANGLES = 2.0 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS

@@ -38,7 +38,7 @@ def poisoned(tmp_path: Path, camera: Camera) -> Path:
     table = cached_disc_table(camera, SHAPE, folder)
     (path,) = folder.iterdir()
     # Its first copy comes from the image's first pixel.
-    copies = changed(table.copies, 0, table.copies[0] & 127)
+    copies = changed(table.copies, 0, table.copies[0] & 511)
     wrong = dataclasses.replace(table, copies=copies)
     check_disc_table(wrong, camera, SHAPE)
     fields = {
@@ -146,11 +146,13 @@ DISC_DAMAGE: list[tuple[str, Callable[[Any], Any]]] = [
     ("block_row", lambda table: changed(table.block_row, 0, -1)),
     ("block_row", lambda table: table.block_row[:-1].copy()),
     ("block_column", lambda table: changed(table.block_column, 0, 96)),
-    ("block_pattern", lambda table: changed(table.block_pattern, 0, len(table.patterns))),
-    ("block_pattern", lambda table: changed(table.block_pattern, 0, -1)),
-    ("patterns", lambda table: changed(table.patterns, -1, 6)),
-    ("patterns", lambda table: table.patterns[:0]),
-    ("patterns", lambda table: table.patterns[:, :1].copy()),
+    ("block_stride", lambda table: changed(table.block_stride, 0, 0)),
+    ("block_stride", lambda table: changed(table.block_stride, 0, 9)),
+    ("block_votes", lambda table: changed(table.block_votes, 1, table.block_votes[1] + 1)),
+    ("block_votes", lambda table: changed(table.block_votes, 1, 1 << 40)),
+    ("votes", lambda table: changed(table.votes, (0, 0), 6)),
+    ("votes", lambda table: np.full_like(table.votes, 1)),
+    ("votes", lambda table: table.votes[:1].copy()),
     ("floor_xy", lambda table: table.floor_xy[:-1].copy()),
 ]
 

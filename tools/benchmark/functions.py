@@ -9,8 +9,9 @@ import numpy as np
 
 from camera import Camera
 from detect.circles import detect_circles, disc_shape
+from detect.discs.candidates import best_centres
 from detect.discs.centre_rows import rows_to_look_at
-from detect.discs.centres import best_centres, quality_of_centres
+from detect.discs.quality import quality_of_centres
 from detect.levelling import levelled
 from detect.line_settings import DEFAULT as LINES_DEFAULT
 from detect.lines import detect_lines
@@ -70,7 +71,7 @@ def circle_detectors(camera: Camera, *, parts: bool = True) -> list[Measured]:
     report = cached_disc_table(camera, disc_shape(REPORT))
     settings = CircleSettings()
     default = cached_disc_table(camera, disc_shape(settings))
-    some, rank = rows_to_look_at(default, settings)
+    rows = rows_to_look_at(default, settings)
     pieces = [
         Measured(KERNEL, "circles", lambda p: quality_of_centres(p.grey, report)),
         Measured("quality map (default)", "circles", lambda p: quality_of_centres(p.grey, default)),
@@ -82,7 +83,7 @@ def circle_detectors(camera: Camera, *, parts: bool = True) -> list[Measured]:
         Measured(
             "best centres (default)",
             "circles",
-            lambda p: best_centres(p.grey, some, settings.threshold, settings.polarity, rank),
+            lambda p: best_centres(p.grey, default, settings.threshold, settings.polarity, rows),
         ),
         Measured("noise estimate", "circles", lambda p: estimate_noise(p.grey)),
     ]

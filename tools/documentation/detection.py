@@ -26,7 +26,7 @@ def draw_discs(figure: Any, run: Path, frame: int) -> None:
     camera, image = _frame(run, frame)
     settings = CircleSettings()
     table = cached_disc_table(camera, disc_shape(settings))
-    from detect.discs.centres import quality_of_centres
+    from detect.discs.quality import quality_of_centres
 
     quality, _ = quality_of_centres(image, table)
     found = detect_circles(image, camera, table, settings)

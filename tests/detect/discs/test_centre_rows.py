@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 
 from camera import Camera, parse_camera
 from detect.circles import CircleDetections, detect_circles, disc_shape, quality_of_centres
+from detect.discs.candidates import best_centres, local_maxima
 from detect.discs.centre_rows import centre_rows
-from detect.discs.centres import best_centres
-from detect.discs.maxima_kernels import local_maxima
 from detect.settings import CircleSettings
 from lut import DiscTable, build_disc_table
 from tests.camera.strategies import cameras
@@ -37,14 +36,14 @@ def detect(image: NDArray[np.uint8], circles: CircleSettings) -> CircleDetection
 
 
 def rows_looked_at(table: DiscTable, apart_m: float) -> list[int]:
-    rows: list[int] = np.unique(centre_rows(table, apart_m).table.block_row).tolist()
+    rows: list[int] = np.unique(table.block_row[centre_rows(table, apart_m).blocks]).tolist()
     return rows
 
 
 def test_every_row_is_looked_at_unless_asked_otherwise() -> None:
     table = table_of(CAMERA)
     every = centre_rows(table, 0.0)
-    assert every.table is table
+    assert np.array_equal(every.blocks, np.arange(len(table.block_row)))
     assert np.all(np.diff(every.rank) == 1)
 
 
@@ -68,16 +67,7 @@ def test_no_usable_centre_is_too_far_from_the_rows_looked_at(
     looked_at = centre_rows(table, apart_m)
     some = np.zeros(camera.height, bool)
     some[np.flatnonzero(np.diff(looked_at.rank, prepend=0))] = True
-    # Blocks of the rows looked at are all there, in order and unchanged.
-    kept = np.flatnonzero(some[table.block_row])
-    assert looked_at.table.block_row.tolist() == table.block_row[kept].tolist()
-    assert looked_at.table.block_column.tolist() == table.block_column[kept].tolist()
-    for b, was in enumerate(kept):
-        now = looked_at.table.block_copies[b : b + 2]
-        then = table.block_copies[was : was + 2]
-        np.testing.assert_array_equal(
-            looked_at.table.copies[slice(*now)], table.copies[slice(*then)]
-        )
+    assert looked_at.blocks.tolist() == np.flatnonzero(some[table.block_row]).tolist()
     # From a centre in a row left out, the nearest row looked at is less than `apart_m` away, or
     # half of two neighbouring rows.
     rows = np.flatnonzero(some)
@@ -101,7 +91,7 @@ def test_best_centres_are_the_maxima_among_the_rows_looked_at() -> None:
     rng = np.random.default_rng(3)
     coarse = rng.integers(0, 256, (CAMERA.height // 8, CAMERA.width // 16), dtype=np.uint8)
     image = np.kron(coarse, np.ones((8, 16), np.uint8))
-    found = best_centres(image, looked_at.table, 0.4, "any", looked_at.rank)
+    found = best_centres(image, table, 0.4, "any", looked_at)
     rows = np.flatnonzero(np.diff(looked_at.rank, prepend=0))
     quality, contrast = quality_of_centres(image, table)
     columns, rank = local_maxima(quality[rows], 0.4)

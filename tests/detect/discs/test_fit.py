@@ -8,9 +8,10 @@ from numpy.typing import NDArray
 
 from camera import Camera
 from detect.circles import disc_shape, refined_covariance, tilt_jacobian
-from detect.discs.candidate_kernels import middles, nearest_pixel, strong_and_alone
+from detect.discs.candidates import middles, strong_and_alone
 from detect.discs.fit import disc_evidence, fit_discs, fit_settings
 from detect.discs.patch import EDGE, Candidate, view_of
+from detect.discs.search import nearest_pixel
 from detect.settings import CircleSettings
 from lut import DiscTable, build_disc_table
 from tests.detect.painted_floor import PaintedFloor

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from camera import Camera
 from detect.circles import disc_shape
-from detect.discs.candidate_kernels import share_of_steps
 from detect.discs.fit import fit_settings
 from detect.discs.model import GREY, ONE, PLANE_X, PLANE_Y
 from detect.discs.patch import EDGE, PATCH, WHOLE, Candidate, FitSettings, Gathered, gather, padded
+from detect.discs.search import share_of_steps
 from detect.settings import CircleSettings
 from lut import DiscTable, build_disc_table
 from tests.detect.painted_floor import PaintedFloor

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from camera import Camera
 from detect.circles import CircleDetections, detect_circles, disc_shape
-from detect.discs.alone_kernels import strong_and_highest
+from detect.discs.published import strong_and_highest
 from detect.settings import PUBLISHED, CircleSettings
 from lut import build_disc_table
 from tests.detect.painted_floor import PaintedFloor, mirrored_camera

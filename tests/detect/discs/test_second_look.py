@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from camera import Camera
 from detect.circles import CircleDetections, candidates_of, detect_circles, disc_shape
 from detect.discs import fit
-from detect.discs.search_kernels import _of_likely_sign
+from detect.discs.search import _of_likely_sign
 from detect.settings import CircleSettings
 from lut import DiscTable, build_disc_table
 from tests.detect.painted_floor import FLOOR, LIGHT, PaintedFloor

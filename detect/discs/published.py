@@ -1,10 +1,40 @@
-"""Compiled: which centres are strong enough, and have no better one nearby."""
+"""The published detector: the best centres of a good quality and contrast, as they are.
+
+It accepts centres of the table by their quality and contrast alone, and keeps the best within a
+disc's width (DLR Spatial Cognition data set report, circle detection).
+"""
 
 from __future__ import annotations
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
+
+from detect.discs.quality import Blocks, Wanted, find_centres
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def published_centres(
+    pixels: NDArray[np.uint8],
+    blocks: Blocks,
+    chosen: NDArray[np.int64],
+    wanted: Wanted,
+    floor_xy: NDArray[np.float32],
+    separation: float,
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Pixels (M, 2) and quality (M,) of the centres that stay: one call for each image.
+
+    Parameters are those of `find_centres` and `strong_and_highest`.
+    """
+    found = find_centres(pixels, blocks, chosen, wanted)
+    places = np.empty((len(found), 2), np.int64)
+    places[:, 0], places[:, 1] = found["u"], found["v"]
+    quality = found["quality"].copy()
+    keep = strong_and_highest(
+        places, quality, found["contrast"].copy(), floor_xy, wanted.quality, wanted.contrast,
+        separation,
+    )  # fmt: skip
+    return places[keep], quality[keep]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -24,7 +54,7 @@ def strong_and_highest(
     Parameters
     ----------
     pixels, quality, contrast : (N, 2) int64, (N,) float64, (N,) float32
-        Centres in scan order (see `detect.discs.centres`).
+        Centres in scan order (see `detect.discs.candidates`).
     floor_xy : (H, W, 2) float32
         Floor position of each pixel, metres.
     threshold : float

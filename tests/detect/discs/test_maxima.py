@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
 
-from detect.discs.maxima_kernels import local_maxima, maxima
-from tests.detect.plain_centres import plain_maxima
+from detect.discs.candidates import local_maxima, maxima
+from tests.reference.centres import plain_maxima
 
 
 def plateaus(quality: NDArray[np.float64], threshold: float) -> list[set[tuple[int, int]]]:

@@ -1,0 +1,544 @@
+"""Compiled search for discs among the maxima of the quality: looks, fits, and one row per disc."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from detect.discs import fit
+from detect.discs.candidates import Centres, middles, strong_and_alone, suppress_neighbours
+from detect.discs.descent import PATIENT, Hope
+from detect.discs.evidence_kernels import (
+    CLEAR_EVIDENCE,
+    LEAST_MIDDLE_STEP,
+    LEAST_RIM,
+    LEAST_RIM_PX,
+    RADIUS_RANGE,
+    evidence_of,
+    evidence_with_rim,
+)
+from detect.discs.fit import RESULT, fit_disc
+from detect.discs.model import Disc
+from detect.discs.patch import Candidate, FitSettings, floor_steps
+from detect.discs.positions import refined_covariances
+from detect.discs.rim import follow_rim
+
+#: Candidates whose first look is this much below the required evidence are not fitted in full; more
+#: is allowed where the quality is high, for what hides part of a disc hardly lowers that.
+_FIRST_LOOK_SLACK = 2.0
+_SLACK_PER_QUALITY, _ORDINARY_QUALITY = 15.0, 0.7
+#: A look must promise to explain this share of the variance.
+_LEAST_SHARE = 0.1
+#: A look this much above the required evidence shows a disc clearly; within this share of the
+#: separation from it nothing else is looked for.
+_CLEAR = 6.0
+_WITHIN = 0.75
+#: Looks that came to places nearer than this share of the separation are at the same disc.
+_SAME_DISC = 0.3
+#: In place of an evidence of minus infinity, where nothing is verified.
+_NO_EVIDENCE = -1e9
+#: A blur that reached this share of the most that a patch allows is fitted again in a wider one.
+_AT_BOUND = 0.98
+_MOST_REFITS = 2
+#: From this number of clear discs on, their sign counts against doubtful ones of the other.
+_LEAST_CLEAR = 20
+#: By fit and rim together, a candidate that the fit speaks against needs these log-odds, and one
+#: that it speaks for is dropped below those.
+_RESCUED, _REFUTED = 0.93, 0.0
+#: Where the edge is farther than this from a circle (radii), the rim is a coincidence.
+_MOST_UNEVEN = 0.14
+#: A disc whose evidence exceeds the least by this much is placed by the fit.
+_BY_FIT = 0.5
+#: From this share of the rim on, the fit of the whole disc gives the place better.
+_WHOLE_RIM = 0.9
+
+
+#: Candidates of a lower quality than this are kept only if the grey value steps in this share
+#: of the directions, by this share of the contrast.
+CLEAR_QUALITY = 0.55
+_LEAST_STEPS = 0.9
+_LEAST_STEP = 0.25
+_DIRECTIONS = np.array([[math.cos(k * math.pi / 8), math.sin(k * math.pi / 8)] for k in range(16)])
+
+
+class DiscSearch(NamedTuple):
+    """What is searched for: see `detect.settings.CircleSettings`."""
+
+    radius: float
+    """Nominal radius, and those of the outlines, metres."""
+    inner: float
+    outer: float
+    separation: float
+    """Metres."""
+    verify: bool
+    """Drop candidates without evidence of a disc."""
+    refine: bool
+    """Neighbours are suppressed at the fitted positions; else at the candidates'."""
+    least_evidence: float
+    optics_px: float
+    pixel_variance: float
+    """Of the systematic error, pixels squared."""
+    tilt_variance: float
+    """Of pitch and of roll, radians squared."""
+
+
+class Scene(NamedTuple):
+    """An image, and how it is searched."""
+
+    image: NDArray[np.uint8]
+    floor_xy: NDArray[np.float32]
+    search: DiscSearch
+    settings: FitSettings
+    camera_numbers: NDArray[np.float64]
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def search_discs(
+    image: NDArray[np.uint8],
+    floor_xy: NDArray[np.float32],
+    centres: Centres,
+    weakest: float,
+    search: DiscSearch,
+    settings: FitSettings,
+    camera: tuple[NDArray[np.float64], NDArray[np.float64]],
+    work: NDArray[Any],
+) -> tuple[
+    NDArray[np.int64],
+    NDArray[np.float64],
+    NDArray[np.float64],
+    NDArray[np.float64],
+    NDArray[np.float64],
+]:
+    """Fit discs at the best centres, weigh the evidence, and keep the best of those that are one.
+
+    Parameters
+    ----------
+    image : (H, W) uint8
+    floor_xy : (H, W, 2) float32
+        Floor position of each pixel, metres.
+    centres : Centres
+    weakest : float
+        Least contrast, grey levels.
+    search : DiscSearch
+    settings : FitSettings
+    camera : (K,) float64, (3,) float64
+        `camera_numbers` and `centre` of `detect.discs.positions.refined_covariances`.
+    work : (1,) WORK
+        See `detect.discs.fit.working_space`.
+
+    Returns
+    -------
+    own_pixels, own_quality : (M, 2) int64, (M,) float64
+        Those of the best centres that are discs, in their order.
+    found_xy : (M, 2) float64
+        Their fitted places, metres.
+    covariance : (M, 2, 2) float64
+        Square metres.
+    evidence : (M,) float64
+    """
+    pixels, quality, contrast = centres.pixels, centres.quality, centres.contrast
+    camera_numbers, centre = camera
+    # Each disc has several best centres: of those in the middle of it one is enough.
+    near = 0.5 * search.separation
+    keep = strong_and_alone(pixels, quality, contrast, floor_xy, weakest, near)
+    starts = middles(pixels, quality, contrast, floor_xy, weakest, near, keep)
+    scene = Scene(image, floor_xy, search, settings, camera_numbers)
+    results, evidence, found = _fit_all(scene, starts, quality[keep], contrast[keep], work[0])
+    if search.verify:
+        found = _of_likely_sign(results, evidence, found, search.least_evidence)
+    own_pixels = np.empty((len(found), 2), np.int64)
+    own_quality = np.empty(len(found))
+    found_xy = np.empty((len(found), 2))
+    covariance = np.empty((len(found), 2, 2))
+    log_odds = np.empty(len(found))
+    for k in range(len(found)):
+        result = results[found[k]]
+        i = keep[found[k]]
+        own_pixels[k, 0] = pixels[i, 0]
+        own_pixels[k, 1] = pixels[i, 1]
+        own_quality[k] = quality[i]
+        found_xy[k, 0] = result[fit.X]
+        found_xy[k, 1] = result[fit.Y]
+        covariance[k, 0, 0] = result[fit.COV_XX]
+        covariance[k, 0, 1] = covariance[k, 1, 0] = result[fit.COV_XY]
+        covariance[k, 1, 1] = result[fit.COV_YY]
+        log_odds[k] = evidence[found[k]]
+    covariance = refined_covariances(
+        camera_numbers, centre, found_xy, covariance, search.pixel_variance, search.tilt_variance
+    )
+    return own_pixels, own_quality, found_xy, covariance, log_odds
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _of_likely_sign(
+    results: NDArray[Any],
+    evidence: NDArray[np.float64],
+    found: NDArray[np.int64],
+    least_evidence: float,
+) -> NDArray[np.int64]:
+    """Which discs are not both doubtful and the only dark ones among light ones, or vice versa.
+
+    Discs of one place are mostly alike. With m of n clear discs of a sign, the odds of that sign
+    are (m + 1) : (n - m + 1) by Laplace's rule of succession; where they speak against a doubtful
+    disc, they are weighed with its evidence. Few clear discs say too little.
+    """
+    light = dark = 0
+    for i in found:
+        if evidence[i] >= least_evidence + CLEAR_EVIDENCE:
+            if results[i][fit.CONTRAST] > 0.0:
+                light += 1
+            else:
+                dark += 1
+    if light + dark < _LEAST_CLEAR:
+        return found
+    log_odds = math.log((light + 1.0) / (dark + 1.0))
+    likely = np.ones(len(found), np.bool_)
+    for k in range(len(found)):
+        i = found[k]
+        sign = 1.0 if results[i][fit.CONTRAST] > 0.0 else -1.0
+        likely[k] = evidence[i] + min(sign * log_odds, 0.0) >= least_evidence
+    return found[likely]
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _evidence(result: Any, radius: float, optics_px: float) -> float:
+    return evidence_of(
+        result[fit.EXPLAINED],
+        result[fit.RADIUS] / radius,
+        result[fit.OUTLINE_DEVIATION],
+        result[fit.SECTORS_GOOD],
+        result[fit.MIDDLE_STEP],
+        result[fit.RELATIVE_BLUR],
+        optics_px,
+    )
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _slack(quality: float) -> float:
+    """How much less than the required evidence a first look may promise."""
+    return _FIRST_LOOK_SLACK + _SLACK_PER_QUALITY * max(quality - _ORDINARY_QUALITY, 0.0)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _shows_rim(
+    image: NDArray[np.uint8],
+    camera_numbers: NDArray[np.float64],
+    search: DiscSearch,
+    result: Any,
+) -> bool:
+    """Whether enough of a rim is in view round a poor first look to be worth a fit."""
+    rim = follow_rim(
+        image, camera_numbers, result[fit.X], result[fit.Y], search.radius, result[fit.CONTRAST]
+    )
+    return bool(rim.agreeing >= LEAST_RIM or rim.radius_px < LEAST_RIM_PX)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _with_rim(
+    image: NDArray[np.uint8],
+    camera_numbers: NDArray[np.float64],
+    search: DiscSearch,
+    quality: float,
+    log_odds: float,
+    result: Any,
+) -> float:
+    """The evidence of a doubtful fit with its rim, which also places a partly hidden disc."""
+    relative = result[fit.RADIUS] / search.radius
+    possible = (
+        RADIUS_RANGE[0] < relative < RADIUS_RANGE[1] and result[fit.MIDDLE_STEP] > LEAST_MIDDLE_STEP
+    )
+    if not possible:
+        return log_odds
+    rim = follow_rim(
+        image, camera_numbers, result[fit.X], result[fit.Y], search.radius, result[fit.CONTRAST]
+    )
+    if rim.radius_px < LEAST_RIM_PX:
+        return log_odds
+    together = evidence_with_rim(
+        log_odds, result[fit.EXPLAINED], result[fit.CONTRAST], quality, rim, search.radius
+    )
+    by_fit = log_odds
+    if log_odds >= search.least_evidence and together < _REFUTED:
+        by_fit = -math.inf
+    by_rim = search.least_evidence + together - _RESCUED
+    if log_odds >= search.least_evidence + _BY_FIT or result[fit.OUTLINE_DEVIATION] > _MOST_UNEVEN:
+        return by_fit
+    if by_rim < search.least_evidence and log_odds >= search.least_evidence:
+        return by_fit
+    if rim.agreeing < _WHOLE_RIM:
+        result[fit.X], result[fit.Y] = rim.x, rim.y
+        result[fit.COV_XX], result[fit.COV_XY], result[fit.COV_YY] = (
+            rim.cov_xx,
+            rim.cov_xy,
+            rim.cov_yy,
+        )
+    return by_rim
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def nearest_pixel(
+    floor_xy: NDArray[np.float32], u: int, v: int, x: float, y: float
+) -> tuple[int, int]:
+    """The pixel that sees the floor nearest to (x, y), starting from one nearby."""
+    height, width = floor_xy.shape[:2]
+    for _ in range(3):
+        u = min(max(u, 1), width - 2)
+        v = min(max(v, 1), height - 2)
+        xu = 0.5 * (floor_xy[v, u + 1, 0] - floor_xy[v, u - 1, 0])
+        yu = 0.5 * (floor_xy[v, u + 1, 1] - floor_xy[v, u - 1, 1])
+        xv = 0.5 * (floor_xy[v + 1, u, 0] - floor_xy[v - 1, u, 0])
+        yv = 0.5 * (floor_xy[v + 1, u, 1] - floor_xy[v - 1, u, 1])
+        area = xu * yv - xv * yu
+        dx = x - floor_xy[v, u, 0]
+        dy = y - floor_xy[v, u, 1]
+        du = (yv * dx - xv * dy) / area
+        dv = (xu * dy - yu * dx) / area
+        if not (abs(du) < width and abs(dv) < height):
+            return u, v
+        if abs(du) <= 0.5 and abs(dv) <= 0.5:
+            return u, v
+        u += round(du)
+        v += round(dv)
+    return min(max(u, 1), width - 2), min(max(v, 1), height - 2)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def share_of_steps(
+    image: NDArray[np.uint8],
+    floor_xy: NDArray[np.float32],
+    u0: int,
+    v0: int,
+    inner: float,
+    outer: float,
+    contrast: float,
+) -> float:
+    """In what share of directions the grey value steps from a small circle to a large one.
+
+    Clutter (an edge, a corner, texture) can part the grey values of the two circles nearly as well
+    as a disc does, but it does so on some sides only.
+
+    Parameters
+    ----------
+    image : (H, W) uint8
+    floor_xy : (H, W, 2) float32
+        Floor position of each pixel, metres.
+    u0, v0 : int
+        The circles' centre.
+    inner, outer : float
+        Radii, metres: on the floor, which is taken to be seen as a plane by parallel rays.
+    contrast : float
+        Grey levels inside minus outside; a step of the same sign and a quarter of that counts.
+
+    Returns
+    -------
+    float
+        Of the directions in which both circles are in the image; 1 if there are none.
+    """
+    height, width = image.shape
+    xu, yu, xv, yv = floor_steps(floor_xy, u0, v0)
+    area = xu * yv - xv * yu
+    if not abs(area) > 0.0:
+        return 1.0
+    per_area = 1.0 / area
+    seen = 0
+    steps = 0
+    for k in range(len(_DIRECTIONS)):
+        x, y = _DIRECTIONS[k, 0], _DIRECTIONS[k, 1]
+        du = (yv * x - xv * y) * per_area
+        dv = (xu * y - yu * x) * per_area
+        # Half a pixel up, and rounded down: nearest pixels.
+        u1 = math.floor(u0 + inner * du + 0.5)
+        v1 = math.floor(v0 + inner * dv + 0.5)
+        u2 = math.floor(u0 + outer * du + 0.5)
+        v2 = math.floor(v0 + outer * dv + 0.5)
+        if min(u1, u2, v1, v2) < 0 or max(u1, u2) >= width or max(v1, v2) >= height:
+            continue
+        seen += 1
+        difference = float(image[v1, u1]) - float(image[v2, u2])
+        steps += 1 if difference * contrast > _LEAST_STEP * contrast * contrast else 0
+    return steps / seen if seen > 0 else 1.0
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def worth_a_look(
+    image: NDArray[np.uint8],
+    floor_xy: NDArray[np.float32],
+    u: int,
+    v: int,
+    quality: float,
+    contrast: float,
+    inner: float,
+    outer: float,
+) -> bool:
+    """Whether a candidate's quality is clear, or the grey value steps on most sides.
+
+    Parameters are those of `share_of_steps`.
+    """
+    if quality >= CLEAR_QUALITY:
+        return True
+    steps = share_of_steps(image, floor_xy, u, v, inner, outer, contrast)
+    return bool(steps >= _LEAST_STEPS)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _near_clear(clear: NDArray[np.float64], count: int, x: float, y: float, near: float) -> bool:
+    """Whether a place is nearer than this to one of the first discs that showed clearly."""
+    for k in range(count):
+        dx, dy = clear[k, 0] - x, clear[k, 1] - y
+        if dx * dx + dy * dy < near * near:
+            return True
+    return False
+
+
+@njit(cache=True, error_model="numpy")
+def _fit(
+    scene: Scene, candidate: Candidate, start: Disc, look: bool, quality: float, work: Any,
+    result: Any,
+) -> tuple[bool, float]:  # fmt: skip
+    """Fit a disc, or look: whether that came to a result, and the evidence.
+
+    The one call of `fit_disc` here: machine code of it twice takes twice as long to compile.
+    """
+    search = scene.search
+    hope = PATIENT
+    if search.verify:
+        hope = Hope(_LEAST_SHARE, search.least_evidence - _slack(quality), search.optics_px)
+    fitted = fit_disc(
+        scene.image, scene.floor_xy, candidate, scene.settings, start, look, hope, work, result
+    )
+    return fitted, _evidence(result, search.radius, search.optics_px) if fitted else -math.inf
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _promising(scene: Scene, quality: float, log_odds: float, result: Any) -> bool:
+    """Whether a look is worth a fit."""
+    search = scene.search
+    if log_odds >= search.least_evidence - _FIRST_LOOK_SLACK:
+        return True
+    if log_odds < search.least_evidence - _slack(quality):
+        return False
+    return _shows_rim(scene.image, scene.camera_numbers, search, result)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _look_at_all(
+    scene: Scene, pixels: NDArray[np.int64], quality: NDArray[np.float64],
+    contrast: NDArray[np.float32], work: Any,
+) -> tuple[Any, NDArray[np.float64]]:  # fmt: skip
+    """Look at the candidates, the best first: (N,) RESULT, and what they promise.
+
+    What lies within a disc that showed clearly need not be looked at. The promise is the evidence;
+    minus infinity for what is not worth a fit.
+    """
+    search, floor_xy = scene.search, scene.floor_xy
+    looks = np.zeros(len(pixels), RESULT)
+    promise = np.full(len(pixels), -np.inf)
+    clear = np.empty((len(pixels), 2))
+    clear_count = 0
+    blur = _first_blur(scene)
+    for i in np.argsort(-quality, kind="mergesort"):
+        u, v = pixels[i, 0], pixels[i, 1]
+        x, y = float(floor_xy[v, u, 0]), float(floor_xy[v, u, 1])
+        if _near_clear(clear, clear_count, x, y, _WITHIN * search.separation):
+            continue
+        if search.verify and not worth_a_look(
+            scene.image, floor_xy, u, v, quality[i], float(contrast[i]), search.inner, search.outer
+        ):
+            continue
+        candidate = Candidate(u, v, search.radius, blur)
+        start = Disc(0.0, 0.0, 1.0, math.log(blur))
+        fitted, log_odds = _fit(scene, candidate, start, True, quality[i], work, looks[i])
+        if not search.verify:
+            if fitted:
+                promise[i] = max(log_odds, _NO_EVIDENCE)
+        elif _promising(scene, quality[i], log_odds, looks[i]):
+            promise[i] = log_odds
+            if log_odds >= search.least_evidence + _CLEAR:
+                clear[clear_count, 0], clear[clear_count, 1] = looks[i][fit.X], looks[i][fit.Y]
+                clear_count += 1
+    return looks, promise
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _first_blur(scene: Scene) -> float:
+    return max(scene.settings.blur_px, 0.6 * scene.search.optics_px)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _fit_after_look(
+    scene: Scene, pixel: NDArray[np.int64], quality: float, look: Any, work: Any, result: Any
+) -> tuple[bool, float]:
+    """Fit in full where a look came to: whether it is a disc, and the evidence."""
+    search, floor_xy = scene.search, scene.floor_xy
+    u, v = nearest_pixel(floor_xy, pixel[0], pixel[1], look[fit.X], look[fit.Y])
+    # A look gives the blur but roughly: too small a patch would be gathered again.
+    blur = max(look[fit.BLUR], _first_blur(scene))
+    x, y, radius, log_blur = look[fit.X], look[fit.Y], look[fit.RADIUS], math.log(look[fit.BLUR])
+    enough, log_odds = False, -math.inf
+    for _ in range(1 + _MOST_REFITS):
+        start = Disc(
+            (x - floor_xy[v, u, 0]) / search.radius,
+            (y - floor_xy[v, u, 1]) / search.radius,
+            radius / search.radius,
+            log_blur,
+        )
+        candidate = Candidate(u, v, search.radius, blur)
+        fitted, log_odds = _fit(scene, candidate, start, False, quality, work, result)
+        if search.verify and fitted and log_odds < search.least_evidence + CLEAR_EVIDENCE:
+            log_odds = _with_rim(
+                scene.image, scene.camera_numbers, search, quality, log_odds, result
+            )
+        enough = fitted and (not search.verify or log_odds >= search.least_evidence)
+        if not (enough and result[fit.BLUR] > _AT_BOUND * result[fit.BLUR_BOUND]):
+            break
+        # Too blurred for its patch: once more, in a wider one.
+        blur = result[fit.BLUR_BOUND]
+        x, y, radius = result[fit.X], result[fit.Y], result[fit.RADIUS]
+        log_blur = math.log(result[fit.BLUR])
+    return enough, log_odds
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _fit_all(
+    scene: Scene, pixels: NDArray[np.int64], quality: NDArray[np.float64],
+    contrast: NDArray[np.float32], work: Any,
+) -> tuple[Any, NDArray[np.float64], NDArray[np.int64]]:  # fmt: skip
+    """Look at all, then fit what the looks left: the results, the evidence, the discs."""
+    n = len(pixels)
+    search = scene.search
+    looks, promise = _look_at_all(scene, pixels, quality, contrast, work)
+    order = np.flatnonzero(promise > -np.inf)
+    place = np.zeros((n, 2))
+    place[:, 0], place[:, 1] = looks[fit.X], looks[fit.Y]
+    order = _apart(order, place, promise, _SAME_DISC * search.separation)
+    results = np.zeros(n, RESULT)
+    evidence = np.full(n, -np.inf)
+    score = np.full(n, -np.inf)
+    for i in order:
+        result = results[i]
+        enough, log_odds = _fit_after_look(scene, pixels[i], quality[i], looks[i], work, result)
+        evidence[i] = log_odds
+        candidate = scene.floor_xy[pixels[i, 1], pixels[i, 0]]
+        place[i, 0] = result[fit.X] if search.refine else candidate[0]
+        place[i, 1] = result[fit.Y] if search.refine else candidate[1]
+        # A fit that wandered off, or turned the disc's contrast round, is about something else.
+        off = math.hypot(result[fit.X] - candidate[0], result[fit.Y] - candidate[1])
+        same_sign = result[fit.CONTRAST] * contrast[i] > 0.0
+        if enough and off < search.radius and same_sign:
+            score[i] = log_odds if log_odds > -math.inf else _NO_EVIDENCE + quality[i]
+    found = np.flatnonzero(score > -np.inf)
+    return results, evidence, _apart(found, place, score, search.separation)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _apart(
+    index: NDArray[np.int64], place: NDArray[np.float64], score: NDArray[np.float64], near: float
+) -> NDArray[np.int64]:
+    """Those of some discs that have no better one nearby; all of them if nothing is near."""
+    if near > 0.0:
+        return index[suppress_neighbours(place[index], score[index], near)]
+    return index
