@@ -98,8 +98,14 @@ class Memory(NamedTuple):
     outer: NDArray[np.uint16]
     products: NDArray[np.uint32]
     matters: NDArray[np.uint8]
+    """1 for those that may be wanted."""
     light: NDArray[np.uint8]
     dark: NDArray[np.uint8]
+    """Votes."""
+    lacking: NDArray[np.uint8]
+    """1 for those with samples outside the image."""
+    none: NDArray[np.uint8]
+    """Zeros."""
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -186,26 +192,25 @@ def compare(
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _count_steps(
-    gathered: NDArray[np.uint8], higher: Any, lower: Any, steps: tuple[int, int], width: Any,
-    counts: NDArray[np.uint8],
+    gathered: NDArray[np.uint8], higher: Any, lower: Any, step: int, without: NDArray[np.uint8],
+    width: Any, counts: NDArray[np.uint8],
 ) -> None:  # fmt: skip
-    """Count where one row of samples exceeds another by a step."""
-    enough, outside = _U8(steps[0]), _U8(steps[1])
+    """Count where one row of samples exceeds another, less `without`, by at least a step."""
+    enough = _U8(step)
     for i in range(width):
         x = _U8(gathered[higher + i])
-        y = np.subtract(_U8(gathered[lower + i]), outside)
+        # Modulo 256: what nothing is taken from stays, and zeros less 1 are exceeded by nothing.
+        y = np.subtract(_U8(gathered[lower + i]), _U8(without[i]))
         more = np.subtract(np.maximum(x, y), y)
         counts[i] += more >= enough
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def vote(
-    memory: Memory, place: int, samples: int, width: int, wanted: Wanted, some_outside: bool
-) -> None:
+def vote(memory: Memory, place: int, samples: int, width: int, wanted: Wanted) -> None:
     """Count the directions that vote, and note where there are enough.
 
-    Zeros of the outer outline may be outside the image. Then nothing exceeds them (and all else is
-    exceeded by one grey level less).
+    Zeros of a lacking outer outline are outside the image: nothing exceeds them (and all else is
+    exceeded by one grey level more).
     """
     light, dark = memory.light, memory.dark
     light[:width] = 0
@@ -217,10 +222,9 @@ def vote(
         inner = _U64(place) + _U64(k) * _ROW
         outer = inner + _U64(padded) * _ROW
         if wanted.sign >= 0.0:
-            shift = 1 if some_outside else 0
-            _count_steps(memory.gathered, inner, outer, (step, shift), wide, light)
+            _count_steps(memory.gathered, inner, outer, step, memory.lacking, wide, light)
         if wanted.sign <= 0.0:
-            _count_steps(memory.gathered, outer, inner, (step, 0), wide, dark)
+            _count_steps(memory.gathered, outer, inner, step, memory.none, wide, dark)
     for i in range(wide):
         memory.matters[i] |= max(light[i], dark[i]) >= wanted.votes
 
@@ -278,6 +282,8 @@ def memory_for(samples: int) -> Memory:
         np.zeros(PITCH, np.uint8),
         np.zeros(PITCH, np.uint8),
         np.zeros(PITCH, np.uint8),
+        np.zeros(PITCH, np.uint8),
+        np.zeros(PITCH, np.uint8),
     )
 
 
@@ -330,7 +336,10 @@ def find_centres(
         else:
             compare(memory, votes, place, width, wanted)
         if wanted.votes > 0:
-            vote(memory, here, samples, width, wanted, not blocks.whole[b])
+            for i in range(width):
+                total = votes[place + i] + votes[place + of_outer + i]
+                memory.lacking[i] = total < 2 * samples
+            vote(memory, here, samples, width, wanted)
         if count + width > len(found):
             more = np.empty(2 * len(found), CENTRE)
             more[:count] = found[:count]
