@@ -139,13 +139,16 @@ def refinement_of(settings: LineSettings, steps: int | None = None) -> StepFilte
     tables = {sigma: gaussian_steps(sigma, _half(sigma))[1:] for sigma in sigmas}
     begins = dict(zip(tables, np.cumsum([0, *(table.size for table in tables.values())])))
     scales = settings.fine_scale_px, settings.coarse_scale_px
-    half = max(_half(sigma) for sigma in scales)
+    heights = [gaussian_steps(sigma, _half(sigma))[0] for sigma in scales]
+    taps = max(table.shape[1] for table in heights)
+    # Both see the same pixels; those of weight 0 do not count.
+    heights = [np.pad(h, [(0, 0), ((taps - h.shape[1]) // 2,) * 2]) for h in heights]
     flat = [np.empty(0), *(table.reshape(-1) for table in tables.values())]
     return StepFilters(
         half=np.array([_half(sigma) for sigma in sigmas], np.int64),
         begin=np.array([begins[sigma] for sigma in sigmas], np.int64),
         derivatives=np.concatenate(flat).astype(np.float32),
-        heights=np.stack([gaussian_steps(s, half)[0] for s in scales]).astype(np.float32),
+        heights=np.stack(heights).astype(np.float32),
         farthest=np.array([distance for _, distance in some], np.float64),
     )
 
