@@ -18,7 +18,7 @@ from camera.kernels import has_brown, project_floor_point
 
 #: Most centres in a block, and bytes from one row of gathered grey values to the next.
 PITCH = 256
-#: Detectors work on so many centres at once.
+#: Number of centres that detectors work on at once.
 LANES = 32
 #: Size of the groups in which rows of grey values are summed.
 GROUP = 4
@@ -27,7 +27,7 @@ GROUP = 4
 ADVANCE_BITS = 9
 #: Pixels of a row from which a copy takes its bytes, and so pixels behind the image's last one.
 COPIED = 64
-#: Copies are carried out so many at once.
+#: Number of copies carried out at once.
 AT_ONCE = 4
 #: Most pixels from one centre of a block to the next.
 LARGEST_STRIDE = 8

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from detect.settings import CircleSettings
 from lut import DiscTable
 
-#: How far apart rows may be is found from every so many centres.
+#: Of the centres of a row, every n-th decides how far apart rows may be.
 _EVERY = 8
 
 

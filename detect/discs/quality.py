@@ -53,7 +53,7 @@ CENTRE = np.dtype(
 
 #: Comparisons of 24-bit numbers let through a little more than the exact ones that follow.
 _CAUTIOUS = 1.0 - 4e-6
-#: Centres for which there is room at first.
+#: Capacity for centres at first.
 _ROOM = 2048
 
 _U8, _U64, _I32, _F32 = np.uint8, np.uint64, np.int32, np.float32
@@ -73,7 +73,7 @@ class Wanted(NamedTuple):
     step: int
     """Directions vote whose grey value steps by more than this, below 255."""
     votes: int
-    """With at least so many votes of the sign, low quality does not matter; 0: it does."""
+    """With at least this number of votes of the sign, low quality does not matter; 0: it does."""
 
 
 class Blocks(NamedTuple):
@@ -299,7 +299,7 @@ def find_centres(
         The image in scan order, and zeros: a zero adds nothing to any sum.
     blocks : Blocks
     chosen : (N,) int64
-        Which blocks are looked at.
+        Indices of the blocks to evaluate.
     wanted : Wanted
 
     Returns

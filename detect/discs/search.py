@@ -431,7 +431,7 @@ def _look_at_all(
 ) -> tuple[Any, NDArray[np.float64]]:  # fmt: skip
     """Look at the candidates, the best first: (N,) RESULT, and what they promise.
 
-    What lies within a disc that showed clearly need not be looked at. The promise is the evidence;
+    What lies within a disc that showed clearly is left out. The promise is the evidence;
     minus infinity for what is not worth a fit.
     """
     search, floor_xy = scene.search, scene.floor_xy

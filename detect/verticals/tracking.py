@@ -244,7 +244,7 @@ def _follow(
 
 @njit(cache=True, error_model="numpy")
 def _with_points(points: _Points, n: int, capacity: int) -> _Points:
-    """The first n points, and room for more."""
+    """The first n points, and capacity for more."""
     row = np.empty(capacity, np.int32)
     column = np.empty(capacity, np.float64)
     score = np.empty(capacity, np.float32)
