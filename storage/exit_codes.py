@@ -108,7 +108,7 @@ def _said(error: BaseException | str) -> str:
 def of_kernel_cache(error: BaseException) -> bool:
     """Whether Numba raised it over its cache of compiled kernels, here or in a worker.
 
-    There is no folder for it, no space left in it, or its index names classes of another version of the
-    program: Numba's own words are no help.
+    There is no folder for it, no space left in it, or its index names classes of another version of
+    the program: Numba's own words are no help.
     """
     return _NUMBAS_CACHING in "".join(traceback.format_exception(error))
