@@ -113,7 +113,7 @@ def resolve_where_defined(app: Any, env: Any, node: Any, content: Any) -> Any:
     """
     package, _, name = node.get("reftarget", "").rpartition(".")
     if node.get("refdomain") != "py" or package not in map(_name, _packages()):
-        return content if package.split(".")[0] in ("numpy", "concurrent") else None
+        return content if package.split(".")[0] in ("numpy", "collections", "concurrent") else None
     member = getattr(import_module(package), name, None)
     target = f"{getattr(member, '__module__', package)}.{name}"
     domain = env.get_domain("py")
