@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 
 from camera import Camera
 
@@ -76,6 +75,8 @@ def level_seen(
 
 def level_matrix(levelled_by: Tilt) -> FloatArray:
     """(3, 3) rotation exp([pitch, roll, 0]x) that turns measured directions level."""
+    from scipy.spatial.transform import Rotation  # a process that delegates starts without SciPy
+
     return np.asarray(Rotation.from_rotvec([*levelled_by, 0.0]).as_matrix())
 
 

@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import re
 import shlex
-import subprocess
-import sys
 from importlib import import_module
-from pathlib import Path
 
 import pytest
 
@@ -73,36 +70,6 @@ def test_an_example_with_a_flag_that_is_none_is_noticed(
         import_module("slam.cli").parsed(words[1:])
     assert end.value.code == 2
     assert "no-such-flag" in capsys.readouterr().err
-
-
-#: Prints what brought a compiler although it is not said to need one, and what does not, although.
-COMPILED_AS_SAID = """
-import sys
-from importlib import import_module
-from pathlib import Path
-program = import_module(sys.argv[1] + ".cli").PROGRAM
-for command, module in program.performed_by.items():
-    if command not in program.compiled:
-        import_module(module)
-        if "numba" in sys.modules:
-            sys.exit(f"{command.__name__} is compiled")
-for command in program.compiled:
-    import_module(program.performed_by[command])
-if "numba" not in sys.modules:
-    sys.exit("none is compiled")
-"""
-
-
-@pytest.mark.parametrize("program", ["slam", "groundtruth"])
-def test_what_is_said_to_be_compiled_is_and_nothing_else(program: str) -> None:
-    process = subprocess.run(
-        [sys.executable, "-c", COMPILED_AS_SAID, program],
-        cwd=Path(__file__).resolve().parents[1],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert (process.returncode, process.stderr) == (0, "")
 
 
 @pytest.mark.lowest

@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.discs.identity import ids_of_map, ids_of_rows
 from detect.errors import FrameError
 from detect.runs.frame import (
     COSTS_THE_FRAME,
@@ -30,7 +29,6 @@ from detect.runs.frame import (
 )
 from detect.runs.known import KnownOfFrame
 from detect.sources.times import format_time
-from detect.verticals.detections import carry_ids
 from landmarks import (
     format_levelling,
     format_no_tilt,
@@ -238,6 +236,8 @@ def disc_numbers(
 def _line_rows(found: LineDetections, known: KnownOfFrame) -> bytes:
     ids: list[tuple[int, ...]] = [(-1,)] * len(found)
     if known.lines:
+        from detect.verticals.detections import carry_ids
+
         ids = [row.ids for row in carry_ids(found.landmarks(), known.lines)]
     ends_and_angles, sigma = found.line_numbers[:6], found.line_numbers[6:7]
     numbers = np.concatenate([ends_and_angles, np.zeros_like(sigma), sigma]).T
@@ -256,6 +256,8 @@ def _ids_of_discs(
     discs: CircleDetections, seen: CircleDetections, known: KnownOfFrame
 ) -> list[tuple[int, ...]]:
     """The IDs of each row: those of a known row of the same disc, or of a map's, or -1."""
+    from detect.discs.identity import ids_of_map, ids_of_rows
+
     ids: list[tuple[int, ...]] = [()] * len(discs)
     if known.discs:
         alike = discs if known.discs_level else seen
