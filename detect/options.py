@@ -251,10 +251,6 @@ class Compare:
     camera : Path
         Calibration, by default the one in the run folder: discs are compared in the image, each row
         where it was seen. Without one, or with --gate-m or --sigma, on the floor.
-    tolerance_deg : float
-        Bearings of the same line differ by at most this,
-    sigmas : float
-        or by this many standard deviations of the detected one.
     min_recall : float
         Exit with 1 if the recall is lower.
     min_precision : float
@@ -272,8 +268,6 @@ class Compare:
     unlisted: MaybePath = None
     lookalikes: MaybePath = None
     camera: MaybePath = None
-    tolerance_deg: float = 0.5
-    sigmas: float = 2.0
     min_recall: MaybeFloat = None
     min_precision: MaybeFloat = None
     json: MaybePath = None

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from camera import Camera
+from landmarks import Frame
 
 FloatArray = NDArray[np.float64]
 Tilt = tuple[float, float]
@@ -113,3 +114,30 @@ class FrameView:
         low = np.where(seen, edge, np.inf).min(axis=1, initial=np.inf)
         high = np.where(seen, edge, -np.inf).max(axis=1, initial=-np.inf)
         return np.asarray(np.maximum(0.5 * (high - low), least_px))
+
+
+@dataclass(frozen=True)
+class Sight:
+    """How rows come back into the images.
+
+    Attributes
+    ----------
+    camera : Camera
+    radius_m : float
+        Of the discs.
+    reference_level : bool
+        Reference rows are level though they do not say by which tilt: they are seen through that
+        of the detected rows.
+    """
+
+    camera: Camera
+    radius_m: float = 0.10
+    reference_level: bool = False
+
+    def of(self, reference: Frame | None, detected: Frame | None) -> FrameView:
+        """The view of a frame with these rows."""
+        detected_by = None if detected is None else detected.levelled_by
+        reference_by = None if reference is None else reference.levelled_by
+        if self.reference_level and reference_by is None:
+            reference_by = detected_by
+        return FrameView(self.camera, self.radius_m, reference_by, detected_by)

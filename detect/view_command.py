@@ -6,20 +6,20 @@ import os
 import shutil
 import tempfile
 from collections.abc import Iterable
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from camera import Camera
+from detect.comparison.matching import numbers
 from detect.drawing.frame import ends_of, line_curves, sigma_bars
-from detect.drawing.inputs import SeenRows, find_files, open_rows, select_frames
+from detect.drawing.inputs import SeenRows, open_rows, select_frames
 from detect.errors import EXIT_FRAMES_FAILED, DetectError, FrameError
 from detect.run import Run, read_image
 from detect.runs.progress import print_failures, progress_bar
 from detect.seen import circle_on_floor, image_positions
-from detect.settings import CircleSettings
 from detect.sources.opening import demand_recording, open_source
 from detect.viewing_options import View
 from landmarks import Step, circle_arrays
@@ -45,13 +45,11 @@ def perform(options: View) -> int:
             f"{options.run}: no calibration: expected a .cam file in it, or one named by --camera; "
             "`camera calibrate` makes one"
         )
-    files = find_files(run, options.files)
+    source = open_rows(run, options.files)
     if options.output is not None and options.output.exists() and not options.force:
         raise OutputExistsError(options.output)
     selection = select_frames(run.frames, options.frames, options.every)
-    source = open_rows(files)
-    head = files.heads.get("circles")
-    settings = CircleSettings() if head is None else head.circle_settings
+    radius_m = source.circle_settings.radius_m
     poses, known = _poses(options, [frame.step for frame in run.frames])
     recording = rr.RecordingStream("detect view", recording_id=f"detect-{run.name}")
     failures: list[str] = []
@@ -68,20 +66,20 @@ def perform(options: View) -> int:
         for name, places in known.items():
             at = np.column_stack([places, np.zeros(len(places))])
             recording.log(f"world/map/{name}", rr.Points3D(at, colors=_MAP), static=True)
-        with progress_bar("frames", selection.expected(run.frames)) as advance:
-            for position, frame in selection.of(run.frames):
+        with progress_bar("frames", selection.expected) as advance:
+            for position, frame in selection:
                 recording.set_time("frame", sequence=position)
                 if frame.time_s is not None:
                     recording.set_time("time", **_clock(frame.time_s))
                 rows = source.of(frame.step.prefix)
-                _log_world(rr, recording, rows, poses[position + 1], settings)
+                _log_world(rr, recording, rows, poses[position + 1], radius_m)
                 try:
                     image = read_image(frame, run.camera)
                 except FrameError as error:
                     failures.append(str(error))
                     continue
                 recording.log("camera/image", rr.Image(image).compress(jpeg_quality=85))
-                _log_image(rr, recording, run, rows, settings)
+                _log_image(rr, recording, run.camera, rows, radius_m)
                 advance()
         recording.flush()
         recording.disconnect()
@@ -144,9 +142,7 @@ def _clock(time_s: float) -> dict[str, float]:
     return {"timestamp" if time_s >= _EARLIEST_DATE_S else "duration": time_s}
 
 
-def _log_world(
-    rr: Any, recording: Any, rows: SeenRows, pose: FloatArray, settings: CircleSettings
-) -> None:
+def _log_world(rr: Any, recording: Any, rows: SeenRows, pose: FloatArray, radius_m: float) -> None:
     x, y, theta = pose.tolist()
     # As a quaternion: with an axis, Rerun 0.23 needs a NumPy that it does not demand.
     turn = [0.0, 0.0, np.sin(0.5 * theta), np.cos(0.5 * theta)]
@@ -155,46 +151,43 @@ def _log_world(
     arrow = rr.Arrows3D(origins=[[0, 0, 0]], vectors=[[0, -0.5, 0]], colors=_LINE)
     recording.log("world/robot/forward", arrow)
     if rows.circles is not None:
-        places = circle_arrays(rows.circles).xy
-        rings = [circle_on_floor(centre, settings.radius_m) for centre in places]
-        rings = [np.column_stack([ring, np.zeros(len(ring))]) for ring in rings]
-        recording.log("world/robot/discs", rr.LineStrips3D(rings, colors=_EDGE))
-        recording.log("count/discs", rr.Scalars([float(len(places))]))
+        rings = circle_on_floor(circle_arrays(rows.circles.circles).xy, radius_m)
+        strips = list(np.pad(rings, ((0, 0), (0, 0), (0, 1))))
+        recording.log("world/robot/discs", rr.LineStrips3D(strips, colors=_EDGE))
+        recording.log("count/discs", rr.Scalars([float(len(rings))]))
     if rows.lines is not None:
-        recording.log("count/verticals", rr.Scalars([float(len(rows.lines))]))
+        recording.log("count/verticals", rr.Scalars([float(len(rows.lines.lines))]))
     if rows.tilt is not None:
         recording.log("tilt/pitch_deg", rr.Scalars([float(np.degrees(rows.tilt.pitch))]))
         recording.log("tilt/roll_deg", rr.Scalars([float(np.degrees(rows.tilt.roll))]))
 
 
-def _log_image(rr: Any, recording: Any, run: Run, rows: SeenRows, settings: CircleSettings) -> None:
-    camera = run.camera
+def _log_image(rr: Any, recording: Any, camera: Camera, rows: SeenRows, radius_m: float) -> None:
+    def log(name: str, curves: Iterable[FloatArray], **style: Any) -> None:
+        strips = [curve + _CORNER for curve in curves]
+        recording.log(f"camera/image/{name}", rr.LineStrips2D(strips, **style))
+
     if rows.circles is not None:
-        project = partial(image_positions, camera, levelled_by=rows.levelled_by)
-        seen = [
-            (project(circle_on_floor(np.array([row.px, row.py]), settings.radius_m)), row.quality)
-            for row in rows.circles
-        ]
-        shown = [(ring + _CORNER, f"{q:.2f}") for ring, q in seen if np.isfinite(ring).all()]
-        strips = [np.vstack([ring, ring[:1]]) for ring, _ in shown]
-        labels = [text for _, text in shown]
-        recording.log("camera/image/discs", rr.LineStrips2D(strips, colors=_EDGE, labels=labels))
+        places = circle_arrays(rows.circles.circles)
+        rings = circle_on_floor(places.xy, radius_m)
+        rings = np.concatenate([rings, rings[:, :1]], axis=1)
+        seen = image_positions(camera, rings, rows.circles.levelled_by)
+        shown = np.isfinite(seen).all(axis=(1, 2))
+        labels = [f"{quality:.2f}" for quality in places.quality[shown]]
+        log("discs", seen[shown], colors=_EDGE, labels=labels)
     if rows.lines is not None:
-        ends = ends_of(rows.lines)
-        sigma = np.array([row.sigma for row in rows.lines], dtype=np.float64)
-        for name, curves, colour in (
-            ("verticals", line_curves(camera, ends), _LINE),
-            ("sigma", sigma_bars(camera, ends, sigma), _SIGMA),
-        ):
-            shown_curves = [curve + _CORNER for curve in curves if np.isfinite(curve).all()]
-            recording.log(f"camera/image/{name}", rr.LineStrips2D(shown_curves, colors=colour))
+        lines = rows.lines.lines
+        curves = line_curves(camera, ends_of(lines))
+        bars = sigma_bars(camera, ends_of(lines), numbers(lines, "sigma"))
+        log("verticals", curves[np.isfinite(curves).all(axis=(1, 2))], colors=_LINE)
+        log("sigma", bars[np.isfinite(bars).all(axis=(1, 2))], colors=_SIGMA)
     if rows.markers is not None:
         squares = [
-            np.array([(c.u, c.v) for c in (*row.corners, row.corners[0])]) + _CORNER
-            for row in rows.markers
+            np.array([(c.u, c.v) for c in (*row.corners, row.corners[0])])
+            for row in rows.markers.markers
         ]
-        labels = [f"{row.id}" for row in rows.markers]
-        recording.log("camera/image/markers", rr.LineStrips2D(squares, colors=_LINE, labels=labels))
+        labels = [f"{row.id}" for row in rows.markers.markers]
+        log("markers", squares, colors=_LINE, labels=labels)
 
 
 def _layout() -> Any:

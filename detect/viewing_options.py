@@ -10,12 +10,11 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import OmitArgPrefixes, arg
 
-from detect.comparison.result import CompareError, CompareOptions
-from detect.flags import MaybeFloat, MaybeInt, MaybePath, MaybeStr, PickedFrames, Preset, RunFlags
+from detect.comparison.result import Gates
+from detect.flags import MaybeInt, MaybePath, MaybeStr, PickedFrames, Preset, RunFlags
 from detect.line_settings import LineSettings
 from detect.settings import CircleSettings
 from detect.sources.options import SourceOptions
-from storage.bounds import ABOVE_0, NOT_NEGATIVE, demand
 
 
 @dataclass(frozen=True)
@@ -51,36 +50,6 @@ class RowFiles:
     reference: MaybePath = None
     reference_lines: MaybePath = None
     no_reference: bool = False
-
-
-@dataclass(frozen=True)
-class Gates:
-    """What counts as the same landmark as one of the reference.
-
-    Parameters
-    ----------
-    gate_m : float
-        Largest distance on the floor between a detected and a reference disc that are the same,
-        metres; by default, discs are the same that were seen at the same place in the image.
-    tolerance_deg : float
-        Bearings of the same vertical differ by at most this,
-    sigmas : float
-        or by this many standard deviations of the detected one.
-    """
-
-    gate_m: MaybeFloat = None
-    tolerance_deg: float = 0.5
-    sigmas: float = 2.0
-
-    def __post_init__(self) -> None:
-        demand(self, CompareError, tolerance_deg=ABOVE_0, sigmas=NOT_NEGATIVE)
-        if self.gate_m is not None:
-            demand(self, CompareError, gate_m=ABOVE_0)
-
-    @property
-    def discs(self) -> CompareOptions:
-        """The same for `detect.comparison.circles`; raises CompareError for gates that are none."""
-        return CompareOptions(gate_m=self.gate_m)
 
 
 @dataclass(frozen=True, kw_only=True)

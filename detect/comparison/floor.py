@@ -11,10 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
+from scipy.optimize import approx_fprime, least_squares
 
 from camera import Camera
-from detect.comparison.figures import disc_normalised_error, quantile
+from detect.comparison.figures import normalised_error, quantile
 from detect.comparison.result import CommonLean, DiscPairs, FloorBin, FloorDifference
 from detect.seen import image_positions, level_seen
 
@@ -29,23 +29,10 @@ _LARGEST_CONDITION = 1e10
 
 
 class Lean(NamedTuple):
-    """Pitch, roll and height that turn reference positions into detected ones.
+    """Pitch, roll (rad) and height (m) that turn reference into detected positions; deviations."""
 
-    Attributes
-    ----------
-    pitch_rad, roll_rad : float
-        As those of a tilt (`landmarks.FrameTilt`).
-    raised_m : float
-        How much higher the camera is.
-    sigma : (float, float, float)
-        Standard deviations of the three, from how frames differ (errors within a frame may be
-        common to its rows).
-    """
-
-    pitch_rad: float
-    roll_rad: float
-    raised_m: float
-    sigma: tuple[float, float, float]
+    value: FloatArray
+    sigma: FloatArray
 
 
 def common_lean(
@@ -57,6 +44,7 @@ def common_lean(
     """Fit the lean to matched rows: robust least squares of their differences in the image.
 
     There all rows are known about equally well; on the floor, far ones would outweigh all others.
+    Standard deviations come from how frames differ, as errors within one may be common to its rows.
 
     Parameters
     ----------
@@ -72,9 +60,7 @@ def common_lean(
         None if the rows are too few or do not determine it.
     """
     seen = image_positions(camera, reference_xy)
-    usable = np.isfinite(seen).all(axis=1) & np.isfinite(image_positions(camera, detected_xy)).all(
-        axis=1
-    )
+    usable = np.isfinite(seen + image_positions(camera, detected_xy)).all(axis=1)
     if usable.sum() < _LEAST_PAIRS:
         return None
     seen, detected_xy, frame = seen[usable], detected_xy[usable], frame[usable]
@@ -83,19 +69,12 @@ def common_lean(
         again = image_positions(camera, detected_xy, (lean[0], lean[1]), lean[2])
         return np.nan_to_num(again - seen, nan=1e3).ravel()
 
-    start = least_squares(differences, np.zeros(3), loss="soft_l1", x_scale=(0.01, 0.01, 0.01))
+    start = least_squares(differences, np.zeros(3), loss="soft_l1", x_scale=0.01)
     scale = _HUBER * max(1.4826 * float(np.median(np.abs(start.fun))), 1e-3)
-    found = least_squares(
-        differences, start.x, loss="huber", f_scale=scale, x_scale=(0.01, 0.01, 0.01)
-    )
-    residual = differences(found.x)
-    # The solver's Jacobian is scaled by its loss.
-    by = np.stack(
-        [(differences(found.x + s) - differences(found.x - s)) / 2e-6 for s in 1e-6 * np.eye(3)],
-        axis=1,
-    )
+    lean = least_squares(differences, start.x, loss="huber", f_scale=scale, x_scale=0.01).x
+    residual, jacobian = differences(lean), approx_fprime(lean, differences, 1e-7)
     weight = np.minimum(1.0, scale / np.maximum(np.abs(residual), 1e-12))
-    normal = by.T @ (weight[:, None] * by)
+    normal = jacobian.T @ (weight[:, None] * jacobian)
     if not np.linalg.cond(normal) < _LARGEST_CONDITION:
         return None
     inverse = np.linalg.inv(normal)
@@ -103,14 +82,11 @@ def common_lean(
     frames = int(of.max()) + 1
     if frames >= _LEAST_FRAMES:
         pull = np.zeros((frames, 3))
-        np.add.at(pull, np.repeat(of, 2), (weight * residual)[:, None] * by)
+        np.add.at(pull, np.repeat(of, 2), (weight * residual)[:, None] * jacobian)
         covariance = inverse @ (pull.T @ pull) @ inverse * frames / (frames - 1)
     else:
-        freedom = max(len(residual) - 3, 1)
-        covariance = inverse * float((weight * residual**2).sum()) / freedom
-    pitch, roll, raised = found.x.tolist()
-    sigma_p, sigma_r, sigma_h = np.sqrt(np.diag(covariance)).tolist()
-    return Lean(pitch, roll, raised, (sigma_p, sigma_r, sigma_h))
+        covariance = inverse * (weight * residual**2).sum() / max(len(residual) - 3, 1)
+    return Lean(lean, np.sqrt(np.diag(covariance)))
 
 
 def floor_pairs(
@@ -119,44 +95,40 @@ def floor_pairs(
     detected_xy: FloatArray,
     covariance: FloatArray,
     frame: NDArray[np.int64],
-) -> tuple[Lean | None, DiscPairs]:
+) -> tuple[CommonLean | None, DiscPairs]:
     """Matched rows on the floor, before and after their common lean (None without a camera).
 
     Parameters as of `common_lean`; `covariance` (N, 2, 2) is what errors are measured in, m^2.
     """
     offset = detected_xy - reference_xy
-    left, lean, centre = offset, None, np.zeros(2)
-    if camera is not None:
-        centre = camera.centre[:2]
-        lean = common_lean(camera, reference_xy, detected_xy, frame)
-        if lean is not None:
-            tilt = (lean.pitch_rad, lean.roll_rad)
-            left = detected_xy - level_seen(camera, reference_xy, tilt, lean.raised_m)
+    lean = None if camera is None else common_lean(camera, reference_xy, detected_xy, frame)
+    left, centre = offset, np.zeros(2) if camera is None else camera.centre[:2]
+    if camera is not None and lean is not None:
+        pitch, roll, raised_m = lean.value.tolist()
+        left = detected_xy - level_seen(camera, reference_xy, (pitch, roll), raised_m)
     away = reference_xy - centre
     away = away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)
-    return lean, DiscPairs(reference_xy, offset, left, covariance, away)
-
-
-def stated_lean(lean: Lean | None, pairs: DiscPairs) -> CommonLean | None:
-    """A lean in degrees, with what it leaves of the differences; None for none."""
+    pairs = DiscPairs(reference_xy, offset, left, covariance, away)
     if lean is None:
-        return None
-    sigma_p, sigma_r, sigma_h = lean.sigma
-    seen = np.isfinite(pairs.left).all(axis=1)
-    return CommonLean(
-        pitch_deg=float(np.degrees(lean.pitch_rad)),
-        pitch_sigma_deg=float(np.degrees(sigma_p)),
-        roll_deg=float(np.degrees(lean.roll_rad)),
-        roll_sigma_deg=float(np.degrees(sigma_r)),
-        raised_m=lean.raised_m,
-        raised_sigma_m=sigma_h,
-        left=_difference(pairs.left, pairs.away),
-        normalised_error=disc_normalised_error(pairs.left[seen], pairs.covariance[seen]),
+        return None, pairs
+    seen = np.isfinite(left).all(axis=1)
+    pitch, roll, _ = np.degrees(lean.value).tolist()
+    pitch_sigma, roll_sigma, _ = np.degrees(lean.sigma).tolist()
+    common = CommonLean(
+        pitch_deg=pitch,
+        pitch_sigma_deg=pitch_sigma,
+        roll_deg=roll,
+        roll_sigma_deg=roll_sigma,
+        raised_m=float(lean.value[2]),
+        raised_sigma_m=float(lean.sigma[2]),
+        left=_difference(left, away),
+        normalised_error=normalised_error(left[seen], covariance[seen]),
     )
+    return common, pairs
 
 
 def floor_bins(
-    pairs: DiscPairs, lean: Lean | None, ranges_m: Sequence[tuple[float, float]]
+    pairs: DiscPairs, lean: CommonLean | None, ranges_m: Sequence[tuple[float, float]]
 ) -> tuple[FloorBin, ...]:
     """Differences at ranges of forward distances, before and after the lean."""
     forward = -pairs.reference_xy[:, 1]
@@ -177,12 +149,12 @@ def floor_bins(
 def _difference(offset: FloatArray, away: FloatArray) -> FloorDifference:
     seen = np.isfinite(offset).all(axis=1)
     offset, away = offset[seen], away[seen]
-    size = np.asarray(np.linalg.norm(offset, axis=1), dtype=np.float64)
+    size = np.asarray(np.linalg.norm(offset, axis=1))
     return FloorDifference(
         pairs=len(offset),
-        median_m=quantile(size, 0.5),
+        median_m=quantile(size),
         most_m=quantile(size, 0.95),
-        along_m=quantile((offset * away).sum(axis=1), 0.5),
+        along_m=quantile((offset * away).sum(axis=1)),
         # Forward is -Y and left is X: left of a direction is it turned from -Y to X.
-        across_m=quantile(away[:, 0] * offset[:, 1] - away[:, 1] * offset[:, 0], 0.5),
+        across_m=quantile(away[:, 0] * offset[:, 1] - away[:, 1] * offset[:, 0]),
     )

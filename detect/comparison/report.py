@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable
-from dataclasses import asdict, replace
+from dataclasses import asdict, fields
 
 from rich import box
 from rich.console import Group
@@ -12,9 +12,9 @@ from rich.table import Table
 from rich.text import Text
 
 from detect.comparison.result import (
-    NO_PAIRS,
     CommonLean,
     Comparison,
+    DiscComparison,
     DistanceBin,
     FloorBin,
     Levelling,
@@ -22,101 +22,109 @@ from detect.comparison.result import (
     NormalisedError,
 )
 
-NONE = "-"
 _WORST_FRAMES = 10
+_COUNTS = ("reference", "detected", "matched", "joined", "found", "missed", "extra", "set_aside")
 
 
-def comparison_tables(comparison: Comparison | LineComparison) -> Group:
+def comparison_tables(comparison: Comparison) -> Group:
     """Format a comparison for a rich console, which omits colour if there is no terminal.
 
-    Parameters
-    ----------
-    comparison : Comparison or LineComparison
-        The figures.
-
-    Returns
-    -------
-    rich.console.Group
-        Summary, figures over distance (of discs), and the worst frames.
+    It has a summary, figures over distance (of discs), and the worst frames.
     """
-    tables = [_summary(comparison)]
+    summary = Table(box=None, show_header=False, pad_edge=False)
+    summary.add_column(style="bold", no_wrap=True)
+    summary.add_column(overflow="fold")
+    for name, value in _summary(comparison):
+        summary.add_row(name, Text(value))
+    tables: list[Table | str] = [summary]
     if comparison.reference or comparison.detected:
-        if isinstance(comparison, Comparison):
+        tables.append("")
+        if isinstance(comparison, DiscComparison):
             tables.append(_over_distance(comparison))
             tables += [] if comparison.lean is None else [_floor_differences(comparison)]
         tables.append(_worst_frames(comparison))
-    return Group(tables[0], *([""] if tables[1:] else []), *tables[1:])
+    return Group(*tables)
 
 
-def format_json(comparison: Comparison | LineComparison) -> str:
+def format_json(comparison: Comparison) -> str:
     """Write a comparison as JSON: same keys in the same order, numbers finite or null.
 
     Lengths are in metres, angles in degrees. Of the frames, the worst are listed, and those that
     only one file has.
     """
-    if isinstance(comparison, Comparison):
-        figures = {
-            **asdict(replace(comparison, pairs=NO_PAIRS)),
-            "missed": comparison.missed,
-            "extra": comparison.extra,
-            "bins": [
-                {**asdict(part), "quality_difference": part.quality_difference}
-                for part in comparison.bins
-            ],
-            "frames": len(comparison.frames),
-            "pairs": comparison.matched,
-        }
-    else:
-        figures = {
-            **asdict(comparison),
-            "found": comparison.found,
-            "missed": comparison.missed,
-            "extra": comparison.extra,
-            "frames": len(comparison.frames),
-        }
-    figures["worst_frames"] = [asdict(frame) for frame in comparison.worst_frames(_WORST_FRAMES)]
-    return json.dumps(figures, indent=2, allow_nan=False) + "\n"
+    figures = {f.name: getattr(comparison, f.name) for f in fields(comparison)}
+    figures |= {name: getattr(comparison, name) for name in (*_COUNTS, "recall", "precision")}
+    figures |= {
+        "frames": len(comparison.frames),
+        "pairs": comparison.matched,
+        "worst_frames": [
+            {name: getattr(match, name) for name in ("name", *_frame_counts(comparison))}
+            | {f"largest_error_{_unit(comparison)}": match.largest_error}
+            for match in comparison.worst_frames(_WORST_FRAMES)
+        ],
+    }
+    return json.dumps(figures, indent=2, allow_nan=False, default=asdict) + "\n"
 
 
-def _summary(c: Comparison | LineComparison) -> Table:
-    table = Table(box=None, show_header=False, pad_edge=False)
-    table.add_column(style="bold", no_wrap=True)
-    table.add_column(overflow="fold")
-    rows = [
-        ("reference", printable(c.reference_name)),
+def _unit(c: Comparison) -> str:
+    return "m" if isinstance(c, DiscComparison) else "deg"
+
+
+def _frame_counts(c: Comparison) -> tuple[str, ...]:
+    joined = ("joined",) if isinstance(c, LineComparison) else ()
+    return ("matched", *joined, "missed", "extra")
+
+
+def _summary(c: Comparison) -> list[tuple[str, str]]:
+    """What was found first, then how it was compared and how large the errors are."""
+    only, counted = c.options.only_identified, "counted" if c.options.all_frames else "not counted"
+    rows = [*_outcome(c), ("recall", number(c.recall, 4)), ("precision", number(c.precision, 4))]
+    rows += [
+        ("reference", printable(c.reference_name) + (", rows with an ID only" if only else "")),
         ("detected", printable(c.detected_name)),
         (
             "frames",
             f"{len(c.frames)} compared; {len(c.frames_only_in_reference)} only in the reference, "
-            f"{len(c.frames_only_in_detected)} only detected "
-            f"({'counted' if c.options.all_frames else 'not counted'})",
+            f"{len(c.frames_only_in_detected)} only detected ({counted})",
         ),
-        ("rows", _rows_text(c)),
-        *(_disc_rows(c) if isinstance(c, Comparison) else _line_rows(c)),
     ]
-    for name, value in rows:
-        table.add_row(name, Text(value))
-    return table
+    if isinstance(c, DiscComparison):
+        rows += _disc_rows(c)
+    elif isinstance(c, LineComparison):
+        rows += _line_rows(c)
+    return rows
 
 
-def _rows_text(c: Comparison | LineComparison) -> str:
-    text = f"{c.reference} reference, {c.detected} detected"
-    if c.options.only_identified:
-        text += f" (with an ID only; {c.set_aside} on rows without one set aside)"
-    elif c.set_aside:
-        text += f" ({c.set_aside} more on what is in view but not listed: neither right nor wrong)"
-    return text
+def _outcome(c: Comparison) -> list[tuple[str, str]]:
+    """What is true of the rows, one sentence each."""
+    joined = f", {c.joined} of them by a row that represents several" if c.joined else ""
+    rows = [
+        ("found", f"{c.found} of {c.reference} reference rows{joined}"),
+        ("missed", f"{c.missed} of {c.reference} reference rows"),
+    ]
+    on_lookalikes = c.on_lookalikes if isinstance(c, DiscComparison) else None
+    if on_lookalikes is not None:
+        of = f"{on_lookalikes} of {c.detected} detected rows"
+        rows.append(("look-alikes", f"{of}: on what is known to look like a disc"))
+    of = f"{c.extra - (on_lookalikes or 0)} of {c.detected} detected rows"
+    nothing = "nothing listed" if on_lookalikes is not None else "no reference row"
+    unknown = on_lookalikes is None and isinstance(c, DiscComparison)
+    known = " (look-alikes are not known)" if unknown else ""
+    rows.append(("clutter", f"{of}: on {nothing}{known}"))
+    if c.set_aside:
+        what = "reference rows without an ID, or" if c.options.only_identified else "discs"
+        rows.append(
+            (
+                "not counted",
+                f"{c.set_aside} more detected rows: on {what} that need not be found",
+            )
+        )
+    return rows
 
 
 def _line_rows(c: LineComparison) -> list[tuple[str, str]]:
     return [
-        (
-            f"within {c.options.tolerance_deg:g} deg or {c.options.sigmas:g} sigma",
-            f"{c.matched} matched, {c.joined} more joined with them, {c.missed} missed, "
-            f"{c.extra} extra",
-        ),
-        ("recall", number(c.recall, 4)),
-        ("precision", number(c.precision, 4)),
+        ("same line", f"within {c.options.tolerance_deg:g} deg or {c.options.sigmas:g} sigma"),
         ("bearing error", _median_and_most(c.bearing_median_deg, c.bearing_95_deg, 4, "deg")),
         (
             "normalised error",
@@ -127,37 +135,22 @@ def _line_rows(c: LineComparison) -> list[tuple[str, str]]:
     ]
 
 
-def _disc_rows(c: Comparison) -> list[tuple[str, str]]:
-    counts = f"{c.matched} matched, {c.missed} missed, {c.extra} extra"
-    if c.on_lookalikes is not None:
-        counts += f": {c.on_lookalikes} on look-alikes, {c.extra - c.on_lookalikes} elsewhere"
+def _disc_rows(c: DiscComparison) -> list[tuple[str, str]]:
+    rows = []
+    if any(s.levelled or s.true for s in (c.reference_levelling, c.detected_levelling)):
+        rows.append(("levelled", levelling_text(c)))
+    rows.append(("same disc", same_disc_text(c)))
     if c.in_image:
-        where = "in the image"
-        gate = f" (within half the disc's image or {c.options.least_px:g} px)"
-    else:
-        measure = (
-            f"{c.options.gate_m:g} m" if c.options.sigma is None else f"{c.options.sigma:g} sigma"
-        )
-        where, gate = f"within {measure}", ""
+        apart = _median_and_most(c.image_median_px, c.image_95_px, 2, "px")
+        rows.append(("image difference", apart))
     covariance = c.options.error_covariance
     source = "detected plus reference" if covariance == "sum" else covariance
-    return [
-        *([("levelled", levelling_text(c))] if _any_levelled(c) else []),
-        (where, counts + gate),
-        ("recall", number(c.recall, 4)),
-        ("precision", number(c.precision, 4)),
-        *(
-            [("image difference", _median_and_most(c.image_median_px, c.image_95_px, 2, "px"))]
-            if c.in_image
-            else []
-        ),
+    error = _normalised_error(
+        c.normalised_error, f", covariance: {source}", "not positive definite"
+    )
+    rows += [
         ("position error", _median_and_most(c.error_median_m, c.error_95_m, 4, "m")),
-        (
-            "normalised error",
-            _normalised_error(
-                c.normalised_error, f", covariance: {source}", "not positive definite"
-            ),
-        ),
+        ("normalised error", error),
         *([] if c.lean is None else [("common lean", lean_text(c.lean))]),
         (
             "reference quality",
@@ -170,17 +163,21 @@ def _disc_rows(c: Comparison) -> list[tuple[str, str]]:
             f"{number(c.detected_quality_extra, 3)} extra",
         ),
     ]
+    return rows
 
 
-def levelling_text(c: Comparison) -> str:
+def same_disc_text(c: DiscComparison) -> str:
+    """When two rows are the same disc."""
+    if c.in_image:
+        return f"in the image, within half the disc's image or {c.options.least_px:g} px"
+    gate, sigma = c.options.gate_m, c.options.sigma
+    return "on the floor, within " + (f"{gate:g} m" if sigma is None else f"{sigma:g} sigma")
+
+
+def levelling_text(c: DiscComparison) -> str:
     """One sentence on which side's rows are levelled."""
-    reference, detected = (
-        _levelled_side(name, side)
-        for name, side in (
-            ("reference", c.reference_levelling),
-            ("detected", c.detected_levelling),
-        )
-    )
+    reference = _levelled_side("reference", c.reference_levelling)
+    detected = _levelled_side("detected", c.detected_levelling)
     held = "compared at the pixels where they were seen" if c.in_image else "compared on the floor"
     return f"{reference}; {detected}: {held}"
 
@@ -195,11 +192,6 @@ def _levelled_side(name: str, side: Levelling) -> str:
         f"{name} rows are levelled in {which} frames "
         f"(medians: pitch {side.pitch_deg:.2f}, roll {side.roll_deg:.2f} deg)"
     )
-
-
-def _any_levelled(c: Comparison) -> bool:
-    sides = (c.reference_levelling, c.detected_levelling)
-    return any(side.levelled or side.true for side in sides)
 
 
 def lean_text(lean: CommonLean) -> str:
@@ -220,18 +212,15 @@ def _median_and_most(median: float | None, most: float | None, decimals: int, un
 
 def _normalised_error(error: NormalisedError, covariance: str, unusable: str) -> str:
     """How large normalised errors are, and how large they should be."""
-    text = NONE
+    text = number(error.per_dof, 3)
     if error.band is not None:
         low, high = error.band
-        text = (
-            f"{number(error.per_dof, 3)} squared per degree of freedom "
-            f"(95 % band {low:.3f} to {high:.3f})"
-        )
+        text += f" squared per degree of freedom (95 % band {low:.3f} to {high:.3f})"
     left_out = f"; {error.left_out} {unusable} left out" if error.left_out else ""
     return text + covariance + left_out
 
 
-def _over_distance(c: Comparison) -> Table:
+def _over_distance(c: DiscComparison) -> Table:
     # Of a width that a terminal of 80 columns has.
     headings = (
         "metres", "ref.", "missed", "recall", "det.", "extra", "prec.",
@@ -239,61 +228,65 @@ def _over_distance(c: Comparison) -> Table:
     )  # fmt: skip
     table = _titled_table("By forward distance (position error and quality: medians)", headings)
     for part in c.bins:
-        if part.reference == part.detected == 0:
-            continue
-        table.add_row(
-            _range(part),
-            str(part.reference),
-            str(part.missed),
-            number(part.recall, 3),
-            str(part.detected),
-            str(part.extra),
-            number(part.precision, 3),
-            number(part.error_median_m, 3),
-            number(part.reference_quality_median, 3),
-            number(part.detected_quality_median, 3),
-            number(part.quality_difference, 3),
-        )
+        if part.reference or part.detected:
+            rates = (part.recall, part.precision)
+            recall, precision = (number(rate, 3) for rate in rates)
+            medians = (
+                part.error_median_m, part.reference_quality_median, part.detected_quality_median,
+                part.quality_difference,
+            )  # fmt: skip
+            table.add_row(
+                range_text(part), str(part.reference), str(part.missed), recall,
+                str(part.detected), str(part.extra), precision,
+                *(number(value, 3) for value in medians),
+            )  # fmt: skip
     return table
 
 
-def _floor_differences(c: Comparison) -> Table:
+def _floor_differences(c: DiscComparison) -> Table:
     headings = ("median", "95 %", "along", "across")
     table = _titled_table(
         "On the floor, m: detected minus reference; the same after the common lean\n"
         "(along: farther away, across: to the left; medians)",
         ("metres", "pairs", *headings, "after", *headings[1:]),
     )
-    for part in c.floor:
-        if part.before.pairs == 0 or part.after is None:
-            continue
-        figures = [
-            number(value, 3)
-            for one in (part.before, part.after)
-            for value in (one.median_m, one.most_m, one.along_m, one.across_m)
-        ]
-        table.add_row(_range(part), str(part.before.pairs), *figures)
+    for part, figures in floor_figures(c):
+        shown = [number(value, 3) for value in figures]
+        table.add_row(range_text(part), str(part.before.pairs), *shown)
     return table
 
 
-def _range(part: DistanceBin | FloorBin) -> str:
+def floor_figures(c: DiscComparison) -> list[tuple[FloorBin, list[float | None]]]:
+    """The four figures before and the four after the lean of each bin that has pairs (m)."""
+    return [
+        (
+            part,
+            [
+                value
+                for one in (part.before, part.after)
+                for value in (one.median_m, one.most_m, one.along_m, one.across_m)
+            ],
+        )
+        for part in c.floor
+        if part.before.pairs and part.after is not None
+    ]
+
+
+def range_text(part: DistanceBin | FloorBin) -> str:
+    """The range of forward distances of a bin (m), open at an end that is None."""
     if part.from_m is None:
         return f"< {part.to_m:g}"
-    if part.to_m is None:
-        return f">= {part.from_m:g}"
-    return f"{part.from_m:g}-{part.to_m:g}"
+    return f">= {part.from_m:g}" if part.to_m is None else f"{part.from_m:g}-{part.to_m:g}"
 
 
-def _worst_frames(c: Comparison | LineComparison) -> Table:
-    discs = isinstance(c, Comparison)
-    counts = ("matched", "missed", "extra") if discs else ("matched", "joined", "missed", "extra")
+def _worst_frames(c: Comparison) -> Table:
     table = _titled_table("Worst frames")
     table.add_column("image", overflow="fold")
-    for heading in (*counts, f"largest error {'m' if discs else 'deg'}"):
+    for heading in (*_frame_counts(c), f"largest error {_unit(c)}"):
         table.add_column(heading, justify="right")
-    for frame in c.worst_frames(_WORST_FRAMES):
-        numbers = [str(getattr(frame, count)) for count in counts]
-        table.add_row(Text(printable(frame.name)), *numbers, number(frame.largest_error, 3))
+    for match in c.worst_frames(_WORST_FRAMES):
+        counts = [str(getattr(match, count)) for count in _frame_counts(c)]
+        table.add_row(Text(printable(match.name)), *counts, number(match.largest_error, 3))
     return table
 
 
@@ -307,7 +300,7 @@ def _titled_table(title: str, headings: Iterable[str] = ()) -> Table:
 def number(value: float | None, decimals: int) -> str:
     """A figure, or a dash where there is none."""
     if value is None:
-        return NONE
+        return "-"
     return f"{round(value, decimals) + 0.0:.{decimals}f}"  # adding 0 makes -0 a 0
 
 

@@ -2,36 +2,67 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from math import isfinite
-from typing import Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Optional
 
 import numpy as np
 from numpy.typing import NDArray
 
+from storage.bounds import ABOVE_0, NOT_NEGATIVE, demand
+
+if TYPE_CHECKING:
+    from detect.seen import FrameView
+    from landmarks import Association
+
+FloatArray = NDArray[np.float64]
+Kind = Literal["circles", "lines"]
 ErrorCovariance = Literal["detected", "reference", "sum"]
+# For `float | None` tyro imports another library that takes a tenth of a second.
+MaybeFloat = Optional[float]  # noqa: UP045
 
 
 class CompareError(ValueError):
     """Two runs that cannot be compared; the message says which file or frame and why."""
 
 
-@dataclass(frozen=True, slots=True)
-class CompareOptions:
-    """What counts as the same disc, and which rows count.
+@dataclass(frozen=True, kw_only=True)
+class Gates:
+    """Which detected and reference rows are the same landmark.
 
-    Attributes
+    Parameters
     ----------
-    gate_m : float or None
-        Compare positions on the floor: the largest distance between a detected and a reference row
-        of the same disc (m). By default the image is compared where there is a calibration: each
-        row where it was seen; without one, 0.1 m.
-    sigma : float or None
-        Compare on the floor, too: the largest Mahalanobis distance under the reference row's
-        covariance (standard deviations).
+    gate_m : float
+        Compare discs on the floor: they are the same within this distance, metres. By default they
+        are compared in the image where there is a calibration, and within 0.1 m where there is
+        none.
+    tolerance_deg : float
+        Bearings of the same line differ by at most this,
+    sigmas : float
+        or by this many standard deviations of the detected one.
+    """
+
+    gate_m: MaybeFloat = None
+    tolerance_deg: float = 0.5
+    sigmas: float = 2.0
+
+    def __post_init__(self) -> None:
+        demand(self, CompareError, tolerance_deg=ABOVE_0, sigmas=NOT_NEGATIVE)
+        if self.gate_m is not None:
+            demand(self, CompareError, gate_m=ABOVE_0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CompareOptions(Gates):
+    """Which rows are the same landmark, and which rows count.
+
+    Parameters
+    ----------
+    sigma : float
+        Compare discs on the floor: they are the same within this Mahalanobis distance under the
+        reference row's covariance (standard deviations).
     least_px : float
-        In the image, rows are the same if they differ by at most half the width and height of the
+        In the image, discs are the same if they differ by at most half the width and height of the
         disc's own image, or by this (px), whichever is more.
     only_identified : bool
         Count only reference rows that have an ID. Detected rows that fit a reference row without
@@ -39,131 +70,130 @@ class CompareOptions:
     all_frames : bool
         Count frames that only one file has, too: all their rows are missed, or extra.
     error_covariance : {"detected", "reference", "sum"}
-        Which covariance position errors are measured in: the detected row's, the reference row's,
-        or, where both err independently, their sum.
+        Which covariance position errors of discs are measured in: the detected row's, the reference
+        row's, or, where both err independently, their sum.
     """
 
-    gate_m: float | None = None
-    sigma: float | None = None
+    sigma: MaybeFloat = None
     least_px: float = 3.0
     only_identified: bool = False
     all_frames: bool = False
     error_covariance: ErrorCovariance = "detected"
 
     def __post_init__(self) -> None:
-        gates = {"gate_m": self.gate_m, "sigma": self.sigma, "least_px": self.least_px}
-        for name, gate in gates.items():
-            if gate is not None and not (isfinite(gate) and gate > 0):
-                raise CompareError(f"{name} is {gate}: expected a positive number")
+        super().__post_init__()
+        demand(self, CompareError, least_px=ABOVE_0)
+        if self.sigma is not None:
+            demand(self, CompareError, sigma=ABOVE_0)
 
     @property
     def on_floor(self) -> bool:
-        """Whether rows are to be compared on the floor even where there is a calibration."""
+        """Whether discs are to be compared on the floor even where there is a calibration."""
         return self.gate_m is not None or self.sigma is not None
 
 
-@dataclass(frozen=True, slots=True)
-class LineCompareOptions:
-    """What counts as the same line, and which rows count.
+class FramePair(NamedTuple):
+    """The rows of one image on both sides, all discs or all lines.
 
     Attributes
     ----------
-    tolerance_deg : float
-        Bearings of the same line may always differ by this much (degrees).
-    sigmas : float
-        They may also differ by as many of the detected row's standard deviations, and all reference
-        rows that near a matched row are found with it.
-    only_identified : bool
-        Count only reference rows that have an ID. Detected rows that fit a reference row without
-        one are then neither right nor wrong: they are set aside.
-    all_frames : bool
-        Count frames that only one file has, too: all their rows are missed, or extra.
+    kind : {"circles", "lines"}
+    name : str
+        The image.
+    reference, detected : sequence of CircleLandmark or of LineLandmark
+    unlisted : sequence of CircleLandmark
+        What may be detected but need not be.
+    view : FrameView or None
+        How discs come back into the image; without it they are compared on the floor.
     """
 
-    tolerance_deg: float = 0.5
-    sigmas: float = 2.0
-    only_identified: bool = False
-    all_frames: bool = False
-
-    def __post_init__(self) -> None:
-        if not (isfinite(self.tolerance_deg) and self.tolerance_deg > 0):
-            raise CompareError(f"tolerance_deg is {self.tolerance_deg}: expected a positive number")
-        if not (isfinite(self.sigmas) and self.sigmas >= 0):
-            raise CompareError(f"sigmas is {self.sigmas}: expected a number of at least 0")
-
-
-@dataclass(frozen=True, slots=True)
-class FrameScore:
-    """Result for one frame's discs."""
-
+    kind: Kind
     name: str
-    matched: int
-    missed: int
-    extra: int
-    largest_error_m: float | None
+    reference: Sequence[Any]
+    detected: Sequence[Any]
+    unlisted: Sequence[Any] = ()
+    view: FrameView | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class FrameMatch:
+    """The rows of one frame that count, and which of them belong together.
+
+    Attributes
+    ----------
+    frame : FramePair
+        All its rows.
+    reference, detected : sequence of rows
+        Those that count.
+    set_aside : sequence of rows
+        Detected rows that fit something that does not count.
+    pairs : Association
+        Of reference (first) and detected rows (second).
+    with_another : (N,) bool
+        Which of the unpaired reference rows are found with another row: a detected line can
+        represent several.
+    errors : (M,) float64
+        Of the pairs: distance on the floor (m), or difference in bearing without sign (degrees).
+    """
+
+    frame: FramePair
+    reference: Sequence[Any]
+    detected: Sequence[Any]
+    set_aside: Sequence[Any]
+    pairs: Association
+    with_another: NDArray[np.bool_]
+    errors: FloatArray
+
+    @property
+    def name(self) -> str:
+        """The image."""
+        return self.frame.name
+
+    @property
+    def matched(self) -> int:
+        """Pairs of rows."""
+        return len(self.pairs.first)
+
+    @property
+    def joined(self) -> int:
+        """Further reference rows that a matched line represents."""
+        return int(self.with_another.sum())
+
+    @property
+    def missed(self) -> int:
+        """Reference rows that no detected row represents."""
+        return int((~self.with_another).sum())
+
+    @property
+    def extra(self) -> int:
+        """Detected rows that fit no reference row."""
+        return len(self.pairs.second_alone)
 
     @property
     def largest_error(self) -> float | None:
         """That of any pair."""
-        return self.largest_error_m
-
-
-@dataclass(frozen=True, slots=True)
-class LineFrameScore:
-    """Result for one frame's lines; `joined` ones were found with another row's match."""
-
-    name: str
-    matched: int
-    joined: int
-    missed: int
-    extra: int
-    largest_error_deg: float | None
+        return float(self.errors.max()) if len(self.errors) else None
 
     @property
-    def largest_error(self) -> float | None:
-        """That of any pair."""
-        return self.largest_error_deg
-
-
-Score = TypeVar("Score", FrameScore, LineFrameScore)
-
-
-def _worst(frames: Iterable[Score], count: int) -> tuple[Score, ...]:
-    """The frames with most missed and extra rows; of equals, with the largest error first."""
-    ranked = sorted(
-        frames, key=lambda f: (-(f.missed + f.extra), -(f.largest_error or 0.0), f.name)
-    )
-    return tuple(ranked[:count])
-
-
-@dataclass(frozen=True, slots=True)
-class DistanceBin:
-    """Rows at a range of forward distances; reference and detected rows each by their own.
-
-    Figures are None where there are no rows to compute them from.
-    """
-
-    from_m: float | None
-    to_m: float | None
-    reference: int
-    missed: int
-    detected: int
-    extra: int
-    recall: float | None
-    precision: float | None
-    reference_quality_median: float | None
-    detected_quality_median: float | None
-    error_median_m: float | None
+    def paired(self) -> tuple[list[Any], list[Any]]:
+        """The rows in pairs: reference, detected."""
+        return (
+            [self.reference[i] for i in self.pairs.first],
+            [self.detected[j] for j in self.pairs.second],
+        )
 
     @property
-    def quality_difference(self) -> float | None:
-        """Detected minus reference quality (of the medians)."""
-        if self.reference_quality_median is None or self.detected_quality_median is None:
-            return None
-        return self.detected_quality_median - self.reference_quality_median
+    def missed_rows(self) -> list[Any]:
+        """Reference rows that no detected row represents."""
+        return [self.reference[i] for i in self.pairs.first_alone[~self.with_another]]
+
+    @property
+    def extra_rows(self) -> list[Any]:
+        """Detected rows that fit no reference row."""
+        return [self.detected[j] for j in self.pairs.second_alone]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class NormalisedError:
     """Squared errors in units of their covariance.
 
@@ -186,7 +216,28 @@ class NormalisedError:
     left_out: int
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
+class DistanceBin:
+    """Discs at a range of forward distances; reference and detected rows each by their own.
+
+    Qualities and errors are medians. Figures are None where there are no rows to compute them from.
+    """
+
+    from_m: float | None
+    to_m: float | None
+    reference: int
+    missed: int
+    detected: int
+    extra: int
+    recall: float | None
+    precision: float | None
+    reference_quality_median: float | None
+    detected_quality_median: float | None
+    error_median_m: float | None
+    quality_difference: float | None
+
+
+@dataclass(frozen=True)
 class Levelling:
     """How many frames' rows are levelled, and by what (medians, degrees; None where none are).
 
@@ -196,11 +247,11 @@ class Levelling:
     frames: int
     levelled: int
     true: bool
-    pitch_deg: float | None = None
-    roll_deg: float | None = None
+    pitch_deg: float | None
+    roll_deg: float | None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class FloorDifference:
     """Detected minus reference positions on the floor of matched rows.
 
@@ -220,7 +271,7 @@ class FloorDifference:
     across_m: float | None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class FloorBin:
     """Floor differences at a range of forward distances, before and after the common lean."""
 
@@ -230,7 +281,7 @@ class FloorBin:
     after: FloorDifference | None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class CommonLean:
     """Constant tilt and height of the camera that explain the differences, and the residuals.
 
@@ -247,9 +298,9 @@ class CommonLean:
     normalised_error: NormalisedError
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class DiscPairs:
-    """Matched rows.
+    """Matched discs.
 
     Attributes
     ----------
@@ -263,43 +314,73 @@ class DiscPairs:
         Unit vectors on the floor along which the camera sees the discs.
     """
 
-    reference_xy: NDArray[np.float64]
-    offset: NDArray[np.float64]
-    left: NDArray[np.float64]
-    covariance: NDArray[np.float64]
-    away: NDArray[np.float64]
+    reference_xy: FloatArray
+    offset: FloatArray
+    left: FloatArray
+    covariance: FloatArray
+    away: FloatArray
 
 
-NO_PAIRS = DiscPairs(*(np.zeros((0, 2)),) * 3, np.zeros((0, 2, 2)), np.zeros((0, 2)))
+@dataclass(frozen=True, eq=False)
+class LinePairs:
+    """Matched lines: bearings of the reference rows, errors and sigmas of the detected ones (rad).
+
+    Each is a (N,) float64 array.
+    """
+
+    bearing_rad: FloatArray
+    error_rad: FloatArray
+    sigma_rad: FloatArray
 
 
-@dataclass(frozen=True, slots=True)
-class _Counts:
-    """What comparisons of discs and of lines have in common.
+@dataclass(frozen=True)
+class Comparison:
+    """How a run's detected rows compare with reference rows.
+
+    Figures are None where there are no rows to compute them from.
 
     Attributes
     ----------
     reference_name, detected_name : str
         The files.
-    options : CompareOptions or LineCompareOptions
-        What counted as the same landmark.
-    reference, detected : int
-        Rows that count.
-    matched : int
-        Pairs of a reference and a detected row; no row is in two of them.
+    options : CompareOptions
+    frames : tuple of FrameMatch
+        Each frame that was compared.
+    frames_only_in_reference, frames_only_in_detected : tuple of str
+        Images that only one file has.
     """
 
     reference_name: str
     detected_name: str
-    options: CompareOptions | LineCompareOptions
-    reference: int
-    detected: int
-    matched: int
+    options: CompareOptions
+    frames: tuple[FrameMatch, ...] = field(repr=False)
+    frames_only_in_reference: tuple[str, ...] = field(repr=False)
+    frames_only_in_detected: tuple[str, ...] = field(repr=False)
+
+    @property
+    def reference(self) -> int:
+        """Reference rows that count."""
+        return sum(len(match.reference) for match in self.frames)
+
+    @property
+    def detected(self) -> int:
+        """Detected rows that count."""
+        return sum(len(match.detected) for match in self.frames)
+
+    @property
+    def matched(self) -> int:
+        """Pairs of a reference and a detected row; no row is in two of them."""
+        return sum(match.matched for match in self.frames)
+
+    @property
+    def joined(self) -> int:
+        """Further reference rows within the deviation of a matched line."""
+        return sum(match.joined for match in self.frames)
 
     @property
     def found(self) -> int:
-        """Reference rows that a detected row represents."""
-        return self.matched
+        """Reference rows that a detected row represents, alone or with others."""
+        return self.matched + self.joined
 
     @property
     def missed(self) -> int:
@@ -311,21 +392,37 @@ class _Counts:
         """Detected rows that fit no reference row."""
         return self.detected - self.matched
 
+    @property
+    def set_aside(self) -> int:
+        """Detected rows that fit something that does not count: neither right nor wrong."""
+        return sum(len(match.set_aside) for match in self.frames)
 
-@dataclass(frozen=True, slots=True)
-class Comparison(_Counts):
+    @property
+    def recall(self) -> float | None:
+        """Share of the reference rows that were found."""
+        return self.found / self.reference if self.reference else None
+
+    @property
+    def precision(self) -> float | None:
+        """Share of the detected rows that were matched."""
+        return self.matched / self.detected if self.detected else None
+
+    def worst_frames(self, count: int) -> list[FrameMatch]:
+        """The frames with most missed and extra rows; of equals, with the largest error first."""
+        return sorted(
+            self.frames, key=lambda f: (-(f.missed + f.extra), -(f.largest_error or 0.0), f.name)
+        )[:count]
+
+
+@dataclass(frozen=True)
+class DiscComparison(Comparison):
     """How a run's detected discs compare with reference rows.
 
-    Figures are None where there are no rows to compute them from. Qualities are medians. Rows set
-    aside count neither as matched nor as extra; `on_lookalikes` of the extra rows are on something
-    that is known to look like a disc.
+    Qualities are medians. `on_lookalikes` of the extra rows are on something that is known to look
+    like a disc (None where these are not known).
     """
 
-    options: CompareOptions
-    set_aside: int
     on_lookalikes: int | None
-    recall: float | None
-    precision: float | None
     error_median_m: float | None
     error_95_m: float | None
     normalised_error: NormalisedError
@@ -342,30 +439,14 @@ class Comparison(_Counts):
     floor: tuple[FloorBin, ...]
     lean: CommonLean | None
     pairs: DiscPairs = field(repr=False)
-    frames: tuple[FrameScore, ...] = field(repr=False)
-    frames_only_in_reference: tuple[str, ...] = field(repr=False)
-    frames_only_in_detected: tuple[str, ...] = field(repr=False)
-
-    def worst_frames(self, count: int) -> tuple[FrameScore, ...]:
-        """The frames with most missed and extra rows; of equals, with the largest error first."""
-        return _worst(self.frames, count)
 
 
-@dataclass(frozen=True, slots=True)
-class LineComparison(_Counts):
+@dataclass(frozen=True)
+class LineComparison(Comparison):
     """How a run's detected lines compare with reference rows.
-
-    Figures are None where there are no rows to compute them from.
 
     Attributes
     ----------
-    joined : int
-        Further reference rows within the deviation of a matched detected row, which represents
-        several lines.
-    set_aside : int
-        Detected rows on reference rows that do not count.
-    recall, precision : float or None
-        Shares of the reference rows that were found, and of the detected rows that were matched.
     bearing_median_deg, bearing_95_deg : float or None
         Median and 95 % quantile of the differences in alpha of the pairs, without sign (degrees).
     normalised_error : NormalisedError
@@ -375,55 +456,26 @@ class LineComparison(_Counts):
         coordinates).
     beta_median_deg : float or None
         Median difference in beta of the pairs, without sign (degrees).
-    frames : tuple of LineFrameScore
-        Each frame that was compared.
-    frames_only_in_reference, frames_only_in_detected : tuple of str
-        Images that only one file has.
+    pairs : LinePairs
     """
 
-    options: LineCompareOptions
-    joined: int
-    set_aside: int
-    recall: float | None
-    precision: float | None
     bearing_median_deg: float | None
     bearing_95_deg: float | None
     normalised_error: NormalisedError
     ends_median: float | None
     beta_median_deg: float | None
-    frames: tuple[LineFrameScore, ...] = field(repr=False)
-    frames_only_in_reference: tuple[str, ...] = field(repr=False)
-    frames_only_in_detected: tuple[str, ...] = field(repr=False)
-
-    @property
-    def found(self) -> int:
-        """Reference rows that a detected row represents, alone or with others."""
-        return self.matched + self.joined
-
-    def worst_frames(self, count: int) -> tuple[LineFrameScore, ...]:
-        """The frames with most missed and extra rows; of equals, with the largest error first."""
-        return _worst(self.frames, count)
+    pairs: LinePairs = field(repr=False)
 
 
 def unmet_demands(
-    comparison: Comparison | LineComparison,
+    comparison: Comparison,
     *,
     min_recall: float | None = None,
     min_precision: float | None = None,
 ) -> tuple[str, ...]:
-    """Say which demands a comparison fails: a command that made them exits 1 if there are any.
+    """Say which demands a comparison fails, a sentence for each.
 
-    Parameters
-    ----------
-    comparison : Comparison or LineComparison
-        The figures.
-    min_recall, min_precision : float, optional
-        Least values. A figure that there are no rows for fails its demand.
-
-    Returns
-    -------
-    tuple of str
-        One sentence for each demand that fails.
+    A figure that there are no rows for fails its demand.
     """
     demands = (
         ("recall", comparison.recall, min_recall),

@@ -13,14 +13,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.comparison.result import LineCompareOptions
+from detect.comparison.result import CompareOptions
 from detect.drawing.frame import draw_rows
-from detect.drawing.inputs import find_files, open_rows, picture_name, select_frames
+from detect.drawing.inputs import open_rows, picture_name, select_frames
 from detect.errors import EXIT_FRAMES_FAILED, DetectError, FrameError
 from detect.run import Run, read_image
 from detect.runs.progress import print_failures, progress_bar
-from detect.runs.rows import KEPT_FAILURES
-from detect.settings import CircleSettings
 from detect.sources.opening import demand_recording, open_source
 from detect.viewing_options import Draw
 from storage import OutputExistsError, write_whole
@@ -34,9 +32,9 @@ def perform(options: Draw) -> int:
         raise DetectError(f"fps is {options.fps:g}: expected above 0")
     demand_recording(options.run)
     run = open_source(options.run, options.camera, options.source)
-    files = find_files(run, options.files)
-    camera = run.camera if isinstance(run, Run) else None
-    if camera is None and set(files.detected) != {"markers"}:
+    rows = open_rows(run, options.files)
+    sight = rows.sight(run.camera) if isinstance(run, Run) else None
+    if sight is None and set(rows.detected) != {"markers"}:
         raise DetectError(
             f"{options.run}: no calibration: expected a .cam file in it, or one named by --camera; "
             "only markers can be drawn without"
@@ -44,51 +42,39 @@ def perform(options: Draw) -> int:
     if options.video is not None and options.video.exists() and not options.force:
         raise OutputExistsError(options.video)
     selection = select_frames(run.frames, options.frames, options.every)
-    source = open_rows(files)
-    head = files.heads.get("circles")
-    settings = CircleSettings() if head is None else head.circle_settings
-    gate, sigmas = options.gates.discs, options.gates.sigmas
-    line_gate = LineCompareOptions(tolerance_deg=options.gates.tolerance_deg, sigmas=sigmas)
+    gates = CompareOptions(**vars(options.gates))
     if options.output is not None:
         options.output.mkdir(parents=True, exist_ok=True)
 
-    drawn, failed = 0, 0
+    drawn = 0
     failures: list[str] = []
     with ExitStack() as stack:
         video = None
         if options.video is not None:
             video = stack.enter_context(mp4(options.video, options.fps, overwrite=options.force))
-        advance = stack.enter_context(progress_bar("pictures", selection.expected(run.frames)))
-        for _, frame in selection.of(run.frames):
+        advance = stack.enter_context(progress_bar("pictures", selection.expected))
+        for _, frame in selection:
             try:
-                image = read_image(frame, camera)
+                image = read_image(frame, None if sight is None else sight.camera)
             except FrameError as error:
-                failed += 1
-                failures += [str(error)][: KEPT_FAILURES - len(failures)]
+                failures.append(str(error))
                 continue
             prefix = frame.step.prefix
-            picture = draw_rows(
-                image, camera, source.of(prefix), settings, gate, line_gate, picture_name(prefix)
-            )
+            name = picture_name(prefix)
+            picture = draw_rows(image, sight, rows.of(prefix), rows.circle_settings, gates, name)
             if options.output is not None:
-                path = options.output / f"{picture_name(prefix)}.png"
+                path = options.output / f"{name}.png"
                 with write_whole(path, overwrite=options.force) as stream:
-                    stream.write(png(picture))
+                    stream.write(cv2.imencode(".png", picture)[1].tobytes())
             if video is not None:
                 video(picture)
             drawn += 1
             advance()
     for where in (options.output, options.video):
         if where is not None:
-            print(f"{where}: {drawn} pictures of {', '.join(files.detected)}")
-    print_failures(failed, failures)
-    return EXIT_FRAMES_FAILED if failed else 0
-
-
-def png(picture: NDArray[np.uint8]) -> bytes:
-    """A picture in OpenCV's order of colours as a PNG file."""
-    _, encoded = cv2.imencode(".png", picture)
-    return encoded.tobytes()
+            print(f"{where}: {drawn} pictures of {', '.join(rows.detected)}")
+    print_failures(len(failures), failures)
+    return EXIT_FRAMES_FAILED if failures else 0
 
 
 @contextmanager
@@ -97,15 +83,6 @@ def mp4(
 ) -> Iterator[Callable[[NDArray[np.uint8]], None]]:
     """A video that appears once it is complete; yields what takes its pictures.
 
-    Parameters
-    ----------
-    path : path
-        The file.
-    fps : float
-        Pictures per second.
-    overwrite : bool
-        Whether an existing file may be replaced.
-
     Raises
     ------
     DetectError
@@ -113,22 +90,20 @@ def mp4(
     storage.OutputExistsError
         If the file exists and must not be replaced.
     """
-    writer: cv2.VideoWriter | None = None
+    writer = cv2.VideoWriter()
     size: tuple[int, int] | None = None
 
     with tempfile.TemporaryDirectory() as folder:
         raw = Path(folder) / "video.mp4"
 
         def add(picture: NDArray[np.uint8]) -> None:
-            nonlocal writer, size
+            nonlocal size
             # The coder wants even numbers of rows and columns.
             height, width = picture.shape[:2]
             even = np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
-            if writer is None:
+            if size is None:
                 size = (even.shape[1], even.shape[0])
-                coder = cv2.VideoWriter.fourcc(*"mp4v")
-                writer = cv2.VideoWriter(str(raw), coder, fps, size)
-                if not writer.isOpened():
+                if not writer.open(str(raw), cv2.VideoWriter.fourcc(*"mp4v"), fps, size):
                     raise DetectError(
                         f"{path}: this OpenCV cannot write MP4 videos: expected -o and a folder"
                     )
@@ -139,9 +114,8 @@ def mp4(
         try:
             yield add
         finally:
-            if writer is not None:
-                writer.release()
-        if writer is None:
+            writer.release()
+        if size is None:
             raise DetectError(f"{path}: no picture: expected one at least for a video")
         with write_whole(path, overwrite=overwrite) as stream, raw.open("rb") as content:
             shutil.copyfileobj(content, stream)

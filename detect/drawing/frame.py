@@ -1,10 +1,9 @@
 """Rows of one frame drawn into its image: discs, verticals, markers, tilt, and their residuals.
 
-Everything drawn comes from files; nothing is detected again. Outlines of discs go through the
-tilt of the frame, where the rows are corrected for it, and through the lens; verticals through the
-lens, with a bar of one standard deviation to each side where they cross the horizon (the report's
-figures 5, 6 and 8). Where there are reference rows, those that are missing are drawn as well, and
-rows that fit none have another colour.
+Outlines of discs go through the tilt of the frame, where the rows are corrected for it, and through
+the lens; verticals through the lens, with a bar of one standard deviation to each side where they
+cross the horizon (the report's figures 5, 6 and 8). Where there are reference rows, those that are
+missing are drawn as well, and rows that fit none have another colour.
 """
 
 from __future__ import annotations
@@ -17,21 +16,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera
-from detect.comparison.circles import pair_discs
-from detect.comparison.lines import joined_lines, pair_lines
-from detect.comparison.result import CompareOptions, LineCompareOptions
+from detect.comparison.matching import apart_px, match_frame, numbers, pair_of
+from detect.comparison.result import CompareOptions, FrameMatch
 from detect.drawing.inputs import SeenRows
-from detect.drawing.strokes import Colour, canvas_of, draw_bar, draw_curve, draw_text, enlargement
-from detect.markers.drawing import mark_marker
-from detect.seen import FrameView, circle_on_floor, image_positions
-from detect.settings import CircleSettings
-from landmarks import (
-    CircleLandmark,
-    LineLandmark,
-    MarkerLandmark,
-    circle_arrays,
-    wrap_angle,
+from detect.drawing.strokes import (
+    Colour,
+    canvas_of,
+    draw_bar,
+    draw_curve,
+    draw_text,
+    with_legend,
 )
+from detect.markers.drawing import mark_marker
+from detect.seen import FrameView, Sight, circle_on_floor, image_positions
+from detect.settings import CircleSettings
+from landmarks import LineLandmark, MarkerLandmark, circle_arrays
 
 if TYPE_CHECKING:
     from detect.circles import CircleDetections
@@ -39,24 +38,22 @@ if TYPE_CHECKING:
 FloatArray = NDArray[np.float64]
 
 _POINTS = 33
-_LEGEND_PX = 16
-_LINE_COLOUR: Colour = (60, 220, 60)
-_SIGMA_COLOUR: Colour = (0, 170, 255)
+LINE_COLOUR: Colour = (60, 220, 60)
+SIGMA_COLOUR: Colour = (0, 170, 255)
 _EDGE_COLOUR: Colour = (0, 170, 255)
 _OUTLINE_COLOUR: Colour = (60, 200, 60)
 _TEXT_COLOUR: Colour = (0, 230, 255)
-_EXTRA_COLOUR: Colour = (255, 60, 255)
-_MISSED_COLOUR: Colour = (60, 60, 255)
+EXTRA_COLOUR: Colour = (255, 60, 255)
+MISSED_COLOUR: Colour = (60, 60, 255)
 _WORDS_COLOUR: Colour = (230, 230, 230)
 
 
 def draw_rows(
     image: NDArray[np.uint8],
-    camera: Camera | None,
+    sight: Sight | None,
     rows: SeenRows,
     settings: CircleSettings,
-    gate: CompareOptions,
-    line_gate: LineCompareOptions,
+    options: CompareOptions,
     title: str = "",
 ) -> NDArray[np.uint8]:
     """Draw what files say of a frame into its image, with a line of words below.
@@ -65,13 +62,13 @@ def draw_rows(
     ----------
     image : (H, W) uint8
         The grey image.
-    camera : Camera or None
+    sight : Sight or None
         The calibrated camera; without one, only markers are drawn.
     rows : SeenRows
         The rows of the files.
     settings : CircleSettings
         The radii of the discs' outlines.
-    gate, line_gate : CompareOptions, LineCompareOptions
+    options : CompareOptions
         What counts as the same disc or vertical as one of the reference.
     title : str
         Beginning of the line below the picture.
@@ -81,26 +78,57 @@ def draw_rows(
     (H + h, W, 3) uint8
         In OpenCV's order blue, green, red; h is the height of the line of words.
     """
-    canvas = canvas_of(image, camera)
+    canvas = canvas_of(image, None if sight is None else sight.camera)
     words = [title] if title else []
-    if camera is not None:
-        if rows.lines is not None:
-            words.append(_draw_lines(canvas, camera, rows.lines, rows.reference_lines, line_gate))
-        if rows.circles is not None:
-            view = FrameView(camera, settings.radius_m, rows.reference_by, rows.levelled_by)
-            words.append(
-                _draw_discs(canvas, view, rows.circles, rows.reference_circles, settings, gate)
-            )
+    if sight is not None and rows.lines is not None:
+        match = match_frame(pair_of("lines", title, rows.reference_lines, rows.lines), options)
+        compared = rows.reference_lines is not None
+        _draw_lines(canvas, sight.camera, match, compared)
+        words.append(_count("verticals", match, compared))
+    if sight is not None and rows.circles is not None:
+        frames = rows.reference_circles, rows.circles
+        pair = pair_of("circles", title, *frames, rows.unlisted, sight.of(*frames))
+        match = match_frame(pair, options)
+        compared = rows.reference_circles is not None
+        _draw_discs(canvas, match, settings, compared)
+        words.append(_count("discs", match, compared))
     if rows.markers is not None:
-        words.append(_draw_markers(canvas, rows.markers))
+        _draw_markers(canvas, rows.markers.markers)
+        words.append(f"{len(rows.markers.markers)} markers")
     if rows.tilt is not None:
         pitch, roll = np.degrees([rows.tilt.pitch, rows.tilt.roll])
         words.append(f"pitch {pitch:.2f} roll {roll:.2f} deg")
-    times = enlargement(canvas)
-    legend = np.zeros((_LEGEND_PX * times, image.shape[1], 3), np.uint8)
-    at = (4 * times, (_LEGEND_PX - 5) * times)
-    draw_text(legend, "   ".join(words), at, _WORDS_COLOUR, 0.38)
-    return np.concatenate([canvas, legend])
+    return with_legend(canvas, [("   ".join(words), _WORDS_COLOUR)], canvas.shape[1], 0.38)
+
+
+def draw_circles(
+    image: NDArray[np.uint8],
+    camera: Camera,
+    found: CircleDetections,
+    settings: CircleSettings,
+) -> NDArray[np.uint8]:
+    """Draw the outlines of detected discs and their quality (the report's figure 8).
+
+    Parameters
+    ----------
+    image : (H, W) uint8
+        The grey image.
+    camera : Camera
+        The calibrated camera, through which the outlines are drawn.
+    found : CircleDetections
+        The discs.
+    settings : CircleSettings
+        The radii of the outlines.
+
+    Returns
+    -------
+    (H, W, 3) uint8
+        In OpenCV's order blue, green, red.
+    """
+    canvas = canvas_of(image, camera)
+    for centre, quality in zip(found.floor_xy, found.quality):
+        _outline_disc(canvas, camera.project_floor, centre, settings, f"{quality:.2f}")
+    return canvas
 
 
 def line_curves(camera: Camera, ends: FloatArray) -> FloatArray:
@@ -139,20 +167,18 @@ def sigma_bars(camera: Camera, ends: FloatArray, sigma_rad: FloatArray) -> Float
         Pixels of the bars' ends; NaN for lines that do not cross the horizon before the camera.
     """
     one = np.ones((len(ends), 1))
-    rotation = camera.rotation
-    top, bottom = (np.hstack([e, one]) @ rotation.T for e in (ends[:, :2], ends[:, 2:]))
-    fall = top[:, 2] - bottom[:, 2]
-    share = np.divide(top[:, 2], fall, out=np.full(len(ends), np.nan), where=np.abs(fall) > 1e-12)
-    crossing = top + share[:, None] * (bottom - top)
-    sine, cosine = np.sin(sigma_rad), np.cos(sigma_rad)
-    bars = []
-    # Bearings grow to the left, from -Y towards X: turned about Z.
-    for sign in (1.0, -1.0):
-        x = cosine * crossing[:, 0] - sign * sine * crossing[:, 1]
-        y = sign * sine * crossing[:, 0] + cosine * crossing[:, 1]
-        seen = np.column_stack([x, y, np.zeros(len(ends))]) @ rotation
-        ahead = np.where(seen[:, 2:] > 1e-6, seen[:, 2:], np.nan)
-        bars.append(camera.distort(seen[:, :2] / ahead))
+    top, bottom = (np.hstack([e, one]) @ camera.rotation.T for e in (ends[:, :2], ends[:, 2:]))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = top[:, 2] / (top[:, 2] - bottom[:, 2])
+        x, y, _ = (top + share[:, None] * (bottom - top)).T
+        bars = []
+        # Bearings grow to the left, from -Y towards X: turned about Z.
+        for angle in (sigma_rad, -sigma_rad):
+            sine, cosine = np.sin(angle), np.cos(angle)
+            turned = np.column_stack([cosine * x - sine * y, sine * x + cosine * y, 0.0 * x])
+            seen = turned @ camera.rotation
+            ahead = np.where(seen[:, 2:] > 1e-6, seen[:, 2:], np.nan)
+            bars.append(camera.distort(seen[:, :2] / ahead))
     return np.stack(bars, axis=1)
 
 
@@ -163,111 +189,58 @@ def ends_of(rows: Sequence[LineLandmark]) -> FloatArray:
 
 
 def _draw_discs(
-    canvas: NDArray[np.uint8],
-    view: FrameView,
-    found: Sequence[CircleLandmark],
-    wanted: Sequence[CircleLandmark] | None,
-    settings: CircleSettings,
-    gate: CompareOptions,
-) -> str:
-    camera = view.camera
-    project = partial(image_positions, camera, levelled_by=view.detected_by)
-    places = circle_arrays(found)
-    colours = [_EDGE_COLOUR if wanted is None else _EXTRA_COLOUR] * len(found)
-    texts = [f"{row.quality:.2f}" for row in found]
-    words = f"{len(found)} discs"
-    if wanted is not None:
-        pairs = pair_discs(wanted, found, gate, view)
-        reference_xy = circle_arrays(wanted).xy
-        at = partial(image_positions, camera, levelled_by=view.reference_by)
-        apart = project(places.xy[pairs.second]) - at(reference_xy[pairs.first])
-        for j, size in zip(pairs.second, np.hypot(*apart.T)):
-            colours[j] = _EDGE_COLOUR
-            texts[j] += f" {size:.1f}px"
-        for i in pairs.first_alone:
-            edge = at(circle_on_floor(reference_xy[i], settings.radius_m))
-            draw_curve(canvas, edge, _MISSED_COLOUR, closed=True)
-        words += _fate(len(pairs.second_alone), len(pairs.first_alone))
-    for centre, text, colour in zip(places.xy, texts, colours):
-        _outline_disc(canvas, project, centre, settings, text, edge_colour=colour)
-    return words
+    canvas: NDArray[np.uint8], match: FrameMatch, settings: CircleSettings, compared: bool
+) -> None:
+    view = match.frame.view
+    assert view is not None
+    project = partial(image_positions, view.camera, levelled_by=view.detected_by)
+    for edge in missed_edges(match, view, settings.radius_m):
+        draw_curve(canvas, edge, MISSED_COLOUR, closed=True)
+    apart = apart_px(match)
+    drawn = [(row, "", _EDGE_COLOUR) for row in match.set_aside]
+    drawn += [(row, "", EXTRA_COLOUR if compared else _EDGE_COLOUR) for row in match.extra_rows]
+    drawn += [(row, f" {px:.1f}px", _EDGE_COLOUR) for row, px in zip(match.paired[1], apart)]
+    for row, text, colour in drawn:
+        centre = np.array([row.px, row.py])
+        _outline_disc(canvas, project, centre, settings, f"{row.quality:.2f}{text}", colour)
 
 
 def _draw_lines(
-    canvas: NDArray[np.uint8],
-    camera: Camera,
-    found: Sequence[LineLandmark],
-    wanted: Sequence[LineLandmark] | None,
-    gate: LineCompareOptions,
-) -> str:
-    colours = [_LINE_COLOUR if wanted is None else _EXTRA_COLOUR] * len(found)
-    texts = [""] * len(found)
-    words = f"{len(found)} verticals"
-    if wanted is not None:
-        pairs = pair_lines(wanted, found, gate)
-        for i, j in zip(pairs.first, pairs.second):
-            colours[j] = _LINE_COLOUR
-            if found[j].sigma > 0.0:
-                error = float(wrap_angle(found[j].alpha - wanted[i].alpha)) / found[j].sigma
-                texts[j] = f"{error:+.1f}"
-        left = [wanted[i] for i in pairs.first_alone]
-        joined = joined_lines(left, [found[j] for j in pairs.second], gate)
-        missed = [row for row, with_another in zip(left, joined) if not with_another]
-        for curve in line_curves(camera, ends_of(missed)):
-            draw_curve(canvas, curve, _MISSED_COLOUR)
-        words += _fate(len(pairs.second_alone), len(missed))
-    ends = ends_of(found)
-    bars = sigma_bars(camera, ends, np.array([row.sigma for row in found], dtype=np.float64))
-    times = enlargement(canvas)
-    for curve, bar, colour, text in zip(line_curves(camera, ends), bars, colours, texts):
+    canvas: NDArray[np.uint8], camera: Camera, match: FrameMatch, compared: bool
+) -> None:
+    for curve in line_curves(camera, ends_of(match.missed_rows)):
+        draw_curve(canvas, curve, MISSED_COLOUR)
+    drawn = [(row, "", LINE_COLOUR) for row in match.set_aside]
+    drawn += [(row, "", EXTRA_COLOUR if compared else LINE_COLOUR) for row in match.extra_rows]
+    for wanted, row in zip(*match.paired):
+        error = (row.alpha - wanted.alpha + np.pi) % (2.0 * np.pi) - np.pi
+        text = f"{error / row.sigma:+.1f}" if row.sigma > 0.0 else ""
+        drawn.append((row, text, LINE_COLOUR))
+    rows = [row for row, _, _ in drawn]
+    curves = line_curves(camera, ends_of(rows))
+    bars = sigma_bars(camera, ends_of(rows), numbers(rows, "sigma"))
+    for (_, text, colour), curve, bar in zip(drawn, curves, bars):
         draw_curve(canvas, curve, colour)
-        draw_bar(canvas, bar, _SIGMA_COLOUR)
-        if text and np.all(np.isfinite(curve[-1])):
-            at = (round(float(curve[-1, 0])) - 8 * times, round(float(curve[-1, 1])) + 9 * times)
-            draw_text(canvas, text, at, _SIGMA_COLOUR, 0.3)
-    return words
+        draw_bar(canvas, bar, SIGMA_COLOUR)
+        draw_text(canvas, text, curve[-1], SIGMA_COLOUR, 0.3, (-8, 9))
 
 
-def _draw_markers(canvas: NDArray[np.uint8], found: Sequence[MarkerLandmark]) -> str:
+def _draw_markers(canvas: NDArray[np.uint8], found: Sequence[MarkerLandmark]) -> None:
     for row in found:
         corners = np.array([(c.u, c.v) for c in row.corners])
         covariance = np.array([[(c.cuu, c.cuv), (c.cuv, c.cvv)] for c in row.corners])
         mark_marker(canvas, row.id, corners, covariance)
-    return f"{len(found)} markers"
 
 
-def _fate(extra: int, missed: int) -> str:
-    return f" ({extra} extra, {missed} missed)"
+def _count(what: str, match: FrameMatch, compared: bool) -> str:
+    fate = f" ({match.extra} extra, {match.missed} missed)" if compared else ""
+    return f"{len(match.frame.detected)} {what}{fate}"
 
 
-def draw_circles(
-    image: NDArray[np.uint8],
-    camera: Camera,
-    found: CircleDetections,
-    settings: CircleSettings,
-) -> NDArray[np.uint8]:
-    """Draw the outlines of detected discs and their quality (the report's figure 8).
-
-    Parameters
-    ----------
-    image : (H, W) uint8
-        The grey image.
-    camera : Camera
-        The calibrated camera, through which the outlines are drawn.
-    found : CircleDetections
-        The discs.
-    settings : CircleSettings
-        The radii of the outlines.
-
-    Returns
-    -------
-    (H, W, 3) uint8
-        In OpenCV's order blue, green, red.
-    """
-    canvas = canvas_of(image, camera)
-    for centre, quality in zip(found.floor_xy, found.quality):
-        _outline_disc(canvas, camera.project_floor, centre, settings, f"{quality:.2f}")
-    return canvas
+def missed_edges(match: FrameMatch, view: FrameView, radius_m: float) -> FloatArray:
+    """(N, P, 2) pixels of circles round the discs that were missed."""
+    rings = circle_on_floor(circle_arrays(match.missed_rows).xy, radius_m)
+    return image_positions(view.camera, rings, view.reference_by)
 
 
 def _outline_disc(
@@ -276,7 +249,6 @@ def _outline_disc(
     centre_xy: FloatArray,
     settings: CircleSettings,
     text: str,
-    *,
     edge_colour: Colour = _EDGE_COLOUR,
 ) -> None:
     """Draw a disc's edge and its two outlines, and a word above.
@@ -289,8 +261,5 @@ def _outline_disc(
         (settings.outer_radius_m, _OUTLINE_COLOUR),
     ):
         draw_curve(canvas, project(circle_on_floor(centre_xy, radius)), colour, closed=True)
-    u, v = project(centre_xy + np.array([0.0, -settings.outer_radius_m]))
-    if np.isfinite(u) and np.isfinite(v):
-        times = enlargement(canvas)
-        at = (round(float(u)) - 14 * times, max(10 * times, round(float(v)) - 3 * times))
-        draw_text(canvas, text, at, _TEXT_COLOUR)
+    top = project(centre_xy + np.array([0.0, -settings.outer_radius_m]))
+    draw_text(canvas, text, top, _TEXT_COLOUR, shift=(-14, -3))

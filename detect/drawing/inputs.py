@@ -1,203 +1,37 @@
-"""What is drawn and compared: rows of a run from files, their heads, and which frames.
-
-Detections and reference rows are read image by image; the head of a file says how its rows were
-made.
-"""
+"""Rows of a run from files, the heads of these files, and which frames are selected."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, get_origin, get_type_hints
 
+from camera import Camera
 from detect.errors import DetectError
 from detect.line_settings import LineSettings
 from detect.run import Frames, ImageRun, RunFrame
 from detect.runs.known import FramesByImage
 from detect.runs.outputs import LEVEL, LEVELLED
-from detect.seen import Tilt
+from detect.seen import Sight
 from detect.settings import CircleSettings
 from detect.sources.image_names import image_name
 from detect.tune.grid import parameter_value
 from detect.viewing_options import RowFiles
-from landmarks import CircleLandmark, FrameTilt, LineLandmark, MarkerLandmark, read_tilts
+from landmarks import Frame, FrameTilt, read_tilts
 from storage.messages import excerpt
 
 KINDS = ("circles", "lines", "markers", "tilt")
 # The head is what precedes the first row; real ones are much shorter.
 _LONGEST_BYTES = 1 << 16
-#: Settings that are several numbers.
-_PAIRS, _LIST = "refine_steps_px", "blurred_widths"
 _NUMBERS = re.compile(r"[^(),]+")
 _RANGE = re.compile(r"(\d*):(\d*)(?::(\d+))?")
+SettingsType = TypeVar("SettingsType", CircleSettings, LineSettings)
 
 
-@dataclass(frozen=True, slots=True)
-class SeenRows:
-    """The files' rows of one image; None where there is no file.
-
-    Attributes
-    ----------
-    circles, lines, markers : tuple of rows or None
-        Detected.
-    tilt : FrameTilt or None
-        None also where the frame has none.
-    levelled_by : (float, float) or None
-        Pitch and roll that turned the discs' positions level.
-    reference_by : (float, float) or None
-        The same of the reference rows.
-    reference_circles, reference_lines : tuple of rows or None
-        What they are compared with; None also if that file does not have the image.
-    """
-
-    circles: tuple[CircleLandmark, ...] | None = None
-    lines: tuple[LineLandmark, ...] | None = None
-    markers: tuple[MarkerLandmark, ...] | None = None
-    tilt: FrameTilt | None = None
-    levelled_by: Tilt | None = None
-    reference_by: Tilt | None = None
-    reference_circles: tuple[CircleLandmark, ...] | None = None
-    reference_lines: tuple[LineLandmark, ...] | None = None
-
-
-@dataclass(frozen=True)
-class SeenFiles:
-    """The files of a run's rows.
-
-    Attributes
-    ----------
-    detected : dict
-        Path of each kind of `KINDS` that there is.
-    heads : dict
-        Their heads, by kind.
-    reference_circles, reference_lines : path or None
-        The reference rows.
-    """
-
-    detected: dict[str, Path]
-    heads: dict[str, FileHead]
-    reference_circles: Path | None
-    reference_lines: Path | None
-
-    @cached_property
-    def reference_level(self) -> bool:
-        """Whether the reference rows of discs are level, whatever the tilt was."""
-        return self.reference_circles is not None and read_head(self.reference_circles).level
-
-    @property
-    def radius_m(self) -> float:
-        """Of the discs."""
-        return self.heads.get("circles", FileHead()).circle_settings.radius_m
-
-
-@dataclass(frozen=True)
-class RowSource:
-    """Rows of a run by image; of the files, only the offsets of frames are in memory."""
-
-    files: SeenFiles
-    _frames: dict[str, FramesByImage] = field(default_factory=dict)
-    _tilts: Mapping[str, FrameTilt] | None = None
-
-    def of(self, prefix: str) -> SeenRows:
-        """The rows of an image, by the prefix of its STEP."""
-        found = {kind: source.get(prefix) for kind, source in self._frames.items()}
-        circles, lines, markers = (found.get(kind) for kind in KINDS[:3])
-        wanted, wanted_lines = found.get("reference_circles"), found.get("reference_lines")
-        levelled_by = None if circles is None else circles.levelled_by
-        reference_by = None if wanted is None else wanted.levelled_by
-        if reference_by is None and self.files.reference_level:
-            reference_by = levelled_by
-        return SeenRows(
-            circles=None if circles is None else circles.circles,
-            lines=None if lines is None else lines.lines,
-            markers=None if markers is None else markers.markers,
-            tilt=None if self._tilts is None else self._tilts.get(prefix),
-            levelled_by=levelled_by,
-            reference_by=reference_by,
-            reference_circles=None if wanted is None else wanted.circles,
-            reference_lines=None if wanted_lines is None else wanted_lines.lines,
-        )
-
-
-def find_files(run: ImageRun, options: RowFiles) -> SeenFiles:
-    """Find the files of a run's rows, and read their heads.
-
-    Parameters
-    ----------
-    run : ImageRun
-        The run.
-    options : RowFiles
-        The options of a command line.
-
-    Returns
-    -------
-    SeenFiles
-
-    Raises
-    ------
-    DetectError
-        If one that is named does not exist, or there is none at all.
-    """
-    detected: dict[str, Path] = {}
-    for kind in KINDS:
-        named: Path | None = getattr(options, kind)
-        path = run.output(kind) if options.rows is None else options.rows / f"detected.{kind}"
-        path = path if named is None else named
-        if path.is_file():
-            detected[kind] = path
-        elif named is not None:
-            raise DetectError(f"{path}: no such file: expected detected {kind}")
-    if not detected:
-        usual = run.output("circles") if options.rows is None else options.rows / "detected.circles"
-        raise DetectError(
-            f"{usual}: no such file, nor .lines, .markers or .tilt: expected one of them: run "
-            "detect all (or circles, lines, markers) on the same images first, or name files"
-        )
-    return SeenFiles(
-        detected,
-        {kind: read_head(path) for kind, path in detected.items()},
-        _reference(run.folder / "map.circles", options.reference, options.no_reference),
-        _reference(run.folder / "map.lines", options.reference_lines, options.no_reference),
-    )
-
-
-def open_rows(files: SeenFiles) -> RowSource:
-    """Find and index the files.
-
-    Raises
-    ------
-    landmarks.LandmarkFileError
-        If one cannot be read or a row is malformed; names file and line.
-    """
-    frames = {kind: path for kind, path in files.detected.items() if kind != "tilt"}
-    if files.reference_circles is not None and "circles" in frames:
-        frames["reference_circles"] = files.reference_circles
-    if files.reference_lines is not None and "lines" in frames:
-        frames["reference_lines"] = files.reference_lines
-    tilt = files.detected.get("tilt")
-    return RowSource(
-        files,
-        {kind: FramesByImage(path) for kind, path in frames.items()},
-        None if tilt is None else read_tilts(tilt),
-    )
-
-
-def picture_name(prefix: str) -> str:
-    """Name of an image's picture without its ending: nothing that leads out of a folder."""
-    return image_name(prefix) or "frame"
-
-
-def _reference(usual: Path, named: Path | None, unwanted: bool) -> Path | None:
-    if unwanted:
-        return None
-    if named is not None:
-        if not named.is_file():
-            raise DetectError(f"{named}: no such file: expected reference rows")
-        return named
-    return usual if usual.is_file() else None
+# -- heads ------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -231,31 +65,39 @@ class FileHead:
         DetectError
             If one has a value that none can have.
         """
-        try:
-            return CircleSettings(**_values(CircleSettings, self.settings))
-        except DetectError as error:
-            raise DetectError(f"{self.name}: {error}") from None
+        return self._settings(CircleSettings)
 
     @property
     def line_settings(self) -> LineSettings:
         """The settings of verticals; as `circle_settings`."""
+        return self._settings(LineSettings)
+
+    def _settings(self, kind: type[SettingsType]) -> SettingsType:
+        hints = get_type_hints(kind)
+        values: dict[str, Any] = {}
         try:
-            return LineSettings(**_line_values(self.settings))
+            for name, text in self.settings:
+                if get_origin(hints.get(name)) is tuple:
+                    values[name] = _numbers(name, text, in_pairs="float, float" in str(hints[name]))
+                elif name in hints:
+                    values[name] = parameter_value(kind, name, text)
+            return kind(**values)
         except DetectError as error:
             raise DetectError(f"{self.name}: {error}") from None
 
 
+def _numbers(name: str, text: str, *, in_pairs: bool) -> tuple[Any, ...]:
+    """Several numbers, or pairs of them, as heads have them."""
+    try:
+        numbers = tuple(float(word) for word in _NUMBERS.findall(text))
+        return tuple(zip(numbers[::2], numbers[1::2], strict=True)) if in_pairs else numbers
+    except ValueError:
+        expected = "pairs of numbers" if in_pairs else "numbers"
+        raise DetectError(f"{name} is {excerpt(text)}: expected {expected}") from None
+
+
 def read_head(path: Path) -> FileHead:
     """Read the head of a file of rows.
-
-    Parameters
-    ----------
-    path : path
-        The file.
-
-    Returns
-    -------
-    FileHead
 
     Raises
     ------
@@ -284,69 +126,149 @@ def read_head(path: Path) -> FileHead:
     return FileHead(tuple(comments), settings, level, str(path))
 
 
-def _line_values(settings: Iterable[tuple[str, str]]) -> dict[str, Any]:
-    """As `_values`, of `LineSettings`; of those that are several numbers, too."""
-    entries = list(settings)
-    singles = [entry for entry in entries if entry[0] not in (_PAIRS, _LIST)]
-    values = _values(LineSettings, singles)
-    for name, text in entries:
-        if name not in (_PAIRS, _LIST):
-            continue
-        expected = "pairs of numbers" if name == _PAIRS else "numbers"
-        try:
-            numbers = tuple(float(word) for word in _NUMBERS.findall(text))
-            pairs = zip(numbers[::2], numbers[1::2], strict=True)
-            values[name] = tuple(pairs) if name == _PAIRS else numbers
-        except ValueError:
-            raise DetectError(f"{name} is {excerpt(text)}: expected {expected}") from None
-    return values
+# -- rows -------------------------------------------------------------------------------------
 
 
-def _values(kind: type, settings: Iterable[tuple[str, str]]) -> dict[str, Any]:
-    """The settings that a detector has, converted to their types."""
-    known = {field.name for field in fields(kind)}
-    return {name: parameter_value(kind, name, text) for name, text in settings if name in known}
+@dataclass(frozen=True)
+class SeenRows:
+    """What files have of one image: None where there is no file, or it does not have the image.
+
+    Attributes
+    ----------
+    circles, lines, markers : Frame or None
+        Detected.
+    tilt : FrameTilt or None
+    reference_circles, reference_lines : Frame or None
+        What they are compared with.
+    unlisted : Frame or None
+        Discs that may be detected but need not be.
+    """
+
+    circles: Frame | None = None
+    lines: Frame | None = None
+    markers: Frame | None = None
+    tilt: FrameTilt | None = None
+    reference_circles: Frame | None = None
+    reference_lines: Frame | None = None
+    unlisted: Frame | None = None
+
+
+class RunRows:
+    """The files of a run's rows; of these, only the offsets of frames are in memory.
+
+    Attributes
+    ----------
+    detected : dict
+        Path of each kind of `KINDS` that there is.
+    reference : dict
+        Paths of the reference rows of these, "circles" and "lines", as far as there are any.
+    heads : dict
+        Heads of the detected files, by kind.
+    """
+
+    def __init__(self, detected: dict[str, Path], reference: dict[str, Path]) -> None:
+        self.detected = detected
+        self.reference = reference
+        self.heads = {kind: read_head(path) for kind, path in detected.items()}
+        files = {kind: path for kind, path in detected.items() if kind != "tilt"}
+        files |= {f"reference_{kind}": path for kind, path in reference.items()}
+        if "circles" in reference:
+            unlisted = reference["circles"].parent / "unlisted.circles"
+            files |= {"unlisted": unlisted} if unlisted.is_file() else {}
+        self._frames = {kind: FramesByImage(path) for kind, path in files.items()}
+        self._tilts = read_tilts(detected["tilt"]) if "tilt" in detected else {}
+
+    @cached_property
+    def circle_settings(self) -> CircleSettings:
+        """The settings that discs were detected with."""
+        return self.heads.get("circles", FileHead()).circle_settings
+
+    def of(self, prefix: str) -> SeenRows:
+        """The rows of an image, by the prefix of its STEP."""
+        frames = {kind: source.get(prefix) for kind, source in self._frames.items()}
+        return SeenRows(**frames, tilt=self._tilts.get(prefix))
+
+    def sight(self, camera: Camera) -> Sight:
+        """How discs come back into the images of a camera."""
+        level = "circles" in self.reference and read_head(self.reference["circles"]).level
+        return Sight(camera, self.circle_settings.radius_m, level)
+
+
+def open_rows(run: ImageRun, options: RowFiles) -> RunRows:
+    """Find the files of a run's rows, and index them.
+
+    Raises
+    ------
+    DetectError
+        If one that is named does not exist, or there is none at all.
+    landmarks.LandmarkFileError
+        If one cannot be read or a row is malformed; names file and line.
+    """
+    detected: dict[str, Path] = {}
+    usual = {
+        kind: run.output(kind) if options.rows is None else options.rows / f"detected.{kind}"
+        for kind in KINDS
+    }
+    for kind in KINDS:
+        named: Path | None = getattr(options, kind)
+        path = named or usual[kind]
+        if path.is_file():
+            detected[kind] = path
+        elif named is not None:
+            raise DetectError(f"{path}: no such file: expected detected {kind}")
+    if not detected:
+        raise DetectError(
+            f"{usual['circles']}: no such file, nor .lines, .markers or .tilt: expected one of "
+            "them: run detect all (or circles, lines, markers) on the same images first, or name "
+            "files"
+        )
+    reference: dict[str, Path] = {}
+    for kind, named in (("circles", options.reference), ("lines", options.reference_lines)):
+        path = named or run.folder / f"map.{kind}"
+        if named is not None and not named.is_file() and not options.no_reference:
+            raise DetectError(f"{named}: no such file: expected reference rows")
+        if kind in detected and path.is_file() and not options.no_reference:
+            reference[kind] = path
+    return RunRows(detected, reference)
+
+
+def picture_name(prefix: str) -> str:
+    """Name of an image's picture without its ending: nothing that leads out of a folder."""
+    return image_name(prefix) or "frame"
+
+
+# -- frames -----------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class FrameSelection:
-    """Some frames of a run.
+    """Some frames of a run; iterates over their positions and the frames, in the run's order.
 
     Attributes
     ----------
+    frames : Frames
+        All of them.
+    positions : frozenset of int or None
+        Those that are selected; None if all are.
     every : int
-        Of the frames that are selected otherwise, only every so manieth.
-    ranges : tuple of range
-        Positions in the run.
-    names : frozenset of str
-        Images, as `detect.sources.image_names.image_name` gives them.
-
-    Without ranges and names, all frames are selected.
+        If all are, only those whose position is a multiple of this.
     """
 
-    every: int = 1
-    ranges: tuple[range, ...] = ()
-    names: frozenset[str] = frozenset()
+    frames: Frames
+    positions: frozenset[int] | None
+    every: int
 
-    def expected(self, frames: Frames) -> int | None:
+    @property
+    def expected(self) -> int | None:
         """Approximate number of these frames; None if unknown."""
-        if self.ranges or self.names or frames.expected is None:
-            return None
-        return -(-frames.expected // self.every)
+        if self.positions is not None:
+            return len(self.positions)
+        return None if self.frames.expected is None else -(-self.frames.expected // self.every)
 
-    def of(self, frames: Frames) -> Iterator[tuple[int, RunFrame]]:
-        """The selected frames, each with its position in the run, in the run's order."""
-        everything = not (self.ranges or self.names)
-        count = 0
-        for position, frame in enumerate(frames):
-            if (
-                everything
-                or any(position in part for part in self.ranges)
-                or image_name(frame.step.prefix) in self.names
-            ):
-                if count % self.every == 0:
-                    yield position, frame
-                count += 1
+    def __iter__(self) -> Iterator[tuple[int, RunFrame]]:
+        for position, frame in enumerate(self.frames):
+            if position % self.every == 0 if self.positions is None else position in self.positions:
+                yield position, frame
 
 
 def select_frames(frames: Frames, wanted: Sequence[str], every: int) -> FrameSelection:
@@ -360,11 +282,7 @@ def select_frames(frames: Frames, wanted: Sequence[str], every: int) -> FrameSel
         Names of images, positions, and ranges FROM:TO[:STEP] of positions without the last. What is
         both a name and a position is a name.
     every : int
-        Of these, every so manieth.
-
-    Returns
-    -------
-    FrameSelection
+        Of these, every n-th.
 
     Raises
     ------
@@ -374,12 +292,13 @@ def select_frames(frames: Frames, wanted: Sequence[str], every: int) -> FrameSel
     if every < 1:
         raise DetectError(f"every is {every}: expected 1 or more")
     if not wanted:
-        return FrameSelection(every)
-    asked = {image_name(word): word for word in wanted}
+        return FrameSelection(frames, None, every)
     names = [image_name(frame.step.prefix) for frame in frames]
-    known = asked.keys() & set(names)
-    ranges = [_positions(word, len(names)) for name, word in asked.items() if name not in known]
-    return FrameSelection(every, tuple(ranges), frozenset(known))
+    asked = {image_name(word): word for word in wanted}
+    positions = {k for k, name in enumerate(names) if name in asked}
+    for name in asked.keys() - set(names):
+        positions.update(_positions(asked[name], len(names)))
+    return FrameSelection(frames, frozenset(sorted(positions)[::every]), 1)
 
 
 def _positions(word: str, count: int) -> range:

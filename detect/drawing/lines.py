@@ -2,30 +2,24 @@
 
 from __future__ import annotations
 
+from collections import Counter
+
 import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera
-from detect.drawing.frame import line_curves
-from detect.drawing.strokes import (
-    Colour,
-    canvas_of,
-    draw_bar,
-    draw_curve,
-    draw_text,
-    enlargement,
-    with_legend,
-)
+from detect.drawing.frame import LINE_COLOUR, SIGMA_COLOUR, line_curves, sigma_bars
+from detect.drawing.strokes import Colour, canvas_of, draw_bar, draw_curve, draw_text, with_legend
 from detect.lines import ACCEPTED, JOINED, LineDetections
 from detect.verticals.tracking import LineTracks
 from lut.verticals import VerticalTable
 
 FloatArray = NDArray[np.float64]
 
-_LINE_COLOUR: Colour = (60, 220, 60)
 _JOINED_COLOUR: Colour = (255, 190, 0)
-_SIGMA_COLOUR: Colour = (0, 170, 255)
-_REJECTED_COLOURS: dict[str, Colour] = {
+_FATE_COLOURS: dict[str, Colour] = {
+    ACCEPTED: LINE_COLOUR,
+    JOINED: _JOINED_COLOUR,
     "short": (120, 120, 120),
     "no maximum": (200, 0, 120),
     "little evidence": (200, 120, 60),
@@ -41,13 +35,12 @@ _REJECTED_COLOURS: dict[str, Colour] = {
 
 
 def draw_lines(
-    image: NDArray[np.uint8], camera: Camera, table: VerticalTable, found: LineDetections
+    image: NDArray[np.uint8], camera: Camera, found: LineDetections
 ) -> NDArray[np.uint8]:
     """Draw lines through the distortion, with bars of their standard deviations on the horizon.
 
     Lines joined from several edges are drawn in another colour. A bar reaches one standard
-    deviation to each side of the column where the line's own edge crosses the horizon (the report's
-    figure 6).
+    deviation to each side of where the line crosses the horizon (the report's figure 6).
 
     Parameters
     ----------
@@ -55,8 +48,6 @@ def draw_lines(
         The grey image.
     camera : Camera
         The calibrated camera.
-    table : VerticalTable
-        Its verticals.
     found : LineDetections
         The lines.
 
@@ -66,31 +57,22 @@ def draw_lines(
         In OpenCV's order blue, green, red.
     """
     canvas = canvas_of(image, camera)
-    curves = line_curves(camera, found.ends)
-    for points, sigma, members in zip(curves, found.sigma_rad, found.members):
-        draw_curve(canvas, points, _LINE_COLOUR if len(members) == 1 else _JOINED_COLOUR)
-        u, v = _horizon_crossing(table, found, members[0])
-        reach = sigma / found.fits.pixel_rad[members[0]]
-        draw_bar(canvas, np.array([[u - reach, v], [u + reach, v]]), _SIGMA_COLOUR)
-    if found.tilt is None:
-        text = "no tilt"
-    else:
+    curves, bars = line_curves(camera, found.ends), sigma_bars(camera, found.ends, found.sigma_rad)
+    for curve, bar, members in zip(curves, bars, found.members):
+        draw_curve(canvas, curve, LINE_COLOUR if len(members) == 1 else _JOINED_COLOUR)
+        draw_bar(canvas, bar, SIGMA_COLOUR)
+    text = "no tilt"
+    if found.tilt is not None:
         pitch, roll = np.degrees([found.tilt.pitch_rad, found.tilt.roll_rad])
         text = f"pitch {pitch:.2f}  roll {roll:.2f} deg  ({found.tilt.lines} lines)"
-    times = enlargement(canvas)
-    draw_text(canvas, text, (4 * times, image.shape[0] - 5 * times), _SIGMA_COLOUR, 0.4)
+    draw_text(canvas, text, (0, image.shape[0]), SIGMA_COLOUR, 0.4, (4, -5))
     return canvas
 
 
 def draw_tracks(
-    image: NDArray[np.uint8],
-    table: VerticalTable,
-    found: LineDetections,
-    *,
-    rejected: bool = True,
-    reasons: bool = True,
+    image: NDArray[np.uint8], table: VerticalTable, found: LineDetections
 ) -> NDArray[np.uint8]:
-    """Draw the points of tracks, coloured by their fates, with a legend.
+    """Draw the points of tracks, coloured by their fates, and below how many have each fate.
 
     Parameters
     ----------
@@ -100,10 +82,6 @@ def draw_tracks(
         Its camera's verticals.
     found : LineDetections
         The tracks and their fates.
-    rejected : bool
-        Whether to draw the tracks that are no lines.
-    reasons : bool
-        Whether to list below the image how many tracks there are of each fate.
 
     Returns
     -------
@@ -111,16 +89,11 @@ def draw_tracks(
         In OpenCV's order blue, green, red; h is the height of the legend.
     """
     canvas = canvas_of(image)
-    counts: dict[str, int] = {}
     for t, fate in enumerate(found.fate):
-        if not rejected and fate not in (ACCEPTED, JOINED):
-            continue
-        counts[fate] = counts.get(fate, 0) + 1
         points = np.rint(track_pixels(found.tracks, table, t)).astype(np.intp)
-        canvas[points[:, 1], np.clip(points[:, 0], 0, image.shape[1] - 1)] = _colour(fate)
-    if not reasons:
-        return canvas
-    words = [(f"{fate}: {counts[fate]}", _colour(fate)) for fate in sorted(counts)]
+        canvas[points[:, 1], np.clip(points[:, 0], 0, image.shape[1] - 1)] = _FATE_COLOURS[fate]
+    counts = sorted(Counter(found.fate).items())
+    words = [(f"{fate}: {count}", _FATE_COLOURS[fate]) for fate, count in counts]
     return with_legend(canvas, words, 190, 0.38)
 
 
@@ -158,18 +131,3 @@ def track_pixels(tracks: LineTracks, table: VerticalTable, t: int) -> FloatArray
     u = (1.0 - share) * table.column[row, left] + share * table.column[row, left + 1]
     u = np.where(np.isfinite(u), u, table.column[row, np.rint(column).astype(np.intp)])
     return np.stack([u, row.astype(np.float64)], axis=-1)
-
-
-def _horizon_crossing(
-    table: VerticalTable, found: LineDetections, track: int
-) -> tuple[float, float]:
-    bearing = found.fits.reference_rad[track] + np.arctan(found.fits.line[track, 0])
-    u = float(table.columns_at(np.array([bearing]))[0])
-    columns = np.flatnonzero(table.usable)
-    return u, float(np.interp(u, columns, table.anchor_row[columns]))
-
-
-def _colour(fate: str) -> Colour:
-    if fate == ACCEPTED:
-        return _LINE_COLOUR
-    return _JOINED_COLOUR if fate == JOINED else _REJECTED_COLOURS[fate]

@@ -7,7 +7,7 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from camera import Camera
 
@@ -73,13 +73,26 @@ def draw_bar(canvas: NDArray[np.uint8], ends: FloatArray, colour: Colour) -> Non
 
 
 def draw_text(
-    canvas: NDArray[np.uint8], text: str, at: tuple[int, int], colour: Colour, size: float = 0.35
+    canvas: NDArray[np.uint8],
+    text: str,
+    at: ArrayLike,
+    colour: Colour,
+    size: float = 0.35,
+    shift: tuple[int, int] = (0, 0),
 ) -> None:
-    """Write at the left end of the base line; what is no ASCII is a question mark."""
-    plain = text.encode("ascii", "replace").decode()
-    times = enlargement(canvas)
-    font = cv2.FONT_HERSHEY_SIMPLEX
-    cv2.putText(canvas, plain, at, font, times * size, colour, times, cv2.LINE_AA)
+    """Write with the left end of the base line at u, v; nothing if these are not finite.
+
+    `shift` moves the words, by more in wide pictures. What is not ASCII is a question mark, and
+    words stay below the upper border.
+    """
+    place = np.asarray(at, dtype=np.float64)
+    if np.isfinite(place).all():
+        times = enlargement(canvas)
+        u, v = (np.rint(place) + times * np.array(shift)).astype(int).tolist()
+        cv2.putText(
+            canvas, text.encode("ascii", "replace").decode(), (u, max(v, 10 * times)),
+            cv2.FONT_HERSHEY_SIMPLEX, times * size, colour, times, cv2.LINE_AA,
+        )  # fmt: skip
 
 
 def with_legend(
@@ -92,6 +105,6 @@ def with_legend(
     rows = -(-len(words) // per_row)
     legend = np.zeros(((14 * rows + 4) * times, width, 3), np.uint8)
     for k, (text, colour) in enumerate(words):
-        at = (4 + column_px * (k % per_row)) * times, (13 + 14 * (k // per_row)) * times
-        draw_text(legend, text, at, colour, size)
+        shift = 4 + column_px * (k % per_row), 13 + 14 * (k // per_row)
+        draw_text(legend, text, (0, 0), colour, size, shift)
     return np.concatenate([canvas, legend])

@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-from functools import partial
-
-from detect import __version__
 from detect.errors import DetectError
 from detect.report.inputs import gather
 from detect.report.page import report_page
-from detect.report.pictures import frame_picture, gallery
 from detect.sources.opening import demand_recording, open_source
 from detect.viewing_options import Report
 from storage import OutputExistsError, write_whole
@@ -24,17 +20,10 @@ def perform(options: Report) -> int:
     if output.exists() and not options.force:
         raise OutputExistsError(output)
     inputs = gather(run, options.files, options.gates, options.time_frames)
-
-    galleries = [found for fate in ("missed", "extra") if (found := gallery(inputs, fate))]
-    pictured = partial(frame_picture, inputs)
-    page = report_page(inputs, __version__, options.worst, pictured, galleries)
+    page = report_page(inputs, options.worst)
     with write_whole(output, overwrite=options.force) as stream:
         stream.write(page)
-    held = [
-        path.name
-        for path in (inputs.files.reference_circles, inputs.files.reference_lines)
-        if path is not None
-    ]
-    against = f" against {' and '.join(held)}" if held else ", no reference rows"
+    names = [path.name for path in inputs.files.reference.values()]
+    against = f" against {' and '.join(names)}" if names else ", no reference rows"
     print(f"{output}: {len(inputs.rows)} frames, {', '.join(inputs.files.detected)}{against}")
     return 0

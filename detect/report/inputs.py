@@ -1,23 +1,20 @@
-"""Inputs of a report: all rows of a run, frame by frame, and the reference rows."""
+"""Inputs of a report: all rows of a run, frame by frame, their comparisons, and the time."""
 
 from __future__ import annotations
 
 import statistics
 import time
 from dataclasses import dataclass
-from functools import cached_property
 
-from detect.comparison.circles import Sight, beside_reference, compare_frames
+from detect.comparison.circles import beside_reference, compare_frames
 from detect.comparison.lines import compare_line_frames
-from detect.comparison.result import CompareOptions, Comparison, LineCompareOptions, LineComparison
-from detect.drawing.inputs import SeenFiles, SeenRows, find_files, open_rows
+from detect.comparison.result import CompareOptions, DiscComparison, Gates, LineComparison
+from detect.drawing.inputs import RunRows, SeenRows, open_rows
 from detect.errors import DetectError, FrameError
-from detect.report.statistics import FramePair
-from detect.run import ImageRun, Run, RunFrame, read_image
+from detect.run import ImageRun, Run, read_image
 from detect.runs.frame import FramePlan, FrameTask, detect_batch, tables_of
-from detect.seen import FrameView
-from detect.viewing_options import Gates, RowFiles
-from landmarks import CircleLandmark, Frame, LineLandmark, Step
+from detect.seen import Sight
+from detect.viewing_options import RowFiles
 
 
 @dataclass(frozen=True)
@@ -32,98 +29,34 @@ class Timing:
 
 @dataclass(frozen=True)
 class ReportInputs:
-    """A run's rows.
+    """A run's rows, and how they compare with the reference.
 
     Attributes
     ----------
     run : ImageRun
-    files : SeenFiles
+    files : RunRows
     names : tuple of str
         Prefixes of the frames, in the run's order.
     rows : tuple of SeenRows
         Of each.
-    gate : CompareOptions
-    line_gate : LineCompareOptions
+    options : CompareOptions
+    sight : Sight or None
+        How discs come back into the images; None without a calibration.
+    discs : DiscComparison or None
+        None without reference rows.
+    lines : LineComparison or None
     timing : Timing or None
     """
 
     run: ImageRun
-    files: SeenFiles
+    files: RunRows
     names: tuple[str, ...]
     rows: tuple[SeenRows, ...]
-    gate: CompareOptions
-    line_gate: LineCompareOptions
-    timing: Timing | None = None
-
-    @cached_property
-    def sight(self) -> Sight | None:
-        """How discs come back into the images; None without a calibration."""
-        if not isinstance(self.run, Run):
-            return None
-        return Sight(self.run.camera, self.files.radius_m, self.files.reference_level)
-
-    def view_of(self, rows: SeenRows) -> FrameView | None:
-        """How the discs of a frame come back into its image."""
-        return None if self.sight is None else self.sight.of(rows.reference_by, rows.levelled_by)
-
-    @cached_property
-    def disc_pairs(self) -> list[FramePair[CircleLandmark]]:
-        """The frames that both files of discs have."""
-        return [
-            FramePair(rows.reference_circles, rows.circles, self.view_of(rows))
-            for rows in self.rows
-            if rows.circles is not None and rows.reference_circles is not None
-        ]
-
-    @cached_property
-    def line_pairs(self) -> list[FramePair[LineLandmark]]:
-        """The frames that both files of verticals have."""
-        return [
-            FramePair(rows.reference_lines, rows.lines)
-            for rows in self.rows
-            if rows.lines is not None and rows.reference_lines is not None
-        ]
-
-    @cached_property
-    def discs(self) -> Comparison | None:
-        """The figures of `detect compare`; None without reference rows."""
-        if self.files.reference_circles is None or not self.disc_pairs:
-            return None
-        both = [
-            (
-                Frame(_step(name), rows.reference_circles, rows.reference_by),
-                Frame(_step(name), rows.circles, rows.levelled_by),
-            )
-            for name, rows in zip(self.names, self.rows)
-            if rows.circles is not None and rows.reference_circles is not None
-        ]
-        return compare_frames(
-            [reference for reference, _ in both],
-            [detected for _, detected in both],
-            self.gate,
-            sight=self.sight,
-            beside=beside_reference(self.files.reference_circles),
-            reference_name=self.files.reference_circles.name,
-            detected_name=self.files.detected["circles"].name,
-        )
-
-    @cached_property
-    def lines(self) -> LineComparison | None:
-        """The figures of `detect compare --lines`; None without reference rows."""
-        if self.files.reference_lines is None or not self.line_pairs:
-            return None
-        both = [
-            (Frame(_step(name), rows.reference_lines), Frame(_step(name), rows.lines))
-            for name, rows in zip(self.names, self.rows)
-            if rows.lines is not None and rows.reference_lines is not None
-        ]
-        return compare_line_frames(
-            [reference for reference, _ in both],
-            [detected for _, detected in both],
-            self.line_gate,
-            reference_name=self.files.reference_lines.name,
-            detected_name=self.files.detected["lines"].name,
-        )
+    options: CompareOptions
+    sight: Sight | None
+    discs: DiscComparison | None
+    lines: LineComparison | None
+    timing: Timing | None
 
 
 def gather(run: ImageRun, options: RowFiles, gates: Gates, time_frames: int) -> ReportInputs:
@@ -132,7 +65,6 @@ def gather(run: ImageRun, options: RowFiles, gates: Gates, time_frames: int) -> 
     Parameters
     ----------
     run : ImageRun
-        The run.
     options : RowFiles
         Which files.
     gates : Gates
@@ -140,50 +72,57 @@ def gather(run: ImageRun, options: RowFiles, gates: Gates, time_frames: int) -> 
     time_frames : int
         Number of frames that are detected again to measure the time.
 
-    Returns
-    -------
-    ReportInputs
-
     Raises
     ------
     DetectError, landmarks.LandmarkFileError
         If a file is missing or malformed.
     """
-    files = find_files(run, options)
-    source = open_rows(files)
+    files = open_rows(run, options)
     names = tuple(frame.step.prefix for frame in run.frames)
     if not names:
         raise DetectError(f"{run.folder}: no frames: expected some of them")
-    return ReportInputs(
-        run,
-        files,
-        names,
-        tuple(source.of(name) for name in names),
-        gates.discs,
-        LineCompareOptions(tolerance_deg=gates.tolerance_deg, sigmas=gates.sigmas),
-        _timing(run, files, len(names), time_frames),
-    )
+    rows = tuple(files.of(name) for name in names)
+    compare = CompareOptions(**vars(gates))
+    sight = files.sight(run.camera) if isinstance(run, Run) else None
+    discs, lines = None, None
+    if "circles" in files.reference:
+        path = files.reference["circles"]
+        both = [seen for seen in rows if seen.circles and seen.reference_circles]
+        discs = compare_frames(
+            [seen.reference_circles for seen in both if seen.reference_circles],
+            [seen.circles for seen in both if seen.circles],
+            compare,
+            sight=sight,
+            beside=beside_reference(path),
+            names=(path.name, files.detected["circles"].name),
+        )
+    if "lines" in files.reference:
+        both = [seen for seen in rows if seen.lines and seen.reference_lines]
+        lines = compare_line_frames(
+            [seen.reference_lines for seen in both if seen.reference_lines],
+            [seen.lines for seen in both if seen.lines],
+            compare,
+            names=(files.reference["lines"].name, files.detected["lines"].name),
+        )
+    timing = _timing(run, files, len(names), time_frames)
+    return ReportInputs(run, files, names, rows, compare, sight, discs, lines, timing)
 
 
-def _timing(run: ImageRun, files: SeenFiles, count: int, wanted: int) -> Timing | None:
+def _timing(run: ImageRun, files: RunRows, count: int, wanted: int) -> Timing | None:
     if wanted < 0:
         raise DetectError(f"time_frames is {wanted}: expected 0 or more")
     if wanted == 0:
         return None
-    heads = files.heads
-    circles = heads["circles"].circle_settings if "circles" in heads else None
-    lines = heads["lines"].line_settings if "lines" in heads else None
+    circles = files.circle_settings if "circles" in files.heads else None
+    lines = files.heads["lines"].line_settings if "lines" in files.heads else None
     if not isinstance(run, Run) or (circles is None and lines is None):
         raise DetectError("--time-frames: expected a calibration, and rows of discs or verticals")
     plan = FramePlan(run.camera, lines=lines, circles=circles)
     tables = tables_of(plan)
     every = max(1, count // wanted)
-    chosen: list[RunFrame] = []
-    for position, frame in enumerate(run.frames):
-        if position % every == 0 and len(chosen) < wanted:
-            chosen.append(frame)
+    chosen = [frame for k, frame in enumerate(run.frames) if k % every == 0][:wanted]
     decoding, detecting = [], []
-    # The first time does what later ones find done.
+    # The first frame, which compiles and fills caches, is processed twice.
     for frame in [chosen[0], *chosen]:
         try:
             start = time.thread_time()
@@ -206,7 +145,3 @@ def _timing(run: ImageRun, files: SeenFiles, count: int, wanted: int) -> Timing 
         1e3 * statistics.median(detecting[1:]),
         what,
     )
-
-
-def _step(prefix: str) -> Step:
-    return Step(prefix, *[0.0] * 9)

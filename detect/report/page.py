@@ -2,86 +2,64 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+import math
+from collections.abc import Callable
 from dataclasses import fields
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 
-from detect.comparison.circles import FLOOR_GATE_M
-from detect.comparison.report import number
+from detect import __version__
+from detect.comparison.matching import FLOOR_GATE_M
+from detect.comparison.report import (
+    floor_figures,
+    lean_text,
+    levelling_text,
+    number,
+    range_text,
+)
+from detect.comparison.result import Comparison, DiscComparison, LineComparison
 from detect.drawing.inputs import picture_name
 from detect.line_settings import LineSettings
 from detect.markers.settings import MarkerSettings
-from detect.report.accuracy import disc_parts, line_parts
-from detect.report.figures import counts_figure, tilt_figure
+from detect.report.figures import (
+    bearings_figure,
+    counts_figure,
+    distance_figure,
+    floor_figure,
+    rates_figure,
+    tilt_figure,
+    whitened_figure,
+)
 from detect.report.inputs import ReportInputs
-from detect.report.parts import PAGE, STYLE, Part, Section, data_address, figure_part, scaled
+from detect.report.parts import PAGE, STYLE, Part, Section
+from detect.report.pictures import frame_picture, gallery
+from detect.report.statistics import RateCurve, disc_rates, line_rates, whitened
 from detect.settings import CircleSettings
-
-#: An image of a frame (JPEG), its width and height; or why there is none.
-Picture = tuple[bytes, int, int] | str
-
-
-class Gallery(NamedTuple):
-    """Cut-outs round discs that are "missed" or "extra": a JPEG, and how many of how many discs."""
-
-    fate: str
-    content: bytes
-    width: int
-    height: int
-    shown: int
-    of: int
-
+from detect.tune.table import knee
 
 _NAMES = {"circles": "Discs", "lines": "Verticals", "markers": "Markers", "tilt": "Tilt"}
-_FATES = {"missed": "reference rows that are missing", "extra": "rows that fit no reference row"}
+_SETTINGS = {"circles": CircleSettings, "lines": LineSettings, "markers": MarkerSettings}
 _SIGMA = "\N{GREEK SMALL LETTER SIGMA}"
+_CURVE_POINTS = 41
+_TABLE_POINTS = 5
 
 
-def report_page(
-    inputs: ReportInputs,
-    version: str,
-    worst: int,
-    picture_of: Callable[[str], Picture],
-    galleries: Sequence[Gallery] = (),
-) -> bytes:
-    """The whole page, UTF-8; the same inputs give the same bytes.
-
-    Parameters
-    ----------
-    inputs : ReportInputs
-    version : str
-        Of the program, for the page's foot.
-    worst : int
-        How many of the worst frames are shown.
-    picture_of : callable
-        Gives the picture of a frame, by its prefix.
-    galleries : sequence of Gallery
-    """
+def report_page(inputs: ReportInputs, worst: int) -> bytes:
+    """The whole page, UTF-8, with `worst` frames shown; the same inputs give the same bytes."""
+    detected = inputs.files.detected
     sections = [Section("summary", "What was found", _summary(inputs))]
-    if "circles" in inputs.files.detected:
-        sections.append(Section("discs", "Discs against the reference", disc_parts(inputs)))
-        sections[-1].parts.extend(
-            Part(
-                "figure",
-                f"{each.shown} of the {each.of} {_FATES[each.fate]}, evenly over the run; the "
-                "outline is wider than the disc.",
-                data_address(each.content, "jpeg"),
-                each.width,
-                each.height,
-            )
-            for each in galleries
-        )
-    if "lines" in inputs.files.detected:
-        sections.append(Section("verticals", "Verticals against the reference", line_parts(inputs)))
-    sections.append(Section("frames", *_frames(inputs, worst, picture_of)))
-    if "tilt" in inputs.files.detected:
+    if "circles" in detected:
+        sections.append(Section("discs", "Discs against the reference", _discs(inputs)))
+    if "lines" in detected:
+        sections.append(Section("verticals", "Verticals against the reference", _lines(inputs)))
+    sections.append(_frames(inputs, worst))
+    if "tilt" in detected:
         sections.append(Section("tilt", "Tilt", _tilt(inputs)))
-    sections.append(Section("timing", "Timing", _timing(inputs)))
-    sections.append(Section("settings", "Effective configuration", _settings(inputs, version)))
+    sections.append(Section("timing", "Timing", [_timing(inputs)]))
+    sections.append(Section("settings", "Effective configuration", _settings(inputs)))
     environment = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, finalize=_clean
     )
@@ -106,168 +84,284 @@ def _clean(value: Any) -> Any:
     )
 
 
-# -- sections ---------------------------------------------------------------------------------
-
-
 def _summary(inputs: ReportInputs) -> list[Part]:
-    entries = [("frames", str(len(inputs.rows)))]
+    figures = [("frames", str(len(inputs.rows)))]
     rows = []
     for kind, path in inputs.files.detected.items():
-        if kind == "tilt":
-            count = sum(seen.tilt is not None for seen in inputs.rows)
-            inside = [seen.tilt is not None for seen in inputs.rows]
-        else:
-            each = [getattr(seen, kind) for seen in inputs.rows]
-            count = sum(len(found) for found in each if found is not None)
-            inside = [found is not None and len(found) > 0 for found in each]
-        entries.append(
-            (_NAMES[kind].lower() if kind != "tilt" else "frames with a tilt", str(count))
+        frames = [getattr(seen, kind) for seen in inputs.rows]
+        counts = [
+            0 if frame is None else 1 if kind == "tilt" else len(getattr(frame, kind))
+            for frame in frames
+        ]
+        name = "frames with a tilt" if kind == "tilt" else _NAMES[kind].lower()
+        figures.append((name, str(sum(counts))))
+        rows.append(
+            (_NAMES[kind], path.name, str(sum(counts)), str(sum(count > 0 for count in counts)))
         )
-        rows.append((_NAMES[kind], path.name, str(count), str(sum(inside))))
-    for name, comparison in (("discs", inputs.discs), ("verticals", inputs.lines)):
-        if comparison is not None:
-            entries.append((f"recall of {name}", number(comparison.recall, 3)))
-            entries.append((f"precision of {name}", number(comparison.precision, 3)))
+    for name, result in (("discs", inputs.discs), ("verticals", inputs.lines)):
+        if result is not None:
+            figures.append((f"recall of {name}", number(result.recall, 3)))
+            figures.append((f"precision of {name}", number(result.precision, 3)))
     head = ("what", "file", "rows", "frames with some")
+    parts = [
+        Part("figures", rows=tuple(figures)),
+        Part("table", "Files of rows", head, tuple(rows), left=(0, 1)),
+    ]
+    return parts if len(inputs.rows) < 2 else [*parts, counts_figure(inputs.rows)]
+
+
+# -- against the reference --------------------------------------------------------------------
+
+
+def _discs(inputs: ReportInputs) -> list[Part]:
+    """Rates and errors of discs, whether covariances are right, and discs cut out."""
+    result = inputs.discs
+    if result is None:
+        return [_no_reference("map.circles", "--reference")]
+    errors = [
+        ("median difference on the floor", f"{_scaled(result.error_median_m, 1e3, 1)} mm"),
+        ("95 %", f"{_scaled(result.error_95_m, 1e3, 1)} mm"),
+    ]
+    if result.in_image:
+        errors.insert(
+            0, ("median difference in the image", f"{number(result.image_median_px, 2)} px")
+        )
+    if result.on_lookalikes is not None:
+        errors.insert(0, ("extra on look-alikes", str(result.on_lookalikes)))
+    parts = [_outcome(result, "in the image" if result.in_image else "on the floor", errors)]
+    if result.in_image:
+        words = levelling_text(result)
+        parts.append(
+            Part(
+                "text",
+                f"{words[:1].upper()}{words[1:]}. A detected row fits a reference row if they are "
+                f"at most half the disc's image apart ({result.options.least_px:g} px for those "
+                "that are smaller).",
+            )
+        )
+    if result.reference or result.detected:
+        parts.append(distance_figure(result.bins))
+    quality = [row.quality for match in result.frames for row in match.frame.detected]
+    levels = np.linspace(min(quality), max(quality), _CURVE_POINTS) if quality else np.zeros(0)
+    parts += _rates(disc_rates(result, np.unique(levels)), "least quality", "quality")
+    if result.matched:
+        parts.append(floor_figure(result.pairs, lean=result.lean is not None))
+    what = "two components for each matched disc"
+    if result.lean is not None:
+        what += ", after the common lean"
+        words = f"One lean for all frames: {lean_text(result.lean)}.".replace("+-", "±")
+        parts += [Part("text", words), _floor(result)]
+    parts += _honesty(result, what)
+    return [*parts, *gallery(inputs, "missed"), *gallery(inputs, "extra")]
+
+
+def _lines(inputs: ReportInputs) -> list[Part]:
+    """Rates and errors of verticals, and whether standard deviations are right."""
+    result = inputs.lines
+    if result is None:
+        return [_no_reference("map.lines", "--reference-lines")]
+    sigma = [row.sigma for match in result.frames for row in match.frame.detected]
+    levels = np.quantile(sigma, np.linspace(0.0, 1.0, _CURVE_POINTS)) if sigma else np.zeros(0)
+    # Quantiles between rows may round below the greatest.
+    curve = line_rates(result, np.nextafter(np.unique(levels), np.inf))
+    options = inputs.options
+    errors = [
+        ("found with another", str(result.joined)),
+        ("median error", f"{number(result.bearing_median_deg, 3)}°"),
+        ("95 %", f"{number(result.bearing_95_deg, 3)}°"),
+    ]
     return [
-        Part("figures", entries=tuple(entries)),
-        Part("table", caption="Files of rows", head=head, rows=tuple(rows), text=(1,)),
-        figure_part(counts_figure(inputs.rows), "Rows in each frame, over the run."),
+        _outcome(
+            result, f"within {options.tolerance_deg:g}° or {options.sigmas:g} {_SIGMA}", errors
+        ),
+        *_rates(curve, f"largest {_SIGMA} of the bearing / deg", f"{_SIGMA} / deg"),
+        *_honesty(result, "one for each matched vertical"),
+        *([bearings_figure(result.pairs)] if result.matched else []),
     ]
 
 
-def _frames(
-    inputs: ReportInputs, worst: int, picture_of: Callable[[str], Picture]
-) -> tuple[str, list[Part]]:
-    """Heading and parts: the worst frames, or some frames if there is no reference to rank them."""
+def _no_reference(usual: str, flag: str) -> Part:
+    words = f"No reference rows: expected {usual} in the run folder, or a file named by {flag}."
+    return Part("note", words)
+
+
+def _outcome(result: Comparison, gate: str, errors: list[tuple[str, str]]) -> Part:
+    rows = (
+        ("reference rows", str(result.reference)),
+        ("detected rows", str(result.detected)),
+        (f"matched {gate}", str(result.matched)),
+        ("missed", str(result.missed)),
+        ("extra", str(result.extra)),
+        ("recall", number(result.recall, 4)),
+        ("precision", number(result.precision, 4)),
+    )
+    return Part("figures", rows=(*rows, *errors))
+
+
+def _rates(curve: RateCurve, axis: str, name: str) -> list[Part]:
+    count = len(curve.threshold)
+    if not count:
+        return [Part("note", "No rows: no rates over thresholds.")]
+    best = knee(curve.recall, curve.precision)
+    chosen = set(np.linspace(0, count - 1, _TABLE_POINTS).astype(int).tolist())
+    chosen |= {best} - {None}
+    rows = tuple(
+        (
+            f"{curve.threshold[k]:.3g}" + (" (knee)" if k == best else ""),
+            str(curve.kept[k]),
+            *("-" if np.isnan(v) else f"{v:.3f}" for v in (curve.recall[k], curve.precision[k])),
+        )
+        for k in sorted(chosen)
+    )
+    head = (name, "rows kept", "recall", "precision")
+    table = Part("table", f"Rates over the threshold ({axis})", head, rows)
+    return [table] if count < 2 else [rates_figure(curve, axis), table]
+
+
+def _floor(result: DiscComparison) -> Part:
+    rows = tuple(
+        (range_text(part), str(part.before.pairs), *(_scaled(value, 1e3, 0) for value in figures))
+        for part, figures in floor_figures(result)
+    )
+    return Part(
+        "table",
+        "Differences on the floor in mm by forward distance of the reference row in m, as the "
+        "rows are and after the common lean; along (farther) and across (left) are medians",
+        ("metres", "pairs", "median", "95 %", "along", "across",
+         "after: median", "95 %", "along", "across"),
+        rows,
+    )  # fmt: skip
+
+
+def _honesty(result: DiscComparison | LineComparison, what: str) -> list[Part]:
+    """Whether the stated covariances are right."""
+    residuals = whitened(result)
+    if not len(residuals):
+        return [Part("note", "No matched rows with a usable covariance: nothing to whiten.")]
+    lean = result.lean if isinstance(result, DiscComparison) else None
+    error = result.normalised_error if lean is None else lean.normalised_error
+    rows = [("mean", f"{residuals.mean():.3f}"), ("deviation", f"{residuals.std():.3f}")]
+    for k in (1, 2, 3):
+        normal = math.erf(k / math.sqrt(2.0))
+        share = np.mean(np.abs(residuals) <= k)
+        rows.append((f"within {k} {_SIGMA} (normal: {normal:.3f})", f"{share:.3f}"))
+    rows.append(("squared, per degree of freedom", number(error.per_dof, 3)))
+    if error.band is not None:
+        rows.append(("95 % band of that", f"{error.band[0]:.3f} to {error.band[1]:.3f}"))
+    return [whitened_figure(residuals, what), Part("figures", rows=tuple(rows))]
+
+
+# -- frames, tilt, time, settings -------------------------------------------------------------
+
+
+def _frames(inputs: ReportInputs, worst: int) -> Section:
+    """The worst frames, or some frames if there is no reference to rank them."""
     named = {picture_name(prefix): prefix for prefix in inputs.names}
     parts: list[Part] = []
     shown: dict[str, str] = {}
-    for kind, unit, scores in _worst(inputs, worst):
+    results: tuple[tuple[str, str, Comparison | None, Callable[[float | None], str]], ...] = (
+        ("discs", "mm", inputs.discs, lambda error: _scaled(error, 1e3, 1)),
+        ("verticals", "deg", inputs.lines, lambda error: number(error, 3)),
+    )
+    for kind, unit, result, text in results:
+        if result is None:
+            continue
+        matches = result.worst_frames(worst)
+        rows = tuple(
+            (m.name, str(m.matched), str(m.missed), str(m.extra), text(m.largest_error))
+            for m in matches
+        )
         head = ("frame", "matched", "missed", "extra", f"largest error / {unit}")
-        caption = f"Frames with most missed and extra {kind}"
-        parts.append(Part("table", caption=caption, head=head, rows=tuple(scores)))
-        for rank, (name, *_) in enumerate(scores, 1):
-            prefix = named.get(name, name)
-            place = f"number {rank} of {kind}"
+        parts.append(Part("table", f"Frames with most missed and extra {kind}", head, rows))
+        for rank, match in enumerate(matches, 1):
+            prefix, place = named[picture_name(match.name)], f"number {rank} of {kind}"
             shown[prefix] = f"{shown[prefix]}, {place}" if prefix in shown else place
     if parts:
-        title = "Worst frames"
-        parts.append(
-            Part(
-                "key",
-                entries=(
-                    ("#ffaa00", f"disc's edge; ±1 {_SIGMA} of a vertical"),
-                    ("#3cc83c", "outlines; vertical"),
-                    ("#ff3cff", "fits no reference row"),
-                    ("#ff3c3c", "reference row that is missing"),
-                ),
-            )
+        key = (
+            ("#ffaa00", f"disc's edge; ±1 {_SIGMA} of a vertical"),
+            ("#3cc83c", "outlines; vertical"),
+            ("#ff3cff", "fits no reference row"),
+            ("#ff3c3c", "reference row that is missing"),
         )
-        parts.append(
-            Part(
-                "note",
-                "Above a disc: quality, distance to its reference row in the image. Below a "
-                "vertical: error of the bearing in standard deviations.",
-            )
+        words = (
+            "Above a disc: quality, distance to its reference row in the image. Below a "
+            "vertical: error of the bearing in standard deviations."
         )
+        parts += [Part("key", rows=key), Part("note", words)]
     else:
-        title = "Some frames"
         count = min(worst, len(inputs.names))
         for k in np.unique(np.linspace(0, len(inputs.names) - 1, count).astype(int)):
             shown[inputs.names[k]] = "no reference rows"
-    for prefix, why in shown.items():
-        words = f"Frame {picture_name(prefix)} ({why})"
-        picture = picture_of(prefix)
-        if isinstance(picture, str):
-            parts.append(Part("note", f"{words}: {picture}"))
-        else:
-            content, width, height = picture
-            parts.append(Part("figure", words, data_address(content, "jpeg"), width, height))
-    return title, parts
-
-
-def _worst(inputs: ReportInputs, count: int) -> Iterator[tuple[str, str, list[tuple[str, ...]]]]:
-    """What, the unit of its errors, and a row of a table for each of the worst frames."""
-    for what, unit, comparison, factor, decimals in (
-        ("discs", "mm", inputs.discs, 1e3, 1),
-        ("verticals", "deg", inputs.lines, 1.0, 3),
-    ):
-        if comparison is not None:
-            yield what, unit, [
-                (s.name, str(s.matched), str(s.missed), str(s.extra),
-                 scaled(s.largest_error, factor, decimals))
-                for s in comparison.worst_frames(count)
-            ]  # fmt: skip
+    title = "Worst frames" if parts else "Some frames"
+    parts += [
+        frame_picture(inputs, prefix, f"Frame {picture_name(prefix)} ({why})")
+        for prefix, why in shown.items()
+    ]
+    return Section("frames", title, parts)
 
 
 def _tilt(inputs: ReportInputs) -> list[Part]:
     tilts = [seen.tilt for seen in inputs.rows if seen.tilt is not None]
     if not tilts:
         return [Part("note", "No frame has a tilt: too few verticals agreed.")]
-    parts = [
-        figure_part(
-            tilt_figure(inputs.rows),
-            "Pitch and roll that turn measured directions level, with one standard deviation.",
-        )
-    ]
     rows = []
     for name, value, variance in (
         ("pitch", [t.pitch for t in tilts], [t.cpp for t in tilts]),
         ("roll", [t.roll for t in tilts], [t.crr for t in tilts]),
     ):
-        angle = np.degrees(value)
-        sigma = np.degrees(np.sqrt(variance))
-        rows.append(
-            (name, *(f"{figure:.3f}" for figure in
-                     (angle.mean(), angle.std(), np.abs(angle).max(), np.median(sigma))))
-        )  # fmt: skip
+        angle, sigma = np.degrees(value), np.degrees(np.sqrt(variance))
+        figures = (angle.mean(), angle.std(), np.abs(angle).max(), np.median(sigma))
+        rows.append((name, *(f"{figure:.3f}" for figure in figures)))
     head = ("degrees", "mean", "deviation", "largest", f"median of its {_SIGMA}")
     lines = np.median([t.lines for t in tilts])
     caption = f"{len(tilts)} of {len(inputs.rows)} frames; {lines:g} verticals agree (median)"
-    return [*parts, Part("table", caption=caption, head=head, rows=tuple(rows))]
+    figure = [tilt_figure(inputs.rows)] if len(tilts) > 1 else []
+    return [*figure, Part("table", caption, head, tuple(rows))]
 
 
-def _timing(inputs: ReportInputs) -> list[Part]:
+def _timing(inputs: ReportInputs) -> Part:
     timing = inputs.timing
     if timing is None:
         words = "Not measured: --time-frames 20 detects 20 of the frames again and states it."
-        return [Part("note", words)]
-    rows = (
-        ("decoding the image", f"{timing.decoding_ms:.2f}", "1.00"),
-        (
-            f"detecting {timing.what}",
-            f"{timing.detecting_ms:.2f}",
-            f"{timing.detecting_ms / timing.decoding_ms:.2f}",
-        ),
+        return Part("note", words)
+    rows = tuple(
+        (what, f"{ms:.2f}", f"{ms / timing.decoding_ms:.2f}")
+        for what, ms in (
+            ("decoding the image", timing.decoding_ms),
+            (f"detecting {timing.what}", timing.detecting_ms),
+        )
     )
     caption = f"Processor time, medians of {timing.frames} frames, on the machine of this report"
-    return [Part("table", caption=caption, head=("", "ms", "x decoding"), rows=rows)]
+    return Part("table", caption, ("", "ms", "x decoding"), rows)
 
 
-def _settings(inputs: ReportInputs, version: str) -> list[Part]:
+def _settings(inputs: ReportInputs) -> list[Part]:
     parts: list[Part] = []
     for kind, head in inputs.files.heads.items():
         usual = _defaults(kind)
         name = inputs.files.detected[kind].name
         parts.append(Part("heading", name))
         if head.settings:
-            rows = tuple((key, value, usual.get(key, "")) for key, value in head.settings)
+            changed = [usual.get(key, value) != value for key, value in head.settings]
+            rows = tuple(
+                (key, value, usual.get(key, "") if differs else "")
+                for (key, value), differs in zip(head.settings, changed)
+            )
+            bold = tuple(np.flatnonzero(changed).tolist())
             caption = f"Settings in the head of {name}; bold where not the default"
-            parts.append(Part("settings", caption=caption, rows=rows))
+            parts.append(Part("table", caption, ("setting", "value", "default"), rows, bold=bold))
         words = [line for line in head.comments if line and not line.startswith("settings ")]
         parts += [Part("note", line) for line in words] or [Part("note", "No head in the file.")]
-    gate, line_gate = inputs.gate, inputs.line_gate
-    if inputs.sight is not None and not gate.on_floor:
-        same = f"within half its image or {gate.least_px:g} px"
-    else:
-        same = f"within {FLOOR_GATE_M if gate.gate_m is None else gate.gate_m:g} m"
+    options = inputs.options
+    same = f"within {FLOOR_GATE_M if options.gate_m is None else options.gate_m:g} m on the floor"
+    if inputs.sight is not None and not options.on_floor:
+        same = f"within half its image or {options.least_px:g} px"
     parts.append(
         Part(
             "note",
-            f"The same disc: {same}. The same vertical: within "
-            f"{line_gate.tolerance_deg:g}° or {line_gate.sigmas:g} standard deviations. "
-            f"Page written by detect report, version {version}.",
+            f"The same disc: {same}. The same vertical: within {options.tolerance_deg:g}° or "
+            f"{options.sigmas:g} standard deviations. "
+            f"Page written by detect report, version {__version__}.",
         )
     )
     return parts
@@ -275,10 +369,12 @@ def _settings(inputs: ReportInputs, version: str) -> list[Part]:
 
 def _defaults(kind: str) -> dict[str, str]:
     """The default settings, written as heads write them."""
-    kinds: dict[str, Any] = {
-        "circles": CircleSettings, "lines": LineSettings, "markers": MarkerSettings,
-    }  # fmt: skip
-    if kind not in kinds:
+    if kind not in _SETTINGS:
         return {}
-    usual = kinds[kind]()
+    usual: Any = _SETTINGS[kind]()
     return {f.name: str(getattr(usual, f.name)).replace(" ", "") for f in fields(usual)}
+
+
+def _scaled(value: float | None, factor: float, decimals: int) -> str:
+    """A figure in another unit, or a dash where there is none."""
+    return number(None if value is None else factor * value, decimals)

@@ -7,70 +7,49 @@ figures are data: addresses.
 from __future__ import annotations
 
 import base64
-from dataclasses import dataclass, field
-
-import numpy as np
-
-from detect.comparison.report import number
-
-_INCHES_PX = 96.0
+from typing import NamedTuple
 
 
-@dataclass(frozen=True)
-class Part:
-    """A piece of a section: what the template makes of it is its `kind`."""
+class Part(NamedTuple):
+    """A piece of a section.
+
+    Attributes
+    ----------
+    kind : {"figures", "image", "table", "heading", "key", "text", "note"}
+        What the template makes of it.
+    words : str
+        The caption, or the text.
+    head, rows : tuple
+        Of a table; rows of figures are names and values, those of a key colours and words.
+    left, bold : tuple of int
+        Columns with text, rows to point out.
+    address, width, height
+        Of an image.
+    """
 
     kind: str
     words: str = ""
+    head: tuple[str, ...] = ()
+    rows: tuple[tuple[str, ...], ...] = ()
+    left: tuple[int, ...] = (0,)
+    bold: tuple[int, ...] = ()
     address: str = ""
     width: int = 0
     height: int = 0
-    caption: str = ""
-    head: tuple[str, ...] = ()
-    rows: tuple[tuple[str, ...], ...] = ()
-    text: tuple[int, ...] = ()
-    entries: tuple[tuple[str, str], ...] = ()
 
 
-@dataclass(frozen=True)
-class Section:
+class Section(NamedTuple):
     """A section with its heading."""
 
     key: str
     name: str
-    parts: list[Part] = field(default_factory=list)
+    parts: list[Part]
 
 
-def figure_part(svg: bytes, words: str) -> Part:
-    """A figure with its caption; its size is what it was drawn in."""
-    start = svg[:2000].decode()
-    width, height = (
-        float(start.split(f' {name}="')[1].split('pt"')[0]) / 72.0 * _INCHES_PX
-        for name in ("width", "height")
-    )
-    return Part("figure", words, data_address(svg, "svg+xml"), round(width), round(height))
-
-
-def data_address(content: bytes, kind: str) -> str:
-    """An image as an address that holds it; `kind` is its type behind ``image/``."""
-    return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
-
-
-def range_text(from_m: float | None, to_m: float | None) -> str:
-    """A range of distances, open at an end that is None."""
-    if from_m is None:
-        return f"below {to_m:g}"
-    return f"{from_m:g} and more" if to_m is None else f"{from_m:g} to {to_m:g}"
-
-
-def scaled(value: float | None, factor: float, decimals: int) -> str:
-    """A figure in another unit, or a dash where there is none."""
-    return number(None if value is None else factor * value, decimals)
-
-
-def share_text(value: float) -> str:
-    """A share, or a dash where it is NaN."""
-    return f"{value:.3f}" if np.isfinite(value) else "-"
+def image_part(words: str, content: bytes, kind: str, width: float, height: float) -> Part:
+    """An image with its caption; `kind` is its type behind ``image/``."""
+    address = f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
+    return Part("image", words, address=address, width=round(width), height=round(height))
 
 
 STYLE = """
@@ -106,23 +85,6 @@ dl.figures dt { font-size: .8rem; color: #444; } dl.figures dd { margin: 0; font
 """
 
 PAGE = """\
-{%- macro figure(drawing) %}
-<figure><img src="{{ drawing.address }}" alt="{{ drawing.words }}"
- width="{{ drawing.width }}" height="{{ drawing.height }}">
-<figcaption>{{ drawing.words }}</figcaption></figure>
-{%- endmacro %}
-{%- macro table(data) %}
-<div class="wide" tabindex="0" role="region" aria-label="{{ data.caption }}"><table>
-<caption>{{ data.caption }}</caption>
-<thead><tr>{% for name in data.head %}
-<th scope="col"{% if loop.first or loop.index0 in data.text %} class="text"{% endif %}>{{ name }}</th>
-{%- endfor %}</tr></thead>
-<tbody>{% for row in data.rows %}
-<tr>{% for word in row %}{% if loop.first %}<th scope="row">{{ word }}</th>
-{%- elif loop.index0 in data.text %}<td class="text">{{ word }}</td>
-{%- else %}<td>{{ word }}</td>{% endif %}{% endfor %}</tr>
-{%- endfor %}</tbody></table></div>
-{%- endmacro -%}
 <!DOCTYPE html>
 <html lang="en"><head><meta charset="utf-8">
 <meta http-equiv="Content-Security-Policy"
@@ -141,28 +103,33 @@ PAGE = """\
 <h2 id="{{ section.key }}-head">{{ section.name }}</h2>
 {%- for part in section.parts %}
 {%- if part.kind == "figures" %}
-<dl class="figures">{% for name, value in part.entries %}
+<dl class="figures">{% for name, value in part.rows %}
 <div><dt>{{ name }}</dt><dd>{{ value }}</dd></div>{% endfor %}</dl>
-{%- elif part.kind == "figure" %}{{ figure(part) }}
-{%- elif part.kind == "table" %}{{ table(part) }}
+{%- elif part.kind == "image" %}
+<figure><img src="{{ part.address }}" alt="{{ part.words }}"
+ width="{{ part.width }}" height="{{ part.height }}">
+<figcaption>{{ part.words }}</figcaption></figure>
+{%- elif part.kind == "table" %}
+<div class="wide" tabindex="0" role="region" aria-label="{{ part.words }}"><table>
+<caption>{{ part.words }}</caption>
+<thead><tr>{% for name in part.head %}
+<th scope="col"{% if loop.index0 in part.left %} class="text"{% endif %}>{{ name }}</th>
+{%- endfor %}</tr></thead>
+<tbody>{% for row in part.rows %}
+<tr{% if loop.index0 in part.bold %} class="changed"{% endif %}>
+{%- for word in row %}{% if loop.first %}<th scope="row">{{ word }}</th>
+{%- else %}<td{% if loop.index0 in part.left %} class="text"{% endif %}>{{ word }}</td>
+{%- endif %}{% endfor %}</tr>
+{%- endfor %}</tbody></table></div>
 {%- elif part.kind == "heading" %}
 <h3>{{ part.words }}</h3>
 {%- elif part.kind == "key" %}
-<p class="key">{% for colour, words in part.entries %}<span><span class="swatch"
+<p class="key">{% for colour, words in part.rows %}<span><span class="swatch"
  style="border-color: {{ colour }}"></span> {{ words }}</span> {% endfor %}</p>
-{%- elif part.kind == "settings" %}
-<div class="wide" tabindex="0" role="region" aria-label="{{ part.caption }}"><table>
-<caption>{{ part.caption }}</caption>
-<thead><tr><th scope="col" class="text">setting</th><th scope="col">value</th>
-<th scope="col">default</th></tr></thead>
-<tbody>{% for name, value, usual in part.rows %}
-<tr{% if value != usual and usual != "" %} class="changed"{% endif %}><th scope="row">{{ name }}</th>
-<td>{{ value }}</td><td>{{ usual if value != usual else "" }}</td></tr>
-{%- endfor %}</tbody></table></div>
 {%- else %}
 <p{% if part.kind == "note" %} class="note"{% endif %}>{{ part.words }}</p>
 {%- endif %}{% endfor %}
 </section>
 {%- endfor %}
 </main></body></html>
-"""  # noqa: E501
+"""

@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Literal
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from camera import Camera
-from detect.comparison.circles import pair_discs
-from detect.drawing.frame import draw_rows
+from detect.drawing.frame import EXTRA_COLOUR, MISSED_COLOUR, draw_rows
+from detect.drawing.inputs import picture_name
 from detect.drawing.strokes import Colour, draw_curve
 from detect.errors import FrameError
 from detect.report.inputs import ReportInputs
-from detect.report.page import Gallery, Picture
-from detect.run import Run, read_image
+from detect.report.parts import Part, image_part
+from detect.run import Run, RunFrame, read_image
 from detect.seen import circle_on_floor, image_positions
-from detect.settings import CircleSettings
 from landmarks import circle_arrays
 
 _JPEG_QUALITY = 88
@@ -28,99 +27,86 @@ _SHOWN = 0.5
 _GAP_PX = 4
 #: Outlines are drawn larger than the disc by this factor, so that they do not hide its edge.
 _WIDER = 1.6
-_COLOUR: dict[str, Colour] = {"missed": (60, 60, 255), "extra": (255, 60, 255)}
+_FATES = {
+    "missed": (MISSED_COLOUR, "reference rows that are missing"),
+    "extra": (EXTRA_COLOUR, "rows that fit no reference row"),
+}
 
 
-def frame_picture(inputs: ReportInputs, prefix: str) -> Picture:
-    """The picture of a frame as JPEG, its width and height; or why there is none."""
-    frame = next((f for f in inputs.run.frames if f.step.prefix == prefix), None)
-    if frame is None:
-        return "no such frame in the run"
-    camera = _camera(inputs)
+def frame_picture(inputs: ReportInputs, prefix: str, words: str) -> Part:
+    """The picture of a frame with its rows; or a note that says why there is none."""
+    frame = next(frame for frame in inputs.run.frames if frame.step.prefix == prefix)
     try:
-        image = read_image(frame, camera)
+        image = _read(inputs, frame)
     except FrameError as error:
-        return str(error)
-    head = inputs.files.heads.get("circles")
-    settings = CircleSettings() if head is None else head.circle_settings
-    rows = inputs.rows[inputs.names.index(prefix)]
-    return _jpeg(draw_rows(image, camera, rows, settings, inputs.gate, inputs.line_gate))
+        return Part("note", f"{words}: {error}")
+    rows, settings = inputs.files.of(prefix), inputs.files.circle_settings
+    return _jpeg(words, draw_rows(image, inputs.sight, rows, settings, inputs.options))
 
 
-def gallery(inputs: ReportInputs, fate: str) -> Gallery | None:
-    """Cut-outs of some of a run's missed or extra discs, evenly over the run.
+def gallery(inputs: ReportInputs, fate: Literal["missed", "extra"]) -> list[Part]:
+    """An image of cut-outs of some of a run's missed or extra discs, evenly over the run.
 
-    Parameters
-    ----------
-    inputs : ReportInputs
-    fate : {"missed", "extra"}
-
-    Returns
-    -------
-    Gallery or None
-        None without any that can be read.
+    There is none if no such disc can be read.
     """
-    rows = list(_rows(inputs, fate))
-    if not rows:
-        return None
-    frames = {frame.step.prefix: frame for frame in inputs.run.frames}
-    chosen = np.unique(np.linspace(0, len(rows) - 1, min(_MOST, len(rows))).round().astype(int))
+    edges = list(_edges(inputs, fate))
+    if not edges:
+        return []
+    frames = {picture_name(frame.step.prefix): frame for frame in inputs.run.frames}
+    chosen = np.unique(np.linspace(0, len(edges) - 1, min(_MOST, len(edges))).round().astype(int))
     tiles = []
-    for k in chosen:
-        prefix, edge = rows[k]
+    colour, words = _FATES[fate]
+    for name, edge in (edges[k] for k in chosen):
         try:
-            image = read_image(frames[prefix], _camera(inputs))
+            tiles.append(_tile(_read(inputs, frames[name]), edge, colour))
         except FrameError:
             continue
-        tiles.append(_tile(image, edge, _COLOUR[fate]))
     if not tiles:
-        return None
-    shown = len(tiles)
-    blank = np.full_like(tiles[0], 255)
-    tiles += [blank] * (-len(tiles) % _IN_A_ROW)
-    lines = [np.hstack(tiles[k : k + _IN_A_ROW]) for k in range(0, len(tiles), _IN_A_ROW)]
-    return Gallery(fate, *_jpeg(np.vstack(lines)), shown, len(rows))
+        return []
+    words = (
+        f"{len(tiles)} of the {len(edges)} {words}, evenly over the run; the outline is wider than "
+        "the disc."
+    )
+    tiles += [np.full_like(tiles[0], 255)] * (-len(tiles) % _IN_A_ROW)
+    rows = [np.hstack(tiles[k : k + _IN_A_ROW]) for k in range(0, len(tiles), _IN_A_ROW)]
+    return [_jpeg(words, np.vstack(rows))]
 
 
-def _camera(inputs: ReportInputs) -> Camera | None:
-    return inputs.run.camera if isinstance(inputs.run, Run) else None
+def _read(inputs: ReportInputs, frame: RunFrame) -> NDArray[np.uint8]:
+    return read_image(frame, inputs.run.camera if isinstance(inputs.run, Run) else None)
 
 
-def _jpeg(picture: NDArray[np.uint8]) -> tuple[bytes, int, int]:
+def _jpeg(words: str, picture: NDArray[np.uint8]) -> Part:
     _, encoded = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
-    return encoded.tobytes(), picture.shape[1], picture.shape[0]
+    return image_part(words, encoded.tobytes(), "jpeg", picture.shape[1], picture.shape[0])
 
 
-def _rows(inputs: ReportInputs, fate: str) -> Iterator[tuple[str, NDArray[np.float64]]]:
-    """Frame and image of the edge of each row that was missed, or is extra."""
-    for prefix, seen in zip(inputs.names, inputs.rows):
-        view = inputs.view_of(seen)
-        if view is None or seen.circles is None or seen.reference_circles is None:
+def _edges(inputs: ReportInputs, fate: str) -> Iterator[tuple[str, NDArray[np.float64]]]:
+    """Frame and image of a circle round each disc that was missed, or is extra."""
+    for match in () if inputs.discs is None else inputs.discs.frames:
+        view = match.frame.view
+        if view is None:
             continue
-        pairs = pair_discs(seen.reference_circles, seen.circles, inputs.gate, view)
-        if fate == "missed":
-            alone, by = [seen.reference_circles[i] for i in pairs.first_alone], view.reference_by
-        else:
-            alone, by = [seen.circles[j] for j in pairs.second_alone], view.detected_by
-        for xy in circle_arrays(alone).xy:
-            edge = image_positions(view.camera, circle_on_floor(xy, _WIDER * view.radius_m), by)
+        rows, by = match.missed_rows, view.reference_by
+        if fate == "extra":
+            rows, by = match.extra_rows, view.detected_by
+        rings = circle_on_floor(circle_arrays(rows).xy, _WIDER * view.radius_m)
+        for edge in image_positions(view.camera, rings, by):
             if np.isfinite(edge).all():
-                yield prefix, edge
+                yield picture_name(match.name), edge
 
 
 def _tile(image: NDArray[np.uint8], edge: NDArray[np.float64], colour: Colour) -> NDArray[np.uint8]:
-    half = np.array(_HALF_PX)
-    corner = np.rint(edge.mean(axis=0)).astype(int) - half
-    (u, v), (width, height) = corner, 2 * half
-    padded = cv2.copyMakeBorder(
-        image, height, height, width, width, cv2.BORDER_CONSTANT, value=(255,)
+    """A cut-out with a curve drawn in, enlarged for that; white beyond the image."""
+    width, height = 2 * _HALF_PX[0], 2 * _HALF_PX[1]
+    left, top = np.rint(edge.mean(axis=0)).astype(int) - _HALF_PX
+    to_cut = np.array([[1.0, 0.0, -left], [0.0, 1.0, -top]])
+    cut = cv2.warpAffine(
+        image, to_cut, (width, height), flags=cv2.INTER_NEAREST, borderValue=(255,)
     )
-    v, u = np.clip([v + height, u + width], 0, np.array(padded.shape) - (height, width))
-    cut = padded[v : v + height, u : u + width]
     large = cv2.resize(cut, None, fx=_TIMES, fy=_TIMES, interpolation=cv2.INTER_CUBIC)
-    canvas = np.repeat(large[:, :, None], 3, axis=2).astype(np.uint8)
-    at = (edge + np.array([width - u, height - v]) + 0.5) * _TIMES - 0.5
-    draw_curve(canvas, at, colour, closed=True)
+    canvas = np.asarray(cv2.cvtColor(large, cv2.COLOR_GRAY2BGR), dtype=np.uint8)
+    draw_curve(canvas, (edge - (left, top) + 0.5) * _TIMES - 0.5, colour, closed=True)
     small = cv2.resize(canvas, None, fx=_SHOWN, fy=_SHOWN, interpolation=cv2.INTER_AREA)
     gap = _GAP_PX
     framed = cv2.copyMakeBorder(small, 0, gap, 0, gap, cv2.BORDER_CONSTANT, value=(255, 255, 255))

@@ -328,9 +328,9 @@ def _drawn(
         picture = draw_circles(image, camera, found.discs, plan.circles)
     elif found.lines is not None and camera and tables.verticals:
         if plan.drawing == "lines":
-            picture = draw_lines(image, camera, tables.verticals, found.lines)
+            picture = draw_lines(image, camera, found.lines)
         elif plan.drawing == "tracks":
-            picture = draw_tracks(image, tables.verticals, found.lines, rejected=True, reasons=True)
+            picture = draw_tracks(image, tables.verticals, found.lines)
     if picture is not None:
         yield f"{name}.png", _png(picture)
     if plan.draw_response and found.lines is not None and plan.lines and tables.verticals:

@@ -5,14 +5,12 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Mapping
-from dataclasses import fields, replace
+from dataclasses import fields
 from decimal import Decimal, InvalidOperation
-from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from detect.errors import DetectError
 from storage.messages import excerpt
-
-SettingsType = TypeVar("SettingsType")
 
 Combination = tuple[tuple[str, Any], ...]
 
@@ -45,22 +43,22 @@ def parameter_value(kind: type, name: str, text: str) -> Any:
             f"{name} is no parameter of {kind.__name__}: expected one of {', '.join(sorted(known))}"
         )
     wanted = get_type_hints(kind)[name]
-    if get_origin(wanted) is Literal:
-        if text in get_args(wanted):
-            return text
-        allowed = ", ".join(get_args(wanted))
-        raise DetectError(f"{name} is {excerpt(text)}: expected one of {allowed}")
-    if wanted is bool:
+    if wanted in (int, float):
+        try:
+            return wanted(text)
+        except ValueError:
+            expected = "a whole number" if wanted is int else "a number"
+    elif wanted is bool:
         if text.lower() in ("true", "false"):
             return text.lower() == "true"
-        raise DetectError(f"{name} is {excerpt(text)}: expected True or False")
-    if wanted not in (int, float):
+        expected = "True or False"
+    elif get_origin(wanted) is Literal:
+        if text in get_args(wanted):
+            return text
+        expected = f"one of {', '.join(get_args(wanted))}"
+    else:
         raise DetectError(f"{name} is no single number or word: it cannot be varied")
-    try:
-        return wanted(text)
-    except ValueError:
-        whole = "a whole number" if wanted is int else "a number"
-        raise DetectError(f"{name} is {excerpt(text)}: expected {whole}") from None
+    raise DetectError(f"{name} is {excerpt(text)}: expected {expected}")
 
 
 def parameter_values(kind: type, name: str, text: str) -> tuple[Any, ...]:
@@ -83,23 +81,17 @@ def parameter_values(kind: type, name: str, text: str) -> tuple[Any, ...]:
     DetectError
         As `parameter_value` does, and for a range that is none.
     """
-    if ":" not in text:
-        words = text.split(",")
-    else:
-        parts = text.split(":")
+    words = text.split(",")
+    if ":" in text:
         expected = f"{name} is {text!r}: expected FROM:TO:STEP with a step above 0, TO not below"
-        if len(parts) != 3:
-            raise DetectError(expected)
         try:
             # Decimal numbers: 0.3 and twice 0.1 are 0.5, and its digits are those of a file.
-            first, last, step = (Decimal(part.strip()) for part in parts)
-        except InvalidOperation:
+            first, last, step = (Decimal(part.strip()) for part in text.split(":"))
+            if not (last - first).is_finite() or step <= 0 or not 0 <= (last - first) / step <= 1e5:
+                raise ValueError
+            words = [str(first + k * step) for k in range(int((last - first) / step) + 1)]
+        except (InvalidOperation, ValueError):
             raise DetectError(expected) from None
-        if not (first.is_finite() and last.is_finite() and step.is_finite()):
-            raise DetectError(expected)
-        if step <= 0 or last < first or (last - first) / step > 100_000:
-            raise DetectError(expected)
-        words = [str(first + k * step) for k in range(int((last - first) / step) + 1)]
     return tuple(dict.fromkeys(parameter_value(kind, name, word.strip()) for word in words))
 
 
@@ -136,14 +128,3 @@ def combinations(kind: type, varied: Mapping[str, str], most: int) -> tuple[Comb
     return tuple(
         tuple(zip(values, combination)) for combination in itertools.product(*values.values())
     )
-
-
-def settings_with(base: SettingsType, combination: Combination) -> SettingsType:
-    """Settings with a combination's values.
-
-    Raises
-    ------
-    DetectError
-        If the detector cannot have them; the message names parameter, value and what was expected.
-    """
-    return replace(base, **dict(combination))  # type: ignore[type-var]

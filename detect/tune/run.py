@@ -12,7 +12,7 @@ from pathlib import Path
 
 from detect.comparison.circles import compare_frames
 from detect.comparison.lines import compare_line_frames
-from detect.comparison.result import CompareOptions, LineCompareOptions
+from detect.comparison.result import CompareOptions, DiscComparison, LineComparison
 from detect.line_settings import LineSettings
 from detect.run import Run, RunFrame
 from detect.runs.dispatch import Workers, detect_chunks
@@ -31,8 +31,7 @@ class Trial:
     Attributes
     ----------
     reference, detected, matched : int
-        Rows that count, and pairs of them; for verticals, `matched` are the reference rows that a
-        detected row represents, alone or with others.
+        Rows that count, and reference rows that were found.
     recall, precision : float or None
         None where there are no rows to compute them from.
     error_median : float or None
@@ -55,10 +54,9 @@ class Trial:
 
 def tune_run(
     run: Run,
-    frames: Sequence[RunFrame],
-    reference: Sequence[Frame],
+    frames: Sequence[tuple[RunFrame, Frame]],
     settings: Sequence[Settings],
-    gate: CompareOptions | LineCompareOptions,
+    options: CompareOptions,
     workers: Workers,
     *,
     tilts: ByPrefix[FrameTilt] | None = None,
@@ -70,16 +68,14 @@ def tune_run(
     ----------
     run : Run
         The run.
-    frames : sequence of RunFrame
-        Which of its frames.
-    reference : sequence of Frame
-        Reference rows, at least of these frames.
+    frames : sequence of (RunFrame, Frame)
+        Which of its frames, with their reference rows.
     settings : sequence of CircleSettings, or of LineSettings
         What to try; all of one kind.
-    gate : CompareOptions for discs, LineCompareOptions for verticals
+    options : CompareOptions
         What counts as the same landmark.
     workers : Workers
-        Workers. They are started once for all settings, and again where some of them have died.
+        They are started once for all settings, and again where some of them have died.
     tilts : mapping, optional
         Tilts by image prefix: positions of discs are corrected for them.
     on_progress : callable, optional
@@ -99,7 +95,8 @@ def tune_run(
     """
     plans = [_plan(run, each) for each in settings]
     known = Known(tilts=tilts)
-    tasks = [FrameTask(frame, known.of(frame.step.prefix)) for frame in frames]
+    tasks = [FrameTask(frame, known.of(frame.step.prefix)) for frame, _ in frames]
+    reference = [rows for _, rows in frames]
     tables_of(plans[0])
     with _kept(workers, plans[0]) as same:
         for plan in plans:
@@ -112,7 +109,17 @@ def tune_run(
                     failures += [] if each.error is None else [each.error]
                     if on_progress is not None:
                         on_progress()
-            yield _trial(reference, found, gate, tuple(failures))
+            result: DiscComparison | LineComparison
+            if kind == "circles":
+                discs = compare_frames(reference, found, options)
+                result, error_median = discs, discs.error_median_m
+            else:
+                lines = compare_line_frames(reference, found, options)
+                result, error_median = lines, lines.bearing_median_deg
+            yield Trial(
+                result.reference, result.detected, result.found, result.recall, result.precision,
+                error_median, result.normalised_error.per_dof, tuple(failures),
+            )  # fmt: skip
 
 
 @contextmanager
@@ -145,22 +152,3 @@ def _plan(run: Run, settings: Settings) -> FramePlan:
     if isinstance(settings, CircleSettings):
         return FramePlan(run.camera, circles=settings, working_folder=Path.cwd())
     return FramePlan(run.camera, lines=settings, working_folder=Path.cwd())
-
-
-def _trial(
-    reference: Sequence[Frame],
-    found: Sequence[Frame],
-    gate: CompareOptions | LineCompareOptions,
-    failures: tuple[str, ...],
-) -> Trial:
-    if isinstance(gate, CompareOptions):
-        discs = compare_frames(reference, found, gate)
-        return Trial(
-            discs.reference, discs.detected, discs.matched, discs.recall, discs.precision,
-            discs.error_median_m, discs.normalised_error.per_dof, failures,
-        )  # fmt: skip
-    lines = compare_line_frames(reference, found, gate)
-    return Trial(
-        lines.reference, lines.detected, lines.found, lines.recall, lines.precision,
-        lines.bearing_median_deg, lines.normalised_error.per_dof, failures,
-    )  # fmt: skip

@@ -1,7 +1,4 @@
-"""Trials of settings as a table (CSV), as JSON and as a curve of precision over recall (PNG).
-
-Which of them are worth having, and which is at the curve's knee.
-"""
+"""Trials of settings as a table (CSV), as JSON and as a curve of precision over recall (PNG)."""
 
 from __future__ import annotations
 
@@ -9,17 +6,14 @@ import csv
 import io
 import json
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from detect.report.plot import DATA, MARK, REFERENCE, plotted
+from detect.report.plot import DATA, MARK, REFERENCE, figure_file
 from detect.tune.grid import Combination
 from detect.tune.run import Trial
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 FloatArray = NDArray[np.float64]
 
@@ -41,9 +35,9 @@ def trial_records(
     unit : str
         Of the errors: ends the name of their column.
     """
-    recall, precision = rates(trials)
+    recall, precision = _rates(trials)
     f1 = f1_score(recall, precision)
-    front, best = set(pareto_front(recall, precision).tolist()), knee(recall, precision)
+    front, best = pareto_front(recall, precision), knee(recall, precision)
     return [
         {
             **dict(combination),
@@ -82,13 +76,13 @@ def curve_picture(
     combinations: Sequence[Combination], trials: Sequence[Trial], title: str
 ) -> bytes:
     """Precision over recall as a PNG file: all trials, their front, and the knee."""
-    recall, precision = rates(trials)
+    recall, precision = _rates(trials)
     front, best = pareto_front(recall, precision), knee(recall, precision)
-
-    def draw(figure: Figure) -> None:
+    known = np.flatnonzero(np.isfinite(recall) & np.isfinite(precision))
+    one_varied = len(combinations[0]) == 1
+    with figure_file((6.4, 6.2), "png") as (figure, content):
         axes = figure.subplots()
-        known = np.isfinite(recall) & np.isfinite(precision)
-        if len(combinations[0]) == 1:
+        if one_varied:
             axes.plot(recall[known], precision[known], color=REFERENCE, lw=0.8, zorder=1)
         axes.plot(recall[known], precision[known], "o", color=DATA, ms=4, label="tried", zorder=3)
         axes.plot(
@@ -100,63 +94,39 @@ def curve_picture(
                 recall[best], precision[best], "o", mfc="none", mec=MARK, mew=2.0, ms=13, zorder=4,
                 label=f"knee: {_words(combinations[best])}",
             )  # fmt: skip
-        if known.any():
-            low = _frame_axes(axes, recall[known], precision[known])
-            _f1_lines(axes, low)
-        named = range(len(trials)) if len(trials) <= _MOST_NAMED else sorted({*front.tolist()})
-        for k in list(named)[:: max(1, len(named) // _MOST_NAMED)]:
-            if known[k]:
-                words = _words(combinations[k])
-                if len(combinations[k]) == 1:
-                    words = f"{combinations[k][0][1]}"
-                # Towards the middle, where there is space.
-                left = recall[k] > sum(axes.get_xlim()) / 2.0
-                axes.annotate(
-                    words, (recall[k], precision[k]), xytext=(-7 if left else 7, 5),
-                    textcoords="offset points", ha="right" if left else "left", fontsize=7,
-                )  # fmt: skip
+        if len(known):
+            low = [max(0.0, 1.08 * v.min() - 0.09) for v in (recall[known], precision[known])]
+            axes.set_xlim(low[0], 1.06 - 0.06 * low[0])
+            axes.set_ylim(low[1], 1.06 - 0.06 * low[1])
+            x, y = (np.linspace(max(start, 1e-3), 1.0, 200) for start in low)
+            lines = axes.contour(
+                x, y, f1_score(x, y[:, None]), levels=[0.2, 0.4, 0.6, 0.7, 0.8, 0.9, 0.95],
+                colors="#cccccc", linewidths=0.7, zorder=0,
+            )  # fmt: skip
+            axes.clabel(lines, fmt="F1 %g", fontsize=6, colors=REFERENCE)
+        named = known if len(trials) <= _MOST_NAMED else np.sort(front)
+        for k in named[:: max(1, len(named) // _MOST_NAMED)]:
+            # Towards the middle, where there is space.
+            left = recall[k] > sum(axes.get_xlim()) / 2.0
+            axes.annotate(
+                str(combinations[k][0][1]) if one_varied else _words(combinations[k]),
+                (recall[k], precision[k]), xytext=(-7 if left else 7, 5),
+                textcoords="offset points", ha="right" if left else "left", fontsize=7,
+            )  # fmt: skip
         axes.set_xlabel("recall")
         axes.set_ylabel("precision")
         axes.grid(alpha=0.25, lw=0.6)
         axes.set_title(title, fontsize=10)
         figure.legend(loc="outside lower center", fontsize=8, ncols=1)
+    return content.getvalue()
 
-    return plotted(draw, (6.4, 6.2))
 
-
-def rates(trials: Sequence[Trial]) -> tuple[FloatArray, FloatArray]:
+def _rates(trials: Sequence[Trial]) -> tuple[FloatArray, FloatArray]:
     """(N,) recall and precision, NaN where there is none."""
-    recall, precision = (
-        np.array([np.nan if v is None else v for v in values], dtype=np.float64)
-        for values in ([t.recall for t in trials], [t.precision for t in trials])
+    return (
+        np.array([t.recall for t in trials], dtype=np.float64),
+        np.array([t.precision for t in trials], dtype=np.float64),
     )
-    return recall, precision
-
-
-def _frame_axes(axes: Any, recall: FloatArray, precision: FloatArray) -> tuple[float, float]:
-    """Both axes from a little below the least to 1."""
-    low = []
-    for values, set_limits in ((recall, axes.set_xlim), (precision, axes.set_ylim)):
-        least = float(values.min())
-        start = max(0.0, least - 0.08 * (1.0 - least) - 0.01)
-        set_limits(start, 1.0 + 0.06 * (1.0 - start))
-        low.append(start)
-    return low[0], low[1]
-
-
-def _f1_lines(axes: Any, low: tuple[float, float]) -> None:
-    """Where the harmonic mean of both is the same."""
-    x = np.linspace(max(low[0], 1e-3), 1.0, 200)
-    for f1 in (0.2, 0.4, 0.6, 0.7, 0.8, 0.9, 0.95):
-        with np.errstate(divide="ignore"):
-            y = f1 * x / (2.0 * x - f1)
-        shown = (2.0 * x > f1) & (y <= 1.0) & (y >= low[1])
-        if shown.sum() > 5:
-            axes.plot(x[shown], y[shown], color="#cccccc", lw=0.7, zorder=0)
-            axes.annotate(
-                f"F1 {f1:g}", (x[shown][-1], y[shown][-1]), fontsize=6, color="#777777",
-                ha="right", va="bottom",
-            )  # fmt: skip
 
 
 def _words(combination: Combination) -> str:
@@ -171,8 +141,7 @@ def _rounded(value: float | None) -> float | None:
 def f1_score(recall: ArrayLike, precision: ArrayLike) -> FloatArray:
     """Harmonic mean of recall and precision; 0 where both are, NaN where one is."""
     r, p = np.asarray(recall, np.float64), np.asarray(precision, np.float64)
-    total = r + p
-    return np.asarray(2.0 * r * p / np.where(total > 0.0, total, 1.0) + 0.0 * total)
+    return np.asarray(2.0 * r * p / np.where(r + p == 0.0, 1.0, r + p))
 
 
 def pareto_front(recall: ArrayLike, precision: ArrayLike) -> NDArray[np.intp]:
@@ -192,13 +161,8 @@ def pareto_front(recall: ArrayLike, precision: ArrayLike) -> NDArray[np.intp]:
     known = np.flatnonzero(np.isfinite(r) & np.isfinite(p))
     # By falling recall, then falling precision: points no better than before are dominated.
     order = known[np.lexsort((known, -p[known], -r[known]))]
-    front = []
-    best = -np.inf
-    for k in order:
-        if p[k] > best:
-            front.append(k)
-            best = p[k]
-    return np.array(front[::-1], dtype=np.intp)
+    before = np.maximum.accumulate(np.concatenate([[-np.inf], p[order]]))[:-1]
+    return order[p[order] > before][::-1]
 
 
 def knee(recall: ArrayLike, precision: ArrayLike) -> int | None:
@@ -231,5 +195,5 @@ def knee(recall: ArrayLike, precision: ArrayLike) -> int | None:
         y = (p[front] - p[front[-1]]) / (p[front[0]] - p[front[-1]])
         beyond = x + y - 1.0
         if beyond.max() > 1e-9:
-            return int(front[int(np.argmax(beyond))])
-    return int(front[int(np.argmax(f1_score(r[front], p[front])))])
+            return int(front[np.argmax(beyond)])
+    return int(front[np.argmax(f1_score(r[front], p[front]))])

@@ -11,7 +11,7 @@ import pytest
 
 from detect.comparison.circles import compare_runs
 from detect.comparison.lines import compare_line_runs
-from detect.comparison.result import CompareOptions, Comparison, LineComparison
+from detect.comparison.result import CompareOptions, DiscComparison, LineComparison
 from detect.line_settings import LineSettings
 from detect.run import open_run
 from detect.runs.frame import FramePlan
@@ -38,7 +38,7 @@ def detected(
     )
 
 
-def redetected(run: Path, settings: CircleSettings, folder: Path) -> Comparison:
+def redetected(run: Path, settings: CircleSettings, folder: Path) -> DiscComparison:
     output = folder / "detected.circles"
     summary = detected(run, settings, output)
     assert summary.failures == []

@@ -365,7 +365,7 @@ def test_settings_without_sense_are_refused(name: str, value: object) -> None:
 def test_drawn_lines_lie_on_the_edges() -> None:
     image = np.full((160, 240), 90, np.uint8)
     found = detect_lines(scene(CAMERA), TABLE)
-    picture = draw_lines(image, CAMERA, TABLE, found)
+    picture = draw_lines(image, CAMERA, found)
     green = (picture[..., 1] > 150) & (picture[..., 2] < 120)
     rows = np.arange(40, 120)
     for bearing in truth():
@@ -379,10 +379,9 @@ def test_drawn_tracks_name_their_fates() -> None:
     found = detect_lines(image, TABLE)
     picture = draw_tracks(image, TABLE, found)
     assert picture.shape[0] > 160
-    kept = draw_tracks(image, TABLE, found, rejected=False, reasons=False)
     track = found.members[0][0]
     pixels = np.rint(track_pixels(found.tracks, TABLE, track)).astype(int)
-    assert np.all(kept[pixels[:, 1], pixels[:, 0]] == [60, 220, 60])
+    assert np.all(picture[pixels[:, 1], pixels[:, 0]] == [60, 220, 60])
 
 
 def test_drawn_response_shows_polarity() -> None:

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from detect.comparison.circles import Beside, compare_frames, compare_runs
 from detect.comparison.report import format_json
-from detect.comparison.result import CompareError, CompareOptions, Comparison, unmet_demands
+from detect.comparison.result import CompareError, CompareOptions, DiscComparison, unmet_demands
 from detect.sources.image_names import image_name
 from landmarks import CircleLandmark, Frame, LandmarkFileError, Step, write_frames
 from tests.detect.comparison.formatting import format_text
@@ -34,7 +34,7 @@ def frame(name: str, *discs: CircleLandmark) -> Frame:
 
 def compare(
     reference: Sequence[Frame], detected: Sequence[Frame], options: CompareOptions = STANDARD
-) -> Comparison:
+) -> DiscComparison:
     return compare_frames(reference, detected, options)
 
 
@@ -169,9 +169,9 @@ def test_the_gate_is_a_distance_or_sigmas_of_the_reference() -> None:
 
 @pytest.mark.parametrize("gate", [0.0, -1.0, float("nan"), float("inf")])
 def test_gates_must_be_positive(gate: float) -> None:
-    with pytest.raises(CompareError, match=r"gate_m is .*: expected a positive number"):
+    with pytest.raises(CompareError, match=r"gate_m is .*: expected above 0"):
         CompareOptions(gate_m=gate)
-    with pytest.raises(CompareError, match=r"sigma is .*: expected a positive number"):
+    with pytest.raises(CompareError, match=r"sigma is .*: expected above 0"):
         CompareOptions(sigma=gate)
 
 
@@ -268,8 +268,8 @@ def test_worst_frames_come_first() -> None:
     worst = found.worst_frames(3)
     assert [score.name for score in worst] == ["worst", "bad", "far"]
     assert (worst[0].matched, worst[0].missed, worst[0].extra) == (0, 2, 1)
-    assert worst[0].largest_error_m is None
-    assert worst[2].largest_error_m == pytest.approx(0.09)
+    assert worst[0].largest_error is None
+    assert worst[2].largest_error == pytest.approx(0.09)
 
 
 @pytest.mark.parametrize(
@@ -319,8 +319,15 @@ def test_json_has_the_figures_in_a_fixed_order() -> None:
 
 def test_text_shows_the_figures_plainly() -> None:
     text = format_text(compare(REFERENCE, DETECTED))
-    assert "recall             0.8000" in text
-    assert "within 0.1 m       4 matched, 1 missed, 1 extra" in text
+    lines = [" ".join(line.split()) for line in text.splitlines()]
+    assert lines[:5] == [
+        "found 4 of 5 reference rows",
+        "missed 1 of 5 reference rows",
+        "clutter 1 of 5 detected rows: on no reference row (look-alikes are not known)",
+        "recall 0.8000",
+        "precision 0.8000",
+    ]
+    assert "same disc on the floor, within 0.1 m" in lines
     (middle,) = (line for line in text.splitlines() if line.strip().startswith("2-2.5"))
     assert " ".join(middle.split()) == "2-2.5 1 1 0.000 1 1 0.000 - 0.920 0.600 -0.320"
     assert "\x1b" not in text

@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from camera import Camera
 from detect.circles import CircleDetections
 from detect.cli import main
-from detect.comparison.circles import Sight, compare_frames
+from detect.comparison.circles import compare_frames
 from detect.comparison.report import format_json
-from detect.comparison.result import CompareOptions, Comparison
+from detect.comparison.result import CompareOptions, DiscComparison
 from detect.levelling import level_positions, levelled
-from detect.seen import image_positions, level_seen
+from detect.seen import Sight, image_positions, level_seen
 from landmarks import (
     CircleLandmark,
     Frame,
@@ -65,7 +65,7 @@ def leaning_run(
     return raw, level
 
 
-def compare(camera: Camera, raw: list[Frame], level: list[Frame]) -> Comparison:
+def compare(camera: Camera, raw: list[Frame], level: list[Frame]) -> DiscComparison:
     return compare_frames(raw, level, CompareOptions(), sight=Sight(camera))
 
 

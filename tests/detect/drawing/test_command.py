@@ -12,15 +12,15 @@ from numpy.typing import NDArray
 from camera import Camera
 from detect.circles import CircleDetections
 from detect.cli import main
-from detect.comparison.result import CompareOptions, LineCompareOptions
+from detect.comparison.result import CompareOptions
 from detect.drawing.frame import draw_rows, line_curves, sigma_bars
 from detect.drawing.inputs import SeenRows, read_head, select_frames
 from detect.errors import DetectError
 from detect.levelling import level_positions
 from detect.run import open_images
-from detect.seen import image_positions
+from detect.seen import Sight, image_positions
 from detect.settings import CircleSettings
-from landmarks import CircleLandmark, FrameTilt, LineLandmark, circle_landmarks
+from landmarks import CircleLandmark, Frame, FrameTilt, LineLandmark, Step, circle_landmarks
 from tests.detect.drawing.test_detections import changed
 from tests.detect.test_cli import assert_refused
 
@@ -28,7 +28,8 @@ Captured = pytest.CaptureFixture[str]
 FloatArray = NDArray[np.float64]
 
 SETTINGS = CircleSettings()
-GATE, LINE_GATE = CompareOptions(), LineCompareOptions()
+OPTIONS = CompareOptions()
+STEP = Step("x.0001", *[0.0] * 9)
 
 
 def discs(*places: tuple[float, float]) -> tuple[CircleLandmark, ...]:
@@ -98,12 +99,13 @@ def test_matched_extra_and_missed_have_colours_of_their_own(
     image: NDArray[np.uint8], published_camera: Camera
 ) -> None:
     rows = SeenRows(
-        circles=discs((0.2, -1.3), (-0.6, -1.5)),
-        reference_circles=discs((0.21, -1.3), (0.7, -1.6)),
-        lines=(vertical(published_camera, 0.3, 0.002),),
-        reference_lines=(vertical(published_camera, -0.4, 0.002),),
+        circles=Frame(STEP, discs((0.2, -1.3), (-0.6, -1.5), (0.0, -2.0))),
+        reference_circles=Frame(STEP, discs((0.21, -1.3), (0.7, -1.6))),
+        unlisted=Frame(STEP, discs((0.0, -2.0))),
+        lines=Frame(STEP, (vertical(published_camera, 0.3, 0.002),)),
+        reference_lines=Frame(STEP, (vertical(published_camera, -0.4, 0.002),)),
     )
-    canvas = draw_rows(image, published_camera, rows, SETTINGS, GATE, LINE_GATE, "x.0001")
+    canvas = draw_rows(image, Sight(published_camera), rows, SETTINGS, OPTIONS, "x.0001")
     assert canvas.shape[0] > 288
     assert canvas[288:].any()
 
@@ -114,6 +116,7 @@ def test_matched_extra_and_missed_have_colours_of_their_own(
     project = published_camera.project_floor
     for centre, expected in (
         ((0.2, -1.3), (0, 170, 255)),
+        ((0.0, -2.0), (0, 170, 255)),
         ((-0.6, -1.5), (255, 60, 255)),
         ((0.7, -1.6), (60, 60, 255)),
     ):
@@ -134,8 +137,8 @@ def test_without_reference_nothing_is_missed_or_extra(
 ) -> None:
     from detect.drawing.frame import draw_circles
 
-    rows = SeenRows(circles=discs((0.2, -1.3)))
-    canvas = draw_rows(image, published_camera, rows, SETTINGS, GATE, LINE_GATE)
+    rows = SeenRows(circles=Frame(STEP, discs((0.2, -1.3))))
+    canvas = draw_rows(image, Sight(published_camera), rows, SETTINGS, OPTIONS)
     found = CircleDetections(
         np.zeros((1, 2), np.int64), np.array([[0.2, -1.3]]), np.eye(2)[None], np.array([0.9]),
         np.array([1.0]),
@@ -172,7 +175,7 @@ def test_frames_are_selected(
 ) -> None:
     frames = open_images(small_run).frames
     selection = select_frames(frames, wanted, every)
-    assert [position for position, _ in selection.of(frames)] == expected
+    assert [position for position, _ in selection] == expected
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shutil
 import subprocess
+from collections.abc import Sequence
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -12,29 +13,22 @@ import numpy as np
 import pytest
 
 from detect.cli import main
-from detect.comparison.circles import Sight, compare_frames, compare_runs
+from detect.comparison.circles import Beside, compare_frames, compare_runs
 from detect.comparison.lines import compare_line_frames
-from detect.comparison.result import CompareOptions, LineCompareOptions
+from detect.comparison.result import CompareOptions, DiscComparison, LineComparison
 from detect.drawing.inputs import read_head
 from detect.line_settings import PUBLISHED as PUBLISHED_LINES
-from detect.report.figures import binned
-from detect.report.statistics import (
-    FramePair,
-    Residuals,
-    disc_rates,
-    disc_residuals,
-    line_rates,
-    line_residuals,
-    normality,
-)
+from detect.report.statistics import binned, disc_rates, line_rates, whitened
 from detect.run import camera_in
-from landmarks import CircleLandmark, Frame, LineLandmark, Step
+from detect.seen import Sight
+from landmarks import CircleLandmark, Frame, Landmark, LineLandmark, Step
 from tests.detect.test_cli import assert_refused
 
 Captured = pytest.CaptureFixture[str]
 
 GATE = CompareOptions(gate_m=0.1)
-LINE_GATE = LineCompareOptions(tolerance_deg=0.5, sigmas=2.0)
+Discs = list[tuple[list[CircleLandmark], list[CircleLandmark]]]
+Lines = list[tuple[list[LineLandmark], list[LineLandmark]]]
 
 
 def disc(x: float, y: float, quality: float = 0.9) -> CircleLandmark:
@@ -45,20 +39,35 @@ def line(alpha: float, sigma: float) -> LineLandmark:
     return LineLandmark(0.0, -0.5, 0.0, 0.2, alpha, 0.0, 0.0, sigma, (-1,))
 
 
+def frames(
+    pairs: Sequence[tuple[Sequence[Landmark], Sequence[Landmark]]], side: int
+) -> list[Frame]:
+    return [Frame(Step(f"e.{k}", *[0.0] * 9), tuple(pair[side])) for k, pair in enumerate(pairs)]
+
+
+def compared(pairs: Discs, options: CompareOptions = GATE) -> DiscComparison:
+    """Discs of frames: reference and detected rows of each."""
+    return compare_frames(frames(pairs, 0), frames(pairs, 1), options)
+
+
+def compared_lines(pairs: Lines) -> LineComparison:
+    return compare_line_frames(frames(pairs, 0), frames(pairs, 1))
+
+
 # -- rates over thresholds --------------------------------------------------------------------
 
 
 def test_rates_of_a_case_made_by_hand() -> None:
-    frames = [
+    discs = [
         # Both rows fit the first disc; the better one takes it until the threshold is above it.
-        FramePair(
+        (
             [disc(0.0, -1.0), disc(1.0, -1.0)],
             [disc(0.01, -1.0, 0.5), disc(0.05, -1.0, 0.8), disc(2.0, -2.0, 0.7)],
         ),
-        FramePair([disc(0.0, -3.0)], [disc(0.0, -3.02, 0.95)]),
-        FramePair([], [disc(0.5, -1.5, 0.6)]),
+        ([disc(0.0, -3.0)], [disc(0.0, -3.02, 0.95)]),
+        ([], [disc(0.5, -1.5, 0.6)]),
     ]
-    curve = disc_rates(frames, GATE, [0.4, 0.55, 0.65, 0.75, 0.9, 0.99])
+    curve = disc_rates(compared(discs), [0.4, 0.55, 0.65, 0.75, 0.9, 0.99])
     assert curve.kept.tolist() == [5, 4, 3, 2, 1, 0]
     np.testing.assert_allclose(curve.recall, [2 / 3, 2 / 3, 2 / 3, 2 / 3, 1 / 3, 0.0])
     np.testing.assert_allclose(curve.precision, [2 / 5, 2 / 4, 2 / 3, 1.0, 1.0, np.nan])
@@ -67,71 +76,66 @@ def test_rates_of_a_case_made_by_hand() -> None:
 def test_rates_of_verticals_count_joined_ones_as_comparing_does() -> None:
     wanted = [line(0.0, 0.001), line(0.004, 0.001), line(0.5, 0.001), line(-0.5, 0.001)]
     found = [line(0.001, 0.01), line(0.502, 0.002), line(1.0, 0.004)]
-    curve = line_rates([FramePair(wanted, found)], LINE_GATE, [0.003, 0.005, 0.02])
-    # The wide one stands for both lines that it covers.
+    result = compared_lines([(wanted, found)])
+    curve = line_rates(result, [0.003, 0.005, 0.02])
+    # The wide one represents both lines that it covers.
     np.testing.assert_allclose(curve.recall, [1 / 4, 1 / 4, 3 / 4])
     np.testing.assert_allclose(curve.precision, [1.0, 1 / 2, 2 / 3])
-    step = Step("a", *[0.0] * 9)
-    result = compare_line_frames(
-        [Frame(step, tuple(wanted))], [Frame(step, tuple(found))], LINE_GATE
-    )
+    np.testing.assert_allclose(curve.threshold, np.degrees([0.003, 0.005, 0.02]))
     assert (result.recall, result.precision) == (curve.recall[-1], curve.precision[-1])
 
 
+def test_rows_set_aside_are_not_kept() -> None:
+    """At the least threshold, the rates are those of the comparison."""
+    discs: Discs = [([disc(0.0, -1.0)], [disc(0.0, -1.0, 0.5), disc(1.0, -2.0, 0.8)])]
+    unlisted = (Frame(Step("e.0", *[0.0] * 9), (disc(1.0, -2.0),)),)
+    result = compare_frames(frames(discs, 0), frames(discs, 1), GATE, beside=Beside(unlisted))
+    curve = disc_rates(result, [0.4, 0.7])
+    assert curve.kept.tolist() == [1, 0]
+    np.testing.assert_allclose(curve.precision, [1.0, np.nan])
+
+
 def test_without_rows_there_are_no_rates() -> None:
-    curve = disc_rates([FramePair([], [])], GATE, [0.5])
+    curve = disc_rates(compared([([], [])]), [0.5])
     assert np.isnan(curve.recall).all()
     assert np.isnan(curve.precision).all()
-
-
-def residuals_of(frames: list[FramePair[CircleLandmark]], gate: CompareOptions) -> Residuals:
-    steps = [Step(f"e.{k}", *[0.0] * 9) for k in range(len(frames))]
-    reference = [Frame(step, tuple(pair.reference)) for step, pair in zip(steps, frames)]
-    detected = [Frame(step, tuple(pair.detected)) for step, pair in zip(steps, frames)]
-    return disc_residuals(compare_frames(reference, detected, gate).pairs)
 
 
 # -- residuals --------------------------------------------------------------------------------
 
 
 def test_whitened_residuals_are_the_mahalanobis_distance() -> None:
-    residuals = residuals_of([FramePair([disc(0.3, -1.0)], [disc(0.32, -1.05)])], GATE)
+    residuals = whitened(compared([([disc(0.3, -1.0)], [disc(0.32, -1.05)])]))
     covariance = np.array([[4e-4, 1e-4], [1e-4, 9e-4]])
     offset = np.array([0.02, -0.05])
-    np.testing.assert_allclose(
-        (residuals.whitened**2).sum(), offset @ np.linalg.solve(covariance, offset)
-    )
-    np.testing.assert_allclose(residuals.error, np.hypot(*offset))
-    # To the left of forward is positive.
-    np.testing.assert_allclose(residuals.bearing_rad, np.arctan2(0.3, 1.0))
+    np.testing.assert_allclose((residuals**2).sum(), offset @ np.linalg.solve(covariance, offset))
 
 
 def test_errors_drawn_from_the_covariance_are_standard_normal() -> None:
     rng = np.random.default_rng(5)
     factor = np.linalg.cholesky(np.array([[4e-4, 1e-4], [1e-4, 9e-4]]))
-    frames = []
+    discs = []
     for _ in range(2000):
         dx, dy = factor @ rng.standard_normal(2)
-        frames.append(FramePair([disc(0.0, -2.0)], [disc(dx, -2.0 + dy)]))
-    residuals = residuals_of(frames, CompareOptions(gate_m=1.0))
-    figures = normality(residuals.whitened)
-    assert figures is not None
-    assert figures.count == 4000
+        discs.append(([disc(0.0, -2.0)], [disc(dx, -2.0 + dy)]))
+    residuals = whitened(compared(discs, CompareOptions(gate_m=1.0)))
+    assert len(residuals) == 4000
     # Four standard deviations of these figures.
-    assert abs(figures.mean) < 4.0 / np.sqrt(4000)
-    assert abs(figures.deviation - 1.0) < 4.0 / np.sqrt(8000)
-    assert figures.within == pytest.approx((0.683, 0.954, 0.997), abs=0.03)
+    assert abs(residuals.mean()) < 4.0 / np.sqrt(4000)
+    assert abs(residuals.std() - 1.0) < 4.0 / np.sqrt(8000)
+    within = [np.mean(np.abs(residuals) <= k) for k in (1, 2, 3)]
+    assert within == pytest.approx([0.683, 0.954, 0.997], abs=0.03)
 
 
 def test_residuals_of_bearings_are_wrapped_and_need_a_sigma() -> None:
-    frames = [
-        FramePair([line(3.141, 0.01)], [line(-3.141, 0.002)]),
-        FramePair([line(0.1, 0.01)], [line(0.101, 0.0)]),
+    lines = [
+        ([line(3.141, 0.01)], [line(-3.141, 0.002)]),
+        ([line(0.1, 0.01)], [line(0.101, 0.0)]),
     ]
-    residuals = line_residuals(frames, LINE_GATE)
-    np.testing.assert_allclose(residuals.error, [2 * np.pi - 6.282, 0.001], atol=1e-12)
-    np.testing.assert_allclose(residuals.whitened, [(2 * np.pi - 6.282) / 0.002])
-    assert normality(residuals.whitened[:0]) is None
+    result = compared_lines(lines)
+    np.testing.assert_allclose(result.pairs.error_rad, [2 * np.pi - 6.282, 0.001], atol=1e-12)
+    np.testing.assert_allclose(whitened(result), [(2 * np.pi - 6.282) / 0.002])
+    assert not len(whitened(compared_lines([([], [])])))
 
 
 def test_bins_are_of_equally_many() -> None:
@@ -253,6 +257,32 @@ def test_page_without_reference_shows_some_frames(small_run: Path, tmp_path: Pat
     changed = [attributes for attributes in page.of("tr") if attributes.get("class") == "changed"]
     assert len(changed) == 1
     assert "threshold 0.4 0.5" in words
+
+
+def test_page_of_one_frame_has_no_empty_figure(judged_run: Path, tmp_path: Path) -> None:
+    """Nothing is drawn over frames, or over thresholds that are all the same."""
+    for name in ("s.0001.png", "s.0002.png"):
+        (judged_run / "images" / name).unlink()
+    steps = (judged_run / "s.txt").read_text().splitlines(keepends=True)
+    (judged_run / "s.txt").write_text("".join(steps[:2]))
+    for ending in ("lines", "tilt"):
+        (judged_run / f"detected.{ending}").write_text("STEP s.0000 0 0 0 0 0 0 0 0 0\n")
+    (judged_run / "detected.tilt").write_text("TILT s.0000 0.01 0.02 1e-6 0 1e-6 9\n")
+    (judged_run / "detected.circles").write_text(
+        "STEP s.0000 0 0 0 0 0 0 0 0 0\nLANDMARK_C 0.1 -1.2 0.9 1e-4 0 1e-4 1\n"
+    )
+    page = reported(judged_run, tmp_path / "r.html")
+    figures = [image["alt"] or "" for image in page.of("img")]
+    assert [words.split(",")[0].split(" (")[0] for words in figures] == [
+        "Rows",
+        "Where on the floor the two sides put the same disc",
+        "Residuals in units of the covariance that the rows state",
+        "1 of the 1 reference rows that are missing",
+        "Frame s.0000",
+    ]
+    words = " ".join(" ".join(page.words).split())
+    assert "0.9 (knee) 1 0.500 1.000" in words
+    assert "1 of 1 frames; 9 verticals agree" in words
 
 
 def test_timing_is_measured_if_asked_for(judged_run: Path, tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ import json
 from collections.abc import Callable, Iterator
 from concurrent.futures import BrokenExecutor, Executor, Future
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,7 @@ from detect.runs.dispatch import Workers
 from detect.runs.frame import FramePlan
 from detect.runs.workers import local_workers
 from detect.settings import CircleSettings
-from detect.tune.grid import combinations, parameter_values, settings_with
+from detect.tune.grid import combinations, parameter_values
 from detect.tune.run import Trial, tune_run
 from detect.tune.table import curve_picture, f1_score, knee, pareto_front, trial_records
 from landmarks import read_frames
@@ -129,7 +130,7 @@ def test_values_that_are_none_are_refused(kind: type, name: str, text: str, says
 
 def test_all_combinations_are_tried() -> None:
     grid = combinations(CircleSettings, {"threshold": "0.4,0.5", "samples": "8,16"}, 4)
-    assert [settings_with(CircleSettings(), c) for c in grid] == [
+    assert [replace(CircleSettings(), **dict(c)) for c in grid] == [
         CircleSettings(threshold=t, samples=s) for t in (0.4, 0.5) for s in (8, 16)
     ]
     with pytest.raises(DetectError, match="4 combinations: expected at most 3"):
@@ -229,9 +230,8 @@ class Mortal(Executor):
 @pytest.mark.parametrize("lives", [[9], [0, 9], [1, 9], [3, 9], [4, 0, 1, 9]])
 def test_workers_that_died_are_replaced(small_run: Path, lives: list[int]) -> None:
     run = open_run(small_run)
-    frames = list(run.frames)
     write_reference(small_run, SMALL_RUN_DISCS)
-    reference = list(read_frames(small_run / "map.circles"))
+    frames = list(zip(run.frames, read_frames(small_run / "map.circles")))
     settings = [CircleSettings(), CircleSettings(threshold=0.999)]
     crews: list[Mortal] = []
 
@@ -241,7 +241,7 @@ def test_workers_that_died_are_replaced(small_run: Path, lives: list[int]) -> No
         yield crews[-1]
 
     def trials(workers: Workers) -> list[Trial]:
-        return list(tune_run(run, frames, reference, settings, CompareOptions(), workers))
+        return list(tune_run(run, frames, settings, CompareOptions(), workers))
 
     found = trials(Workers(start, chunk=1, window=lambda: 1))
     assert found == trials(local_workers(1))
