@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.comparison.figures import fraction, normalised_error, quantile
+from detect.comparison.figures import normalised_error, quantile
 from detect.comparison.floor import floor_bins, floor_pairs
 from detect.comparison.matching import (
     FLOOR_GATE_M,
@@ -35,10 +35,9 @@ from detect.comparison.result import (
 )
 from detect.seen import Sight
 from detect.sources.image_names import image_name
-from landmarks import CircleLandmark, Frame, circle_arrays, read_frames
+from landmarks import CircleArrays, Frame, circle_arrays, read_frames
 
 FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 # The forward distances for which the data set's own qualities are known.
 _EDGES_M = (-inf, 0.8, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, inf)
@@ -150,12 +149,11 @@ def compare_frames(
     view_of = None if sight is None else sight.of
     common = match_runs("circles", wanted, found, options, names, view_of, unlisted)
     matches = common.frames
-    sides = (
-        _side([match.reference for match in matches], [match.pairs.first for match in matches]),
-        _side([match.detected for match in matches], [match.pairs.second for match in matches]),
-    )
-    first, second = (
-        circle_arrays([row for match in matches for row in match.paired[side]]) for side in (0, 1)
+    first, second, missed, extra = sides = (
+        circle_arrays([row for m in matches for row in m.paired[0]]),
+        circle_arrays([row for m in matches for row in m.paired[1]]),
+        circle_arrays([row for m in matches for row in m.missed]),
+        circle_arrays([row for m in matches for row in m.extra]),
     )
     covariance = {
         "detected": second.covariance,
@@ -167,7 +165,7 @@ def compare_frames(
         first.xy,
         second.xy,
         covariance,
-        np.repeat(np.arange(len(matches)), [match.matched for match in matches]),
+        np.repeat(np.arange(len(matches)), [len(match.matched) for match in matches]),
     )
     apart = [] if sight is None else [apart_px(match) for match in matches]
     image_px = np.concatenate([np.zeros(0), *apart])
@@ -181,64 +179,45 @@ def compare_frames(
         error_median_m=quantile(error_m),
         error_95_m=quantile(error_m, 0.95),
         normalised_error=normalised_error(pairs.offset, covariance),
-        reference_quality_matched=quantile(sides[0].quality[sides[0].paired]),
-        reference_quality_missed=quantile(sides[0].quality[~sides[0].paired]),
-        detected_quality_matched=quantile(sides[1].quality[sides[1].paired]),
-        detected_quality_extra=quantile(sides[1].quality[~sides[1].paired]),
-        bins=tuple(_distance_bin(ends, *sides, -first.xy[:, 1], error_m) for ends in ranges),
+        reference_quality_matched=quantile(first.quality),
+        reference_quality_missed=quantile(missed.quality),
+        detected_quality_matched=quantile(second.quality),
+        detected_quality_extra=quantile(extra.quality),
+        bins=tuple(_distance_bin(ends, sides, error_m) for ends in ranges),
         in_image=in_image,
         image_median_px=quantile(image_px),
         image_95_px=quantile(image_px, 0.95),
-        reference_levelling=_levelling([m.name for m in matches], wanted, true=true),
-        detected_levelling=_levelling([m.name for m in matches], found),
+        reference_levelling=_levelling(matches, wanted, true=true),
+        detected_levelling=_levelling(matches, found),
         floor=floor_bins(pairs, lean, ranges),
         lean=lean,
         pairs=pairs,
     )
 
 
-class _Side(NamedTuple):
-    """All rows of one side that count, and which of them are in pairs."""
-
-    forward_m: FloatArray
-    quality: FloatArray
-    paired: BoolArray
-
-
-def _side(frames: Sequence[Sequence[CircleLandmark]], paired: Sequence[NDArray[np.intp]]) -> _Side:
-    arrays = circle_arrays([row for rows in frames for row in rows])
-    inside = [np.isin(np.arange(len(rows)), where) for rows, where in zip(frames, paired)]
-    return _Side(-arrays.xy[:, 1], arrays.quality, np.concatenate([np.zeros(0, bool), *inside]))
-
-
 def _distance_bin(
-    range_m: tuple[float, float],
-    reference: _Side,
-    detected: _Side,
-    pair_forward_m: FloatArray,
-    error_m: FloatArray,
+    range_m: tuple[float, float], sides: tuple[CircleArrays, ...], error_m: FloatArray
 ) -> DistanceBin:
+    """The bin of a range; `sides` are matched reference and detected rows, missed and extra."""
     from_m, to_m = range_m
-    wanted, found, pairs = (
-        (from_m <= forward) & (forward < to_m)
-        for forward in (reference.forward_m, detected.forward_m, pair_forward_m)
-    )
-    qualities = quantile(reference.quality[wanted]), quantile(detected.quality[found])
+    inside = [(from_m <= -side.xy[:, 1]) & (-side.xy[:, 1] < to_m) for side in sides]
+    first, second, missed, extra = (int(mask.sum()) for mask in inside)
+    qualities = [side.quality[mask] for side, mask in zip(sides, inside)]
+    wanted = quantile(np.concatenate([qualities[0], qualities[2]]))
+    found = quantile(np.concatenate([qualities[1], qualities[3]]))
     return DistanceBin(
         from_m=from_m if isfinite(from_m) else None,
         to_m=to_m if isfinite(to_m) else None,
-        reference=int(wanted.sum()),
-        missed=int((wanted & ~reference.paired).sum()),
-        detected=int(found.sum()),
-        extra=int((found & ~detected.paired).sum()),
-        recall=fraction(reference.paired[wanted]),
-        precision=fraction(detected.paired[found]),
-        reference_quality_median=qualities[0],
-        detected_quality_median=qualities[1],
-        error_median_m=quantile(error_m[pairs]),
-        quality_difference=None
-        if qualities[0] is None or qualities[1] is None
-        else qualities[1] - qualities[0],
+        reference=first + missed,
+        missed=missed,
+        detected=second + extra,
+        extra=extra,
+        recall=first / (first + missed) if first + missed else None,
+        precision=second / (second + extra) if second + extra else None,
+        reference_quality_median=wanted,
+        detected_quality_median=found,
+        error_median_m=quantile(error_m[inside[0]]),
+        quality_difference=None if wanted is None or found is None else found - wanted,
     )
 
 
@@ -250,16 +229,16 @@ def _on_lookalikes(
         return None
     known = {image_name(frame.step.prefix): frame.circles for frame in beside.lookalikes}
     return sum(
-        len(pair_discs(known[m.name], m.extra_rows, options, m.frame.view).first)
+        len(pair_discs(known[m.frame.name], m.extra, options, m.frame.view).first)
         for m in matches
-        if m.name in known
+        if m.frame.name in known
     )
 
 
 def _levelling(
-    images: Sequence[str], frames: Mapping[str, Frame], *, true: bool = False
+    matches: Sequence[FrameMatch], frames: Mapping[str, Frame], *, true: bool = False
 ) -> Levelling:
-    by = [frames[name].levelled_by for name in images if name in frames]
+    by = [frames[m.frame.name].levelled_by for m in matches if m.frame.name in frames]
     tilts = np.degrees([tilt for tilt in by if tilt is not None]).reshape(-1, 2)
     medians = (quantile(tilts[:, 0]), quantile(tilts[:, 1]))
-    return Levelling(len(images), len(tilts), true and not len(tilts), *medians)
+    return Levelling(len(matches), len(tilts), true and not len(tilts), *medians)

@@ -17,11 +17,6 @@ def quantile(values: FloatArray, q: float = 0.5) -> float | None:
     return float(np.quantile(values, q)) if len(values) else None
 
 
-def fraction(mask: NDArray[np.bool_]) -> float | None:
-    """Share of `mask` that is true."""
-    return float(mask.mean()) if len(mask) else None
-
-
 def normalised_error(offset: FloatArray, covariance: FloatArray) -> NormalisedError:
     """Mean of squared normalised errors, with the central 95 % of the chi-square distribution.
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import isfinite
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,36 +27,20 @@ _LEAST_FRAMES = 10
 _LARGEST_CONDITION = 1e10
 
 
-class Lean(NamedTuple):
-    """Pitch, roll (rad) and height (m) that turn reference into detected positions; deviations."""
-
-    value: FloatArray
-    sigma: FloatArray
-
-
 def common_lean(
     camera: Camera,
     reference_xy: FloatArray,
     detected_xy: FloatArray,
     frame: NDArray[np.int64],
-) -> Lean | None:
+) -> tuple[FloatArray, FloatArray] | None:
     """Fit the lean to matched rows: robust least squares of their differences in the image.
 
     There all rows are known about equally well; on the floor, far ones would outweigh all others.
-    Standard deviations come from how frames differ, as errors within one may be common to its rows.
+    `frame` (N,) says which frame each pair (N, 2) is of: standard deviations come from how frames
+    differ, as errors within one may be common to its rows.
 
-    Parameters
-    ----------
-    camera : Camera
-    reference_xy, detected_xy : (N, 2) float64
-        Positions of matched rows, metres.
-    frame : (N,) int64
-        Which frame each pair is of.
-
-    Returns
-    -------
-    Lean or None
-        None if the rows are too few or do not determine it.
+    Returns pitch, roll (rad) and height (m) that turn reference into detected positions, and their
+    standard deviations; None if the rows are too few or do not determine them.
     """
     seen = image_positions(camera, reference_xy)
     usable = np.isfinite(seen + image_positions(camera, detected_xy)).all(axis=1)
@@ -86,7 +69,7 @@ def common_lean(
         covariance = inverse @ (pull.T @ pull) @ inverse * frames / (frames - 1)
     else:
         covariance = inverse * (weight * residual**2).sum() / max(len(residual) - 3, 1)
-    return Lean(lean, np.sqrt(np.diag(covariance)))
+    return lean, np.sqrt(np.diag(covariance))
 
 
 def floor_pairs(
@@ -101,30 +84,25 @@ def floor_pairs(
     Parameters as of `common_lean`; `covariance` (N, 2, 2) is what errors are measured in, m^2.
     """
     offset = detected_xy - reference_xy
-    lean = None if camera is None else common_lean(camera, reference_xy, detected_xy, frame)
-    left, centre = offset, np.zeros(2) if camera is None else camera.centre[:2]
-    if camera is not None and lean is not None:
-        pitch, roll, raised_m = lean.value.tolist()
-        left = detected_xy - level_seen(camera, reference_xy, (pitch, roll), raised_m)
-    away = reference_xy - centre
+    away = reference_xy - (np.zeros(2) if camera is None else camera.centre[:2])
     away = away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)
-    pairs = DiscPairs(reference_xy, offset, left, covariance, away)
-    if lean is None:
-        return None, pairs
+    lean = None if camera is None else common_lean(camera, reference_xy, detected_xy, frame)
+    if camera is None or lean is None:
+        return None, DiscPairs(reference_xy, offset, offset, covariance, away)
+    value, sigma = lean
+    left = detected_xy - level_seen(camera, reference_xy, (value[0], value[1]), value[2])
     seen = np.isfinite(left).all(axis=1)
-    pitch, roll, _ = np.degrees(lean.value).tolist()
-    pitch_sigma, roll_sigma, _ = np.degrees(lean.sigma).tolist()
     common = CommonLean(
-        pitch_deg=pitch,
-        pitch_sigma_deg=pitch_sigma,
-        roll_deg=roll,
-        roll_sigma_deg=roll_sigma,
-        raised_m=float(lean.value[2]),
-        raised_sigma_m=float(lean.sigma[2]),
+        pitch_deg=float(np.degrees(value[0])),
+        pitch_sigma_deg=float(np.degrees(sigma[0])),
+        roll_deg=float(np.degrees(value[1])),
+        roll_sigma_deg=float(np.degrees(sigma[1])),
+        raised_m=float(value[2]),
+        raised_sigma_m=float(sigma[2]),
         left=_difference(left, away),
         normalised_error=normalised_error(left[seen], covariance[seen]),
     )
-    return common, pairs
+    return common, DiscPairs(reference_xy, offset, left, covariance, away)
 
 
 def floor_bins(

@@ -48,13 +48,7 @@ _line_order = attrgetter("alpha", "sigma", "beta", "xtop", "ytop", "xbottom", "y
 
 
 def frames_by_image(frames: Iterable[Frame], name: str) -> dict[str, Frame]:
-    """Frames by the names of their images; `name` is what errors call the run.
-
-    Raises
-    ------
-    CompareError
-        If an image has two frames.
-    """
+    """Frames by the names of their images; CompareError calls the run `name` if one has two."""
     by_image: dict[str, Frame] = {}
     for frame in frames:
         image = image_name(frame.step.prefix)
@@ -87,10 +81,22 @@ def match_runs(
         view = None if view_of is None else view_of(*frames)
         pair = pair_of(kind, name, *frames, (unlisted or {}).get(name), view)
         matches.append(match_frame(pair, options))
+    counts: dict[str, Any] = {
+        name: sum(len(getattr(match, name)) for match in matches)
+        for name in ("matched", "joined", "missed", "extra", "set_aside")
+    }
+    found, detected_rows = counts["matched"] + counts["joined"], counts["matched"] + counts["extra"]
+    wanted = found + counts["missed"]
     return Comparison(
         *names,
         options,
-        tuple(matches),
+        reference=wanted,
+        detected=detected_rows,
+        found=found,
+        **counts,
+        recall=found / wanted if wanted else None,
+        precision=counts["matched"] / detected_rows if detected_rows else None,
+        frames=tuple(matches),
         frames_only_in_reference=tuple(name for name in reference if name not in detected),
         frames_only_in_detected=tuple(name for name in detected if name not in reference),
     )
@@ -116,21 +122,9 @@ def pair_of(
 def match_frame(frame: FramePair, options: CompareOptions) -> FrameMatch:
     """Match the rows of one frame one to one.
 
-    Parameters
-    ----------
-    frame : FramePair
-    options : CompareOptions
-        Which rows are the same landmark. Detected rows that fit an unlisted disc (or a reference
-        row without ID, if these do not count), and no reference row that counts, are set aside.
-
-    Returns
-    -------
-    FrameMatch
-
-    Raises
-    ------
-    CompareError
-        If the gate needs a reference disc's covariance and that is not positive definite.
+    Detected rows that fit an unlisted disc (or a reference row without ID, if these do not count),
+    and no reference row that counts, are set aside. Raises CompareError if the gate needs a
+    reference disc's covariance and that is not positive definite.
     """
     pair_up: Callable[..., Association] = partial(pair_lines, options=options)
     if frame.kind == "circles":
@@ -144,20 +138,28 @@ def match_frame(frame: FramePair, options: CompareOptions) -> FrameMatch:
     pairs, set_aside = pair_up(counted, detected), []
     if uncounted:
         alone = pairs.second_alone
-        fitting = alone[pair_up(uncounted, [detected[j] for j in alone]).second]
-        set_aside = [detected[j] for j in np.sort(fitting)]
-        detected = [row for j, row in enumerate(detected) if j not in set(fitting.tolist())]
+        fitting = set(alone[pair_up(uncounted, [detected[j] for j in alone]).second].tolist())
+        set_aside = [row for j, row in enumerate(detected) if j in fitting]
+        detected = [row for j, row in enumerate(detected) if j not in fitting]
         pairs = pair_up(counted, detected)
     left = [counted[i] for i in pairs.first_alone]
     first, second = [counted[i] for i in pairs.first], [detected[j] for j in pairs.second]
     if frame.kind == "lines":
         reach = numbers(second, "sigma") * options.sigmas
-        with_another = np.asarray((np.abs(_turns(left, second)) <= reach).any(axis=1))
+        joined = np.asarray((np.abs(_turns(left, second)) <= reach).any(axis=1))
         errors = np.degrees(np.abs(wrap_angle(numbers(second, "alpha") - numbers(first, "alpha"))))
     else:
-        with_another = np.zeros(len(left), dtype=np.bool_)
+        joined = np.zeros(len(left), dtype=np.bool_)
         errors = np.linalg.norm(circle_arrays(second).xy - circle_arrays(first).xy, axis=1)
-    return FrameMatch(frame, counted, detected, set_aside, pairs, with_another, np.asarray(errors))
+    return FrameMatch(
+        frame,
+        matched=list(zip(first, second)),
+        joined=[row for row, with_another in zip(left, joined) if with_another],
+        missed=[row for row, with_another in zip(left, joined) if not with_another],
+        extra=[detected[j] for j in pairs.second_alone],
+        set_aside=set_aside,
+        errors=np.asarray(errors),
+    )
 
 
 def pair_discs(

@@ -23,7 +23,6 @@ from detect.comparison.result import (
 )
 
 _WORST_FRAMES = 10
-_COUNTS = ("reference", "detected", "matched", "joined", "found", "missed", "extra", "set_aside")
 
 
 def comparison_tables(comparison: Comparison) -> Group:
@@ -53,13 +52,15 @@ def format_json(comparison: Comparison) -> str:
     only one file has.
     """
     figures = {f.name: getattr(comparison, f.name) for f in fields(comparison)}
-    figures |= {name: getattr(comparison, name) for name in (*_COUNTS, "recall", "precision")}
     figures |= {
         "frames": len(comparison.frames),
         "pairs": comparison.matched,
         "worst_frames": [
-            {name: getattr(match, name) for name in ("name", *_frame_counts(comparison))}
-            | {f"largest_error_{_unit(comparison)}": match.largest_error}
+            {
+                "name": match.frame.name,
+                **{count: len(getattr(match, count)) for count in _counts(comparison)},
+                f"largest_error_{_unit(comparison)}": match.largest_error,
+            }
             for match in comparison.worst_frames(_WORST_FRAMES)
         ],
     }
@@ -70,7 +71,7 @@ def _unit(c: Comparison) -> str:
     return "m" if isinstance(c, DiscComparison) else "deg"
 
 
-def _frame_counts(c: Comparison) -> tuple[str, ...]:
+def _counts(c: Comparison) -> tuple[str, ...]:
     joined = ("joined",) if isinstance(c, LineComparison) else ()
     return ("matched", *joined, "missed", "extra")
 
@@ -280,13 +281,13 @@ def range_text(part: DistanceBin | FloorBin) -> str:
 
 
 def _worst_frames(c: Comparison) -> Table:
-    table = _titled_table("Worst frames")
-    table.add_column("image", overflow="fold")
-    for heading in (*_frame_counts(c), f"largest error {_unit(c)}"):
-        table.add_column(heading, justify="right")
+    headings = ("image", *_counts(c), f"largest error {_unit(c)}")
+    table = _titled_table("Worst frames", headings)
+    table.columns[0].justify, table.columns[0].overflow = "left", "fold"
     for match in c.worst_frames(_WORST_FRAMES):
-        counts = [str(getattr(match, count)) for count in _frame_counts(c)]
-        table.add_row(Text(printable(match.name)), *counts, number(match.largest_error, 3))
+        numbers = [str(len(getattr(match, count))) for count in _counts(c)]
+        error = number(match.largest_error, 3)
+        table.add_row(Text(printable(match.frame.name)), *numbers, error)
     return table
 
 

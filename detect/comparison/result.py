@@ -13,7 +13,6 @@ from storage.bounds import ABOVE_0, NOT_NEGATIVE, demand
 
 if TYPE_CHECKING:
     from detect.seen import FrameView
-    from landmarks import Association
 
 FloatArray = NDArray[np.float64]
 Kind = Literal["circles", "lines"]
@@ -115,59 +114,34 @@ class FramePair(NamedTuple):
     view: FrameView | None = None
 
 
-@dataclass(frozen=True, eq=False)
-class FrameMatch:
-    """The rows of one frame that count, and which of them belong together.
+class FrameMatch(NamedTuple):
+    """Which rows of one frame belong together.
 
     Attributes
     ----------
     frame : FramePair
         All its rows.
-    reference, detected : sequence of rows
-        Those that count.
-    set_aside : sequence of rows
-        Detected rows that fit something that does not count.
-    pairs : Association
-        Of reference (first) and detected rows (second).
-    with_another : (N,) bool
-        Which of the unpaired reference rows are found with another row: a detected line can
-        represent several.
+    matched : list of (row, row)
+        Pairs of a reference and a detected row; no row is in two of them.
+    joined : list of rows
+        Further reference rows that a matched line represents.
+    missed : list of rows
+        Reference rows that no detected row represents.
+    extra : list of rows
+        Detected rows that fit no reference row.
+    set_aside : list of rows
+        Detected rows that fit something that does not count: neither right nor wrong.
     errors : (M,) float64
         Of the pairs: distance on the floor (m), or difference in bearing without sign (degrees).
     """
 
     frame: FramePair
-    reference: Sequence[Any]
-    detected: Sequence[Any]
-    set_aside: Sequence[Any]
-    pairs: Association
-    with_another: NDArray[np.bool_]
+    matched: list[tuple[Any, Any]]
+    joined: list[Any]
+    missed: list[Any]
+    extra: list[Any]
+    set_aside: list[Any]
     errors: FloatArray
-
-    @property
-    def name(self) -> str:
-        """The image."""
-        return self.frame.name
-
-    @property
-    def matched(self) -> int:
-        """Pairs of rows."""
-        return len(self.pairs.first)
-
-    @property
-    def joined(self) -> int:
-        """Further reference rows that a matched line represents."""
-        return int(self.with_another.sum())
-
-    @property
-    def missed(self) -> int:
-        """Reference rows that no detected row represents."""
-        return int((~self.with_another).sum())
-
-    @property
-    def extra(self) -> int:
-        """Detected rows that fit no reference row."""
-        return len(self.pairs.second_alone)
 
     @property
     def largest_error(self) -> float | None:
@@ -177,20 +151,7 @@ class FrameMatch:
     @property
     def paired(self) -> tuple[list[Any], list[Any]]:
         """The rows in pairs: reference, detected."""
-        return (
-            [self.reference[i] for i in self.pairs.first],
-            [self.detected[j] for j in self.pairs.second],
-        )
-
-    @property
-    def missed_rows(self) -> list[Any]:
-        """Reference rows that no detected row represents."""
-        return [self.reference[i] for i in self.pairs.first_alone[~self.with_another]]
-
-    @property
-    def extra_rows(self) -> list[Any]:
-        """Detected rows that fit no reference row."""
-        return [self.detected[j] for j in self.pairs.second_alone]
+        return [row for row, _ in self.matched], [row for _, row in self.matched]
 
 
 @dataclass(frozen=True)
@@ -253,15 +214,9 @@ class Levelling:
 
 @dataclass(frozen=True)
 class FloorDifference:
-    """Detected minus reference positions on the floor of matched rows.
+    """Detected minus reference positions on the floor: median and 95 % quantile of the distance.
 
-    Attributes
-    ----------
-    pairs : int
-    median_m, most_m : float or None
-        Median and 95 % quantile of the distance.
-    along_m, across_m : float or None
-        Medians along the viewing direction (positive: farther away) and across (to the left).
+    Also medians along the viewing direction (positive: farther away) and across (to the left).
     """
 
     pairs: int
@@ -344,6 +299,14 @@ class Comparison:
     reference_name, detected_name : str
         The files.
     options : CompareOptions
+    reference, detected : int
+        Rows that count.
+    matched, joined, missed, extra, set_aside : int
+        As in `FrameMatch`, of all frames.
+    found : int
+        Reference rows that were matched or joined.
+    recall, precision : float or None
+        Shares of the reference rows that were found, and of the detected rows that were matched.
     frames : tuple of FrameMatch
         Each frame that was compared.
     frames_only_in_reference, frames_only_in_detected : tuple of str
@@ -353,65 +316,28 @@ class Comparison:
     reference_name: str
     detected_name: str
     options: CompareOptions
+    reference: int
+    detected: int
+    matched: int
+    joined: int
+    found: int
+    missed: int
+    extra: int
+    set_aside: int
+    recall: float | None
+    precision: float | None
     frames: tuple[FrameMatch, ...] = field(repr=False)
     frames_only_in_reference: tuple[str, ...] = field(repr=False)
     frames_only_in_detected: tuple[str, ...] = field(repr=False)
 
-    @property
-    def reference(self) -> int:
-        """Reference rows that count."""
-        return sum(len(match.reference) for match in self.frames)
-
-    @property
-    def detected(self) -> int:
-        """Detected rows that count."""
-        return sum(len(match.detected) for match in self.frames)
-
-    @property
-    def matched(self) -> int:
-        """Pairs of a reference and a detected row; no row is in two of them."""
-        return sum(match.matched for match in self.frames)
-
-    @property
-    def joined(self) -> int:
-        """Further reference rows within the deviation of a matched line."""
-        return sum(match.joined for match in self.frames)
-
-    @property
-    def found(self) -> int:
-        """Reference rows that a detected row represents, alone or with others."""
-        return self.matched + self.joined
-
-    @property
-    def missed(self) -> int:
-        """Reference rows that no detected row represents."""
-        return self.reference - self.found
-
-    @property
-    def extra(self) -> int:
-        """Detected rows that fit no reference row."""
-        return self.detected - self.matched
-
-    @property
-    def set_aside(self) -> int:
-        """Detected rows that fit something that does not count: neither right nor wrong."""
-        return sum(len(match.set_aside) for match in self.frames)
-
-    @property
-    def recall(self) -> float | None:
-        """Share of the reference rows that were found."""
-        return self.found / self.reference if self.reference else None
-
-    @property
-    def precision(self) -> float | None:
-        """Share of the detected rows that were matched."""
-        return self.matched / self.detected if self.detected else None
-
     def worst_frames(self, count: int) -> list[FrameMatch]:
         """The frames with most missed and extra rows; of equals, with the largest error first."""
-        return sorted(
-            self.frames, key=lambda f: (-(f.missed + f.extra), -(f.largest_error or 0.0), f.name)
-        )[:count]
+
+        def order(match: FrameMatch) -> tuple[float, float, str]:
+            wrong = len(match.missed) + len(match.extra)
+            return -wrong, -(match.largest_error or 0.0), match.frame.name
+
+        return sorted(self.frames, key=order)[:count]
 
 
 @dataclass(frozen=True)

@@ -198,7 +198,7 @@ def _draw_discs(
         draw_curve(canvas, edge, MISSED_COLOUR, closed=True)
     apart = apart_px(match)
     drawn = [(row, "", _EDGE_COLOUR) for row in match.set_aside]
-    drawn += [(row, "", EXTRA_COLOUR if compared else _EDGE_COLOUR) for row in match.extra_rows]
+    drawn += [(row, "", EXTRA_COLOUR if compared else _EDGE_COLOUR) for row in match.extra]
     drawn += [(row, f" {px:.1f}px", _EDGE_COLOUR) for row, px in zip(match.paired[1], apart)]
     for row, text, colour in drawn:
         centre = np.array([row.px, row.py])
@@ -208,11 +208,11 @@ def _draw_discs(
 def _draw_lines(
     canvas: NDArray[np.uint8], camera: Camera, match: FrameMatch, compared: bool
 ) -> None:
-    for curve in line_curves(camera, ends_of(match.missed_rows)):
+    for curve in line_curves(camera, ends_of(match.missed)):
         draw_curve(canvas, curve, MISSED_COLOUR)
     drawn = [(row, "", LINE_COLOUR) for row in match.set_aside]
-    drawn += [(row, "", EXTRA_COLOUR if compared else LINE_COLOUR) for row in match.extra_rows]
-    for wanted, row in zip(*match.paired):
+    drawn += [(row, "", EXTRA_COLOUR if compared else LINE_COLOUR) for row in match.extra]
+    for wanted, row in match.matched:
         error = (row.alpha - wanted.alpha + np.pi) % (2.0 * np.pi) - np.pi
         text = f"{error / row.sigma:+.1f}" if row.sigma > 0.0 else ""
         drawn.append((row, text, LINE_COLOUR))
@@ -233,13 +233,13 @@ def _draw_markers(canvas: NDArray[np.uint8], found: Sequence[MarkerLandmark]) ->
 
 
 def _count(what: str, match: FrameMatch, compared: bool) -> str:
-    fate = f" ({match.extra} extra, {match.missed} missed)" if compared else ""
+    fate = f" ({len(match.extra)} extra, {len(match.missed)} missed)" if compared else ""
     return f"{len(match.frame.detected)} {what}{fate}"
 
 
 def missed_edges(match: FrameMatch, view: FrameView, radius_m: float) -> FloatArray:
     """(N, P, 2) pixels of circles round the discs that were missed."""
-    rings = circle_on_floor(circle_arrays(match.missed_rows).xy, radius_m)
+    rings = circle_on_floor(circle_arrays(match.missed).xy, radius_m)
     return image_positions(view.camera, rings, view.reference_by)
 
 

@@ -268,13 +268,17 @@ def _frames(inputs: ReportInputs, worst: int) -> Section:
             continue
         matches = result.worst_frames(worst)
         rows = tuple(
-            (m.name, str(m.matched), str(m.missed), str(m.extra), text(m.largest_error))
+            (
+                m.frame.name,
+                *(str(len(rows)) for rows in (m.matched, m.missed, m.extra)),
+                text(m.largest_error),
+            )
             for m in matches
         )
         head = ("frame", "matched", "missed", "extra", f"largest error / {unit}")
         parts.append(Part("table", f"Frames with most missed and extra {kind}", head, rows))
         for rank, match in enumerate(matches, 1):
-            prefix, place = named[picture_name(match.name)], f"number {rank} of {kind}"
+            prefix, place = named[picture_name(match.frame.name)], f"number {rank} of {kind}"
             shown[prefix] = f"{shown[prefix]}, {place}" if prefix in shown else place
     if parts:
         key = (

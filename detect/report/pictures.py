@@ -87,13 +87,13 @@ def _edges(inputs: ReportInputs, fate: str) -> Iterator[tuple[str, NDArray[np.fl
         view = match.frame.view
         if view is None:
             continue
-        rows, by = match.missed_rows, view.reference_by
+        rows, by = match.missed, view.reference_by
         if fate == "extra":
-            rows, by = match.extra_rows, view.detected_by
+            rows, by = match.extra, view.detected_by
         rings = circle_on_floor(circle_arrays(rows).xy, _WIDER * view.radius_m)
         for edge in image_positions(view.camera, rings, by):
             if np.isfinite(edge).all():
-                yield picture_name(match.name), edge
+                yield picture_name(match.frame.name), edge
 
 
 def _tile(image: NDArray[np.uint8], edge: NDArray[np.float64], colour: Colour) -> NDArray[np.uint8]:

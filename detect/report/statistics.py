@@ -58,9 +58,9 @@ def _rates(
             if len(fewer) < len(passed):
                 passed = fewer
                 match = match_frame(match.frame._replace(detected=passed), comparison.options)
-            found[k] += len(match.reference) - match.missed
-            right[k] += match.matched
-            kept[k] += len(match.detected)
+            found[k] += len(match.matched) + len(match.joined)
+            right[k] += len(match.matched)
+            kept[k] += len(match.matched) + len(match.extra)
     with np.errstate(invalid="ignore"):
         recall, precision = found / np.float64(comparison.reference), right / kept
     return RateCurve(levels, recall, precision, kept)
