@@ -48,7 +48,7 @@ def perform(options: View) -> int:
     source = open_rows(run, options.files)
     if options.output is not None and options.output.exists() and not options.force:
         raise OutputExistsError(options.output)
-    selection = select_frames(run.frames, options.frames, options.every)
+    expected, selection = select_frames(run.frames, options.frames, options.every)
     radius_m = source.circle_settings.radius_m
     poses, known = _poses(options, [frame.step for frame in run.frames])
     recording = rr.RecordingStream("detect view", recording_id=f"detect-{run.name}")
@@ -61,12 +61,12 @@ def perform(options: View) -> int:
             recording.save(str(raw))
         rr.send_blueprint(_layout(), recording=recording)
         recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-        path = np.column_stack([poses[:, :2], np.zeros(len(poses))])
-        recording.log("world/path", rr.LineStrips3D([path]), static=True)
+        path = rr.LineStrips3D([poses * [1.0, 1.0, 0.0]])
+        recording.log("world/path", path, static=True)
         for name, places in known.items():
-            at = np.column_stack([places, np.zeros(len(places))])
-            recording.log(f"world/map/{name}", rr.Points3D(at, colors=_MAP), static=True)
-        with progress_bar("frames", selection.expected) as advance:
+            at = rr.Points3D(np.pad(places, ((0, 0), (0, 1))), colors=_MAP)
+            recording.log(f"world/map/{name}", at, static=True)
+        with progress_bar("frames", expected) as advance:
             for position, frame in selection:
                 recording.set_time("frame", sequence=position)
                 if frame.time_s is not None:
@@ -95,30 +95,13 @@ def perform(options: View) -> int:
 
 
 def summed_steps(steps: Iterable[Step]) -> FloatArray:
-    """Poses along the odometry: the start, and one after each step.
-
-    Parameters
-    ----------
-    steps : iterable of Step
-        Movements, each in the robot frame before it.
-
-    Returns
-    -------
-    (N + 1, 3) float64
-        x, y (m), heading (rad) in the robot frame of the start.
-    """
-    poses = [(0.0, 0.0, 0.0)]
-    for step in steps:
-        x, y, theta = poses[-1]
-        cosine, sine = np.cos(theta), np.sin(theta)
-        poses.append(
-            (
-                float(x + cosine * step.dx - sine * step.dy),
-                float(y + sine * step.dx + cosine * step.dy),
-                theta + step.dphi,
-            )
-        )
-    return np.array(poses)
+    """(N + 1, 3) poses along N steps, the start first: x, y (m), heading (rad) in its frame."""
+    dx, dy, dphi = np.array([(0.0, 0.0, 0.0), *((s.dx, s.dy, s.dphi) for s in steps)]).T
+    heading = np.cumsum(dphi)
+    before = heading - dphi
+    x = np.cumsum(np.cos(before) * dx - np.sin(before) * dy)
+    y = np.cumsum(np.sin(before) * dx + np.cos(before) * dy)
+    return np.column_stack([x, y, heading])
 
 
 def _poses(options: View, steps: list[Step]) -> tuple[FloatArray, dict[str, FloatArray]]:

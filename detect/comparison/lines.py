@@ -33,26 +33,7 @@ def compare_line_runs(
 ) -> LineComparison:
     """Compare a run's detected lines with its reference rows.
 
-    Parameters
-    ----------
-    run : path
-        The run's folder.
-    reference, detected : path, optional
-        By default ``map.lines`` and ``detected.lines`` in that folder.
-    options : CompareOptions, optional
-        What counts as the same line, and which rows count.
-
-    Returns
-    -------
-    LineComparison
-        The figures.
-
-    Raises
-    ------
-    landmarks.LandmarkFileError
-        If a file cannot be read.
-    CompareError
-        If an image has two frames in a file.
+    As `detect.comparison.circles.compare_runs`, by default of ``map.lines`` and ``detected.lines``.
     """
     reference = Path(run) / "map.lines" if reference is None else reference
     detected = Path(run) / "detected.lines" if detected is None else detected
@@ -71,10 +52,7 @@ def compare_line_frames(
     *,
     names: tuple[str, str] = ("reference", "detected"),
 ) -> LineComparison:
-    """Compare the lines of two sets of frames; errors and reports use their names.
-
-    See `compare_line_runs`.
-    """
+    """Compare the lines of two sets of frames; errors and reports use their names."""
     options = options or CompareOptions()
     sides = frames_by_image(reference, names[0]), frames_by_image(detected, names[1])
     common = match_runs("lines", *sides, options, names)

@@ -33,7 +33,7 @@ def comparison_tables(comparison: Comparison) -> Group:
     summary = Table(box=None, show_header=False, pad_edge=False)
     summary.add_column(style="bold", no_wrap=True)
     summary.add_column(overflow="fold")
-    for name, value in _summary(comparison):
+    for name, value in _summary(comparison).items():
         summary.add_row(name, Text(value))
     tables: list[Table | str] = [summary]
     if comparison.reference or comparison.detected:
@@ -76,103 +76,75 @@ def _counts(c: Comparison) -> tuple[str, ...]:
     return ("matched", *joined, "missed", "extra")
 
 
-def _summary(c: Comparison) -> list[tuple[str, str]]:
+def _summary(c: Comparison) -> dict[str, str]:
     """What was found first, then how it was compared and how large the errors are."""
     only, counted = c.options.only_identified, "counted" if c.options.all_frames else "not counted"
-    rows = [*_outcome(c), ("recall", number(c.recall, 4)), ("precision", number(c.precision, 4))]
-    rows += [
-        ("reference", printable(c.reference_name) + (", rows with an ID only" if only else "")),
-        ("detected", printable(c.detected_name)),
-        (
-            "frames",
-            f"{len(c.frames)} compared; {len(c.frames_only_in_reference)} only in the reference, "
-            f"{len(c.frames_only_in_detected)} only detected ({counted})",
-        ),
-    ]
-    if isinstance(c, DiscComparison):
-        rows += _disc_rows(c)
-    elif isinstance(c, LineComparison):
-        rows += _line_rows(c)
-    return rows
-
-
-def _outcome(c: Comparison) -> list[tuple[str, str]]:
-    """What is true of the rows, one sentence each."""
-    joined = f", {c.joined} of them by a row that represents several" if c.joined else ""
-    rows = [
-        ("found", f"{c.found} of {c.reference} reference rows{joined}"),
-        ("missed", f"{c.missed} of {c.reference} reference rows"),
-    ]
     on_lookalikes = c.on_lookalikes if isinstance(c, DiscComparison) else None
+    joined = f", {c.joined} of them by a row that represents several" if c.joined else ""
+    rows = {
+        "found": f"{c.found} of {c.reference} reference rows{joined}",
+        "missed": f"{c.missed} of {c.reference} reference rows",
+    }
     if on_lookalikes is not None:
         of = f"{on_lookalikes} of {c.detected} detected rows"
-        rows.append(("look-alikes", f"{of}: on what is known to look like a disc"))
-    of = f"{c.extra - (on_lookalikes or 0)} of {c.detected} detected rows"
-    nothing = "nothing listed" if on_lookalikes is not None else "no reference row"
-    unknown = on_lookalikes is None and isinstance(c, DiscComparison)
-    known = " (look-alikes are not known)" if unknown else ""
-    rows.append(("clutter", f"{of}: on {nothing}{known}"))
+        rows["look-alikes"] = f"{of}: on what is known to look like a disc"
+    of, nothing = f"{c.extra - (on_lookalikes or 0)} of {c.detected} detected rows", "nothing known"
+    if on_lookalikes is None:
+        unknown = " (look-alikes are not known)" if isinstance(c, DiscComparison) else ""
+        nothing = f"no reference row{unknown}"
+    rows["clutter"] = f"{of}: on {nothing}"
     if c.set_aside:
-        what = "reference rows without an ID, or" if c.options.only_identified else "discs"
-        rows.append(
-            (
-                "not counted",
-                f"{c.set_aside} more detected rows: on {what} that need not be found",
-            )
-        )
+        what = "what has no ID or is not listed" if only else "discs in view that are not listed"
+        rows["not counted"] = f"{c.set_aside} more detected rows: on {what}"
+    rows |= {
+        "recall": number(c.recall, 4),
+        "precision": number(c.precision, 4),
+        "reference": printable(c.reference_name) + (", rows with an ID only" if only else ""),
+        "detected": printable(c.detected_name),
+        "frames": f"{len(c.frames)} compared; {len(c.frames_only_in_reference)} only in the "
+        f"reference, {len(c.frames_only_in_detected)} only detected ({counted})",
+    }
+    if isinstance(c, DiscComparison):
+        rows |= _disc_rows(c)
+    elif isinstance(c, LineComparison):
+        error = _normalised_error(c.normalised_error, "", "without a positive sigma")
+        rows |= {
+            "same line": f"within {c.options.tolerance_deg:g} deg or {c.options.sigmas:g} sigma",
+            "bearing error": _median_and_most(c.bearing_median_deg, c.bearing_95_deg, 4, "deg"),
+            "normalised error": error,
+            "beta error": f"median {number(c.beta_median_deg, 4)} deg",
+            "distance of ends": f"median {number(c.ends_median, 4)} (normalised coordinates)",
+        }
     return rows
 
 
-def _line_rows(c: LineComparison) -> list[tuple[str, str]]:
-    return [
-        ("same line", f"within {c.options.tolerance_deg:g} deg or {c.options.sigmas:g} sigma"),
-        ("bearing error", _median_and_most(c.bearing_median_deg, c.bearing_95_deg, 4, "deg")),
-        (
-            "normalised error",
-            _normalised_error(c.normalised_error, "", "without a positive sigma"),
-        ),
-        ("beta error", f"median {number(c.beta_median_deg, 4)} deg"),
-        ("distance of ends", f"median {number(c.ends_median, 4)} (normalised coordinates)"),
-    ]
-
-
-def _disc_rows(c: DiscComparison) -> list[tuple[str, str]]:
-    rows = []
+def _disc_rows(c: DiscComparison) -> dict[str, str]:
+    rows = {}
     if any(s.levelled or s.true for s in (c.reference_levelling, c.detected_levelling)):
-        rows.append(("levelled", levelling_text(c)))
-    rows.append(("same disc", same_disc_text(c)))
+        rows["levelled"] = levelling_text(c)
     if c.in_image:
+        same = f"in the image, within half the disc's image or {c.options.least_px:g} px"
         apart = _median_and_most(c.image_median_px, c.image_95_px, 2, "px")
-        rows.append(("image difference", apart))
+        rows |= {"same disc": same, "image difference": apart}
+    elif c.options.sigma is None:
+        rows["same disc"] = f"on the floor, within {c.options.gate_m:g} m"
+    else:
+        rows["same disc"] = f"on the floor, within {c.options.sigma:g} sigma"
     covariance = c.options.error_covariance
-    source = "detected plus reference" if covariance == "sum" else covariance
-    error = _normalised_error(
-        c.normalised_error, f", covariance: {source}", "not positive definite"
+    source = ", covariance: " + ("detected plus reference" if covariance == "sum" else covariance)
+    rows["position error"] = _median_and_most(c.error_median_m, c.error_95_m, 4, "m")
+    rows["normalised error"] = _normalised_error(
+        c.normalised_error, source, "not positive definite"
     )
-    rows += [
-        ("position error", _median_and_most(c.error_median_m, c.error_95_m, 4, "m")),
-        ("normalised error", error),
-        *([] if c.lean is None else [("common lean", lean_text(c.lean))]),
-        (
-            "reference quality",
-            f"median {number(c.reference_quality_matched, 3)} matched, "
-            f"{number(c.reference_quality_missed, 3)} missed",
-        ),
-        (
-            "detected quality",
-            f"median {number(c.detected_quality_matched, 3)} matched, "
-            f"{number(c.detected_quality_extra, 3)} extra",
-        ),
-    ]
+    if c.lean is not None:
+        rows["common lean"] = lean_text(c.lean)
+    for side, matched, fate, alone in (
+        ("reference", c.reference_quality_matched, "missed", c.reference_quality_missed),
+        ("detected", c.detected_quality_matched, "extra", c.detected_quality_extra),
+    ):
+        text = f"median {number(matched, 3)} matched, {number(alone, 3)} {fate}"
+        rows[f"{side} quality"] = text
     return rows
-
-
-def same_disc_text(c: DiscComparison) -> str:
-    """When two rows are the same disc."""
-    if c.in_image:
-        return f"in the image, within half the disc's image or {c.options.least_px:g} px"
-    gate, sigma = c.options.gate_m, c.options.sigma
-    return "on the floor, within " + (f"{gate:g} m" if sigma is None else f"{sigma:g} sigma")
 
 
 def levelling_text(c: DiscComparison) -> str:
@@ -230,17 +202,14 @@ def _over_distance(c: DiscComparison) -> Table:
     table = _titled_table("By forward distance (position error and quality: medians)", headings)
     for part in c.bins:
         if part.reference or part.detected:
-            rates = (part.recall, part.precision)
-            recall, precision = (number(rate, 3) for rate in rates)
-            medians = (
-                part.error_median_m, part.reference_quality_median, part.detected_quality_median,
-                part.quality_difference,
+            figures = (
+                part.recall, part.precision, part.error_median_m, part.reference_quality_median,
+                part.detected_quality_median, part.quality_difference,
             )  # fmt: skip
-            table.add_row(
-                range_text(part), str(part.reference), str(part.missed), recall,
-                str(part.detected), str(part.extra), precision,
-                *(number(value, 3) for value in medians),
-            )  # fmt: skip
+            recall, precision, *medians = (number(value, 3) for value in figures)
+            counts = [str(n) for n in (part.reference, part.missed, part.detected, part.extra)]
+            row = (*counts[:2], recall, *counts[2:], precision, *medians)
+            table.add_row(range_text(part), *row)
     return table
 
 

@@ -41,7 +41,7 @@ def perform(options: Draw) -> int:
         )
     if options.video is not None and options.video.exists() and not options.force:
         raise OutputExistsError(options.video)
-    selection = select_frames(run.frames, options.frames, options.every)
+    expected, selection = select_frames(run.frames, options.frames, options.every)
     gates = CompareOptions(**vars(options.gates))
     if options.output is not None:
         options.output.mkdir(parents=True, exist_ok=True)
@@ -52,7 +52,7 @@ def perform(options: Draw) -> int:
         video = None
         if options.video is not None:
             video = stack.enter_context(mp4(options.video, options.fps, overwrite=options.force))
-        advance = stack.enter_context(progress_bar("pictures", selection.expected))
+        advance = stack.enter_context(progress_bar("pictures", expected))
         for _, frame in selection:
             try:
                 image = read_image(frame, None if sight is None else sight.camera)

@@ -56,16 +56,12 @@ def draw_rows(
     options: CompareOptions,
     title: str = "",
 ) -> NDArray[np.uint8]:
-    """Draw what files say of a frame into its image, with a line of words below.
+    """Draw what files say of a frame into its image (H, W), with a line of words below.
 
     Parameters
     ----------
-    image : (H, W) uint8
-        The grey image.
     sight : Sight or None
         The calibrated camera; without one, only markers are drawn.
-    rows : SeenRows
-        The rows of the files.
     settings : CircleSettings
         The radii of the discs' outlines.
     options : CompareOptions
@@ -109,21 +105,7 @@ def draw_circles(
 ) -> NDArray[np.uint8]:
     """Draw the outlines of detected discs and their quality (the report's figure 8).
 
-    Parameters
-    ----------
-    image : (H, W) uint8
-        The grey image.
-    camera : Camera
-        The calibrated camera, through which the outlines are drawn.
-    found : CircleDetections
-        The discs.
-    settings : CircleSettings
-        The radii of the outlines.
-
-    Returns
-    -------
-    (H, W, 3) uint8
-        In OpenCV's order blue, green, red.
+    Of a grey image (H, W), returns a picture (H, W, 3); `settings` has the radii of the outlines.
     """
     canvas = canvas_of(image, camera)
     for centre, quality in zip(found.floor_xy, found.quality):
@@ -132,18 +114,9 @@ def draw_circles(
 
 
 def line_curves(camera: Camera, ends: FloatArray) -> FloatArray:
-    """Lines as they are seen through the lens.
+    """Lines as they are seen through the lens: (N, P, 2) pixels from top to bottom.
 
-    Parameters
-    ----------
-    camera : Camera
-    ends : (N, 4) float64
-        xtop, ytop, xbottom, ybottom: undistorted normalised coordinates.
-
-    Returns
-    -------
-    (N, P, 2) float64
-        Pixels from top to bottom.
+    `ends` (N, 4) are xtop, ytop, xbottom, ybottom in undistorted normalised coordinates.
     """
     share = np.linspace(0.0, 1.0, _POINTS)[:, None]
     return camera.distort((1.0 - share) * ends[:, None, :2] + share * ends[:, None, 2:])
@@ -152,19 +125,9 @@ def line_curves(camera: Camera, ends: FloatArray) -> FloatArray:
 def sigma_bars(camera: Camera, ends: FloatArray, sigma_rad: FloatArray) -> FloatArray:
     """Bars of one standard deviation of the bearing to each side of where lines cross the horizon.
 
-    Parameters
-    ----------
-    camera : Camera
-        Gives the horizon, that of the level robot.
-    ends : (N, 4) float64
-        As for `line_curves`; a line that ends before the horizon is made longer.
-    sigma_rad : (N,) float64
-        Standard deviations of the bearings.
-
-    Returns
-    -------
-    (N, 2, 2) float64
-        Pixels of the bars' ends; NaN for lines that do not cross the horizon before the camera.
+    The horizon is that of the level robot; a line that ends before it is made longer. Of (N, 4)
+    `ends` as for `line_curves` and (N,) standard deviations, returns (N, 2, 2) pixels; NaN for
+    lines that do not cross the horizon before the camera.
     """
     one = np.ones((len(ends), 1))
     top, bottom = (np.hstack([e, one]) @ camera.rotation.T for e in (ends[:, :2], ends[:, 2:]))

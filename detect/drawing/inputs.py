@@ -6,6 +6,7 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import islice
 from pathlib import Path
 from typing import Any, TypeVar, get_origin, get_type_hints
 
@@ -45,8 +46,8 @@ class FileHead:
     settings : tuple of (str, str)
         The effective settings: names and values, as they are written.
     level : bool
-        Whether it says that positions of discs are corrected for the frames' tilts, or true ones
-        in the level robot frame.
+        Whether positions of discs are corrected for the frames' tilts, or true ones in the level
+        robot frame.
     name : str
         What messages call the file.
     """
@@ -133,15 +134,7 @@ def read_head(path: Path) -> FileHead:
 class SeenRows:
     """What files have of one image: None where there is no file, or it does not have the image.
 
-    Attributes
-    ----------
-    circles, lines, markers : Frame or None
-        Detected.
-    tilt : FrameTilt or None
-    reference_circles, reference_lines : Frame or None
-        What they are compared with.
-    unlisted : Frame or None
-        Discs that may be detected but need not be.
+    `unlisted` are discs that may be detected but need not be.
     """
 
     circles: Frame | None = None
@@ -156,14 +149,8 @@ class SeenRows:
 class RunRows:
     """The files of a run's rows; of these, only the offsets of frames are in memory.
 
-    Attributes
-    ----------
-    detected : dict
-        Path of each kind of `KINDS` that there is.
-    reference : dict
-        Paths of the reference rows of these, "circles" and "lines", as far as there are any.
-    heads : dict
-        Heads of the detected files, by kind.
+    `detected` has the path of each kind of `KINDS` that there is, `heads` their heads, `reference`
+    the paths of reference rows of these kinds.
     """
 
     def __init__(self, detected: dict[str, Path], reference: dict[str, Path]) -> None:
@@ -240,38 +227,9 @@ def picture_name(prefix: str) -> str:
 # -- frames -----------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class FrameSelection:
-    """Some frames of a run; iterates over their positions and the frames, in the run's order.
-
-    Attributes
-    ----------
-    frames : Frames
-        All of them.
-    positions : frozenset of int or None
-        Those that are selected; None if all are.
-    every : int
-        If all are, only those whose position is a multiple of this.
-    """
-
-    frames: Frames
-    positions: frozenset[int] | None
-    every: int
-
-    @property
-    def expected(self) -> int | None:
-        """Approximate number of these frames; None if unknown."""
-        if self.positions is not None:
-            return len(self.positions)
-        return None if self.frames.expected is None else -(-self.frames.expected // self.every)
-
-    def __iter__(self) -> Iterator[tuple[int, RunFrame]]:
-        for position, frame in enumerate(self.frames):
-            if position % self.every == 0 if self.positions is None else position in self.positions:
-                yield position, frame
-
-
-def select_frames(frames: Frames, wanted: Sequence[str], every: int) -> FrameSelection:
+def select_frames(
+    frames: Frames, wanted: Sequence[str], every: int
+) -> tuple[int | None, Iterator[tuple[int, RunFrame]]]:
     """Parse the selection of frames of a command line.
 
     Parameters
@@ -284,6 +242,13 @@ def select_frames(frames: Frames, wanted: Sequence[str], every: int) -> FrameSel
     every : int
         Of these, every n-th.
 
+    Returns
+    -------
+    expected : int or None
+        Approximate number of the selected frames, if known.
+    selected : iterator of (int, RunFrame)
+        Their positions in the run and they themselves.
+
     Raises
     ------
     DetectError
@@ -292,13 +257,15 @@ def select_frames(frames: Frames, wanted: Sequence[str], every: int) -> FrameSel
     if every < 1:
         raise DetectError(f"every is {every}: expected 1 or more")
     if not wanted:
-        return FrameSelection(frames, None, every)
+        expected = None if frames.expected is None else -(-frames.expected // every)
+        return expected, islice(enumerate(frames), 0, None, every)
     names = [image_name(frame.step.prefix) for frame in frames]
     asked = {image_name(word): word for word in wanted}
     positions = {k for k, name in enumerate(names) if name in asked}
     for name in asked.keys() - set(names):
         positions.update(_positions(asked[name], len(names)))
-    return FrameSelection(frames, frozenset(sorted(positions)[::every]), 1)
+    kept = frozenset(sorted(positions)[::every])
+    return len(kept), ((k, frame) for k, frame in enumerate(frames) if k in kept)
 
 
 def _positions(word: str, count: int) -> range:

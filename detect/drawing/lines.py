@@ -39,22 +39,9 @@ def draw_lines(
 ) -> NDArray[np.uint8]:
     """Draw lines through the distortion, with bars of their standard deviations on the horizon.
 
-    Lines joined from several edges are drawn in another colour. A bar reaches one standard
-    deviation to each side of where the line crosses the horizon (the report's figure 6).
-
-    Parameters
-    ----------
-    image : (H, W) uint8
-        The grey image.
-    camera : Camera
-        The calibrated camera.
-    found : LineDetections
-        The lines.
-
-    Returns
-    -------
-    (H, W, 3) uint8
-        In OpenCV's order blue, green, red.
+    A bar reaches one standard deviation to each side of where the line crosses the horizon (the
+    report's figure 6). Lines joined from several edges have another colour. Of a grey image (H, W),
+    returns a picture (H, W, 3).
     """
     canvas = canvas_of(image, camera)
     curves, bars = line_curves(camera, found.ends), sigma_bars(camera, found.ends, found.sigma_rad)
@@ -74,19 +61,7 @@ def draw_tracks(
 ) -> NDArray[np.uint8]:
     """Draw the points of tracks, coloured by their fates, and below how many have each fate.
 
-    Parameters
-    ----------
-    image : (H, W) uint8
-        The grey image.
-    table : VerticalTable
-        Its camera's verticals.
-    found : LineDetections
-        The tracks and their fates.
-
-    Returns
-    -------
-    (H + h, W, 3) uint8
-        In OpenCV's order blue, green, red; h is the height of the legend.
+    Of a grey image (H, W), returns a picture (H + h, W, 3); h is the height of the legend.
     """
     canvas = canvas_of(image)
     for t, fate in enumerate(found.fate):
@@ -98,19 +73,9 @@ def draw_tracks(
 
 
 def draw_response(response: NDArray[np.float32], table: VerticalTable) -> NDArray[np.uint8]:
-    """Draw the response of the strip image, where the building's verticals are vertical.
+    """Draw a response (`detect.verticals.response.line_response`, (H, W)) as a picture (H, W, 3).
 
-    Parameters
-    ----------
-    response : (H, W) float32
-        See `detect.verticals.response.line_response`.
-    table : VerticalTable
-        Its camera's verticals; the horizon is drawn in green.
-
-    Returns
-    -------
-    (H, W, 3) uint8
-        In OpenCV's order: edges that are brighter on the right are red, on the left blue.
+    Edges that are brighter on the right are red, on the left blue; the horizon is green.
     """
     strength = np.clip(np.abs(response) / (2.0 / np.pi), 0.0, 1.0)
     shade = (255.0 * np.sqrt(strength)).astype(np.uint8)

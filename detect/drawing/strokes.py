@@ -22,19 +22,9 @@ _COLUMNS = 1500
 
 
 def canvas_of(image: NDArray[np.uint8], camera: Camera | None = None) -> NDArray[np.uint8]:
-    """A picture to draw into; pixels that see nothing through the camera's lens are dark and red.
+    """A grey image (H, W) as a picture to draw into, (H, W, 3) in OpenCV's order blue, green, red.
 
-    Parameters
-    ----------
-    image : (H, W) uint8
-        The grey image.
-    camera : Camera, optional
-        The calibrated camera, of the image's size.
-
-    Returns
-    -------
-    (H, W, 3) uint8
-        In OpenCV's order blue, green, red.
+    Pixels that see nothing through the lens of the calibrated camera are dark and red.
     """
     canvas = np.repeat(image[:, :, None], 3, axis=2)
     if camera is not None and camera.seen_share < 1.0:

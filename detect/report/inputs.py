@@ -31,21 +31,8 @@ class Timing:
 class ReportInputs:
     """A run's rows, and how they compare with the reference.
 
-    Attributes
-    ----------
-    run : ImageRun
-    files : RunRows
-    names : tuple of str
-        Prefixes of the frames, in the run's order.
-    rows : tuple of SeenRows
-        Of each.
-    options : CompareOptions
-    sight : Sight or None
-        How discs come back into the images; None without a calibration.
-    discs : DiscComparison or None
-        None without reference rows.
-    lines : LineComparison or None
-    timing : Timing or None
+    `names` are the prefixes of its frames in their order, `rows` the rows of each. `sight` is None
+    without a calibration, comparisons without reference rows.
     """
 
     run: ImageRun
@@ -60,22 +47,9 @@ class ReportInputs:
 
 
 def gather(run: ImageRun, options: RowFiles, gates: Gates, time_frames: int) -> ReportInputs:
-    """Read all rows of a run.
+    """Read and compare all rows of a run, and detect `time_frames` frames to measure the time.
 
-    Parameters
-    ----------
-    run : ImageRun
-    options : RowFiles
-        Which files.
-    gates : Gates
-        What counts as the same landmark.
-    time_frames : int
-        Number of frames that are detected again to measure the time.
-
-    Raises
-    ------
-    DetectError, landmarks.LandmarkFileError
-        If a file is missing or malformed.
+    Raises DetectError or landmarks.LandmarkFileError if a file is missing or malformed.
     """
     files = open_rows(run, options)
     names = tuple(frame.step.prefix for frame in run.frames)

@@ -11,20 +11,11 @@ from typing import NamedTuple
 
 
 class Part(NamedTuple):
-    """A piece of a section.
+    """A piece of a section; its kind says what the template makes of it.
 
-    Attributes
-    ----------
-    kind : {"figures", "image", "table", "heading", "key", "text", "note"}
-        What the template makes of it.
-    words : str
-        The caption, or the text.
-    head, rows : tuple
-        Of a table; rows of figures are names and values, those of a key colours and words.
-    left, bold : tuple of int
-        Columns with text, rows to point out.
-    address, width, height
-        Of an image.
+    `words` are the text or the caption. Rows of figures are names and values, those of a key
+    colours and words. `left` are the columns of a table that have text, `bold` the rows to point
+    out.
     """
 
     kind: str

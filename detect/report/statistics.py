@@ -17,16 +17,9 @@ _LEAST_SIGMA_RAD = 1e-12
 
 
 class RateCurve(NamedTuple):
-    """Recall and precision of the rows that pass a threshold.
+    """Recall and precision (NaN without rows) of the `kept` rows that pass each threshold.
 
-    Attributes
-    ----------
-    threshold : (K,) float64
-        Least quality of discs, largest sigma of lines (degrees).
-    recall, precision : (K,) float64
-        NaN where there are no rows to compute them from.
-    kept : (K,) int64
-        Detected rows that pass, and count.
+    That is the least quality of discs, or the largest sigma of lines (degrees).
     """
 
     threshold: FloatArray
@@ -82,22 +75,12 @@ def whitened(comparison: DiscComparison | LineComparison) -> FloatArray:
 
 
 def binned(at: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Medians and 95 % quantiles of values in up to 10 bins of equally many.
-
-    Parameters
-    ----------
-    at, values : (N,) float64
-        Where, and what.
-
-    Returns
-    -------
-    middle, median, quantile : (K,) float64
-        Median of `at` in each bin, and the two figures of `values`.
-    """
+    """Medians of `at`, medians and 95 % quantiles of `values` in up to 10 bins of equally many."""
     parts = np.array_split(np.argsort(at, kind="stable"), np.clip(len(at) // 8, 1, 10))
-    parts = [part for part in parts if len(part)]
-    return (
-        np.array([np.median(at[part]) for part in parts]),
-        np.array([np.median(values[part]) for part in parts]),
-        np.array([np.quantile(values[part], 0.95) for part in parts]),
-    )
+    figures = [
+        (np.median(at[part]), np.median(values[part]), np.quantile(values[part], 0.95))
+        for part in parts
+        if len(part)
+    ]
+    middle, median, most = np.array(figures, dtype=np.float64).reshape(-1, 3).T
+    return middle, median, most

@@ -46,10 +46,9 @@ def perform(options: Tune) -> int:
     if not path.is_file():
         raise LandmarkFileError(path, None, "no such reference rows: give some with --reference")
     reference = FramesByImage(path)
+    _, selection = select_frames(run.frames, options.frames, options.every)
     chosen = [
-        frame
-        for _, frame in select_frames(run.frames, options.frames, options.every)
-        if frame.image is not None or frame.content is not None
+        frame for _, frame in selection if frame.image is not None or frame.content is not None
     ]
     wanted = [(frame, reference.get(frame.step.prefix)) for frame in chosen]
     frames = [(frame, rows) for frame, rows in wanted if rows is not None]

@@ -27,11 +27,6 @@ def parameter_value(kind: type, name: str, text: str) -> Any:
     text : str
         The word.
 
-    Returns
-    -------
-    bool, int, float or str
-        Whatever the field is.
-
     Raises
     ------
     DetectError
@@ -62,24 +57,10 @@ def parameter_value(kind: type, name: str, text: str) -> Any:
 
 
 def parameter_values(kind: type, name: str, text: str) -> tuple[Any, ...]:
-    """The values of a parameter that are to be tried.
+    """The values of a parameter that are to be tried, each once.
 
-    Parameters
-    ----------
-    kind, name
-        As for `parameter_value`.
-    text : str
-        FROM:TO:STEP, both ends included, or values with commas between them.
-
-    Returns
-    -------
-    tuple
-        The values, each once, in the order given.
-
-    Raises
-    ------
-    DetectError
-        As `parameter_value` does, and for a range that is none.
+    `text` is FROM:TO:STEP, both ends included, or values with commas between them; errors as those
+    of `parameter_value`.
     """
     words = text.split(",")
     if ":" in text:
@@ -96,26 +77,10 @@ def parameter_values(kind: type, name: str, text: str) -> tuple[Any, ...]:
 
 
 def combinations(kind: type, varied: Mapping[str, str], most: int) -> tuple[Combination, ...]:
-    """All combinations of the parameters' values.
+    """All combinations of the values of parameters, written as for `parameter_values`.
 
-    Parameters
-    ----------
-    kind : type
-        As for `parameter_value`.
-    varied : mapping of str
-        The values of each parameter, as for `parameter_values`.
-    most : int
-        Largest number of combinations; more are refused.
-
-    Returns
-    -------
-    tuple of combinations
-        Each the names and values in the order of `varied`; the last varies fastest.
-
-    Raises
-    ------
-    DetectError
-        If nothing is varied, there are too many, or as `parameter_values` does.
+    Each has the names and values in the order of `varied`; the last varies fastest. Raises
+    DetectError if nothing is varied, there are more than `most`, or as `parameter_values` does.
     """
     if not varied:
         raise DetectError(

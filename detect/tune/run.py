@@ -62,36 +62,22 @@ def tune_run(
     tilts: ByPrefix[FrameTilt] | None = None,
     on_progress: Callable[[], None] | None = None,
 ) -> Iterator[Trial]:
-    """Detect with each setting in turn, and compare.
+    """Detect with each setting in turn, and compare; yields the trial of each.
 
     Parameters
     ----------
     run : Run
-        The run.
     frames : sequence of (RunFrame, Frame)
         Which of its frames, with their reference rows.
     settings : sequence of CircleSettings, or of LineSettings
         What to try; all of one kind.
     options : CompareOptions
-        What counts as the same landmark.
     workers : Workers
         They are started once for all settings, and again where some of them have died.
     tilts : mapping, optional
         Tilts by image prefix: positions of discs are corrected for them.
     on_progress : callable, optional
         Called once after every frame of every setting.
-
-    Yields
-    ------
-    Trial
-        Of each setting, in their order.
-
-    Raises
-    ------
-    lut.TableError
-        If there can be no table for the camera and a setting.
-    WorkerError
-        If there are no workers.
     """
     plans = [_plan(run, each) for each in settings]
     known = Known(tilts=tilts)

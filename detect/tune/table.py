@@ -24,17 +24,7 @@ _MOST_NAMED = 12
 def trial_records(
     combinations: Sequence[Combination], trials: Sequence[Trial], unit: str
 ) -> list[dict[str, Any]]:
-    """One record for each trial: the parameters, then the figures.
-
-    Parameters
-    ----------
-    combinations : sequence of combinations
-        See `detect.tune.grid.combinations`.
-    trials : sequence of Trial
-        Their results.
-    unit : str
-        Of the errors: ends the name of their column.
-    """
+    """One record for each trial: the parameters, then the figures; `unit` is that of the errors."""
     recall, precision = _rates(trials)
     f1 = f1_score(recall, precision)
     front, best = pareto_front(recall, precision), knee(recall, precision)
@@ -147,15 +137,8 @@ def f1_score(recall: ArrayLike, precision: ArrayLike) -> FloatArray:
 def pareto_front(recall: ArrayLike, precision: ArrayLike) -> NDArray[np.intp]:
     """Settings that no other one beats in recall or precision without losing in the other.
 
-    Parameters
-    ----------
-    recall, precision : (N,) array_like
-        Of each setting; NaN where there is none.
-
-    Returns
-    -------
-    (M,) intp
-        Which settings, by rising recall (and so by falling precision); of equals the first.
+    Of (N,) recalls and precisions, NaN where there are none, the (M,) indices of these settings, by
+    rising recall and so by falling precision; of equals the first.
     """
     r, p = np.asarray(recall, np.float64), np.asarray(precision, np.float64)
     known = np.flatnonzero(np.isfinite(r) & np.isfinite(p))
@@ -166,25 +149,12 @@ def pareto_front(recall: ArrayLike, precision: ArrayLike) -> NDArray[np.intp]:
 
 
 def knee(recall: ArrayLike, precision: ArrayLike) -> int | None:
-    """The setting at the knee of the curve of precision over recall.
+    """The setting at the knee of the curve of precision over recall; None without any.
 
     That is the point of the front farthest beyond the chord between the front's ends, both axes
-    scaled to the front's extent. Where no point is beyond it, there is no knee, and the point with
-    the greatest harmonic mean of recall and precision is used instead.
-
-    Parameters
-    ----------
-    recall, precision : (N,) array_like
-        Of each setting; NaN where there is none.
-
-    Returns
-    -------
-    int or None
-        Which setting; None without any.
-
-    References
-    ----------
-    Satopää, Albrecht, Irwin, Raghavan: Finding a "Kneedle" in a Haystack, 2011.
+    scaled to the front's extent (Satopää, Albrecht, Irwin, Raghavan: Finding a "Kneedle" in a
+    Haystack, 2011). Where no point is beyond it, there is no knee, and the point with the greatest
+    harmonic mean of recall and precision is used instead.
     """
     r, p = np.asarray(recall, np.float64), np.asarray(precision, np.float64)
     front = pareto_front(r, p)

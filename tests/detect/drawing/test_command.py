@@ -174,8 +174,9 @@ def test_frames_are_selected(
     small_run: Path, wanted: list[str], every: int, expected: list[int]
 ) -> None:
     frames = open_images(small_run).frames
-    selection = select_frames(frames, wanted, every)
+    count, selection = select_frames(frames, wanted, every)
     assert [position for position, _ in selection] == expected
+    assert count == len(expected)
 
 
 @pytest.mark.parametrize(
