@@ -228,7 +228,7 @@ class All(DetectorFlags):
 
 @dataclass(frozen=True)
 class Compare:
-    """Compare detected rows with reference rows: matched, missed, extra, errors.
+    """Compare detected rows with reference rows: found, missed, look-alikes, clutter, errors.
 
     Example: detect compare images/e --min-recall 0.9, or: detect compare images/e --lines
 

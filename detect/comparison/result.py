@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Optional
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from detect.flags import MaybeFloat
 from storage.bounds import ABOVE_0, NOT_NEGATIVE, demand
 
 if TYPE_CHECKING:
@@ -17,8 +18,6 @@ if TYPE_CHECKING:
 FloatArray = NDArray[np.float64]
 Kind = Literal["circles", "lines"]
 ErrorCovariance = Literal["detected", "reference", "sum"]
-# For `float | None` tyro imports another library that takes a tenth of a second.
-MaybeFloat = Optional[float]  # noqa: UP045
 
 
 class CompareError(ValueError):
@@ -94,16 +93,8 @@ class CompareOptions(Gates):
 class FramePair(NamedTuple):
     """The rows of one image on both sides, all discs or all lines.
 
-    Attributes
-    ----------
-    kind : {"circles", "lines"}
-    name : str
-        The image.
-    reference, detected : sequence of CircleLandmark or of LineLandmark
-    unlisted : sequence of CircleLandmark
-        What may be detected but need not be.
-    view : FrameView or None
-        How discs come back into the image; without it they are compared on the floor.
+    `unlisted` are those that may be detected but need not be. `view` is how discs come back into
+    the image; without it, they are compared on the floor.
     """
 
     kind: Kind

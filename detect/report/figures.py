@@ -149,7 +149,7 @@ def floor_figure(pairs: DiscPairs, *, lean: bool) -> Part:
             for label, offset, colour, mark in series:
                 usable = np.isfinite(offset).all(axis=1)
                 error = 1e3 * (offset * direction).sum(axis=1)[usable]
-                _dots(axes, distance[usable], error, color=colour, ms=1.5, alpha=0.25)
+                _dots(axes, distance[usable], error, colour)
                 middle, half, _ = binned(distance[usable], error)
                 axes.plot(middle, half, mark, color=colour, lw=1.4, ms=4, label=label)
                 ends += [*np.quantile(error, [0.01, 0.99])] if len(error) else []
@@ -172,7 +172,7 @@ def bearings_figure(pairs: LinePairs) -> Part:
     at, error = np.degrees(pairs.bearing_rad), np.degrees(np.abs(pairs.error_rad))
     with figure_file((_WIDE, 2.8), "svg") as (figure, content):
         axes = figure.subplots()
-        _dots(axes, at, error, color=REFERENCE, ms=2.5, alpha=0.6)
+        _dots(axes, at, error, REFERENCE)
         middle, half, most = binned(at, error)
         axes.plot(middle, half, "o-", color=DATA, lw=1.4, ms=4, label="median")
         axes.plot(middle, most, "s--", color=SECOND, lw=1.2, ms=3.5, label="95 %")
@@ -212,9 +212,11 @@ def tilt_figure(rows: Sequence[SeenRows]) -> Part:
     return _part(words, content, 3.4)
 
 
-def _dots(axes: Axes, at: FloatArray, values: FloatArray, **style: float | str) -> None:
+def _dots(axes: Axes, at: FloatArray, values: FloatArray, colour: str) -> None:
+    """Some of the points, small and pale unless they are few."""
     thin = max(1, len(at) // _MOST_DOTS)
-    axes.plot(at[::thin], values[::thin], ".", **style)  # type: ignore[arg-type]
+    size, alpha = (1.5, 0.25) if len(at) > 100 else (5.0, 0.7)
+    axes.plot(at[::thin], values[::thin], ".", color=colour, ms=size, alpha=alpha)
 
 
 def _finish(axes: Axes, x: str, y: str) -> None:

@@ -59,9 +59,8 @@ def gather(run: ImageRun, options: RowFiles, gates: Gates, time_frames: int) -> 
     compare = CompareOptions(**vars(gates))
     sight = files.sight(run.camera) if isinstance(run, Run) else None
     discs, lines = None, None
-    if "circles" in files.reference:
+    if both := [seen for seen in rows if seen.circles and seen.reference_circles]:
         path = files.reference["circles"]
-        both = [seen for seen in rows if seen.circles and seen.reference_circles]
         discs = compare_frames(
             [seen.reference_circles for seen in both if seen.reference_circles],
             [seen.circles for seen in both if seen.circles],
@@ -70,8 +69,7 @@ def gather(run: ImageRun, options: RowFiles, gates: Gates, time_frames: int) -> 
             beside=beside_reference(path),
             names=(path.name, files.detected["circles"].name),
         )
-    if "lines" in files.reference:
-        both = [seen for seen in rows if seen.lines and seen.reference_lines]
+    if both := [seen for seen in rows if seen.lines and seen.reference_lines]:
         lines = compare_line_frames(
             [seen.reference_lines for seen in both if seen.reference_lines],
             [seen.lines for seen in both if seen.lines],

@@ -118,27 +118,25 @@ def _discs(inputs: ReportInputs) -> list[Part]:
     result = inputs.discs
     if result is None:
         return [_no_reference("map.circles", "--reference")]
-    errors = [
+    errors, text = [], []
+    if result.on_lookalikes is not None:
+        errors.append(("extra on look-alikes", str(result.on_lookalikes)))
+    if result.in_image:
+        apart = f"{number(result.image_median_px, 2)} px"
+        errors.append(("median difference in the image", apart))
+        words = levelling_text(result)
+        words = (
+            f"{words[:1].upper()}{words[1:]}. A detected row fits a reference row if they are at "
+            f"most half the disc's image apart ({result.options.least_px:g} px for those that are "
+            "smaller)."
+        )
+        text.append(Part("text", words))
+    errors += [
         ("median difference on the floor", f"{_scaled(result.error_median_m, 1e3, 1)} mm"),
         ("95 %", f"{_scaled(result.error_95_m, 1e3, 1)} mm"),
     ]
-    if result.in_image:
-        errors.insert(
-            0, ("median difference in the image", f"{number(result.image_median_px, 2)} px")
-        )
-    if result.on_lookalikes is not None:
-        errors.insert(0, ("extra on look-alikes", str(result.on_lookalikes)))
-    parts = [_outcome(result, "in the image" if result.in_image else "on the floor", errors)]
-    if result.in_image:
-        words = levelling_text(result)
-        parts.append(
-            Part(
-                "text",
-                f"{words[:1].upper()}{words[1:]}. A detected row fits a reference row if they are "
-                f"at most half the disc's image apart ({result.options.least_px:g} px for those "
-                "that are smaller).",
-            )
-        )
+    where = "in the image" if result.in_image else "on the floor"
+    parts = [_outcome(result, where, errors), *text]
     if result.reference or result.detected:
         parts.append(distance_figure(result.bins))
     quality = [row.quality for match in result.frames for row in match.frame.detected]
