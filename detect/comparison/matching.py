@@ -130,20 +130,15 @@ def match_frame(frame: FramePair, options: CompareOptions) -> FrameMatch:
     if frame.kind == "circles":
         _demand_measurable(frame, options)
         pair_up = partial(pair_discs, options=options, view=frame.view)
-    counted, detected = frame.reference, frame.detected
-    uncounted = list(frame.unlisted)
+    counted, uncounted = frame.reference, list(frame.unlisted)
     if options.only_identified:
         uncounted += [row for row in counted if not row.identified]
         counted = [row for row in counted if row.identified]
-    pairs, set_aside = pair_up(counted, detected), []
-    if uncounted:
-        alone = pairs.second_alone
-        fitting = set(alone[pair_up(uncounted, [detected[j] for j in alone]).second].tolist())
-        set_aside = [row for j, row in enumerate(detected) if j in fitting]
-        detected = [row for j, row in enumerate(detected) if j not in fitting]
-        pairs = pair_up(counted, detected)
-    left = [counted[i] for i in pairs.first_alone]
-    first, second = [counted[i] for i in pairs.first], [detected[j] for j in pairs.second]
+    pairs = pair_up(counted, frame.detected)
+    first, left = ([counted[i] for i in side] for side in (pairs.first, pairs.first_alone))
+    second = [frame.detected[j] for j in pairs.second]
+    alone = [frame.detected[j] for j in pairs.second_alone]
+    aside = pair_up(uncounted, alone)
     if frame.kind == "lines":
         reach = numbers(second, "sigma") * options.sigmas
         joined = np.asarray((np.abs(_turns(left, second)) <= reach).any(axis=1))
@@ -156,8 +151,8 @@ def match_frame(frame: FramePair, options: CompareOptions) -> FrameMatch:
         matched=list(zip(first, second)),
         joined=[row for row, with_another in zip(left, joined) if with_another],
         missed=[row for row, with_another in zip(left, joined) if not with_another],
-        extra=[detected[j] for j in pairs.second_alone],
-        set_aside=set_aside,
+        extra=[alone[j] for j in aside.second_alone],
+        set_aside=[alone[j] for j in np.sort(aside.second)],
         errors=np.asarray(errors),
     )
 

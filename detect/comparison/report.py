@@ -87,7 +87,7 @@ def _summary(c: Comparison) -> dict[str, str]:
     }
     if on_lookalikes is not None:
         of = f"{on_lookalikes} of {c.detected} detected rows"
-        rows["look-alikes"] = f"{of}: on what is known to look like a disc"
+        rows["look-alikes"] = f"{of}: on things known to look like a disc"
     of, nothing = f"{c.extra - (on_lookalikes or 0)} of {c.detected} detected rows", "nothing known"
     if on_lookalikes is None:
         unknown = " (look-alikes are not known)" if isinstance(c, DiscComparison) else ""
