@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable
-from dataclasses import asdict, fields
+from dataclasses import asdict, astuple, fields
 
 from rich import box
 from rich.console import Group
@@ -229,14 +229,7 @@ def _floor_differences(c: DiscComparison) -> Table:
 def floor_figures(c: DiscComparison) -> list[tuple[FloorBin, list[float | None]]]:
     """The four figures before and the four after the lean of each bin that has pairs (m)."""
     return [
-        (
-            part,
-            [
-                value
-                for one in (part.before, part.after)
-                for value in (one.median_m, one.most_m, one.along_m, one.across_m)
-            ],
-        )
+        (part, [*astuple(part.before)[1:], *astuple(part.after)[1:]])
         for part in c.floor
         if part.before.pairs and part.after is not None
     ]

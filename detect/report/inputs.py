@@ -5,6 +5,7 @@ from __future__ import annotations
 import statistics
 import time
 from dataclasses import dataclass
+from itertools import islice
 
 from detect.comparison.circles import beside_reference, compare_frames
 from detect.comparison.lines import compare_line_frames
@@ -92,7 +93,7 @@ def _timing(run: ImageRun, files: RunRows, count: int, wanted: int) -> Timing | 
     plan = FramePlan(run.camera, lines=lines, circles=circles)
     tables = tables_of(plan)
     every = max(1, count // wanted)
-    chosen = [frame for k, frame in enumerate(run.frames) if k % every == 0][:wanted]
+    chosen = list(islice(run.frames, 0, every * wanted, every))
     decoding, detecting = [], []
     # The first frame, which compiles and fills caches, is processed twice.
     for frame in [chosen[0], *chosen]:

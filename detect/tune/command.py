@@ -31,7 +31,7 @@ def perform(options: Tune) -> int:
         base = PRESETS[options.preset]
     varied = {name: text for name, text in vars(options.grid).items() if text is not None}
     grid = combinations(type(base), varied, options.most)
-    settings = [replace(base, **dict(combination)) for combination in grid]
+    settings = [replace(base, **combination) for combination in grid]
     if options.verticals and options.tilt is not None:
         raise DetectError("--tilt and --verticals: verticals show the tilt themselves")
 

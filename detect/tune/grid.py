@@ -12,7 +12,8 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 from detect.errors import DetectError
 from storage.messages import excerpt
 
-Combination = tuple[tuple[str, Any], ...]
+#: The value of each parameter that is varied.
+Combination = dict[str, Any]
 
 
 def parameter_value(kind: type, name: str, text: str) -> Any:
@@ -90,6 +91,4 @@ def combinations(kind: type, varied: Mapping[str, str], most: int) -> tuple[Comb
     count = math.prod(len(v) for v in values.values())
     if count > most:
         raise DetectError(f"the grid has {count} combinations: expected at most {most} (--most)")
-    return tuple(
-        tuple(zip(values, combination)) for combination in itertools.product(*values.values())
-    )
+    return tuple(dict(zip(values, chosen)) for chosen in itertools.product(*values.values()))

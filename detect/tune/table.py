@@ -30,7 +30,7 @@ def trial_records(
     front, best = pareto_front(recall, precision), knee(recall, precision)
     return [
         {
-            **dict(combination),
+            **combination,
             "reference": trial.reference,
             "detected": trial.detected,
             "matched": trial.matched,
@@ -99,7 +99,7 @@ def curve_picture(
             # Towards the middle, where there is space.
             left = recall[k] > sum(axes.get_xlim()) / 2.0
             axes.annotate(
-                str(combinations[k][0][1]) if one_varied else _words(combinations[k]),
+                str(*combinations[k].values()) if one_varied else _words(combinations[k]),
                 (recall[k], precision[k]), xytext=(-7 if left else 7, 5),
                 textcoords="offset points", ha="right" if left else "left", fontsize=7,
             )  # fmt: skip
@@ -120,7 +120,7 @@ def _rates(trials: Sequence[Trial]) -> tuple[FloatArray, FloatArray]:
 
 
 def _words(combination: Combination) -> str:
-    return ", ".join(f"{name} {value}" for name, value in combination)
+    return ", ".join(f"{name} {value}" for name, value in combination.items())
 
 
 def _rounded(value: float | None) -> float | None:

@@ -130,7 +130,7 @@ def test_values_that_are_none_are_refused(kind: type, name: str, text: str, says
 
 def test_all_combinations_are_tried() -> None:
     grid = combinations(CircleSettings, {"threshold": "0.4,0.5", "samples": "8,16"}, 4)
-    assert [replace(CircleSettings(), **dict(c)) for c in grid] == [
+    assert [replace(CircleSettings(), **c) for c in grid] == [
         CircleSettings(threshold=t, samples=s) for t in (0.4, 0.5) for s in (8, 16)
     ]
     with pytest.raises(DetectError, match="4 combinations: expected at most 3"):
@@ -143,7 +143,7 @@ def test_all_combinations_are_tried() -> None:
 
 
 def test_records_mark_front_and_knee() -> None:
-    grid = [(("threshold", k / 10),) for k in range(len(CURVE))]
+    grid = [{"threshold": k / 10} for k in range(len(CURVE))]
     trials = [Trial(10, 9, 8, r, p, 0.0123456789, None) for r, p in CURVE]
     records = trial_records(grid, trials, "m")
     assert [r["front"] for r in records] == [True] * 4 + [False] * 3
