@@ -46,13 +46,8 @@ _EDGES_M = (-inf, 0.8, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, inf)
 class Beside(NamedTuple):
     """What is in view besides the reference rows, where that is known.
 
-    Attributes
-    ----------
-    unlisted : tuple of Frame
-        Discs that may be detected but need not be: detected rows on them count neither as right
-        nor as wrong.
-    lookalikes : tuple of Frame or None
-        What looks like a disc: detected rows on them are extra, and counted apart.
+    Detected rows on `unlisted` discs are neither right nor wrong, those on `lookalikes` are extra
+    and counted apart.
     """
 
     unlisted: tuple[Frame, ...] = ()

@@ -114,14 +114,10 @@ class FrameMatch(NamedTuple):
         All its rows.
     matched : list of (row, row)
         Pairs of a reference and a detected row; no row is in two of them.
-    joined : list of rows
-        Further reference rows that a matched line represents.
-    missed : list of rows
-        Reference rows that no detected row represents.
-    extra : list of rows
-        Detected rows that fit no reference row.
-    set_aside : list of rows
-        Detected rows that fit something that does not count: neither right nor wrong.
+    joined, missed : list of rows
+        Other reference rows: those that a matched line represents, too, and those that none does.
+    extra, set_aside : list of rows
+        Other detected rows; those set aside fit something that does not count.
     errors : (M,) float64
         Of the pairs: distance on the floor (m), or difference in bearing without sign (degrees).
     """
@@ -149,17 +145,9 @@ class FrameMatch(NamedTuple):
 class NormalisedError:
     """Squared errors in units of their covariance.
 
-    Attributes
-    ----------
-    per_dof : float or None
-        Mean per degree of freedom: 1 if the covariance is right, more if it is too small.
-    dof : int
-        Degrees of freedom: two for each matched disc, one for each matched line.
-    band : (float, float) or None
-        Interval of `per_dof` with 95 % probability if errors are normal, independent and have that
-        covariance.
-    left_out : int
-        Matched rows whose covariance is not positive definite, or whose sigma is not positive.
+    `per_dof` is their mean per degree of freedom (two for each disc, one for each line): 1 if the
+    covariance is right, more if it is too small; within `band` with 95 % probability if errors are
+    normal, independent and have that covariance. `left_out` rows have no usable covariance.
     """
 
     per_dof: float | None
@@ -246,18 +234,11 @@ class CommonLean:
 
 @dataclass(frozen=True, eq=False)
 class DiscPairs:
-    """Matched discs.
+    """N matched discs on the floor (m).
 
-    Attributes
-    ----------
-    reference_xy : (N, 2) float64
-        Metres.
-    offset, left : (N, 2) float64
-        Detected minus reference positions on the floor (m), before and after the common lean.
-    covariance : (N, 2, 2) float64
-        That errors are measured in.
-    away : (N, 2) float64
-        Unit vectors on the floor along which the camera sees the discs.
+    `offset` and `left` (N, 2) are detected minus reference positions before and after the common
+    lean, `covariance` (N, 2, 2) is what errors are measured in, and `away` (N, 2) has unit vectors
+    along which the camera sees the discs.
     """
 
     reference_xy: FloatArray
@@ -269,10 +250,7 @@ class DiscPairs:
 
 @dataclass(frozen=True, eq=False)
 class LinePairs:
-    """Matched lines: bearings of the reference rows, errors and sigmas of the detected ones (rad).
-
-    Each is a (N,) float64 array.
-    """
+    """N matched lines: bearings of reference rows, errors and sigmas of detected ones (rad)."""
 
     bearing_rad: FloatArray
     error_rad: FloatArray
@@ -362,18 +340,8 @@ class DiscComparison(Comparison):
 class LineComparison(Comparison):
     """How a run's detected lines compare with reference rows.
 
-    Attributes
-    ----------
-    bearing_median_deg, bearing_95_deg : float or None
-        Median and 95 % quantile of the differences in alpha of the pairs, without sign (degrees).
-    normalised_error : NormalisedError
-        Of these differences in units of the detected rows' sigmas.
-    ends_median : float or None
-        Median distance between the pairs' ends, top and bottom alike (normalised image
-        coordinates).
-    beta_median_deg : float or None
-        Median difference in beta of the pairs, without sign (degrees).
-    pairs : LinePairs
+    Differences in bearing (alpha) and beta are without sign, distances between the pairs' ends, top
+    and bottom alike, in normalised image coordinates.
     """
 
     bearing_median_deg: float | None

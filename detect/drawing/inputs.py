@@ -79,7 +79,8 @@ class FileHead:
         try:
             for name, text in self.settings:
                 if get_origin(hints.get(name)) is tuple:
-                    values[name] = _numbers(name, text, in_pairs="float, float" in str(hints[name]))
+                    in_pairs = hints[name] == tuple[tuple[float, float], ...]
+                    values[name] = _numbers(name, text, in_pairs=in_pairs)
                 elif name in hints:
                     values[name] = parameter_value(kind, name, text)
             return kind(**values)

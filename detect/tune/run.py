@@ -26,20 +26,11 @@ Settings = CircleSettings | LineSettings
 
 @dataclass(frozen=True)
 class Trial:
-    """Result of one setting.
+    """Result of one setting, as in `detect.comparison.result.Comparison`.
 
-    Attributes
-    ----------
-    reference, detected, matched : int
-        Rows that count, and reference rows that were found.
-    recall, precision : float or None
-        None where there are no rows to compute them from.
-    error_median : float or None
-        Of the pairs: metres (discs), degrees (verticals).
-    normalised_error : float or None
-        Squared, per degree of freedom: 1 if the covariances are right.
-    failures : tuple of str
-        Frames that could not be worked on: they count as frames without detections.
+    `matched` are the reference rows that were found. The median error is in metres (discs) or
+    degrees (verticals), the normalised one squared per degree of freedom. Frames in `failures`
+    could not be worked on: they count as frames without detections.
     """
 
     reference: int
