@@ -70,6 +70,14 @@ def test_rows_on_what_is_known_besides_are_told_apart() -> None:
     assert (found.matched, found.missed, found.extra) == (4, 1, 2)
     assert (found.set_aside, found.on_lookalikes) == (1, 1)
     assert found.precision == pytest.approx(4 / 6)
+    lines = [" ".join(line.split()) for line in format_text(found).splitlines()]
+    assert lines[:5] == [
+        "found 4 of 5 reference rows",
+        "missed 1 of 5 reference rows",
+        "look-alikes 1 of 6 detected rows: on things known to look like a disc",
+        "clutter 1 of 6 detected rows: on nothing known",
+        "not counted 1 more detected rows: on discs in view that are not listed",
+    ]
     without = compare_frames(REFERENCE, detected, STANDARD)
     assert (without.extra, without.set_aside, without.on_lookalikes) == (3, 0, None)
 
