@@ -43,7 +43,6 @@ from landmarks.tilts import (
     format_no_tilt,
     format_outline_tilt,
     format_tilt,
-    iterate_tilts,
     read_tilts,
     tilt_as_written,
 )
@@ -89,7 +88,6 @@ __all__ = [
     "is_positive_definite",
     "iterate_prefixes",
     "iterate_steps",
-    "iterate_tilts",
     "parse_record",
     "parse_rows",
     "read_frames",

@@ -33,9 +33,8 @@ class Association:
 def associate(costs: ArrayLike, allowed: ArrayLike) -> Association:
     """Pair the rows of two sets: as many pairs as possible, and of those the least total cost.
 
-    The pairs that are allowed fall apart into small groups of rows that compete; each is solved on
-    its own as a linear assignment problem. Deterministic; where several solutions have the same
-    number of pairs and the same cost, which one comes out may depend on the order of the rows.
+    A linear assignment problem. Deterministic; where several solutions have the same number of
+    pairs and the same cost, which one comes out may depend on the order of the rows.
 
     Parameters
     ----------
@@ -56,42 +55,24 @@ def associate(costs: ArrayLike, allowed: ArrayLike) -> Association:
         If the shapes differ or an allowed cost is negative or not finite.
     """
     from scipy.optimize import linear_sum_assignment
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
 
     cost = np.asarray(costs, dtype=np.float64)
     gate = np.asarray(allowed, dtype=np.bool_)
     if cost.ndim != 2 or cost.shape != gate.shape:
         raise ValueError(f"costs {cost.shape}, allowed {gate.shape}: expected both (N, M)")
-    rows, columns = np.nonzero(gate)
     if not (np.isfinite(cost[gate]) & (cost[gate] >= 0)).all():
         raise ValueError("a cost is negative or not finite where a pair is allowed")
-
-    n_first, n_second = cost.shape
-    # SciPy before 1.12 does not support graphs with 64-bit indices.
-    ends = (rows.astype(np.int32), (n_first + columns).astype(np.int32))
-    edges = coo_array((np.ones(len(rows)), ends), shape=(n_first + n_second,) * 2)
-    _, group = connected_components(edges, directed=False)
-    partner = np.full(n_first, -1, dtype=np.intp)
-    for label in np.unique(group[rows]):
-        some_first = np.flatnonzero(group[:n_first] == label)
-        some_second = np.flatnonzero(group[n_first:] == label)
-        block = np.ix_(some_first, some_second)
-        # One forbidden pair costs more than all allowed ones together: no more are taken than must.
-        scale = cost[block][gate[block]].max() or 1.0
-        forbidden = 1.0 + min(gate[block].shape)
-        solved = linear_sum_assignment(np.where(gate[block], cost[block] / scale, forbidden))
-        for i, j in zip(some_first[solved[0]], some_second[solved[1]]):
-            if gate[i, j]:
-                partner[i] = j
-
-    first = np.flatnonzero(partner >= 0)
-    second = partner[first]
+    # One forbidden pair costs more than all allowed ones together: no more are taken than must.
+    scale = cost[gate].max(initial=0.0) or 1.0
+    forbidden = 1.0 + min(cost.shape)
+    first, second = linear_sum_assignment(np.where(gate, cost / scale, forbidden))
+    paired = gate[first, second]
+    first, second = first[paired], second[paired]
     return Association(
         first=first,
         second=second,
-        first_alone=np.flatnonzero(partner < 0),
-        second_alone=np.setdiff1d(np.arange(n_second), second),
+        first_alone=np.setdiff1d(np.arange(cost.shape[0]), first),
+        second_alone=np.setdiff1d(np.arange(cost.shape[1]), second),
     )
 
 

@@ -6,8 +6,8 @@ frame X left, Y backward, on the floor; pixels from the centre of the top left o
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import astuple, fields
+from typing import Literal, NamedTuple
 
 from landmarks.records import (
     MARKER_CORNERS,
@@ -24,18 +24,16 @@ TableName = Literal["steps", "circles", "lines", "markers", "tilts"]
 Value = str | float | int | tuple[int, ...] | None
 
 
-@dataclass(frozen=True, slots=True)
-class Column:
+class Column(NamedTuple):
     """A column of a table.
 
     Attributes
     ----------
     name : str
-        Its name, ending in the unit if it has one.
+        Ends in the unit if it has one.
     kind : str
-        What its values are.
     unit : str
-        "1" for pure numbers, empty where there is nothing to measure.
+        "1" for pure numbers, empty for text and identifiers.
     meaning : str
         Its description.
     """
@@ -58,15 +56,17 @@ FRAME_COLUMNS = (
 
 _IDS = Column("ids", "whole numbers", "", "identifiers, -1 unknown; usually one")
 
-_MARKER_CORNERS = tuple(
-    column
-    for corner in MARKER_CORNERS
-    for column in _numbers(
-        (f"{corner.replace(' ', '_')}_u_px", "px", f"column of the {corner} corner"),
-        (f"{corner.replace(' ', '_')}_v_px", "px", f"row of the {corner} corner"),
-        (f"{corner.replace(' ', '_')}_cuu_px2", "px^2", "variance of the column"),
-        (f"{corner.replace(' ', '_')}_cuv_px2", "px^2", "covariance of column and row"),
-        (f"{corner.replace(' ', '_')}_cvv_px2", "px^2", "variance of the row"),
+_MARKER_CORNERS = _numbers(
+    *(
+        (f"{corner.replace(' ', '_')}_{name}", unit, meaning.format(corner))
+        for corner in MARKER_CORNERS
+        for name, unit, meaning in (
+            ("u_px", "px", "column of the {} corner"),
+            ("v_px", "px", "row of the {} corner"),
+            ("cuu_px2", "px^2", "variance of the column"),
+            ("cuv_px2", "px^2", "covariance of column and row"),
+            ("cvv_px2", "px^2", "variance of the row"),
+        )
     )
 )
 
@@ -135,26 +135,22 @@ TABLES: dict[TableName, tuple[Column, ...]] = {
 
 def table_of(record: Step | Landmark | FrameTilt) -> TableName:
     """The table that a record is a row of."""
-    if isinstance(record, Step):
-        return "steps"
-    if isinstance(record, CircleLandmark):
-        return "circles"
-    if isinstance(record, LineLandmark):
-        return "lines"
-    return "markers" if isinstance(record, MarkerLandmark) else "tilts"
+    return _TABLE_BY_TYPE[type(record)]
 
 
 def values_of(record: Step | Landmark | FrameTilt) -> tuple[Value, ...]:
     """The values of a record, in the order of its table's columns after `FRAME_COLUMNS`."""
-    r = record
-    if isinstance(r, Step):
-        return (r.dx, r.dy, r.dphi, r.cxx, r.cxy, r.cyy, r.cxphi, r.cyphi, r.cphiphi)
-    if isinstance(r, CircleLandmark):
-        return (r.px, r.py, r.quality, r.cxx, r.cxy, r.cyy, r.ids)
-    if isinstance(r, LineLandmark):
-        ends = (r.xtop, r.ytop, r.xbottom, r.ybottom)
-        return (*ends, r.alpha, r.beta, r.quality, r.sigma, r.ids)
-    if isinstance(r, MarkerLandmark):
-        corners = [v for c in r.corners for v in (c.u, c.v, c.cuu, c.cuv, c.cvv)]
-        return (r.dictionary, r.id, r.quality, *corners)
-    return (r.pitch, r.roll, r.cpp, r.cpr, r.crr, r.lines)
+    if isinstance(record, MarkerLandmark):
+        corners = [value for corner in record.corners for value in astuple(corner)]
+        return (record.dictionary, record.id, record.quality, *corners)
+    names = [field.name for field in fields(record) if field.name != "prefix"]
+    return tuple(getattr(record, name) for name in names)
+
+
+_TABLE_BY_TYPE: dict[type, TableName] = {
+    Step: "steps",
+    CircleLandmark: "circles",
+    LineLandmark: "lines",
+    MarkerLandmark: "markers",
+    FrameTilt: "tilts",
+}

@@ -6,8 +6,6 @@ import os
 
 from storage.messages import OneLineError
 
-_LONGEST_EXCERPT = 40
-
 
 class LandmarkError(OneLineError, ValueError):
     """An invalid record; the message names the quantity, its value and what was expected."""
@@ -19,9 +17,8 @@ class LandmarkFileError(LandmarkError):
     Parameters
     ----------
     file : path
-        The file.
     line : int or None
-        The wrong line, counted from 1; None where the file as a whole is.
+        The wrong line, counted from 1; None if the error concerns the whole file.
     problem : str
         What was found and what was expected.
     """
@@ -32,12 +29,3 @@ class LandmarkFileError(LandmarkError):
         self.problem = problem
         place = self.file if line is None else f"{self.file}:{line}"
         super().__init__(f"{place}: {problem}")
-
-
-def excerpt(text: bytes) -> str:
-    """Show text of unknown origin on one line: ASCII, escaped, at most 40 characters and quotes."""
-    # Escapes make a text longer, never shorter: text past the limit is never shown.
-    shown = text[: _LONGEST_EXCERPT + 1].decode("latin-1").encode("unicode_escape").decode("ascii")
-    if len(shown) > _LONGEST_EXCERPT:
-        shown = shown[: _LONGEST_EXCERPT - 3] + "..."
-    return f"'{shown}'"

@@ -8,8 +8,6 @@ import math
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,23 +19,15 @@ from storage.bounded import read_bounded
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-Kind = Literal["disc", "line"]
-
 MAP_COLUMNS = ("kind", "id", "x_m", "y_m", "cxx_m2", "cxy_m2", "cyy_m2", "rows")
-#: A map of discs that are where they are said to be.
+#: Of a map of discs whose places are exact.
 SHORT_MAP_COLUMNS = ("id", "x_m", "y_m", "rows")
-_COVARIANCE = (
-    "cxx",
-    "cxy",
-    "cxtheta",
-    "cyx",
-    "cyy",
-    "cytheta",
-    "cthetax",
-    "cthetay",
-    "cthetatheta",
+PATH_COLUMNS = (
+    *("prefix", "x_m", "y_m", "theta_rad"),
+    *(f"c{row}{column}" for row in ("x", "y", "theta") for column in ("x", "y", "theta")),
 )
-PATH_COLUMNS = ("prefix", "x_m", "y_m", "theta_rad", *_COVARIANCE)
+#: Of a path without covariances.
+SHORT_PATH_COLUMNS = PATH_COLUMNS[:4]
 _LARGEST_FILE_BYTES = 1 << 28
 
 
@@ -54,7 +44,7 @@ class Landmarks:
     covariance : (M, 2, 2) float64
         Of `xy` (m^2).
     rows : (M,) int64
-        How many rows each was estimated from.
+        Number of rows that each was estimated from.
     """
 
     ids: IntArray
@@ -95,12 +85,7 @@ class Path2D:
 
 def no_landmarks() -> Landmarks:
     """A map of nothing."""
-    return Landmarks(
-        ids=np.zeros(0, dtype=np.int64),
-        xy=np.zeros((0, 2)),
-        covariance=np.zeros((0, 2, 2)),
-        rows=np.zeros(0, dtype=np.int64),
-    )
+    return _landmarks({})
 
 
 def write_map(
@@ -128,13 +113,9 @@ def write_map(
     storage.OutputExistsError
         If the file exists and may not be replaced.
     """
-    kinds: tuple[tuple[Kind, Landmarks], ...] = (
-        ("disc", landmark_map.discs),
-        ("line", landmark_map.lines),
-    )
     rows = [
-        (kind, int(number), *map(_number, (*xy, c[0, 0], c[0, 1], c[1, 1])), int(count))
-        for kind, some in kinds
+        (kind, int(number), *map(float, (*xy, c[0, 0], c[0, 1], c[1, 1])), int(count))
+        for kind, some in (("disc", landmark_map.discs), ("line", landmark_map.lines))
         for number, xy, c, count in zip(some.ids, some.xy, some.covariance, some.rows)
     ]
     _write(path, MAP_COLUMNS, rows, comments, overwrite)
@@ -152,23 +133,22 @@ def read_map(path: str | os.PathLike[str]) -> LandmarkMap:
         is negative; the message names file and line.
     """
     found: dict[str, dict[int, tuple[list[float], int]]] = {"disc": {}, "line": {}}
-    for line, words in _read(path, MAP_COLUMNS):
-        if words[0] not in found:
-            raise LandmarkFileError(path, line, f"kind is {words[0][:20]!r}: expected disc or line")
+    what = "a map, map.csv, of `slam map`"
+    for line, words in _read(path, what, MAP_COLUMNS, SHORT_MAP_COLUMNS):
+        if len(words) == len(SHORT_MAP_COLUMNS):
+            words = ["disc", *words[:3], "0", "0", "0", words[3]]
+        kind = words[0]
+        if kind not in found:
+            raise LandmarkFileError(path, line, f"kind is {kind[:20]!r}: expected disc or line")
         number = _whole(path, line, "id", words[1])
-        values = [
-            _finite(path, line, name, word) for name, word in zip(MAP_COLUMNS[2:7], words[2:7])
-        ]
+        values = _finite(path, line, MAP_COLUMNS[2:7], words[2:7])
         rows = _whole(path, line, "rows", words[7])
-        if number in found[words[0]]:
-            raise LandmarkFileError(path, line, f"{words[0]} {number} is in the map already")
-        if (
-            values[2] < 0.0
-            or values[4] < 0.0
-            or values[3] * values[3] > (values[2] * values[4] * 1.000001)
-        ):
-            raise LandmarkFileError(path, line, f"{words[0]} {number}: covariance is negative")
-        found[words[0]][number] = (values, rows)
+        if number in found[kind]:
+            raise LandmarkFileError(path, line, f"{kind} {number} is in the map already")
+        _, _, cxx, cxy, cyy = values
+        if cxx < 0.0 or cyy < 0.0 or cxy * cxy > 1.000001 * cxx * cyy:
+            raise LandmarkFileError(path, line, f"{kind} {number}: covariance is negative")
+        found[kind][number] = (values, rows)
     return LandmarkMap(discs=_landmarks(found["disc"]), lines=_landmarks(found["line"]))
 
 
@@ -180,12 +160,12 @@ def write_path(
     overwrite: bool = False,
 ) -> None:
     """Write a path: columns as `PATH_COLUMNS`, the covariance row by row where there is one."""
-    width = len(PATH_COLUMNS) if poses.covariance is not None else 4
-    rows = []
-    for k, (prefix, pose) in enumerate(zip(poses.prefixes, poses.poses)):
-        spread = () if poses.covariance is None else poses.covariance[k].ravel()
-        rows.append((prefix, *map(_number, (*pose, *spread))))
-    _write(path, PATH_COLUMNS[:width], rows, comments, overwrite)
+    columns, table = SHORT_PATH_COLUMNS, poses.poses
+    if poses.covariance is not None:
+        columns = PATH_COLUMNS
+        table = np.hstack([table, poses.covariance.reshape(len(table), -1)])
+    rows = [(prefix, *row) for prefix, row in zip(poses.prefixes, table.tolist())]
+    _write(path, columns, rows, comments, overwrite)
 
 
 def read_path(path: str | os.PathLike[str]) -> Path2D:
@@ -197,11 +177,10 @@ def read_path(path: str | os.PathLike[str]) -> Path2D:
         If the file cannot be read or a row is malformed; the message names file and line.
     """
     prefixes, numbers = [], []
-    for line, words in _read(path, PATH_COLUMNS, fewest=4):
+    what = "a path, path.csv, of `slam map`"
+    for line, words in _read(path, what, PATH_COLUMNS, SHORT_PATH_COLUMNS):
         prefixes.append(words[0])
-        numbers.append(
-            [_finite(path, line, name, word) for name, word in zip(PATH_COLUMNS[1:], words[1:])]
-        )
+        numbers.append(_finite(path, line, PATH_COLUMNS[1:], words[1:]))
     table = np.array(numbers, dtype=np.float64)
     return Path2D(
         prefixes=tuple(prefixes),
@@ -211,19 +190,13 @@ def read_path(path: str | os.PathLike[str]) -> Path2D:
 
 
 def _landmarks(found: dict[int, tuple[list[float], int]]) -> Landmarks:
-    if not found:
-        return no_landmarks()
-    table = np.array([values for values, _ in found.values()], dtype=np.float64)
+    table = np.array([values for values, _ in found.values()], dtype=np.float64).reshape(-1, 5)
     return Landmarks(
         ids=np.array(list(found), dtype=np.int64),
         xy=table[:, :2].copy(),
         covariance=table[:, [2, 3, 3, 4]].reshape(-1, 2, 2),
         rows=np.array([rows for _, rows in found.values()], dtype=np.int64),
     )
-
-
-def _number(value: float) -> str:
-    return repr(float(value))
 
 
 def _write(
@@ -234,62 +207,57 @@ def _write(
     overwrite: bool,
 ) -> None:
     text = io.StringIO()
-    for comment in comments:
-        text.write(f"# {comment}\n")
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(columns)
-    writer.writerows(rows)
+    text.writelines(f"# {comment}\n" for comment in comments)
+    csv.writer(text, lineterminator="\n").writerows([columns, *rows])
     with write_whole(path, overwrite=overwrite) as stream:
         stream.write(text.getvalue().encode("utf-8", "surrogateescape"))
 
 
 def _read(
-    path: str | os.PathLike[str], columns: Sequence[str], fewest: int | None = None
+    path: str | os.PathLike[str], what: str, columns: Sequence[str], fewer: Sequence[str]
 ) -> Iterator[tuple[int, list[str]]]:
-    """Rows of a file with their line numbers, after its head was checked."""
-    place = Path(path)
-    what = "a map, map.csv" if columns is MAP_COLUMNS else "a path, path.csv"
+    """Rows of a file with their line numbers, under a head of either set of columns."""
     try:
-        text = read_bounded(place, _LARGEST_FILE_BYTES).decode("utf-8", "surrogateescape")
+        text = read_bounded(path, _LARGEST_FILE_BYTES).decode("utf-8", "surrogateescape")
     except OSError as error:
-        raise LandmarkFileError(
-            place, None, f"cannot be read: {error.strerror or error}: expected {what} of `slam map`"
-        ) from None
-    head: list[str] | None = None
-    count = 0
+        reason = error.strerror or error
+        raise LandmarkFileError(path, None, f"cannot be read: {reason}: expected {what}") from None
+    head: list[str] = []
+    empty = True
     for number, line in enumerate(text.splitlines(), 1):
         if not line.strip() or line.startswith("#"):
             continue
         words = next(csv.reader([line]))
-        if head is None:
-            widths = {len(columns), fewest or len(columns)}
-            if columns is MAP_COLUMNS and tuple(words) == SHORT_MAP_COLUMNS:
-                head = words
-                continue
-            if len(words) not in widths or tuple(words) != tuple(columns[: len(words)]):
-                raise LandmarkFileError(place, number, f"expected the columns {','.join(columns)}")
+        if not head:
+            if tuple(words) not in (columns, fewer):
+                raise LandmarkFileError(path, number, f"expected the columns {','.join(columns)}")
             head = words
             continue
         if len(words) != len(head):
-            raise LandmarkFileError(place, number, f"{len(words)} values: expected {len(head)}")
-        count += 1
-        if tuple(head) == SHORT_MAP_COLUMNS:
-            words = ["disc", *words[:3], "0", "0", "0", words[3]]
+            raise LandmarkFileError(path, number, f"{len(words)} values: expected {len(head)}")
+        empty = False
         yield number, words
-    if count == 0:
+    if empty:
         raise LandmarkFileError(
-            place, None, f"no rows: expected at least one under {','.join(columns)}"
+            path, None, f"no rows: expected at least one under {','.join(columns)}"
         )
 
 
-def _finite(path: str | os.PathLike[str], line: int, name: str, word: str) -> float:
-    try:
-        value = float(word)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise LandmarkFileError(path, line, f"{name} is {word[:30]!r}: expected a finite number")
-    return value
+def _finite(
+    path: str | os.PathLike[str], line: int, names: Sequence[str], words: Sequence[str]
+) -> list[float]:
+    values = []
+    for name, word in zip(names, words):
+        try:
+            value = float(word)
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value):
+            raise LandmarkFileError(
+                path, line, f"{name} is {word[:30]!r}: expected a finite number"
+            )
+        values.append(value)
+    return values
 
 
 def _whole(path: str | os.PathLike[str], line: int, name: str, word: str) -> int:

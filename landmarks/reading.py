@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from itertools import takewhile
 from pathlib import Path
-from typing import BinaryIO, TypeVar
+from typing import BinaryIO
 
-from landmarks.errors import LandmarkError, LandmarkFileError, excerpt
+from landmarks.errors import LandmarkError, LandmarkFileError
 from landmarks.records import (
     CIRCLE_NUMBERS,
     LINE_NUMBERS,
@@ -32,8 +33,7 @@ from landmarks.records import (
     Row,
     Step,
 )
-
-T = TypeVar("T")
+from storage.messages import excerpt
 
 _LONGEST_ROW_BYTES = 1 << 16
 _LONGEST_ID_DIGITS = 20
@@ -42,16 +42,9 @@ _BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 # Narrower than `float`, which also takes nan, infinity and 1_000.
 _NUMBER_PATTERN = rb"[+-]?(?:[0-9]++(?:\.[0-9]*+)?|\.[0-9]++)(?:[eE][+-]?[0-9]++)?"
 _NUMBER = re.compile(_NUMBER_PATTERN)
-_NUMBERS = re.compile(rb"(?:%b )*+" % _NUMBER_PATTERN)
 _WHOLE_NUMBER = re.compile(rb"[+-]?[0-9]+")
 # A comment, so that other programs can read the file as well.
 _LEVELLED = re.compile(rb"# levelled (%b) (%b)\r?\n?" % (_NUMBER_PATTERN, _NUMBER_PATTERN))
-# A STEP as programs write it, in a line of its own, with finite numbers: the usual case.
-_PLAIN_STEP = re.compile(
-    rb"STEP ((?!#)[!-\[\]-~]{1,255}+)"
-    + len(STEP_NUMBERS) * rb" {1,32}+(-?[0-9]{1,15}\.[0-9]{1,20})"
-    + rb"\r?\n"
-)
 
 
 def read_rows(path: str | os.PathLike[str]) -> Iterator[Row]:
@@ -75,7 +68,7 @@ def read_rows(path: str | os.PathLike[str]) -> Iterator[Row]:
         If the file cannot be opened, a row is malformed, or a landmark precedes the first STEP; the
         message names the file, the line and what was expected.
     """
-    with _opened(path) as stream:
+    with opened(path, "landmark file") as stream:
         yield from parse_rows(stream, name=os.fspath(path))
 
 
@@ -93,7 +86,6 @@ def read_steps(path: str | os.PathLike[str]) -> list[Step]:
     Parameters
     ----------
     path : path
-        The file.
 
     Returns
     -------
@@ -110,20 +102,12 @@ def read_steps(path: str | os.PathLike[str]) -> list[Step]:
 
 def iterate_steps(path: str | os.PathLike[str]) -> Iterator[Step]:
     """Read a run's odometry step by step; parameters and errors are those of `read_steps`."""
-    with _opened(path) as stream:
-        for record, _, _ in _parsed(stream, os.fspath(path), _plain_step):
-            if isinstance(record, Step):
-                yield record
+    return (row.record for row in read_rows(path) if isinstance(row.record, Step))
 
 
 def iterate_prefixes(path: str | os.PathLike[str]) -> Iterator[str]:
-    """The prefixes of a run's steps: the same errors, sooner than by the steps themselves."""
-    with _opened(path) as stream:
-        for record, _, _ in _parsed(stream, os.fspath(path), _plain_prefix):
-            if isinstance(record, str):
-                yield record
-            elif isinstance(record, Step):
-                yield record.prefix
+    """The prefixes of a run's steps; parameters and errors are those of `read_steps`."""
+    return (step.prefix for step in iterate_steps(path))
 
 
 def frames_of_rows(rows: Iterable[Row]) -> Iterator[Frame]:
@@ -146,7 +130,16 @@ def frames_of_rows(rows: Iterable[Row]) -> Iterator[Frame]:
 
 def parse_rows(stream: BinaryIO, name: str = "<stream>") -> Iterator[Row]:
     """Read rows from a binary stream; errors name the file `name` (see `read_rows`)."""
-    for record, source, line in _parsed(stream, name, _plain_step):
+    seen_step = False
+    for words, source, line in rows_of_words(stream, name):
+        try:
+            record = _record(words)
+        except LandmarkError as error:
+            raise LandmarkFileError(name, line, str(error)) from None
+        if isinstance(record, Step):
+            seen_step = True
+        elif isinstance(record, Landmark) and not seen_step:
+            raise LandmarkFileError(name, line, "landmark before any STEP: expected a STEP first")
         yield Row(record, source, line)
 
 
@@ -158,186 +151,120 @@ def parse_record(text: str) -> Record | None:
     LandmarkError
         If the row is malformed; the message says what was expected.
     """
-    return _parse(text.encode("utf-8", "surrogateescape"))
+    return _record(_words(text.encode("utf-8", "surrogateescape")))
 
 
 @contextmanager
-def _opened(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
-    """Open a landmark file for reading; errors of the system become `LandmarkFileError`s."""
+def opened(path: str | os.PathLike[str], kind: str) -> Iterator[BinaryIO]:
+    """Open a file of a kind for reading; errors of the system become `LandmarkFileError`s."""
     try:
         with Path(path).open("rb") as stream:
             yield stream
     except FileNotFoundError:
-        raise LandmarkFileError(path, None, "no such landmark file") from None
+        raise LandmarkFileError(path, None, f"no such {kind}") from None
     except OSError as error:
         reason = error.strerror or str(error)
-        raise LandmarkFileError(
-            path, None, f"cannot be read as a landmark file: {reason}"
-        ) from None
+        raise LandmarkFileError(path, None, f"cannot be read as a {kind}: {reason}") from None
 
 
-def _parsed(
-    stream: BinaryIO, name: str, plain: Callable[[re.Match[bytes]], T]
-) -> Iterator[tuple[Record | T | None, bytes, int]]:
-    """Each row's record, its text in the file and the number of its first line.
-
-    Of a plain STEP, the record is what `plain` makes of its words.
-    """
-    number = 0  # of the last line
-    seen_step = False
-    while source := stream.readline(_LONGEST_ROW_BYTES + 1):
+def rows_of_words(stream: BinaryIO, name: str) -> Iterator[tuple[list[bytes], bytes, int]]:
+    """The words of each row of a file, its text and the number of its first line."""
+    source = text = b""
+    first, number = 1, 0
+    while line := stream.readline(_LONGEST_ROW_BYTES + 1):
         number += 1
-        found = _PLAIN_STEP.fullmatch(source)
-        if found is not None:
-            seen_step = True
-            yield plain(found), source, number
+        source += line
+        if len(source) > _LONGEST_ROW_BYTES:
+            raise LandmarkFileError(
+                name, number, f"longer than {_LONGEST_ROW_BYTES} bytes: expected a row of text"
+            )
+        text += line.rstrip(b"\r\n")
+        if number == 1:
+            text = text.removeprefix(_BYTE_ORDER_MARK)
+        if text.endswith(b"\\") and not text.lstrip().startswith(b"#"):
+            text = text[:-1]
             continue
-        first = number
-        source, text, number = _logical_line(stream, name, source, number)
-        try:
-            record = _parse(text)
-        except LandmarkError as error:
-            raise LandmarkFileError(name, first, str(error)) from None
-        if isinstance(record, Step):
-            seen_step = True
-        elif isinstance(record, Landmark) and not seen_step:
-            raise LandmarkFileError(name, first, "landmark before any STEP: expected a STEP first")
-        yield record, source, first
+        yield _words(text), source, first
+        source = text = b""
+        first = number + 1
+    if source:
+        raise LandmarkFileError(name, number, "ends with \\: expected a line to follow")
 
 
-def _plain_step(found: re.Match[bytes]) -> Step:
-    prefix, *numbers = found.groups()
-    return Step(prefix.decode(), *map(float, numbers))
+def decode(word: bytes) -> str:
+    """A word of a file; bytes that are not UTF-8 become surrogates, as in Python's file names."""
+    return word.decode("utf-8", "surrogateescape")
 
 
-def _plain_prefix(found: re.Match[bytes]) -> str:
-    return found[1].decode()
+def _words(text: bytes) -> list[bytes]:
+    """The words of a row without its comment."""
+    return list(takewhile(lambda word: not word.startswith(b"#"), text.split()))
 
 
-def _logical_line(
-    stream: BinaryIO, name: str, source: bytes, number: int
-) -> tuple[bytes, bytes, int]:
-    """A row from its first line: its text in the file, the same joined to one line, its last line.
-
-    `number` is that of the first line.
-    """
-    _demand_row_length(source, name, number)
-    text = source.rstrip(b"\r\n")
-    if number == 1:
-        text = text.removeprefix(_BYTE_ORDER_MARK)
-    if text.lstrip().startswith(b"#"):
-        text = b""
-    while text.endswith(b"\\"):
-        following = stream.readline(_LONGEST_ROW_BYTES + 1)
-        if not following:
-            raise LandmarkFileError(name, number, "ends with \\: expected a line to follow")
-        number += 1
-        source += following
-        _demand_row_length(source, name, number)
-        text = text[:-1] + following.rstrip(b"\r\n")
-    return source, text, number
-
-
-def _demand_row_length(source: bytes, name: str, line: int) -> None:
-    if len(source) > _LONGEST_ROW_BYTES:
-        raise LandmarkFileError(
-            name, line, f"longer than {_LONGEST_ROW_BYTES} bytes: expected a row of text"
-        )
-
-
-def _parse(text: bytes) -> Record | None:
-    words = text.split()
-    if b"#" in text:
-        comment = next((i for i, word in enumerate(words) if word.startswith(b"#")), len(words))
-        words = words[:comment]
+def _record(words: list[bytes]) -> Record | None:
     if not words:
         return None
     keyword = words[0]
-    parse = _PARSERS.get(keyword)
-    if parse is not None:
-        return parse(words)
+    if keyword == b"STEP":
+        if len(words) != 2 + len(STEP_NUMBERS):
+            raise LandmarkError(
+                f"STEP with {len(words) - 1} values: expected {1 + len(STEP_NUMBERS)}: "
+                f"prefix {' '.join(STEP_NUMBERS)}"
+            )
+        return Step(decode(words[1]), *_numbers(words[2:], STEP_NUMBERS))
+    # LANDMARK is what the comments at the head of the data set's files of circles call the row.
+    if keyword in (b"LANDMARK_C", b"LANDMARK"):
+        return CircleLandmark(*_numbers_before_ids(words, CIRCLE_NUMBERS), ids=_ids(words[7:]))
+    if keyword == b"LANDMARK_L":
+        return LineLandmark(*_numbers_before_ids(words, LINE_NUMBERS), ids=_ids(words[9:]))
+    if keyword == b"LANDMARK_M":
+        return _marker(words)
     if keyword.endswith(b"DETECTOR"):
-        return DetectorSettings(_decode(keyword), tuple(map(_decode, words[1:])))
+        return DetectorSettings(decode(keyword), tuple(map(decode, words[1:])))
     raise LandmarkError(
-        f"row starts with {excerpt(keyword)}: expected STEP, LANDMARK_C, LANDMARK_L, "
+        f"row starts with {excerpt(decode(keyword))}: expected STEP, LANDMARK_C, LANDMARK_L, "
         "LANDMARK_M or a # comment"
     )
 
 
-def _parse_step(words: list[bytes]) -> Step:
-    if len(words) != 2 + len(STEP_NUMBERS):
-        raise LandmarkError(
-            f"STEP with {len(words) - 1} values: expected {1 + len(STEP_NUMBERS)}: "
-            f"prefix {' '.join(STEP_NUMBERS)}"
-        )
-    return Step(_decode(words[1]), *_numbers(words[2:], STEP_NUMBERS))
-
-
-def _parse_circle(words: list[bytes]) -> CircleLandmark:
-    numbers, ids = _numbers_and_ids(words, CIRCLE_NUMBERS)
-    px, py, quality, cxx, cxy, cyy = numbers
-    return CircleLandmark(px, py, quality, cxx, cxy, cyy, ids)
-
-
-def _parse_line(words: list[bytes]) -> LineLandmark:
-    numbers, ids = _numbers_and_ids(words, LINE_NUMBERS)
-    xtop, ytop, xbottom, ybottom, alpha, beta, quality, sigma = numbers
-    return LineLandmark(xtop, ytop, xbottom, ybottom, alpha, beta, quality, sigma, ids)
-
-
-def _parse_marker(words: list[bytes]) -> MarkerLandmark:
-    expected = 3 + len(MARKER_CORNERS) * len(MARKER_CORNER_NUMBERS)
+def _marker(words: list[bytes]) -> MarkerLandmark:
+    per_corner = len(MARKER_CORNER_NUMBERS)
+    expected = 3 + len(MARKER_CORNERS) * per_corner
     if len(words) != 1 + expected:
         raise LandmarkError(
             f"LANDMARK_M with {len(words) - 1} values: expected {expected}: dictionary ID quality "
             f"and four times {' '.join(MARKER_CORNER_NUMBERS)}"
         )
     (quality,) = _numbers(words[3:4], ("quality",))
-    per_corner = len(MARKER_CORNER_NUMBERS)
     first, second, third, fourth = (
         MarkerCorner(*_numbers(words[start : start + per_corner], MARKER_CORNER_NUMBERS))
         for start in range(4, 1 + expected, per_corner)
     )
-    return MarkerLandmark(
-        _decode(words[1]), _identifier(words[2]), quality, (first, second, third, fourth)
-    )
+    (identifier,) = _ids(words[2:3])
+    return MarkerLandmark(decode(words[1]), identifier, quality, (first, second, third, fourth))
 
 
-_PARSERS: dict[bytes, Callable[[list[bytes]], Record]] = {
-    b"STEP": _parse_step,
-    b"LANDMARK_C": _parse_circle,
-    # Name of the row in the comments at the head of the data set's files of circles.
-    b"LANDMARK": _parse_circle,
-    b"LANDMARK_L": _parse_line,
-    b"LANDMARK_M": _parse_marker,
-}
-
-
-def _numbers_and_ids(
-    words: list[bytes], names: tuple[str, ...]
-) -> tuple[list[float], tuple[int, ...]]:
+def _numbers_before_ids(words: list[bytes], names: tuple[str, ...]) -> list[float]:
     if len(words) < 1 + len(names):
         raise LandmarkError(
-            f"{_decode(words[0])} with {len(words) - 1} values: expected at least {len(names)}: "
+            f"{decode(words[0])} with {len(words) - 1} values: expected at least {len(names)}: "
             f"{' '.join(names)} and any IDs"
         )
-    numbers = _numbers(words[1 : 1 + len(names)], names)
-    return numbers, tuple(map(_identifier, words[1 + len(names) :]))
+    return _numbers(words[1:], names)
 
 
 def _numbers(words: list[bytes], names: tuple[str, ...]) -> list[float]:
-    if not _NUMBERS.fullmatch(b" ".join([*words, b""])):
-        for word, name in zip(words, names):
-            if not _NUMBER.fullmatch(word):
-                raise LandmarkError(f"{name} is {excerpt(word)}: expected a finite number")
-    return [float(word) for word in words]
+    """The numbers at the beginning of some words, as many as names."""
+    for word, name in zip(words, names):
+        if not _NUMBER.fullmatch(word):
+            raise LandmarkError(f"{name} is {excerpt(decode(word))}: expected a finite number")
+    return [float(word) for word in words[: len(names)]]
 
 
-def _identifier(word: bytes) -> int:
-    if not _WHOLE_NUMBER.fullmatch(word) or len(word) > _LONGEST_ID_DIGITS:
-        raise LandmarkError(f"ID is {excerpt(word)}: expected a whole number, -1 if unknown")
-    return int(word)
-
-
-def _decode(word: bytes) -> str:
-    return word.decode("utf-8", "surrogateescape")
+def _ids(words: list[bytes]) -> tuple[int, ...]:
+    for word in words:
+        if not _WHOLE_NUMBER.fullmatch(word) or len(word) > _LONGEST_ID_DIGITS:
+            raise LandmarkError(
+                f"ID is {excerpt(decode(word))}: expected a whole number, -1 if unknown"
+            )
+    return tuple(map(int, words))

@@ -7,13 +7,11 @@ metres and radians. The field names are the format's own.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
 from math import isfinite
-from operator import attrgetter
 
-from landmarks.errors import LandmarkError, excerpt
+from landmarks.errors import LandmarkError
+from storage.messages import excerpt
 
 STEP_NUMBERS = ("dx", "dy", "dphi", "cxx", "cxy", "cyy", "cxphi", "cyphi", "cphiphi")
 CIRCLE_NUMBERS = ("px", "py", "quality", "cxx", "cxy", "cyy")
@@ -33,7 +31,7 @@ class Step:
     Attributes
     ----------
     prefix : str
-        The image's name, usually without extension. Bytes of the file that are no UTF-8 are kept
+        The image's name, usually without extension. Bytes of the file that are not UTF-8 are kept
         as surrogates, as in Python's file names.
     dx, dy, dphi : float
         Pose after the movement in the robot frame before it (m, m, rad).
@@ -60,10 +58,6 @@ class Step:
     def __post_init__(self) -> None:
         _demand_finite(self, STEP_NUMBERS)
         _demand_word(self.prefix, "image prefix")
-
-    def __reduce__(self) -> tuple[type[Step], tuple[str | float, ...]]:
-        # One travels to a worker with every frame: a dataclass's own way takes longer.
-        return Step, (self.prefix, *_values_of(STEP_NUMBERS)(self))
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,8 +95,8 @@ class CircleLandmark:
 
     @property
     def identified(self) -> bool:
-        """Whether the row says which disc this is."""
-        return _identified(self.ids)
+        """Whether the disc's identifier is known."""
+        return any(identifier >= 0 for identifier in self.ids)
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,8 +140,8 @@ class LineLandmark:
 
     @property
     def identified(self) -> bool:
-        """Whether the row says which line this is."""
-        return _identified(self.ids)
+        """Whether the line's identifier is known."""
+        return any(identifier >= 0 for identifier in self.ids)
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,7 +201,7 @@ class MarkerLandmark:
     def __post_init__(self) -> None:
         _demand_word(self.dictionary, "dictionary of markers")
         if not 0 <= self.id <= _LARGEST_ID:
-            raise LandmarkError(f"marker's ID is {self.id:.6g}: expected 0 or more, 64 bits")
+            raise LandmarkError(f"marker's ID is {excerpt(self.id)}: expected 0 or more, 64 bits")
         _demand_finite(self, ("quality",))
         if len(self.corners) != len(MARKER_CORNERS):
             raise LandmarkError(f"marker has {len(self.corners)} corners: expected 4")
@@ -239,8 +233,9 @@ class DetectorSettings:
         for word in (self.keyword, *self.words):
             _demand_word(word, "word of detector settings")
         if not self.keyword.endswith("DETECTOR"):
-            shown = excerpt(self.keyword.encode("utf-8", "surrogatepass"))
-            raise LandmarkError(f"keyword is {shown}: expected one that ends in DETECTOR")
+            raise LandmarkError(
+                f"keyword is {excerpt(self.keyword)}: expected one that ends in DETECTOR"
+            )
 
 
 Landmark = CircleLandmark | LineLandmark | MarkerLandmark
@@ -256,8 +251,8 @@ class Frame:
     step : Step
     landmarks : tuple of Landmark
     levelled_by : (float, float) or None
-        Pitch and roll (rad) that turned the positions of its discs level; None: they are where the
-        camera as calibrated sees them.
+        Pitch and roll (rad) by which the positions of its discs were levelled; None if they are
+        where the camera as calibrated sees them.
     """
 
     step: Step
@@ -287,7 +282,7 @@ class Row:
     Attributes
     ----------
     record : Record or None
-        What the row says; None for comments and blank lines.
+        None for comments and blank lines.
     source : bytes or None
         The row's text in the file, continuation lines and line end included; None for a row that
         was not read from a file, or was changed since.
@@ -300,21 +295,11 @@ class Row:
     line: int = 0
 
     def with_record(self, record: Record) -> Row:
-        """Return the row saying `record`; its text is kept only if that says the same already."""
+        """The row with another record; it keeps its text if the record is equal."""
         return self if record == self.record else Row(record, line=self.line)
 
 
-@cache
-def _values_of(names: tuple[str, ...]) -> Callable[[object], tuple[float, ...]]:
-    """A function that gets attributes of those names from a record."""
-    if len(names) == 1:
-        return lambda record: (getattr(record, names[0]),)
-    return attrgetter(*names)
-
-
 def _demand_finite(record: object, names: tuple[str, ...]) -> None:
-    if all(map(isfinite, _values_of(names)(record))):
-        return
     for name in names:
         value = getattr(record, name)
         if not isfinite(value):
@@ -322,19 +307,15 @@ def _demand_finite(record: object, names: tuple[str, ...]) -> None:
 
 
 def _demand_word(word: str, name: str) -> None:
-    """Refuse text that a file would not preserve as one word."""
+    """Refuse text that would not be read back from a file as one word."""
     if not _WORD.fullmatch(word):
-        shown = excerpt(word.encode("utf-8", "surrogatepass"))
         raise LandmarkError(
-            f"{name} is {shown}: expected one word that starts with no # and ends with no backslash"
+            f"{name} is {excerpt(word)}: expected one word that starts with no # and ends with no "
+            "backslash"
         )
 
 
 def _demand_ids(ids: tuple[int, ...]) -> None:
     for identifier in ids:
         if not -_LARGEST_ID <= identifier <= _LARGEST_ID:
-            raise LandmarkError(f"ID is {identifier:.6g}: expected at most 64 bits")
-
-
-def _identified(ids: tuple[int, ...]) -> bool:
-    return any(identifier >= 0 for identifier in ids)
+            raise LandmarkError(f"ID is {excerpt(identifier)}: expected at most 64 bits")

@@ -17,12 +17,11 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Iterator
-from dataclasses import dataclass
-from pathlib import Path
+from dataclasses import dataclass, replace
 
 from landmarks.errors import LandmarkFileError
-
-_LARGEST_ROW = 65536
+from landmarks.reading import decode, opened, rows_of_words
+from storage.messages import excerpt
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,9 +69,8 @@ def format_no_tilt(prefix: str, lines: int) -> str:
 
 def tilt_as_written(tilt: FrameTilt) -> FrameTilt:
     """The tilt rounded to the digits that its row has."""
-    _, _, *numbers, _ = format_tilt(tilt).split()
-    pitch, roll, cpp, cpr, crr = map(float, numbers)
-    return FrameTilt(tilt.prefix, pitch, roll, cpp, cpr, crr, tilt.lines)
+    pitch, roll, cpp, cpr, crr = map(float, format_tilt(tilt).rsplit(" ", 6)[1:-1])
+    return replace(tilt, pitch=pitch, roll=roll, cpp=cpp, cpr=cpr, crr=crr)
 
 
 def read_tilts(path: str | os.PathLike[str]) -> dict[str, FrameTilt]:
@@ -81,7 +79,6 @@ def read_tilts(path: str | os.PathLike[str]) -> dict[str, FrameTilt]:
     Parameters
     ----------
     path : path
-        The file.
 
     Returns
     -------
@@ -93,51 +90,37 @@ def read_tilts(path: str | os.PathLike[str]) -> dict[str, FrameTilt]:
     LandmarkFileError
         If the file cannot be read or a row is malformed; names file and line.
     """
-    return {tilt.prefix: tilt for tilt in iterate_tilts(path)}
-
-
-def iterate_tilts(path: str | os.PathLike[str]) -> Iterator[FrameTilt]:
-    """Read a tilt file row by row; parameters and errors are those of `read_tilts`."""
-    return (tilt for _, tilt in numbered_tilts(path))
+    return {tilt.prefix: tilt for _, tilt in numbered_tilts(path)}
 
 
 def numbered_tilts(path: str | os.PathLike[str]) -> Iterator[tuple[int, FrameTilt]]:
     """The tilts of a file with the numbers of their frames, counted from 0; see `read_tilts`."""
     frame = -1
-    try:
-        with Path(path).open("rb") as stream:
-            number = 0
-            while source := stream.readline(_LARGEST_ROW + 1):
-                number += 1
-                if len(source) > _LARGEST_ROW:
-                    raise LandmarkFileError(str(path), number, "the row is too long")
-                line = source.decode("utf-8", "surrogateescape")
-                words = line.partition("#")[0].split()
-                if not words or words[0] == "TILT_D":
-                    continue
-                frame += 1
-                if words[0] != "NOTILT":
-                    yield frame, _tilt(words, str(path), number)
-    except FileNotFoundError:
-        raise LandmarkFileError(str(path), None, "no such tilt file") from None
-    except OSError as error:
-        raise LandmarkFileError(str(path), None, f"cannot be read: {error.strerror}") from None
+    name = os.fspath(path)
+    with opened(path, "tilt file") as stream:
+        for words, _, line in rows_of_words(stream, name):
+            if not words or words[0] == b"TILT_D":
+                continue
+            frame += 1
+            if words[0] != b"NOTILT":
+                yield frame, _tilt([decode(word) for word in words], name, line)
 
 
-def _tilt(words: list[str], name: str, number: int) -> FrameTilt:
+def _tilt(words: list[str], name: str, line: int) -> FrameTilt:
     if words[0] != "TILT" or len(words) != 8:
-        found = ascii(" ".join(words)[:40])
         raise LandmarkFileError(
-            name, number, f"{found}: expected TILT, an image, 5 numbers and a count"
+            name,
+            line,
+            f"{excerpt(' '.join(words))}: expected TILT, an image, 5 numbers and a count",
         )
     try:
-        values = [float(word) for word in words[2:7]]
+        pitch, roll, cpp, cpr, crr = map(float, words[2:7])
         lines = int(words[7])
     except ValueError:
-        values, lines = [math.nan], 0
-    if not all(math.isfinite(value) for value in values) or not 0 <= lines < 1 << 31:
-        raise LandmarkFileError(name, number, "expected 5 finite numbers and a whole one")
-    pitch, roll, cpp, cpr, crr = values
+        pitch = roll = cpp = cpr = crr = math.nan
+        lines = 0
+    if not all(map(math.isfinite, (pitch, roll, cpp, cpr, crr))) or not 0 <= lines < 1 << 31:
+        raise LandmarkFileError(name, line, "expected 5 finite numbers and a whole one")
     if not (cpp > 0.0 and crr > 0.0 and cpp * crr > cpr * cpr):
-        raise LandmarkFileError(name, number, "the tilt's covariance is not positive definite")
+        raise LandmarkFileError(name, line, "the tilt's covariance is not positive definite")
     return FrameTilt(words[1], pitch, roll, cpp, cpr, crr, lines)

@@ -130,19 +130,16 @@ def write_rows(
         If the folder cannot be written to.
     """
     line_end = b"\n"
-    unfinished = False
+    text = line_end
     with write_whole(path, overwrite=overwrite) as stream:
         for row in rows:
-            if unfinished:  # what was the file's last line, without a line end, no longer is
+            if not text.endswith(b"\n"):  # the last line of the file that was read
                 stream.write(line_end)
             if row.source is not None:
                 text = row.source
-            elif row.record is not None:
-                text = _encode(format_record(row.record)) + line_end
             else:
-                text = line_end
-            unfinished = not text.endswith(b"\n")
-            if not unfinished:
+                text = _encode("" if row.record is None else format_record(row.record)) + line_end
+            if text.endswith(b"\n"):
                 line_end = b"\r\n" if text.endswith(b"\r\n") else b"\n"
             stream.write(text)
 

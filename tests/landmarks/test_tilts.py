@@ -15,6 +15,7 @@ from landmarks import (
     format_outline_tilt,
     format_tilt,
     read_tilts,
+    tilt_as_written,
 )
 from landmarks.tilts import numbered_tilts
 
@@ -75,3 +76,12 @@ def test_what_outlines_show_is_passed_over(tmp_path: Path) -> None:
         (0, "a/b"),
         (2, "d"),
     ]
+
+
+@pytest.mark.parametrize("prefix", ["a#1", "a\u00a0b"])
+def test_any_prefix_of_a_step_may_have_a_tilt(tmp_path: Path, prefix: str) -> None:
+    tilt = FrameTilt(prefix, 0.01, -0.02, 1e-6, 0.0, 2e-6, 4)
+    assert tilt_as_written(tilt) == tilt
+    path = tmp_path / "x.tilt"
+    path.write_text(format_tilt(tilt) + "\r\n", newline="")
+    assert read_tilts(path) == {prefix: tilt}
