@@ -214,9 +214,11 @@ def _record(words: list[bytes]) -> Record | None:
         return Step(decode(words[1]), *_numbers(words[2:], STEP_NUMBERS))
     # LANDMARK is what the comments at the head of the data set's files of circles call the row.
     if keyword in (b"LANDMARK_C", b"LANDMARK"):
-        return CircleLandmark(*_numbers_before_ids(words, CIRCLE_NUMBERS), ids=_ids(words[7:]))
+        px, py, quality, cxx, cxy, cyy = _numbers_before_ids(words, CIRCLE_NUMBERS)
+        return CircleLandmark(px, py, quality, cxx, cxy, cyy, _ids(words[7:]))
     if keyword == b"LANDMARK_L":
-        return LineLandmark(*_numbers_before_ids(words, LINE_NUMBERS), ids=_ids(words[9:]))
+        xt, yt, xb, yb, alpha, beta, quality, sigma = _numbers_before_ids(words, LINE_NUMBERS)
+        return LineLandmark(xt, yt, xb, yb, alpha, beta, quality, sigma, _ids(words[9:]))
     if keyword == b"LANDMARK_M":
         return _marker(words)
     if keyword.endswith(b"DETECTOR"):

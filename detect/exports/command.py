@@ -8,7 +8,7 @@ from detect.errors import DetectError
 from detect.exports.options import Export
 from detect.exports.rows import ExportedRows
 from detect.exports.writers import demand_pyarrow, write_csv, write_mcap, write_parquet
-from detect.sources.times import TimesByImage
+from detect.sources.times import read_image_times
 from landmarks.columns import TableName
 from storage import OutputExistsError, write_whole
 
@@ -28,67 +28,57 @@ def perform(command: Export) -> int:
     storage.OutputExistsError
         If an output exists and must not be replaced.
     """
-    if command.file.is_dir():
-        found = sorted(path.name for path in command.file.iterdir() if path.suffix in _LANDMARKS)
+    file = command.file
+    if file.is_dir():
+        found = sorted(path.name for path in file.iterdir() if path.suffix in _LANDMARKS)
         such = f", such as {', '.join(found)} in it" if found else ""
         raise DetectError(
-            f"{command.file}: is a folder: expected a .circles, .lines, .markers or .tilt "
-            f"file{such}"
+            f"{file}: is a folder: expected a .circles, .lines, .markers or .tilt file{such}"
         )
-    if command.file.suffix == ".cam":
+    if file.suffix == ".cam":
         raise DetectError(
-            f"{command.file}: is a calibration, not rows: camera convert {command.file} "
+            f"{file}: is a calibration, not rows: camera convert {file} "
             "cameras.txt writes it for COLMAP (or for OpenCV, ROS, Kalibr)"
         )
-    rows = ExportedRows(command.file, _times(command), command.rate_hz)
-    output = command.output
-    if output is None:
-        output = command.file.with_name(f"{command.file.name}.{command.to}")
+    rows = ExportedRows(file, _times(command), command.rate_hz)
+    output = command.output or file.with_name(f"{file.name}.{command.to}")
     if command.to == "parquet":
         demand_pyarrow()
     tables = rows.tables()
     if not tables:
-        raise DetectError(f"{command.file}: no rows in it: expected STEP, LANDMARK or TILT rows")
-    places = {tables[0]: output} if command.to == "mcap" else table_files(output, tables)
+        raise DetectError(f"{file}: no rows in it: expected STEP, LANDMARK or TILT rows")
+    places = {tables[0]: output} if command.to == "mcap" else _table_files(output, tables)
     for path in places.values():
-        if path.exists() and path.samefile(command.file):
+        if path.exists() and path.samefile(file):
             raise DetectError(f"{path}: is the file to export: expected another output")
-    if command.to == "mcap":
-        with write_whole(output, overwrite=command.force) as stream:
-            count = write_mcap(stream, tables, rows, str(command.file))
-        print(f"{output}: {count} messages")
-        return 0
-    for path in places.values():
         if path.exists() and not command.force:
             raise OutputExistsError(path)
     for table, path in places.items():
         with write_whole(path, overwrite=command.force) as stream:
-            if command.to == "csv":
+            if command.to == "mcap":
+                count = write_mcap(stream, tables, rows, str(file))
+            elif command.to == "csv":
                 count = write_csv(stream, table, rows)
             else:
-                count = write_parquet(stream, table, rows, command.file.name)
-        print(f"{path}: {count} rows")
+                count = write_parquet(stream, table, rows, file.name)
+        print(f"{path}: {count} {'messages' if command.to == 'mcap' else 'rows'}")
     return 0
 
 
-def table_files(output: Path, tables: list[TableName]) -> dict[TableName, Path]:
-    """The file of each table: the first one to `output`, others beside it.
-
-    Steps are never first where there is anything else.
-    """
-    order = sorted(tables, key=lambda table: table == "steps")
-    first, *others = order
+def _table_files(output: Path, tables: list[TableName]) -> dict[TableName, Path]:
+    """The file of each table: the first but steps goes to `output`, others beside it."""
+    first, *others = sorted(tables, key=lambda table: table == "steps")
     beside = {table: output.with_name(f"{output.stem}.{table}{output.suffix}") for table in others}
     return {first: output, **beside}
 
 
-def _times(command: Export) -> TimesByImage | None:
+def _times(command: Export) -> dict[str, float] | None:
     if command.times is not None:
-        return TimesByImage(command.times)
+        return read_image_times(command.times)
     if command.rate_hz is not None:
         return None
     for name in (f"{command.file.name}.times", f"{command.file.stem}.times"):
         beside = command.file.with_name(name)
         if beside.is_file():
-            return TimesByImage(beside)
+            return read_image_times(beside)
     return None

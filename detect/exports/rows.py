@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 from detect.errors import DetectError
-from detect.sources.times import TimesByImage
 from landmarks import FrameTilt, Landmark, Step, read_rows
 from landmarks.columns import TableName, Value, table_of, values_of
 from landmarks.tilts import numbered_tilts
 
-#: Which table a file of a kind has rows of, even where there are none.
-TABLE_BY_SUFFIX: dict[str, TableName] = {
+# Which table a file of a kind has rows of, even where there are none.
+_TABLE_BY_SUFFIX: dict[str, TableName] = {
     ".circles": "circles",
     ".lines": "lines",
     ".markers": "markers",
@@ -29,13 +28,11 @@ class TableRow:
     Attributes
     ----------
     table : str
-        Which table.
     frame : int
         The frame's number in its file.
     image : str
         Its prefix.
     time_s : float or None
-        Its time.
     values : tuple
         The values of the columns after those.
     """
@@ -58,7 +55,7 @@ class ExportedRows:
     Parameters
     ----------
     path : path
-    times : TimesByImage or None
+    times : mapping or None
         Times by image prefix.
     rate_hz : float or None
         Frames in a second, where there are no times.
@@ -69,7 +66,9 @@ class ExportedRows:
         If the rate is none.
     """
 
-    def __init__(self, path: Path, times: TimesByImage | None, rate_hz: float | None) -> None:
+    def __init__(
+        self, path: Path, times: Mapping[str, float] | None, rate_hz: float | None
+    ) -> None:
         if rate_hz is not None and not 0.0 < rate_hz < float("inf"):
             raise DetectError(f"rate_hz is {rate_hz:g}: expected above 0")
         self.path = path
@@ -81,14 +80,17 @@ class ExportedRows:
         for frame, record in self._records():
             if isinstance(record, Step | FrameTilt):
                 image = record.prefix
-                time_s = self._time_s(frame, image)
+                if self._times is not None:
+                    time_s = self._times.get(image)
+                elif self._rate_hz is not None:
+                    time_s = frame / self._rate_hz
             yield TableRow(table_of(record), frame, image, time_s, values_of(record))
 
     def tables(self) -> list[TableName]:
         """The tables that the file has rows of, the one that its ending names first."""
-        found = {row.table: None for row in self}
-        named = TABLE_BY_SUFFIX.get(self.path.suffix)
-        return [*dict.fromkeys([*([named] if named is not None else []), *sorted(found)])]
+        found = sorted({row.table for row in self})
+        named = _TABLE_BY_SUFFIX.get(self.path.suffix)
+        return found if named is None else [named, *(t for t in found if t != named)]
 
     def _records(self) -> Iterator[tuple[int, Step | Landmark | FrameTilt]]:
         """The records with the numbers of their frames."""
@@ -100,8 +102,3 @@ class ExportedRows:
             if isinstance(row.record, Step | Landmark):
                 frame += isinstance(row.record, Step)
                 yield frame, row.record
-
-    def _time_s(self, frame: int, image: str) -> float | None:
-        if self._times is not None:
-            return self._times.get(image)
-        return None if self._rate_hz is None else frame / self._rate_hz

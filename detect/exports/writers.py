@@ -28,20 +28,11 @@ from landmarks.columns import FRAME_COLUMNS, TABLES, Column, TableName, Value
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
-_ROWS_AT_ONCE = 20_000
-
 #: The robot frame of the data set, X left and Y backward: not ROS's base_link.
 FRAME_ID = "robot_left_backward"
 
-_PACKAGE = "redetect_msgs"
-# Message of one row, message of a frame, topic.
-_NAMES: dict[TableName, tuple[str, str, str]] = {
-    "steps": ("Step", "Steps", "/redetect/steps"),
-    "circles": ("Circle", "Circles", "/redetect/circles"),
-    "lines": ("Line", "Lines", "/redetect/lines"),
-    "markers": ("Marker", "Markers", "/redetect/markers"),
-    "tilts": ("Tilt", "Tilts", "/redetect/tilts"),
-}
+_ROWS_AT_ONCE = 20_000
+_PACKAGE = "redetect_msgs/msg"
 _TYPES = {
     "text": "string",
     "number": "float64",
@@ -51,47 +42,27 @@ _TYPES = {
 
 
 def write_csv(stream: BinaryIO, table: TableName, rows: Iterable[TableRow]) -> int:
-    """Write a table.
-
-    Parameters
-    ----------
-    stream : binary stream
-    table : str
-        Which table; rows of others are passed over.
-    rows : iterable of TableRow
+    """Write a table; rows of other tables are passed over.
 
     Returns
     -------
     int
         How many rows were written.
     """
-
-    def write(lines: Iterable[Iterable[str]]) -> None:
-        text = io.StringIO()
-        csv.writer(text, lineterminator="\n").writerows(lines)
-        stream.write(text.getvalue().encode("utf-8", "surrogateescape"))
-
-    write([[column.name for column in TABLES[table]]])
+    text = io.TextIOWrapper(stream, "utf-8", "surrogateescape", newline="")
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(column.name for column in TABLES[table])
     count = 0
-    for part in _parts(table, rows):
-        write([[_text(value) for value in row] for row in part])
-        count += len(part)
+    for row in rows:
+        if row.table == table:
+            writer.writerow(_csv_value(value) for value in row.all_values)
+            count += 1
+    text.detach()
     return count
 
 
-def _parts(table: TableName, rows: Iterable[TableRow]) -> Iterator[list[tuple[Value, ...]]]:
-    """The values of a table's rows, many at once."""
-    own = (row.all_values for row in rows if row.table == table)
-    while part := list(islice(own, _ROWS_AT_ONCE)):
-        yield part
-
-
-def _text(value: Value) -> str:
-    if value is None:
-        return ""
-    if isinstance(value, tuple):
-        return " ".join(map(str, value))
-    return repr(value) if isinstance(value, float) else str(value)
+def _csv_value(value: Value) -> Value:
+    return " ".join(map(str, value)) if isinstance(value, tuple) else value
 
 
 def demand_pyarrow() -> None:
@@ -112,12 +83,13 @@ def demand_pyarrow() -> None:
 
 
 def write_parquet(stream: BinaryIO, table: TableName, rows: Iterable[TableRow], source: str) -> int:
-    """Write a table; parameters as those of `write_csv`.
+    """Write a table; rows of other tables are passed over.
 
     Parameters
     ----------
-    stream, table, rows
-        See there.
+    stream : binary stream
+    table : str
+    rows : iterable of TableRow
     source : str
         Where the rows come from, for the file's own description.
 
@@ -141,17 +113,14 @@ def write_parquet(stream: BinaryIO, table: TableName, rows: Iterable[TableRow], 
         "whole numbers": pa.list_(pa.int64()),
     }
     fields = [
-        pa.field(
-            column.name,
-            types[column.kind],
-            metadata={"unit": column.unit, "meaning": column.meaning},
-        )
-        for column in TABLES[table]
+        pa.field(c.name, types[c.kind], metadata={"unit": c.unit, "meaning": c.meaning})
+        for c in TABLES[table]
     ]
     schema = pa.schema(fields, metadata={"table": table, "source": source})
+    own = (row.all_values for row in rows if row.table == table)
     count = 0
     with pq.ParquetWriter(stream, schema) as writer:
-        for part in _parts(table, rows):
+        while part := list(islice(own, _ROWS_AT_ONCE)):
             try:
                 arrays = [pa.array(c, f.type) for c, f in zip(zip(*part), fields)]
             except UnicodeEncodeError:
@@ -167,38 +136,38 @@ def write_parquet(stream: BinaryIO, table: TableName, rows: Iterable[TableRow], 
 
 def message_definitions(table: TableName) -> dict[str, str]:
     """The definitions of a table's messages, by their names, in ROS's own notation."""
-    row, frame, _ = _NAMES[table]
+    row, frame = _message_types(table)
     columns = TABLES[table][len(FRAME_COLUMNS) :]
     return {
-        f"{_PACKAGE}/msg/{row}": "".join(_field(column) for column in columns),
-        f"{_PACKAGE}/msg/{frame}": (
+        row: "".join(_field(column) for column in columns),
+        frame: (
             f"std_msgs/Header header  # time of the image; frame_id {FRAME_ID}\n"
             f"int64 frame  # {FRAME_COLUMNS[0].meaning}\n"
             f"string image  # {FRAME_COLUMNS[1].meaning}\n"
-            f"{_PACKAGE}/{row}[] {table}\n"
+            f"{row.replace('/msg', '')}[] {table}\n"
         ),
     }
 
 
 def topic_of(table: TableName) -> str:
     """The topic that a table's messages are recorded under."""
-    return _NAMES[table][2]
+    return f"/redetect/{table}"
 
 
 def write_mcap(
-    stream: BinaryIO, tables: Iterable[TableName], rows: Iterable[TableRow], source: str
+    stream: BinaryIO, tables: list[TableName], rows: Iterable[TableRow], source: str
 ) -> int:
     """Write the rows of a file as messages.
 
     Parameters
     ----------
     stream : binary stream
-    tables : iterable of str
+    tables : list of str
         The tables that there are.
     rows : iterable of TableRow
         With times; those of a frame are consecutive.
     source : str
-        What messages call the file.
+        The file's name in messages.
 
     Returns
     -------
@@ -214,19 +183,18 @@ def write_mcap(
     from rosbags.rosbag2 import StoragePlugin, Writer
 
     count = 0
-    tables = list(tables)
     with tempfile.TemporaryDirectory(prefix="redetect-") as folder:
         bag = Path(folder) / "detections"
         with Writer(bag, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-            opened = {
+            connections = {
                 table: writer.add_connection(
-                    topic_of(table), f"{_PACKAGE}/msg/{_NAMES[table][1]}", typestore=store
+                    topic_of(table), _message_types(table)[1], typestore=store
                 )
                 for table in tables
             }
             for table, time_ns, message in _messages(rows, tables, store, source):
                 content = store.serialize_cdr(message, message.__msgtype__)
-                writer.write(opened[table], time_ns, content)
+                writer.write(connections[table], time_ns, content)
                 count += 1
         with (bag / "detections.mcap").open("rb") as written:
             shutil.copyfileobj(written, stream)
@@ -250,25 +218,25 @@ def _messages(
         if not 0 <= time_ns < 2**31 * 10**9:
             raise DetectError(f"{source}: {image} is from {time_s:g} s: expected 0 to 2^31 s")
         stamp = types["builtin_interfaces/msg/Time"](sec=time_ns // 10**9, nanosec=time_ns % 10**9)
+        header = types["std_msgs/msg/Header"](stamp=stamp, frame_id=FRAME_ID)
         for table in tables:
-            row_name, frame_name, _ = _NAMES[table]
-            row_type = types[f"{_PACKAGE}/msg/{row_name}"]
-            header = types["std_msgs/msg/Header"](stamp=stamp, frame_id=FRAME_ID)
-            content = [row_type(*_ros_values(row)) for row in found if row.table == table]
-            message_type = types[f"{_PACKAGE}/msg/{frame_name}"]
-            yield table, time_ns, message_type(header, frame, _ros_text(image), content)
+            row_type, frame_type = (types[name] for name in _message_types(table))
+            content = [row_type(*map(_ros_value, r.values)) for r in found if r.table == table]
+            yield table, time_ns, frame_type(header, frame, _ros_value(image), content)
 
 
-def _ros_values(row: TableRow) -> Iterator[Any]:
-    for value in row.values:
-        if isinstance(value, tuple):
-            yield np.array(value, dtype=np.int64)
-        else:
-            yield _ros_text(value) if isinstance(value, str) else value
+def _message_types(table: TableName) -> tuple[str, str]:
+    """The types of a row and of a frame's message, such as Circle and Circles."""
+    name = table.capitalize()
+    return f"{_PACKAGE}/{name.removesuffix('s')}", f"{_PACKAGE}/{name}"
 
 
-def _ros_text(text: str) -> str:
-    return text.encode("utf-8", "surrogateescape").decode("utf-8", "replace")
+def _ros_value(value: Value) -> Any:
+    if isinstance(value, tuple):
+        return np.array(value, dtype=np.int64)
+    if isinstance(value, str):
+        return value.encode("utf-8", "surrogateescape").decode("utf-8", "replace")
+    return value
 
 
 def _field(column: Column) -> str:

@@ -88,9 +88,8 @@ class Bag(Source):
         """The images of the topic: raw ones as grey values, compressed ones unchanged."""
         bits = self._bits
         with opened_bag(self.path) as reader:
-            for number, (kind, recorded_s, message) in enumerate(
-                messages(reader, self.path, self.topic)
-            ):
+            said = messages(reader, self.path, self.topic)
+            for number, (kind, recorded_s, message) in enumerate(said):
                 prefix = numbered_prefix(self.stem, number)
                 name = f"{self.name}: {prefix}"
                 try:
@@ -102,7 +101,7 @@ class Bag(Source):
                             image = SourceImage(prefix, time_s, content=content, bits=bits or 16)
                         else:
                             pixels = pixels_of_message(message, name)
-                            bits = significant_bits(pixels) if bits is None else bits
+                            bits = bits or significant_bits(pixels)
                             gray = gray_of_pixels(pixels, name, bits)
                             image = SourceImage(prefix, time_s, content=gray)
                 except FrameError as error:
@@ -112,28 +111,19 @@ class Bag(Source):
     def calibration(self) -> Calibration | None:
         """The ``.cam`` file beside it: of its name, or the only one; else what it holds itself."""
         beside = only_calibration(self.path.parent, self.stem)
-        if beside is not None:
-            return beside
-        return recorded_calibration(self.path, self.topic, self._base_frame)
+        return beside or recorded_calibration(self.path, self.topic, self._base_frame)
 
     def poses(self, topic: str | None) -> PoseStream | None:
         """The odometry of a topic, or of the only one that has any."""
         with opened_bag(self.path) as reader:
-            kinds = {c.msgtype for c in reader.connections}
-            if topic is None and _ODOMETRY not in kinds:
+            if topic is None and all(c.msgtype != _ODOMETRY for c in reader.connections):
                 return None
             found = chosen_topic(reader, self.path, (_ODOMETRY,), topic, "odometry", "--odometry")
         return BagOdometry(self.path, found)
 
 
 class BagOdometry:
-    """Poses of a nav_msgs/Odometry topic: X forward, Y left, with covariance.
-
-    Parameters
-    ----------
-    path : path
-    topic : str
-    """
+    """Poses of a nav_msgs/Odometry topic of a bag: X forward, Y left, with covariance."""
 
     def __init__(self, path: Path, topic: str) -> None:
         self.path = path
@@ -146,8 +136,8 @@ class BagOdometry:
                 with understood(self.name):
                     pose = message.pose.pose
                     q, p = pose.orientation, pose.position
-                    covariance = np.array(message.pose.covariance, dtype=np.float64).reshape(6, 6)
-                    planar = covariance[_PLANAR]
+                    covariance = np.array(message.pose.covariance, dtype=np.float64)
+                    planar = covariance.reshape(6, 6)[_PLANAR]
                     numbers = [p.x, p.y, q.x, q.y, q.z, q.w, *planar.ravel()]
                     values = np.array(numbers, dtype=np.float64)
                     time_s = stamp_s(message, recorded_s)

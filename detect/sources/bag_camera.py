@@ -8,7 +8,6 @@ floor can be detected.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -42,20 +41,15 @@ Matrix = NDArray[np.float64]
 
 
 def recorded_calibration(path: Path, image_topic: str, base: str) -> Calibration | None:
-    """The calibration that a bag holds of the camera of a topic; None if there is none.
+    """The calibration that a bag holds of the camera of a topic of images; None if there is none.
 
     Parameters
     ----------
     path : path
         The bag.
     image_topic : str
-        The camera's images.
     base : str
         The frame of the robot's base, on the floor.
-
-    Returns
-    -------
-    Calibration or None
 
     Raises
     ------
@@ -86,9 +80,9 @@ def recorded_calibration(path: Path, image_topic: str, base: str) -> Calibration
     )
     with understood(name):
         camera = _camera_of_info(message, name)
-        return (
-            Calibration(camera, why_not) if pose is None else Calibration(with_pose(camera, pose))
-        )
+        if pose is None:
+            return Calibration(camera, why_not)
+        return Calibration(with_pose(camera, pose))
 
 
 def _info_topic(reader: AnyReader, image_topic: str) -> str | None:
@@ -129,22 +123,17 @@ def static_transforms(reader: AnyReader, path: Path) -> dict[str, tuple[str, Mat
     DetectError
         If one is none.
     """
-    kinds = {c.topic: c.msgtype for c in reader.connections}
-    if kinds.get(_STATIC) != _TRANSFORMS:
-        return {}
-    with understood(f"{path}: {_STATIC}"):
-        return _transforms(said for _, _, said in messages(reader, path, _STATIC))
-
-
-def _transforms(messages: Iterable[Any]) -> dict[str, tuple[str, Matrix]]:
     found: dict[str, tuple[str, Matrix]] = {}
-    for message in messages:
-        for item in message.transforms:
-            t, q = item.transform.translation, item.transform.rotation
-            placed = np.eye(4)
-            placed[:3, :3] = rotation_of(q.x, q.y, q.z, q.w)
-            placed[:3, 3] = (t.x, t.y, t.z)
-            found[item.child_frame_id.lstrip("/")] = (item.header.frame_id.lstrip("/"), placed)
+    if all((c.topic, c.msgtype) != (_STATIC, _TRANSFORMS) for c in reader.connections):
+        return found
+    with understood(f"{path}: {_STATIC}"):
+        for _, _, message in messages(reader, path, _STATIC):
+            for item in message.transforms:
+                t, q = item.transform.translation, item.transform.rotation
+                placed = np.eye(4)
+                placed[:3, :3] = rotation_of(q.x, q.y, q.z, q.w)
+                placed[:3, 3] = (t.x, t.y, t.z)
+                found[item.child_frame_id.lstrip("/")] = (item.header.frame_id.lstrip("/"), placed)
     return found
 
 
@@ -165,13 +154,7 @@ def pose_in_dataset(
 
 
 def rotation_of(qx: float, qy: float, qz: float, qw: float) -> Matrix:
-    """The rotation matrix of a quaternion of any length but zero.
-
-    Raises
-    ------
-    ValueError
-        If it is none.
-    """
+    """The rotation matrix of a quaternion of any length but zero; else a ValueError."""
     q = np.array([qx, qy, qz, qw], dtype=np.float64)
     largest = np.abs(q).max()
     if not 0.0 < largest < np.inf:

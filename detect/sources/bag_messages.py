@@ -5,6 +5,7 @@ Image messages become pixels by the encodings of `sensor_msgs/image_encodings`.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -23,14 +24,16 @@ if TYPE_CHECKING:
 #: Characters that are shown of what another package says, and of topics and types in a bag.
 _LONGEST_CAUSE, LONGEST_NAME = 200, 60
 
-_GRAY = frozenset({"mono8", "8UC1", "mono16", "16UC1"})
+#: Numbers of a pixel, by its encoding; numbers have 16 bits if the encoding says so, else 8.
 _CHANNELS = {
+    "mono8": 1, "8UC1": 1, "mono16": 1, "16UC1": 1,
     "bgr8": 3, "rgb8": 3, "bgra8": 4, "rgba8": 4, "8UC3": 3, "8UC4": 4,
     "bgr16": 3, "rgb16": 3, "bgra16": 4, "rgba16": 4,
+    "yuv422": 2, "uyvy": 2, "yuv422_yuy2": 2, "yuyv": 2,
 }  # fmt: skip
-_BAYER = ("bayer_rggb", "bayer_bggr", "bayer_gbrg", "bayer_grbg")
-# Offset of the brightness in each pair of bytes.
+# Which of the two numbers of a pixel is the brightness.
 _LUMA = {"yuv422": 1, "uyvy": 1, "yuv422_yuy2": 0, "yuyv": 0}
+_BAYER = re.compile("bayer_(rggb|bggr|gbrg|grbg)_?[0-9]*")
 
 
 @contextmanager
@@ -57,7 +60,7 @@ def opened_bag(path: Path) -> Iterator[AnyReader]:
         reader.open()
     except Exception as error:  # a damaged file can raise anything
         raise DetectError(
-            f"{path}: cannot be read as a bag: {_one_line(error)}: expected a whole ROS 1 or 2 bag "
+            f"{path}: cannot be read as a bag: {_cause(error)}: expected a whole ROS 1 or 2 bag "
             "or an MCAP file of ROS messages"
         ) from None
     try:
@@ -74,24 +77,18 @@ def messages(reader: AnyReader, path: Path, topic: str) -> Iterator[tuple[str, f
     DetectError
         If the bag is damaged.
     """
-    connections = [c for c in reader.connections if c.topic == topic]
-    stream = reader.messages(connections)
     number = 0
-    while True:
-        try:
-            connection, recorded_ns, content = next(stream)
-            recorded_s = recorded_ns / 1e9  # a database's column may hold anything
+    try:
+        connections = [c for c in reader.connections if c.topic == topic]
+        for connection, recorded_ns, content in reader.messages(connections):
             message = reader.deserialize(content, connection.msgtype)
-        except StopIteration:
-            return
-        except Exception as error:  # as above
-            raise DetectError(
-                f"{path}: message {number + 1} of {one_line(topic, LONGEST_NAME)} cannot be read: "
-                f"{_one_line(error)}: "
-                f"expected a whole bag (--frames takes the first images only)"
-            ) from None
-        number += 1
-        yield connection.msgtype, recorded_s, message
+            yield connection.msgtype, recorded_ns / 1e9, message
+            number += 1
+    except Exception as error:  # as above
+        raise DetectError(
+            f"{path}: message {number + 1} of {one_line(topic, LONGEST_NAME)} cannot be read: "
+            f"{_cause(error)}: expected a whole bag (--frames takes the first images only)"
+        ) from None
 
 
 @contextmanager
@@ -105,21 +102,14 @@ def understood(name: str) -> Iterator[None]:
     """
     try:
         yield
-    except OneLineError:  # that has been said already
+    except OneLineError:  # reported already
         raise
     except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
-        raise DetectError(
-            f"{name}: a message is not as ROS defines it: {_one_line(error)}"
-        ) from None
+        raise DetectError(f"{name}: a message is not as ROS defines it: {_cause(error)}") from None
 
 
 def chosen_topic(
-    reader: AnyReader,
-    path: Path,
-    kinds: tuple[str, ...],
-    named: str | None,
-    what: str,
-    flag: str,
+    reader: AnyReader, path: Path, kinds: tuple[str, ...], named: str | None, what: str, flag: str
 ) -> str:
     """The topic that was named, or the only one of some types.
 
@@ -150,7 +140,7 @@ def stamp_s(message: Any, recorded_s: float) -> float:
     return (stamp.sec + stamp.nanosec / 1e9) if stamp.sec or stamp.nanosec else recorded_s
 
 
-def _one_line(error: Exception) -> str:
+def _cause(error: Exception) -> str:
     return one_line(" ".join(str(error).split()) or type(error).__name__, _LONGEST_CAUSE)
 
 
@@ -173,7 +163,7 @@ def pixels_of_message(message: ImageMessage, name: object) -> NDArray[Any]:
     message : sensor_msgs/Image
         Grey, colour, Bayer or YUV 4:2:2, of 8 or 16 bits.
     name : object
-        What messages call the image.
+        The image's name in messages.
 
     Returns
     -------
@@ -186,44 +176,34 @@ def pixels_of_message(message: ImageMessage, name: object) -> NDArray[Any]:
     FrameError
         If the encoding is another, or there is less data than the message states.
     """
-    encoding = message.encoding
-    bayer = encoding.rstrip("0123456789").rstrip("_") if encoding.startswith("bayer_") else None
-    if encoding in _LUMA:
-        return _rows(message, name, np.dtype(np.uint8), 2)[:, _LUMA[encoding] :: 2]
-    if encoding not in _GRAY and encoding not in _CHANNELS and bayer not in _BAYER:
+    encoding, height, width = message.encoding, message.height, message.width
+    bayer = _BAYER.fullmatch(encoding)
+    channels = 1 if bayer else _CHANNELS.get(encoding)
+    if channels is None:
         raise FrameError(
             f"{name}: encoding {excerpt(encoding)}: expected mono, bgr, rgb, bgra, rgba or bayer "
             "of 8 or 16 bits, or yuv422"
         )
-    deep = encoding.endswith("16") or encoding.startswith("16")
-    order = ">" if message.is_bigendian else "<"
-    dtype = np.dtype(f"{order}u2" if deep else "u1")
-    channels = _CHANNELS.get(encoding, 1)
-    rows = _rows(message, name, dtype, channels).astype(dtype.newbyteorder("="), copy=False)
-    if bayer is not None:
-        pattern = bayer.removeprefix("bayer_").upper()
-        code: int = getattr(cv2, f"COLOR_Bayer{pattern}2GRAY")
-        return np.asarray(cv2.cvtColor(np.ascontiguousarray(rows), code))
-    if channels == 1:
-        return rows
-    pixels = rows.reshape(message.height, message.width, channels)
-    if encoding.startswith("rgb"):
-        pixels = pixels[:, :, [2, 1, 0, 3][:channels]]
-    return np.ascontiguousarray(pixels)
-
-
-def _rows(message: ImageMessage, name: object, dtype: np.dtype[Any], channels: int) -> NDArray[Any]:
-    """The (H, W * channels) numbers of a message, without what its rows are padded with."""
-    height, width = message.height, message.width
+    dtype = np.dtype(np.uint16 if "16" in encoding else np.uint8)
     wide = width * channels * dtype.itemsize
     data = np.asarray(message.data).view(np.uint8).ravel()
     if height < 1 or width < 1 or message.step < wide or len(data) < height * message.step:
         raise FrameError(
-            f"{name}: {len(data)} bytes for {width}x{height} px of {message.encoding} in rows of "
+            f"{name}: {len(data)} bytes for {width}x{height} px of {encoding} in rows of "
             f"{message.step}: expected {wide} or more in a row"
         )
     rows = data[: height * message.step].reshape(height, message.step)[:, :wide]
-    return np.ascontiguousarray(rows).view(dtype)
+    stored = dtype.newbyteorder(">" if message.is_bigendian else "<")
+    pixels = np.ascontiguousarray(rows).view(stored).astype(dtype, copy=False)
+    if bayer:
+        code: int = getattr(cv2, f"COLOR_Bayer{bayer[1].upper()}2GRAY")
+        return np.asarray(cv2.cvtColor(pixels, code))
+    if channels == 1:
+        return pixels
+    pixels = pixels.reshape(height, width, channels)
+    if encoding in _LUMA:
+        return pixels[:, :, _LUMA[encoding]]
+    return pixels[:, :, [2, 1, 0, 3][:channels]] if encoding.startswith("rgb") else pixels
 
 
 def compressed_content(message: Any, name: object) -> bytes:

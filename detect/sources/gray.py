@@ -42,9 +42,9 @@ def decode_gray(
     Parameters
     ----------
     content : bytes
-        JPEG, PNG, PGM, TIFF or whatever else OpenCV decodes.
+        JPEG, PNG, PNM, BMP or TIFF.
     name : object
-        What messages call it.
+        The image's name in messages.
     bits : int
         Significant bits of images that have more than 8 bits.
     size : (int, int) or None
@@ -64,7 +64,7 @@ def decode_gray(
     if content.startswith(_JPEG_BEGIN) and content.rfind(_JPEG_END, len(content) // 2) < 0:
         raise FrameError(f"{name}: the JPEG is cut off: its end is missing")
     demand_bounded(content, name, size)
-    image = _decoded(content, deep=bits < 16)
+    image = _decoded(content)
     if image is None:
         raise FrameError(f"{name}: cannot be decoded: expected an image")
     return gray_of_pixels(image, name, bits)
@@ -75,10 +75,10 @@ def gray_of_pixels(pixels: NDArray[Any], name: object, bits: int = 16) -> NDArra
 
     Parameters
     ----------
-    pixels : (H, W), (H, W, 3) or (H, W, 4) uint8 or uint16 array
-        Grey values, or blue, green, red and perhaps opacity.
+    pixels : (H, W), (H, W, 1), (H, W, 3) or (H, W, 4) uint8 or uint16 array
+        Grey values, or blue, green, red and perhaps opacity; of any byte order and strides.
     name : object
-        What messages call the image.
+        The image's name in messages.
     bits : int
         Significant bits of uint16.
 
@@ -90,35 +90,41 @@ def gray_of_pixels(pixels: NDArray[Any], name: object, bits: int = 16) -> NDArra
     Raises
     ------
     FrameError
-        If there are other numbers in it, or values that need more bits.
+        If it is another array, or has values that need more bits.
     """
-    if pixels.ndim == 2 and pixels.dtype == np.uint8:  # of all images but a few
-        # For arrays that must not be written to, as those of a message are, Numba would compile
-        # every kernel once more.
-        sound = pixels.flags.c_contiguous and pixels.flags.writeable
-        return pixels if sound else np.require(pixels, requirements=["C", "W"])
-    if pixels.dtype not in (np.uint8, np.uint16):
-        raise FrameError(f"{name}: holds {pixels.dtype}: expected images of 8 or 16 bits")
-    if pixels.ndim == 3:
-        code = cv2.COLOR_BGR2GRAY if pixels.shape[2] == 3 else cv2.COLOR_BGRA2GRAY
-        pixels = cv2.cvtColor(pixels, code)
-    if pixels.dtype == np.uint8:
-        return np.ascontiguousarray(pixels, dtype=np.uint8)
-    largest = int(pixels.max(initial=0))
+    dtype = pixels.dtype.newbyteorder("=")
+    if dtype not in (np.uint8, np.uint16):
+        raise FrameError(
+            f"{name}: holds {pixels.dtype}: expected images of 8 or 16 bits (uint8, uint16)"
+        )
+    channels = 1 if pixels.ndim == 2 else pixels.shape[-1]
+    if pixels.ndim not in (2, 3) or channels not in (1, 3, 4) or not pixels.size:
+        raise FrameError(
+            f"{name}: is an array of shape {pixels.shape}: expected (height, width) grey values, "
+            "or (height, width, 3 or 4) of colours in the order blue, green, red"
+        )
+    # Numba would compile every kernel once more for arrays that are read-only, as in messages.
+    gray: NDArray[Any] = np.require(pixels, dtype, ["C", "W"])
+    if channels == 1:
+        gray = gray.reshape(gray.shape[:2])
+    else:
+        code = cv2.COLOR_BGR2GRAY if channels == 3 else cv2.COLOR_BGRA2GRAY
+        gray = np.asarray(cv2.cvtColor(gray, code), dtype)
+    if dtype == np.uint8:
+        return gray
+    largest = int(gray.max())
     if largest >> bits:
         raise FrameError(
             f"{name}: a value of {largest} needs more than {bits} bits: "
             "name the significant bits of these images by --bits"
         )
-    return np.ascontiguousarray(pixels >> (bits - 8), dtype=np.uint8)
+    return (gray >> (bits - 8)).astype(np.uint8)
 
 
 def significant_bits(pixels: NDArray[Any]) -> int:
     """The smallest of `BIT_DEPTHS` that holds all values of an image; 8 for an 8-bit image."""
-    if pixels.dtype == np.uint8:
-        return 8
     largest = int(pixels.max(initial=0))
-    return next(bits for bits in BIT_DEPTHS if not largest >> bits or bits == BIT_DEPTHS[-1])
+    return next((bits for bits in BIT_DEPTHS if not largest >> bits), BIT_DEPTHS[-1])
 
 
 def significant_bits_of_file(path: Path) -> int | None:
@@ -130,38 +136,29 @@ def significant_bits_of_file(path: Path) -> int | None:
         demand_bounded(content, path, None)
     except FrameError:
         return None  # reported when the file is processed
-    image = _decoded(content, deep=True)
+    image = _decoded(content)
     return None if image is None or image.dtype != np.uint16 else significant_bits(image)
 
 
-def _decoded(content: bytes, *, deep: bool) -> NDArray[Any] | None:
-    if not content:
-        return None
+def _decoded(content: bytes) -> NDArray[Any] | None:
     # A calibration is of the sensor's pixels, whichever way up a telephone would show them (Exif).
-    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
-    flags |= cv2.IMREAD_ANYDEPTH if deep else 0
+    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
     try:
-        image = cv2.imdecode(np.frombuffer(without_orientation(content), np.uint8), flags)
-    except cv2.error:  # sizes beyond OpenCV's bounds are no None
+        return cv2.imdecode(np.frombuffer(without_orientation(content), np.uint8), flags)
+    except cv2.error:  # sizes beyond OpenCV's bounds
         return None
-    return image
 
 
 def bounded_content(path: Path | str, name: object, size: tuple[int, int] | None) -> bytes:
-    """The content of an image file that may be anything: a pipe, a device, a film.
+    """The content of an image file, which is refused where it is no file or too large.
 
     Parameters
     ----------
     path : path or str
-        The file.
     name : object
-        What messages call it.
+        The image's name in messages.
     size : (int, int) or None
         Width and height that are expected.
-
-    Returns
-    -------
-    bytes
 
     Raises
     ------
@@ -176,16 +173,7 @@ def bounded_content(path: Path | str, name: object, size: tuple[int, int] | None
 
 
 def demand_bounded(content: bytes, name: object, size: tuple[int, int] | None) -> None:
-    """Refuse an image by its header, before it is decoded.
-
-    Parameters
-    ----------
-    content : bytes
-        The file.
-    name : object
-        What messages call it.
-    size : (int, int) or None
-        Width and height that are expected.
+    """Refuse an image by its header, before it is decoded; parameters as in `decode_gray`.
 
     Raises
     ------
@@ -202,7 +190,7 @@ def demand_bounded(content: bytes, name: object, size: tuple[int, int] | None) -
             f"{name}: cannot be decoded: claims {width}x{height} px: "
             f"expected at most {MOST_PIXELS} pixels"
         )
-    if size is not None and size != (width, height):
+    if size is not None and size != claimed:
         raise FrameError(
             f"{name}: is {width}x{height} px: "
             f"expected {size[0]}x{size[1]}, the calibration's size: "

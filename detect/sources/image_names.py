@@ -25,17 +25,21 @@ IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".pgm", ".ppm", ".tif", ".t
 #: Size in bytes and time of change in nanoseconds: they identify a state of a file.
 FileStamp = tuple[int, int]
 
-_DIGITS = re.compile(r"[0-9]+")
 #: Longer names are known by their digest, bytes.
 _LONGEST = 64
 
 
 def image_name(prefix: str) -> str:
     """Name of an image without directories (of either system) and image extension."""
-    name = prefix.replace("\\", "/").rpartition("/")[2]
+    name = last_part(prefix)
     # Not just any suffix: the data set's prefixes end in a number, as in e.0067.
     stem, dot, extension = name.rpartition(".")
     return stem if stem and (dot + extension).lower() in IMAGE_SUFFIXES else name
+
+
+def last_part(prefix: str) -> str:
+    """A prefix without directories (of either system)."""
+    return prefix.replace("\\", "/").rpartition("/")[2]
 
 
 class ImageNames:
@@ -57,27 +61,23 @@ class ImageNames:
 
     def __init__(self, folder: Path, pattern: str = "*") -> None:
         self.folder = folder
-        self.has_links = False
         # Where a run's images may be: in their folder, or that of the run.
-        own = os.path.abspath(folder)  # noqa: PTH100 - links are not followed yet
-        above, name = os.path.split(own)
-        self._homes = (own, above) if name == "images" else (own,)
-        suffixes = set()
-        keys = []
-        matches = re.compile("" if pattern == "*" else fnmatch.translate(pattern)).match
+        own = folder.absolute()
+        self._homes = (own, own.parent) if own.name == "images" else (own,)
+        matches = re.compile(fnmatch.translate(pattern)).match
         with os.scandir(folder) as entries:
-            for entry in entries:
-                suffix = os.path.splitext(entry.name)[1]  # noqa: PTH122 - a Path for each is slow
-                if suffix.lower() in IMAGE_SUFFIXES and matches(entry.name):
-                    self.has_links |= entry.is_symlink()
-                    suffixes.add(os.fsencode(suffix))
-                    keys.append(_natural_order(entry.name))
-        keys.sort()
-        self._names: NDArray[np.bytes_] = np.array(
-            [os.fsencode(key.rpartition("/")[2]) for key in keys], dtype=np.bytes_
-        )
-        self._index = NameIndex(bytes(name) for name in self._names)
-        self._suffixes = tuple(sorted(suffixes))
+            found = [
+                entry
+                for entry in entries
+                if _suffix(entry.name) in IMAGE_SUFFIXES and matches(entry.name)
+            ]
+        self.has_links = any(entry.is_symlink() for entry in found)
+        names = sorted(entry.name for entry in found)
+        names.sort(key=_natural_order)
+        encoded = [os.fsencode(name) for name in names]
+        self._names: NDArray[np.bytes_] = np.array(encoded, dtype=np.bytes_)
+        self._index = NameIndex(encoded)
+        self._suffixes = sorted({name[name.rindex(b".") :] for name in encoded})
 
     def __len__(self) -> int:
         return len(self._names)
@@ -89,12 +89,7 @@ class ImageNames:
     def find(self, name: str) -> int | None:
         """The place of the image of a name, with or without its ending; the first of several."""
         stem = name.encode("utf-8", "surrogateescape")
-        names = [stem + suffix for suffix in self._suffixes]
-        if stem.endswith(self._suffixes):  # else there is no file of exactly that name
-            names.append(stem)
-        if len(names) == 1:
-            return self._index.find(names[0])
-        places = [self._index.find(name) for name in names]
+        places = [self._index.find(stem + suffix) for suffix in (b"", *self._suffixes)]
         return min((place for place in places if place is not None), default=None)
 
     def place_of(self, prefix: str) -> int | None:
@@ -107,10 +102,10 @@ class ImageNames:
             files are read.
         """
         name = prefix.strip('"')
-        why = leads_out(name, *self._homes)
+        why = leads_out(name, *map(str, self._homes))
         if why is not None:
             raise FrameError(f"{excerpt(prefix)}: the prefix {why}: expected an image of the run")
-        return self.find(name.replace("\\", "/").rsplit("/", 1)[-1])
+        return self.find(last_part(name))
 
     def checked(self, index: int) -> tuple[Path, FileStamp | None]:
         """The image at a place, and its file's stamp: None if it is a link, or nothing is there.
@@ -122,12 +117,12 @@ class ImageNames:
         """
         path = self.path(index)
         try:
-            status = os.lstat(path)
+            status = path.lstat()
         except (OSError, ValueError):
             return path, None
         if not stat.S_ISLNK(status.st_mode):
             return path, (status.st_size, status.st_mtime_ns)
-        if link_out(path, *map(Path, self._homes)):
+        if link_out(path, *self._homes):
             raise FrameError(
                 f"{path}: cannot be read: is a link that leads out of the run: expected an image "
                 "in it"
@@ -152,36 +147,19 @@ def images_of_folder(folder: Path) -> ImageNames:
     raise DetectError(f"{folder}: no images: expected {kinds} in it or in {folder / 'images'}")
 
 
-def _natural_order(name: str) -> str:
-    """Sort key of names, with numbers by value, then by the name itself, which follows the last /.
-
-    A number becomes NUL, how many digits it has, and the digits: longer numbers are larger ones.
-    """
-
-    def by_value(match: re.Match[str]) -> str:
-        digits = match.group().lstrip("0")
-        return f"\0{chr(1 + len(digits))}{digits}"
-
-    begins_with_number = "1" if name[0].isdigit() else "0"
-    return f"{begins_with_number}{_DIGITS.sub(by_value, name)}\0\0/{name}"
-
-
 class NameIndex:
     """Finds the place of a name in a sequence; costs the width of the longest name and 4 bytes.
 
     Parameters
     ----------
     names : iterable of bytes
-        Without NUL; longer ones than 64 bytes are known by their digest. Of equal ones the last
-        counts.
+        Without NUL. Of equal ones the last counts.
     """
 
     def __init__(self, names: Iterable[bytes]) -> None:
         keys: NDArray[np.bytes_] = np.array([_key(name) for name in names], dtype=np.bytes_)
-        order = np.argsort(keys, kind="stable")
-        self._keys = keys[order]
-        self._places = order.astype(np.uint32)
-        self._next = 0  # in a run, after a name mostly comes its successor
+        self._places = np.argsort(keys, kind="stable").astype(np.uint32)
+        self._keys = keys[self._places]
 
     def __len__(self) -> int:
         return len(self._keys)
@@ -189,18 +167,27 @@ class NameIndex:
     def find(self, name: bytes) -> int | None:
         """The place of a name in the sequence; None if it is not there."""
         key = _key(name)
-        keys = self._keys
-        # For a wider needle numpy would copy the whole haystack to its width.
-        if not len(keys) or len(key) > keys.itemsize:
+        if len(key) > self._keys.itemsize:  # numpy would copy all keys to this width
             return None
-        after = self._next + 1
-        if after >= len(keys) or keys.item(after - 1) != key or keys.item(after) == key:
-            after = int(keys.searchsorted(np.bytes_(key), side="right"))
-            if not after or keys.item(after - 1) != key:
-                return None
-        self._next = after
-        return self._places.item(after - 1)
+        after = int(self._keys.searchsorted(np.bytes_(key), side="right"))
+        if not after or self._keys[after - 1] != key:
+            return None
+        return int(self._places[after - 1])
 
 
 def _key(name: bytes) -> bytes:
     return name if len(name) < _LONGEST else hashlib.sha256(name).hexdigest().encode()
+
+
+def _suffix(name: str) -> str:
+    return os.path.splitext(name)[1].lower()  # noqa: PTH122 - a Path for each name is slow
+
+
+def _natural_order(name: str) -> str:
+    """Sort key of names with numbers by value: before its digits, how many there are."""
+    key = re.sub("[0-9]+", lambda found: _by_value(found[0].lstrip("0")), name)
+    return f"{name[0].isdigit():d}{key}"
+
+
+def _by_value(digits: str) -> str:
+    return f"\0{chr(1 + len(digits))}{digits}"

@@ -23,7 +23,7 @@ class SourceImage:
     Attributes
     ----------
     prefix : str
-        What its STEP row is called.
+        The prefix of its STEP row.
     time_s : float or None
         When it was taken; what zero is, is the source's.
     path : path or None
@@ -31,7 +31,7 @@ class SourceImage:
     content : bytes or (H, W) uint8 array or None
         the encoded image, or its grey values.
     bits : int
-        Significant bits, where the file has more than 8.
+        Significant bits of a file with more than 8.
     failure : str or None
         Why there is no image, although there should be.
     """
@@ -46,14 +46,7 @@ class SourceImage:
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """A calibrated camera.
-
-    Attributes
-    ----------
-    camera : Camera
-    why_no_pose : str or None
-        Why its pose above the floor is not known, where it is not.
-    """
+    """A calibrated camera; `why_no_pose` says why its pose above the floor is not known, if so."""
 
     camera: Camera
     why_no_pose: str | None = None
@@ -65,7 +58,7 @@ class Source(ABC):
     Attributes
     ----------
     name : str
-        What messages call it.
+        Its name in messages.
     output_base : path
         Results are called this, with an ending of their own.
     ships_images : bool
@@ -138,9 +131,7 @@ def only_calibration(folder: Path, stem: str) -> Calibration | None:
         If it cannot be read.
     """
     own = folder / f"{stem}.cam"
-    if own.is_file():
-        return Calibration(read_camera(own))
-    found = sorted(folder.glob("*.cam"))
+    found = [own] if own.is_file() else sorted(folder.glob("*.cam"))
     if len(found) > 1:
         names = ", ".join(path.name for path in found[:4])
         raise DetectError(f"{folder}: several calibrations ({names}): name one by --camera")

@@ -7,10 +7,12 @@ processed and the results written. A second one ends the program, which then wri
 
 from __future__ import annotations
 
+import itertools
 import logging
 import signal
 import threading
 import time
+from collections import deque
 from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -30,6 +32,7 @@ _log = logging.getLogger("redetect")
 #: How long a camera may be silent (s).
 PATIENCE_S = 10.0
 
+# How often interrupts are noticed while no image comes (s).
 _LOOK_S = 0.1
 
 
@@ -58,14 +61,18 @@ class LiveCamera(Source):
 
     def images(self) -> Generator[SourceImage, None, None]:
         """The camera's images from now on, until it is interrupted or gone."""
-        with _watched(_open_camera(self._index)) as newest, _stoppable() as stop:
-            number = 0
-            while (taken := newest.next(stop)) is not None:
-                time_s, pixels = taken
-                prefix = numbered_prefix(f"camera{self._index}", number)
-                gray = gray_of_pixels(pixels, prefix)
-                yield SourceImage(prefix, time_s, content=gray)
-                number += 1
+        newest = _Newest(_open_camera(self._index))
+        try:
+            with _stoppable() as stop:
+                for number in itertools.count():
+                    taken = newest.next(stop)
+                    if taken is None:
+                        return
+                    time_s, pixels = taken
+                    prefix = numbered_prefix(f"camera{self._index}", number)
+                    yield SourceImage(prefix, time_s, content=gray_of_pixels(pixels, prefix))
+        finally:
+            newest.close()
 
 
 class _Newest:
@@ -73,54 +80,42 @@ class _Newest:
 
     def __init__(self, capture: Capture) -> None:
         self._capture = capture
-        self._changed = threading.Condition()
-        self._image: tuple[float, NDArray[Any]] | None = None
-        self._ended = False
+        self._image: deque[tuple[float, NDArray[Any]]] = deque(maxlen=1)
+        self._changed = threading.Event()
+        self._ended = threading.Event()
         self._thread = threading.Thread(target=self._read, daemon=True)
         self._thread.start()
 
     def next(self, stop: threading.Event) -> tuple[float, NDArray[Any]] | None:
         """Wait for an image that was not given yet; None when there will be none."""
         latest_s = time.monotonic() + PATIENCE_S
-        with self._changed:
-            while not stop.is_set() and time.monotonic() < latest_s:
-                if self._image is not None:
-                    image, self._image = self._image, None
-                    return image
-                if self._ended:
-                    _log.info("the camera gives no more images: the results so far are written")
-                    return None
-                self._changed.wait(_LOOK_S)  # an interrupt is noticed in between
-        if not stop.is_set():
-            _log.info(f"no image came within {PATIENCE_S:g} s: the results so far are written")
+        while not stop.is_set():
+            self._changed.clear()
+            ended = self._ended.is_set()
+            if self._image:
+                return self._image.popleft()
+            if ended:
+                _log.info("the camera gives no more images: the results so far are written")
+                return None
+            if time.monotonic() >= latest_s:
+                _log.info(f"no image came within {PATIENCE_S:g} s: the results so far are written")
+                return None
+            self._changed.wait(_LOOK_S)
         return None
 
-    def end(self) -> None:
-        with self._changed:
-            self._ended = True
+    def close(self) -> None:
+        self._ended.set()
         self._thread.join(PATIENCE_S)
+        self._capture.release()
 
     def _read(self) -> None:
-        while True:
+        while not self._ended.is_set():
             there, pixels = self._capture.read()
-            with self._changed:
-                if not there or pixels is None:
-                    self._ended = True
-                else:
-                    self._image = (time.time(), pixels)
-                self._changed.notify()
-                if self._ended:
-                    return
-
-
-@contextmanager
-def _watched(capture: Capture) -> Iterator[_Newest]:
-    newest = _Newest(capture)
-    try:
-        yield newest
-    finally:
-        newest.end()
-        capture.release()
+            if there and pixels is not None:
+                self._image.append((time.time(), pixels))
+            else:
+                self._ended.set()
+            self._changed.set()
 
 
 @contextmanager

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from detect.errors import DetectError
 from detect.sources.gray import significant_bits_of_file
-from detect.sources.image_names import IMAGE_SUFFIXES, ImageNames
+from detect.sources.image_names import IMAGE_SUFFIXES, ImageNames, images_of_folder
 from detect.sources.interface import (
     Calibration,
     Source,
@@ -15,99 +15,83 @@ from detect.sources.interface import (
     frame_prefix,
     only_calibration,
 )
-from detect.sources.times import TimesByImage
+from detect.sources.times import read_image_times
 
 WILDCARDS = frozenset("*?[")
 
 # Number of images, spread over all, that determine the significant bits.
-_LOOKED_AT = 5
+_SAMPLES = 5
 
 
 class ImageFiles(Source):
     """Images in natural order of their names.
 
+    Calibration and times are in the run's folder, and results are written there: the folder of the
+    images, or the one above ``images/``.
+
     Parameters
     ----------
-    names : ImageNames
-        The images.
-    name : str
-        What messages call them.
-    home : path
-        The run's folder: calibration and times are there, and results are written there.
-    times : TimesByImage or None
-        When they were taken.
+    name : path
+        A folder, an image or a pattern.
+    times : str
+        File of the images' times; empty: ``<folder>.times`` in the run's folder, if there is one.
     bits : int or None
         Significant bits of 16-bit images; by default what some of them need.
+
+    Raises
+    ------
+    DetectError
+        If there are no such images, or their times cannot be read.
     """
 
     ships_images = False
     times_own = False
 
-    def __init__(
-        self,
-        names: ImageNames,
-        name: str,
-        home: Path,
-        times: TimesByImage | None,
-        bits: int | None,
-    ) -> None:
-        self.name = name
-        self.output_base = home / "detected"
-        self.has_times = times is not None
-        self._home = home
-        self._names = names
-        self.expected = len(names)
-        self._times = times
-        self._bits = bits if bits is not None else bits_of_images(names)
+    def __init__(self, name: Path, times: str = "", bits: int | None = None) -> None:
+        self.name = str(name)
+        if name.is_dir():
+            self._names, self._home = images_of_folder(name), name
+        else:
+            self._names, self._home = _matching_images(name), name.parent
+            if name.parent.resolve().name == "images":
+                self._home = name.parent.parent
+        self.output_base = self._home / "detected"
+        self.expected = len(self._names)
+        times_file = Path(times) if times else self._home / f"{self._home.resolve().name}.times"
+        self._times = read_image_times(times_file) if times or times_file.is_file() else {}
+        self.has_times = bool(times) or times_file.is_file()
+        self._bits = bits_of_images(self._names) if bits is None else bits
 
     def images(self) -> Generator[SourceImage, None, None]:
         """The images, by the names of their files."""
         for place in range(len(self._names)):
             path = self._names.path(place)
-            time_s = None if self._times is None else self._times.get(path.stem)
+            time_s = self._times.get(path.stem)
             yield SourceImage(frame_prefix(path.stem), time_s, path, bits=self._bits)
 
     def calibration(self) -> Calibration | None:
-        """The ``.cam`` file in the folder, or in the one above ``images/``."""
+        """The ``.cam`` file in the run's folder."""
         return only_calibration(self._home, self._home.resolve().name)
-
-
-def matching_images(pattern: str) -> ImageNames:
-    """The images that a pattern names, or one image.
-
-    Raises
-    ------
-    DetectError
-        If there are wildcards in the folder's name, no such folder, or no image of that name.
-    """
-    path = Path(pattern)
-    if WILDCARDS & set(str(path.parent)):
-        raise DetectError(
-            f"{pattern}: wildcards in the folder's name: expected them in the last part only"
-        )
-    if not path.parent.is_dir():
-        raise DetectError(f"{pattern}: no such folder: {path.parent}")
-    found = ImageNames(path.parent, path.name)
-    if not len(found):
-        kinds = " ".join(sorted(IMAGE_SUFFIXES))
-        raise DetectError(f"{pattern}: no image matches: expected {kinds}")
-    return found
-
-
-def home_of(folder: Path) -> Path:
-    """The run folder of a folder of images: that above ``images/``, else itself."""
-    return folder.parent if folder.resolve().name == "images" else folder
-
-
-def own_times(home: Path) -> Path | None:
-    """The file of times in a run folder."""
-    path = home / f"{home.resolve().name}.times"
-    return path if path.is_file() else None
 
 
 def bits_of_images(names: ImageNames) -> int:
     """Significant bits of 16-bit images: what some, spread over all, need; 16 if there are none."""
-    count = len(names)
-    places = sorted({round(k * (count - 1) / (_LOOKED_AT - 1)) for k in range(_LOOKED_AT)})
-    found = [significant_bits_of_file(names.path(place)) for place in places if count]
+    last = len(names) - 1
+    places = {round(k * last / (_SAMPLES - 1)) for k in range(_SAMPLES)}
+    found = [significant_bits_of_file(names.path(place)) for place in places if last >= 0]
     return max((bits for bits in found if bits is not None), default=16)
+
+
+def _matching_images(pattern: Path) -> ImageNames:
+    """The images that a pattern matches, or one image."""
+    if WILDCARDS & set(str(pattern.parent)):
+        raise DetectError(
+            f"{pattern}: wildcards in the folder's name: expected them in the last part only"
+        )
+    if not pattern.parent.is_dir():
+        raise DetectError(f"{pattern}: no such folder: {pattern.parent}")
+    found = ImageNames(pattern.parent, pattern.name)
+    if not len(found):
+        kinds = " ".join(sorted(IMAGE_SUFFIXES))
+        raise DetectError(f"{pattern}: no image matches: expected {kinds}")
+    return found

@@ -9,7 +9,7 @@ robot moves on the floor: of its attitude the heading is taken, of its position 
 from __future__ import annotations
 
 import math
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -26,13 +26,17 @@ FloatArray = NDArray[np.float64]
 
 #: Limit of distances from the start (m), such that products of two remain finite.
 FARTHEST = 1e12
+#: Between poses farther apart than this (s), nothing is interpolated.
+LARGEST_GAP_S = 1.0
 #: Takes (forward, left, turn) to (left, backward, turn).
 DATASET_FROM_ROBOTICS: FloatArray = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
 # A covariance of a step that is less definite than this, against that of the pose, is none.
 _INDEFINITE = 1e-9
-# Columns of a TUM trajectory, and how far its quaternions may be from unit length.
-_COLUMNS, _UNIT = 8, 1e-2
+# How far the length of a trajectory's quaternions may be from 1.
+_UNIT = 1e-2
+# Times are written with six digits: the last image may seem to be later than the last pose.
+_END_SLACK_S = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,20 +51,20 @@ class TimedPose:
     theta : float
         Radians.
     covariance : (3, 3) float64 or None
-        Of (x, y, theta) in the fixed frame, since the start; None if nothing is known.
+        Of (x, y, theta) in the fixed frame, since the start; None if unknown.
     """
 
     time_s: float
     x: float
     y: float
     theta: float
-    covariance: NDArray[np.float64] | None = None
+    covariance: FloatArray | None = None
 
 
 class PoseStream(Protocol):
     """Poses of the robot over time, as recorded; iterating again starts over."""
 
-    #: What messages call it.
+    #: Its name in messages.
     name: str
     #: The file that it is read from, which heads of files name.
     path: Path
@@ -81,22 +85,13 @@ def movement_between(before: TimedPose, after: TimedPose) -> Movement:
 
     The covariances of poses are assumed to grow with the path: that of the later pose is that
     of the earlier, carried along, plus that of the movement, independent of it. Where they have
-    not (a driver that publishes the same covariance all the time), nothing is known of the
-    movement's.
-
-    Parameters
-    ----------
-    before, after : TimedPose
-
-    Returns
-    -------
-    Movement
+    not (a driver that publishes the same covariance all the time), that of the movement is unknown.
     """
     cos, sin = np.cos(before.theta), np.sin(before.theta)
-    robot_from_fixed = np.array([[cos, sin], [-sin, cos]])
     moved = np.array([after.x - before.x, after.y - before.y])
     turn = wrap_angle(after.theta - before.theta)
-    pose = DATASET_FROM_ROBOTICS @ np.array([*(robot_from_fixed @ moved), turn])
+    robot_from_fixed = np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
+    pose = DATASET_FROM_ROBOTICS @ np.array([*(robot_from_fixed[:2, :2] @ moved), turn])
     if before.covariance is None or after.covariance is None:
         return Movement(pose, None)
     carried = np.eye(3)
@@ -105,25 +100,12 @@ def movement_between(before: TimedPose, after: TimedPose) -> Movement:
     scale = float(np.abs(after.covariance).max())
     if float(np.linalg.eigvalsh(grown).min()) < -_INDEFINITE * scale:
         return Movement(pose, None)
-    rotation = np.eye(3)
-    rotation[:2, :2] = robot_from_fixed
-    to_dataset = DATASET_FROM_ROBOTICS @ rotation
+    to_dataset = DATASET_FROM_ROBOTICS @ robot_from_fixed
     return Movement(pose, to_dataset @ grown @ to_dataset.T)
 
 
 def pose_between(before: TimedPose, after: TimedPose, time_s: float) -> TimedPose:
-    """The pose at a time between two: linear, the heading the shorter way round.
-
-    Parameters
-    ----------
-    before, after : TimedPose
-    time_s : float
-        From the first one's time to the second one's, which are not the same.
-
-    Returns
-    -------
-    TimedPose
-    """
+    """The pose at a time between two: linear, the heading the shorter way round."""
     share = (time_s - before.time_s) / (after.time_s - before.time_s)
     covariance = None
     if before.covariance is not None and after.covariance is not None:
@@ -139,12 +121,44 @@ def pose_between(before: TimedPose, after: TimedPose, time_s: float) -> TimedPos
 
 def step_of(prefix: str, movement: Movement | None) -> Step:
     """A STEP row; unknown values (the movement, its covariance) are zero."""
-    if movement is None:
-        return Step(prefix, *[0.0] * 9)
-    c = np.zeros((3, 3)) if movement.covariance is None else movement.covariance
-    dx, dy, dphi = (float(value) for value in movement.pose)
+    pose, c = np.zeros(3), np.zeros((3, 3))
+    if movement is not None:
+        pose = movement.pose
+        c = c if movement.covariance is None else movement.covariance
     entries = (c[0, 0], c[0, 1], c[1, 1], c[0, 2], c[1, 2], c[2, 2])
-    return Step(prefix, dx, dy, dphi, *(float(value) for value in entries))
+    return Step(prefix, *map(float, (*pose, *entries)))
+
+
+class PosesOverTime:
+    """Poses in order, read once; what is asked for must be in order, too."""
+
+    def __init__(self, poses: Iterator[TimedPose], name: str) -> None:
+        self._poses = poses
+        self._name = name
+        self._before: TimedPose | None = None
+        self._after = next(poses, None)
+        if self._after is None:
+            raise DetectError(f"{name}: no pose in it: expected odometry, or --odometry none")
+
+    def at(self, time_s: float) -> TimedPose | None:
+        """The pose at a time; None if unknown, or if a later one was requested before."""
+        while self._after is not None and self._after.time_s < time_s:
+            passed, self._after = self._after, next(self._poses, None)
+            self._before = passed
+            if self._after is not None and self._after.time_s < passed.time_s:
+                raise DetectError(
+                    f"{self._name}: the pose of {self._after.time_s:.6f} s comes after that of "
+                    f"{passed.time_s:.6f} s: expected times in order"
+                )
+        before, after = self._before, self._after
+        if before is None or after is None:  # before the first pose, or after the last one
+            end = after or before
+            return end if end and abs(end.time_s - time_s) <= _END_SLACK_S else None
+        if after.time_s == time_s:
+            return after
+        if time_s < before.time_s or after.time_s - before.time_s > LARGEST_GAP_S:
+            return None
+        return pose_between(before, after, time_s)
 
 
 class TumTrajectory:
@@ -164,28 +178,24 @@ class TumTrajectory:
 
     def __iter__(self) -> Generator[TimedPose, None, None]:
         for number, words in text_rows(self.path, "TUM trajectory"):
-            yield self._pose(words, number)
-
-    def _pose(self, words: list[str], number: int) -> TimedPose:
-        try:
-            values = [float(word) for word in words]
-        except ValueError:
-            values = []
-        if len(values) != _COLUMNS or not all(map(math.isfinite, values)):
-            raise DetectError(
-                f"{self.path}:{number}: {' '.join(words)[:60]!r}: "
-                "expected 8 numbers: t x y z qx qy qz qw"
-            )
-        time_s, x, y, _, *quaternion = values
-        if max(abs(x), abs(y)) > FARTHEST:
-            raise DetectError(f"{self.path}:{number}: expected x and y of at most {FARTHEST:g} m")
-        if abs(math.hypot(*quaternion) - 1.0) > _UNIT:
-            raise DetectError(f"{self.path}:{number}: qx qy qz qw: expected a unit quaternion")
-        theta = heading_rad(*quaternion)
-        if self._axes == "dataset":
-            # Only the robot's own axes differ; the fixed frame is the trajectory's, whatever it is.
-            theta -= 0.5 * math.pi
-        return TimedPose(time_s, x, y, theta)
+            place = f"{self.path}:{number}"
+            try:
+                time_s, x, y, _, *quaternion = values = [float(word) for word in words]
+            except ValueError:
+                values = []
+            if len(values) != 8 or not all(map(math.isfinite, values)):
+                raise DetectError(
+                    f"{place}: {' '.join(words)[:60]!r}: expected 8 numbers: t x y z qx qy qz qw"
+                )
+            if max(abs(x), abs(y)) > FARTHEST:
+                raise DetectError(f"{place}: expected x and y of at most {FARTHEST:g} m")
+            if abs(math.hypot(*quaternion) - 1.0) > _UNIT:
+                raise DetectError(f"{place}: qx qy qz qw: expected a unit quaternion")
+            theta = heading_rad(*quaternion)
+            if self._axes == "dataset":
+                # Only the robot's own axes differ; the fixed frame is the trajectory's.
+                theta -= 0.5 * math.pi
+            yield TimedPose(time_s, x, y, theta)
 
 
 def heading_rad(qx: float, qy: float, qz: float, qw: float) -> float:

@@ -3,49 +3,37 @@
 from __future__ import annotations
 
 import math
-from array import array
 from collections.abc import Iterator
 from pathlib import Path
 
 from detect.errors import DetectError
-from detect.sources.image_names import NameIndex
 
 #: The head of a file of times.
 TIMES_HEAD = "Times of the frames: <image> <seconds>, as their source gives them."
 
-_LARGEST_ROW = 65536
+_LONGEST_ROW = 65536
 
 
-class TimesByImage:
-    """The times of a ``.times`` file, by image prefix; 8 bytes each, and the prefix.
-
-    Parameters
-    ----------
-    path : path
+def read_image_times(path: Path) -> dict[str, float]:
+    """The times of images (s), by their prefixes.
 
     Raises
     ------
     DetectError
         If the file cannot be read or a row is malformed; it names file and line.
     """
-
-    def __init__(self, path: Path) -> None:
-        self._seconds = array("d")
-
-        def prefixes() -> Iterator[bytes]:
-            for prefix, time_s in _rows(path):
-                self._seconds.append(time_s)
-                yield _bytes(prefix)
-
-        self._index = NameIndex(prefixes())
-
-    def __len__(self) -> int:
-        return len(self._seconds)
-
-    def get(self, prefix: str) -> float | None:
-        """The time of an image (s); None if the file has none."""
-        place = self._index.find(_bytes(prefix))
-        return None if place is None else self._seconds[place]
+    times = {}
+    for number, words in text_rows(path, "file of times", "surrogateescape"):
+        try:
+            prefix, seconds = words[0], float(words[1])
+        except (IndexError, ValueError):
+            prefix, seconds = "", math.nan
+        if len(words) != 2 or not math.isfinite(seconds):
+            raise DetectError(
+                f"{path}:{number}: {' '.join(words)[:60]!a}: expected an image's prefix and seconds"
+            )
+        times[prefix] = seconds
+    return times
 
 
 def format_time(prefix: str, time_s: float) -> str:
@@ -64,7 +52,7 @@ def text_rows(path: Path, what: str, errors: str = "strict") -> Iterator[tuple[i
     try:
         with path.open(encoding="utf-8-sig", errors=errors) as stream:
             for number, line in enumerate(stream, start=1):
-                words = line[:_LARGEST_ROW].partition("#")[0].replace(",", " ").split()
+                words = line[:_LONGEST_ROW].partition("#")[0].replace(",", " ").split()
                 if words:
                     yield number, words
     except FileNotFoundError:
@@ -73,20 +61,3 @@ def text_rows(path: Path, what: str, errors: str = "strict") -> Iterator[tuple[i
         raise DetectError(f"{path}: is no text: expected a {what}") from None
     except OSError as error:
         raise DetectError(f"{path}: cannot be read: {error.strerror}") from None
-
-
-def _rows(path: Path) -> Iterator[tuple[str, float]]:
-    for number, words in text_rows(path, "file of times", "surrogateescape"):
-        try:
-            prefix, seconds = words[0], float(words[1])
-        except (IndexError, ValueError):
-            prefix, seconds = "", math.nan
-        if len(words) != 2 or not math.isfinite(seconds):
-            raise DetectError(
-                f"{path}:{number}: {' '.join(words)[:60]!a}: expected an image's prefix and seconds"
-            )
-        yield prefix, seconds
-
-
-def _bytes(text: str) -> bytes:
-    return text.encode("utf-8", "surrogateescape")

@@ -28,7 +28,7 @@ from detect.sources.gray import (
     significant_bits_of_file,
 )
 from detect.sources.poses import TumTrajectory, movement_between, step_of
-from detect.sources.times import TimesByImage
+from detect.sources.times import read_image_times
 from lut.cache import cached_vertical_table
 from storage import OutputExistsError
 from storage.image_header import claimed_size
@@ -238,7 +238,7 @@ DETECT_READERS: tuple[Reader, ...] = (
     Reader(
         "image times",
         "e.times",
-        TimesByImage,
+        read_image_times,
         (DetectError,),
         (b"e.0000 0.1\ne.0001 0.2\n",),
         NUMBERS,

@@ -16,7 +16,7 @@ from detect.run import RunFrames
 from detect.sources.opening import open_source
 from detect.sources.options import SourceOptions
 from detect.sources.poses import TimedPose, TumTrajectory, movement_between, pose_between
-from detect.sources.times import TimesByImage, format_time
+from detect.sources.times import format_time, read_image_times
 from groundtruth.trajectories.streams import read_times
 from landmarks import read_frames
 
@@ -133,7 +133,7 @@ def test_a_missing_trajectory(timed_run: Path, tmp_path: Path) -> None:
 def test_malformed_times(tmp_path: Path, content: str) -> None:
     (tmp_path / "a.times").write_text("# head\n" + content)
     with pytest.raises(DetectError, match=r"a\.times:2: .*expected an image's prefix and seconds"):
-        TimesByImage(tmp_path / "a.times")
+        read_image_times(tmp_path / "a.times")
 
 
 def test_headings_of_quaternions(tmp_path: Path) -> None:
