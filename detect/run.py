@@ -25,7 +25,7 @@ from camera import Camera, read_camera
 from detect.errors import DetectError, FrameError
 from detect.sources.gray import bounded_content, decode_gray
 from detect.sources.image_names import IMAGE_SUFFIXES, FileStamp, ImageNames, images_of_folder
-from landmarks import Step, iterate_prefixes, iterate_steps
+from landmarks import Step, read_steps
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,7 +130,7 @@ class RunFrames:
                     continue
                 yield RunFrame(step, path, bits=self._bits, stamp=stamp)
             return
-        for step in iterate_steps(self._odometry):
+        for step in read_steps(self._odometry):
             try:
                 found = self._images.place_of(step.prefix)
                 image, stamp = (None, None) if found is None else self._images.checked(found)
@@ -274,10 +274,10 @@ def _image_run(folder: Path, bits: int | None) -> ImageRun:
     else:
         named = np.zeros(len(images), bool)
         count = 0
-        for prefix in iterate_prefixes(odometry):
+        for step in read_steps(odometry):
             count += 1
             try:
-                found = images.place_of(prefix)
+                found = images.place_of(step.prefix)
                 if found is not None:
                     if images.has_links:
                         images.checked(found)

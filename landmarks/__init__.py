@@ -9,7 +9,6 @@ from landmarks.arrays import CircleArrays, circle_arrays, circle_landmarks, is_p
 from landmarks.association import (
     Association,
     associate,
-    associate_bearings,
     associate_positions,
     associate_within_covariance,
     squared_mahalanobis,
@@ -18,8 +17,6 @@ from landmarks.association import (
 from landmarks.errors import LandmarkError, LandmarkFileError
 from landmarks.reading import (
     frames_of_rows,
-    iterate_prefixes,
-    iterate_steps,
     parse_record,
     parse_rows,
     read_frames,
@@ -72,7 +69,6 @@ __all__ = [
     "Row",
     "Step",
     "associate",
-    "associate_bearings",
     "associate_positions",
     "associate_within_covariance",
     "circle_arrays",
@@ -86,8 +82,6 @@ __all__ = [
     "format_tilt",
     "frames_of_rows",
     "is_positive_definite",
-    "iterate_prefixes",
-    "iterate_steps",
     "parse_record",
     "parse_rows",
     "read_frames",

@@ -65,11 +65,6 @@ def circle_landmarks(
     ids : (N,) array_like of int, optional
         Identifiers, -1 where unknown; by default the rows have none.
 
-    Returns
-    -------
-    tuple of CircleLandmark
-        In the same order.
-
     Raises
     ------
     LandmarkError
@@ -85,19 +80,15 @@ def circle_landmarks(
             f"xy, quality and covariance have shapes {position.shape}, {confidence.shape} and "
             f"{spread.shape}: expected (N, 2), (N,) and (N, 2, 2)"
         )
-    identifiers: list[tuple[int, ...]] = [()] * count
-    if ids is not None:
-        numbers = np.asarray(ids)
-        if numbers.shape != (count,) or not np.issubdtype(numbers.dtype, np.integer):
-            raise LandmarkError(
-                f"ids are {numbers.dtype} of shape {numbers.shape}: expected {count} integers"
-            )
-        identifiers = [(number,) for number in numbers.tolist()]
-    return tuple(
-        CircleLandmark(px, py, q, cxx, cxy, cyy, ids=identifier)
-        for (px, py), q, ((cxx, cxy), (_, cyy)), identifier in zip(
-            position.tolist(), confidence.tolist(), spread.tolist(), identifiers
+    identifiers = np.zeros((count, 0), dtype=np.int64) if ids is None else np.reshape(ids, (-1, 1))
+    if len(identifiers) != count or not np.issubdtype(identifiers.dtype, np.integer):
+        raise LandmarkError(
+            f"ids are {len(identifiers)} {identifiers.dtype}: expected {count} integers"
         )
+    numbers = np.column_stack([position, confidence, spread.reshape(count, 4)[:, [0, 1, 3]]])
+    return tuple(
+        CircleLandmark(px, py, q, cxx, cxy, cyy, tuple(identifier))
+        for (px, py, q, cxx, cxy, cyy), identifier in zip(numbers.tolist(), identifiers.tolist())
     )
 
 

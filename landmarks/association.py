@@ -44,11 +44,6 @@ def associate(costs: ArrayLike, allowed: ArrayLike) -> Association:
     allowed : (N, M) array_like of bool
         The gate.
 
-    Returns
-    -------
-    Association
-        The pairs and the unpaired elements.
-
     Raises
     ------
     ValueError
@@ -85,11 +80,6 @@ def associate_positions(first: ArrayLike, second: ArrayLike, *, gate_m: float) -
         Positions in one frame (m).
     gate_m : float
         Largest distance of a pair (m), at least 0.
-
-    Returns
-    -------
-    Association
-        See `associate`.
     """
     with np.errstate(over="ignore"):  # distances that overflow are beyond any gate
         distance = np.linalg.norm(_differences(first, second), axis=-1)
@@ -111,11 +101,6 @@ def associate_within_covariance(
     gate_sigma : float
         Largest Mahalanobis distance of a pair (standard deviations), at least 0.
 
-    Returns
-    -------
-    Association
-        See `associate`.
-
     Raises
     ------
     numpy.linalg.LinAlgError
@@ -131,26 +116,6 @@ def associate_within_covariance(
     return associate(squared, squared <= gate_sigma**2)
 
 
-def associate_bearings(first: ArrayLike, second: ArrayLike, *, gate_rad: float) -> Association:
-    """Pair bearings that lie within `gate_rad` of each other round the circle.
-
-    Parameters
-    ----------
-    first, second : (N,), (M,) array_like
-        Bearings (rad), of any turn.
-    gate_rad : float
-        Largest difference of a pair (rad), at least 0.
-
-    Returns
-    -------
-    Association
-        See `associate`; squared differences are least.
-    """
-    bearings = np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64)
-    difference = wrap_angle(bearings[0][:, np.newaxis] - bearings[1])
-    return associate(difference**2, np.abs(difference) <= gate_rad)
-
-
 def squared_mahalanobis(offset: ArrayLike, covariance: ArrayLike) -> FloatArray:
     """Square of the Mahalanobis distance, ``offset' covariance^-1 offset``.
 
@@ -164,7 +129,6 @@ def squared_mahalanobis(offset: ArrayLike, covariance: ArrayLike) -> FloatArray:
     Returns
     -------
     (...) float64
-        Squared distances in standard deviations.
 
     Raises
     ------

@@ -80,34 +80,12 @@ def read_frames(path: str | os.PathLike[str]) -> Iterator[Frame]:
     return frames_of_rows(read_rows(path))
 
 
-def read_steps(path: str | os.PathLike[str]) -> list[Step]:
+def read_steps(path: str | os.PathLike[str]) -> Iterator[Step]:
     """Read a run's odometry: the STEP rows of a ``.txt``, ``.circles`` or ``.lines`` file.
 
-    Parameters
-    ----------
-    path : path
-
-    Returns
-    -------
-    list of Step
-        In the file's order; landmarks are checked and left out.
-
-    Raises
-    ------
-    LandmarkFileError
-        As `read_rows`.
+    Parameters, errors and laziness are those of `read_rows`: landmarks are checked and left out.
     """
-    return list(iterate_steps(path))
-
-
-def iterate_steps(path: str | os.PathLike[str]) -> Iterator[Step]:
-    """Read a run's odometry step by step; parameters and errors are those of `read_steps`."""
     return (row.record for row in read_rows(path) if isinstance(row.record, Step))
-
-
-def iterate_prefixes(path: str | os.PathLike[str]) -> Iterator[str]:
-    """The prefixes of a run's steps; parameters and errors are those of `read_steps`."""
-    return (step.prefix for step in iterate_steps(path))
 
 
 def frames_of_rows(rows: Iterable[Row]) -> Iterator[Frame]:

@@ -2,35 +2,34 @@
 
 from __future__ import annotations
 
+import math
+from functools import partial
 from pathlib import Path
 
 from detect.errors import DetectError
 from detect.exports.options import Export
-from detect.exports.rows import ExportedRows
+from detect.exports.rows import table_rows
 from detect.exports.writers import demand_pyarrow, write_csv, write_mcap, write_parquet
 from detect.sources.times import read_image_times
 from landmarks.columns import TableName
 from storage import OutputExistsError, write_whole
 
-_LANDMARKS = (".circles", ".lines", ".markers", ".tilt")
+# Which table a file of a kind has rows of, even where there are none.
+_TABLES: dict[str, TableName] = {
+    ".circles": "circles",
+    ".lines": "lines",
+    ".markers": "markers",
+    ".tilt": "tilts",
+    ".txt": "steps",
+}
 
 
 def perform(command: Export) -> int:
-    """Export a file; returns the exit code.
-
-    Raises
-    ------
-    DetectError
-        If times are needed and there are none, the output is the file itself, or a package is not
-        installed.
-    landmarks.LandmarkFileError
-        If the file cannot be read.
-    storage.OutputExistsError
-        If an output exists and must not be replaced.
-    """
-    file = command.file
+    """Export a file; returns the exit code."""
+    file, to, rate_hz = command.file, command.to, command.rate_hz
     if file.is_dir():
-        found = sorted(path.name for path in file.iterdir() if path.suffix in _LANDMARKS)
+        kinds = _TABLES.keys() - {".txt"}
+        found = sorted(path.name for path in file.iterdir() if path.suffix in kinds)
         such = f", such as {', '.join(found)} in it" if found else ""
         raise DetectError(
             f"{file}: is a folder: expected a .circles, .lines, .markers or .tilt file{such}"
@@ -40,14 +39,17 @@ def perform(command: Export) -> int:
             f"{file}: is a calibration, not rows: camera convert {file} "
             "cameras.txt writes it for COLMAP (or for OpenCV, ROS, Kalibr)"
         )
-    rows = ExportedRows(file, _times(command), command.rate_hz)
-    output = command.output or file.with_name(f"{file.name}.{command.to}")
-    if command.to == "parquet":
+    if rate_hz is not None and not 0.0 < rate_hz < math.inf:
+        raise DetectError(f"rate_hz is {rate_hz:g}: expected above 0")
+    if to == "parquet":
         demand_pyarrow()
-    tables = rows.tables()
+    rows = partial(table_rows, file, _times(command), rate_hz)
+    named = [_TABLES[file.suffix]] if file.suffix in _TABLES else []
+    tables = list(dict.fromkeys([*named, *sorted({row.table for row in rows()})]))
     if not tables:
         raise DetectError(f"{file}: no rows in it: expected STEP, LANDMARK or TILT rows")
-    places = {tables[0]: output} if command.to == "mcap" else _table_files(output, tables)
+    output = command.output or file.with_name(f"{file.name}.{to}")
+    places = {tables[0]: output} if to == "mcap" else _table_files(output, tables)
     for path in places.values():
         if path.exists() and path.samefile(file):
             raise DetectError(f"{path}: is the file to export: expected another output")
@@ -55,13 +57,13 @@ def perform(command: Export) -> int:
             raise OutputExistsError(path)
     for table, path in places.items():
         with write_whole(path, overwrite=command.force) as stream:
-            if command.to == "mcap":
-                count = write_mcap(stream, tables, rows, str(file))
-            elif command.to == "csv":
-                count = write_csv(stream, table, rows)
+            if to == "mcap":
+                count = write_mcap(stream, tables, rows(), str(file))
+            elif to == "csv":
+                count = write_csv(stream, table, rows())
             else:
-                count = write_parquet(stream, table, rows, file.name)
-        print(f"{path}: {count} {'messages' if command.to == 'mcap' else 'rows'}")
+                count = write_parquet(stream, table, rows(), file.name)
+        print(f"{path}: {count} {'messages' if to == 'mcap' else 'rows'}")
     return 0
 
 

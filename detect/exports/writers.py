@@ -42,13 +42,7 @@ _TYPES = {
 
 
 def write_csv(stream: BinaryIO, table: TableName, rows: Iterable[TableRow]) -> int:
-    """Write a table; rows of other tables are passed over.
-
-    Returns
-    -------
-    int
-        How many rows were written.
-    """
+    """Write a table; rows of other tables are passed over. Returns how many rows were written."""
     text = io.TextIOWrapper(stream, "utf-8", "surrogateescape", newline="")
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(column.name for column in TABLES[table])
@@ -66,13 +60,7 @@ def _csv_value(value: Value) -> Value:
 
 
 def demand_pyarrow() -> None:
-    """Refuse to begin where the package is not installed.
-
-    Raises
-    ------
-    DetectError
-        If it is not.
-    """
+    """Refuse to begin where the package is not installed."""
     try:
         import pyarrow.parquet  # type: ignore[import-untyped]  # noqa: F401
     except ImportError:
@@ -83,26 +71,7 @@ def demand_pyarrow() -> None:
 
 
 def write_parquet(stream: BinaryIO, table: TableName, rows: Iterable[TableRow], source: str) -> int:
-    """Write a table; rows of other tables are passed over.
-
-    Parameters
-    ----------
-    stream : binary stream
-    table : str
-    rows : iterable of TableRow
-    source : str
-        Where the rows come from, for the file's own description.
-
-    Returns
-    -------
-    int
-        How many rows were written.
-
-    Raises
-    ------
-    DetectError
-        If an image's name is no Unicode.
-    """
+    """Write a table as `write_csv`; `source` is for the file's own description."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -157,27 +126,10 @@ def topic_of(table: TableName) -> str:
 def write_mcap(
     stream: BinaryIO, tables: list[TableName], rows: Iterable[TableRow], source: str
 ) -> int:
-    """Write the rows of a file as messages.
+    """Write rows as messages; returns how many.
 
-    Parameters
-    ----------
-    stream : binary stream
-    tables : list of str
-        The tables that there are.
-    rows : iterable of TableRow
-        With times; those of a frame are consecutive.
-    source : str
-        The file's name in messages.
-
-    Returns
-    -------
-    int
-        How many messages were written.
-
-    Raises
-    ------
-    DetectError
-        If a frame has no time, or the package is not installed.
+    Rows must have times, and those of a frame be consecutive; `source` is the file's name in
+    messages of errors.
     """
     store = _typestore()
     from rosbags.rosbag2 import StoragePlugin, Writer

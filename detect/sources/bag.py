@@ -3,17 +3,30 @@
 The images are one topic of sensor_msgs/Image or sensor_msgs/CompressedImage, in the order of the
 recording; the odometry is a topic of nav_msgs/Odometry, read beside them. The time of a message is
 that of its header or, where that is zero, of its recording.
+
+A bag may also hold the calibration: camera_info, and by tf_static where the camera is. The
+intrinsics are converted to the project's model, and refused where that cannot follow them. The
+pose is the chain of static transforms from the robot's base *on the floor* to the camera's optical
+frame (x right, y down, z forward), brought to the data set's axes. Without one, only what needs no
+floor can be detected.
 """
 
 from __future__ import annotations
 
 from collections.abc import Generator
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
+from camera import Camera
+from camera.calibration.floor import with_pose
+from camera.formats.conversion import convert_to_camera
+from camera.formats.ros import camera_from_message
 from detect.errors import DetectError, FrameError
-from detect.sources.bag_camera import BASE_FRAME, recorded_calibration
+from detect.run import RunFrame
 from detect.sources.bag_messages import (
     LONGEST_NAME,
     chosen_topic,
@@ -25,24 +38,35 @@ from detect.sources.bag_messages import (
     understood,
 )
 from detect.sources.gray import gray_of_pixels, significant_bits
-from detect.sources.interface import (
-    Calibration,
-    Source,
-    SourceImage,
-    numbered_prefix,
-    only_calibration,
+from detect.sources.interface import Source, numbered_prefix, only_calibration
+from detect.sources.poses import (
+    DATASET_FROM_ROBOTICS,
+    FARTHEST,
+    PoseStream,
+    TimedPose,
+    heading_rad,
+    step_of,
 )
-from detect.sources.poses import FARTHEST, PoseStream, TimedPose, heading_rad
 from storage.messages import one_line
+
+if TYPE_CHECKING:
+    from rosbags.highlevel import AnyReader
 
 #: Endings of bags that are one file.
 BAG_SUFFIXES = frozenset({".bag", ".mcap", ".db3"})
+#: What ROS calls the robot's base on the floor (REP 105, REP 120).
+BASE_FRAME = "base_footprint"
+#: Largest deviation of a conversion from the camera_info, anywhere in the image.
+LIMIT_PX = 0.05
 
 _IMAGE, _COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
-_ODOMETRY = "nav_msgs/msg/Odometry"
+_ODOMETRY, _INFO = "nav_msgs/msg/Odometry", "sensor_msgs/msg/CameraInfo"
+_STATIC = ("/tf_static", "tf2_msgs/msg/TFMessage")
 
 # x, y and the rotation about z, in the 6x6 covariances of ROS.
 _PLANAR = np.ix_([0, 1, 5], [0, 1, 5])
+
+Matrix = NDArray[np.float64]
 
 
 class Bag(Source):
@@ -52,39 +76,30 @@ class Bag(Source):
     ----------
     path : path
         A .bag, .mcap or .db3 file, or the folder of a ROS 2 bag.
-    image_topic : str or None
+    image_topic : str
         Which topic of images, if there are several.
     bits : int or None
         Significant bits of 16-bit images; by default what the first one needs.
     base_frame : str
         The frame of the robot's base, on the floor, among the static transforms.
-
-    Raises
-    ------
-    DetectError
-        If the package is not installed, the bag cannot be read, or has no such images.
     """
 
     def __init__(
-        self,
-        path: Path,
-        image_topic: str | None = None,
-        bits: int | None = None,
-        base_frame: str = BASE_FRAME,
+        self, path: Path, image_topic: str = "", bits: int | None = None, base_frame: str = ""
     ) -> None:
         self.path = path
         self.name = str(path)
         self.stem = path.name if path.is_dir() else path.stem
         self.output_base = path.with_name(f"{self.stem}.detected")
         self._bits = bits
-        self._base_frame = base_frame
+        self._base_frame = base_frame or BASE_FRAME
         with opened_bag(path) as reader:
             self.topic = chosen_topic(
                 reader, path, (_IMAGE, _COMPRESSED), image_topic, "images", "--image-topic"
             )
             self.expected = sum(c.msgcount for c in reader.connections if c.topic == self.topic)
 
-    def images(self) -> Generator[SourceImage, None, None]:
+    def images(self) -> Generator[RunFrame, None, None]:
         """The images of the topic: raw ones as grey values, compressed ones unchanged."""
         bits = self._bits
         with opened_bag(self.path) as reader:
@@ -92,26 +107,27 @@ class Bag(Source):
             for number, (kind, recorded_s, message) in enumerate(said):
                 prefix = numbered_prefix(self.stem, number)
                 name = f"{self.name}: {prefix}"
+                content: bytes | NDArray[np.uint8] | None = None
+                failure = None
                 try:
                     with understood(name):
                         time_s = stamp_s(message, recorded_s)
                         if kind == _COMPRESSED:
                             content = compressed_content(message, name)
-                            # Of compressed images the bits are those of PNG files: 16, or named.
-                            image = SourceImage(prefix, time_s, content=content, bits=bits or 16)
                         else:
                             pixels = pixels_of_message(message, name)
                             bits = bits or significant_bits(pixels)
-                            gray = gray_of_pixels(pixels, name, bits)
-                            image = SourceImage(prefix, time_s, content=gray)
+                            content = gray_of_pixels(pixels, name, bits)
                 except FrameError as error:
-                    image = SourceImage(prefix, time_s, failure=str(error))
-                yield image
+                    failure = str(error)
+                # Of compressed images the bits are those of PNG files: 16, or named.
+                step = step_of(prefix)
+                yield RunFrame(step, None, content, time_s, self._bits or 16, failure)
 
-    def calibration(self) -> Calibration | None:
+    def calibration(self, *, posed: bool) -> Camera | None:
         """The ``.cam`` file beside it: of its name, or the only one; else what it holds itself."""
         beside = only_calibration(self.path.parent, self.stem)
-        return beside or recorded_calibration(self.path, self.topic, self._base_frame)
+        return beside or _recorded_calibration(self.path, self.topic, self._base_frame, posed)
 
     def poses(self, topic: str | None) -> PoseStream | None:
         """The odometry of a topic, or of the only one that has any."""
@@ -119,32 +135,133 @@ class Bag(Source):
             if topic is None and all(c.msgtype != _ODOMETRY for c in reader.connections):
                 return None
             found = chosen_topic(reader, self.path, (_ODOMETRY,), topic, "odometry", "--odometry")
-        return BagOdometry(self.path, found)
+        name = f"{self.path}: {one_line(found, LONGEST_NAME)}"
+        return PoseStream(name, self.path, lambda: _odometry_poses(self.path, found, name))
 
 
-class BagOdometry:
-    """Poses of a nav_msgs/Odometry topic of a bag: X forward, Y left, with covariance."""
+def _odometry_poses(path: Path, topic: str, name: str) -> Generator[TimedPose, None, None]:
+    with opened_bag(path) as reader:
+        for _, recorded_s, message in messages(reader, path, topic):
+            with understood(name):
+                pose = message.pose.pose
+                q, p = pose.orientation, pose.position
+                covariance = np.array(message.pose.covariance, dtype=np.float64)
+                planar = covariance.reshape(6, 6)[_PLANAR]
+                numbers = [p.x, p.y, q.x, q.y, q.z, q.w, *planar.ravel()]
+                values = np.array(numbers, dtype=np.float64)
+                time_s = stamp_s(message, recorded_s)
+            if not np.abs(values).max() <= FARTHEST or not np.any(values[2:6] ** 2 > 0.0):
+                raise DetectError(
+                    f"{name}: at {time_s:.6f} s: expected a finite pose with an orientation and a "
+                    f"finite covariance, no number above {FARTHEST:g}"
+                )
+            theta = heading_rad(q.x, q.y, q.z, q.w)
+            yield TimedPose(time_s, float(p.x), float(p.y), theta, planar)
 
-    def __init__(self, path: Path, topic: str) -> None:
-        self.path = path
-        self.name = f"{path}: {one_line(topic, LONGEST_NAME)}"
-        self._topic = topic
 
-    def __iter__(self) -> Generator[TimedPose, None, None]:
-        with opened_bag(self.path) as reader:
-            for _, recorded_s, message in messages(reader, self.path, self._topic):
-                with understood(self.name):
-                    pose = message.pose.pose
-                    q, p = pose.orientation, pose.position
-                    covariance = np.array(message.pose.covariance, dtype=np.float64)
-                    planar = covariance.reshape(6, 6)[_PLANAR]
-                    numbers = [p.x, p.y, q.x, q.y, q.z, q.w, *planar.ravel()]
-                    values = np.array(numbers, dtype=np.float64)
-                    time_s = stamp_s(message, recorded_s)
-                if not np.abs(values).max() <= FARTHEST or not np.any(values[2:6] ** 2 > 0.0):
-                    raise DetectError(
-                        f"{self.name}: at {time_s:.6f} s: expected a finite pose with an "
-                        f"orientation and a finite covariance, no number above {FARTHEST:g}"
-                    )
-                theta = heading_rad(q.x, q.y, q.z, q.w)
-                yield TimedPose(time_s, float(p.x), float(p.y), theta, planar)
+def _recorded_calibration(path: Path, image_topic: str, base: str, posed: bool) -> Camera | None:
+    """The calibration that a bag holds of the camera of a topic of images; None if there is none.
+
+    If it must be posed, one is refused that no static transforms lead to from the base.
+    """
+    with opened_bag(path) as reader:
+        topic = _info_topic(reader, image_topic)
+        if topic is None:
+            return None
+        name = f"{path}: {one_line(topic, LONGEST_NAME)}"
+        found = next(messages(reader, path, topic), None)
+        with understood(name):
+            # Drivers that are not calibrated publish a matrix of zeros.
+            if found is None or not np.any(_field(found[2], "k")):
+                return None
+            message = found[2]
+            optical = str(message.header.frame_id)
+        transforms = static_transforms(reader, path)
+    pose = pose_in_dataset(transforms, base, optical)
+    if pose is None and posed:
+        raise DetectError(
+            f"{name} says nothing of the camera's pose above the floor, and no static "
+            f"transforms lead from {base!r} to {optical!r}: name a .cam file by --camera (`camera "
+            "convert` and `camera floor` make one), or the robot's base on the floor by "
+            "--base-frame"
+        )
+    with understood(name):
+        camera = _camera_of_info(message, name)
+        return camera if pose is None else with_pose(camera, pose)
+
+
+def _info_topic(reader: AnyReader, image_topic: str) -> str | None:
+    """The camera_info of an image topic: that of its namespace, or the only one."""
+    topics = sorted({c.topic for c in reader.connections if c.msgtype == _INFO})
+    own = image_topic.removesuffix("/compressed").rpartition("/")[0] + "/camera_info"
+    if own in topics:
+        return own
+    return topics[0] if len(topics) == 1 else None
+
+
+def _camera_of_info(message: Any, name: str) -> Camera:
+    """The camera of a whole image's camera_info, without its pose, in the project's model."""
+    part = message.roi.width or message.roi.height
+    if part or max(message.binning_x, message.binning_y) > 1:
+        raise DetectError(f"{name}: binning or roi is set: name a calibration by --camera")
+    d, k = (_field(message, letter).tolist() for letter in "dk")
+    foreign = camera_from_message(
+        message.width, message.height, message.distortion_model, d, k, name
+    )
+    converted = convert_to_camera(foreign)
+    if not converted.deviation_px <= LIMIT_PX:
+        raise DetectError(
+            f"{name}: this project's model differs from it by up to {converted.deviation_px:.3g} "
+            f"px, more than {LIMIT_PX:g}: name a calibration by --camera (`camera convert` makes "
+            "one with a wider --limit-px)"
+        )
+    assert isinstance(converted.camera, Camera)
+    return converted.camera
+
+
+def static_transforms(reader: AnyReader, path: Path) -> dict[str, tuple[str, Matrix]]:
+    """Parent and 4x4 parent_from_child of each child frame, of a bag's ``/tf_static``."""
+    found: dict[str, tuple[str, Matrix]] = {}
+    if all((c.topic, c.msgtype) != _STATIC for c in reader.connections):
+        return found
+    with understood(f"{path}: {_STATIC[0]}"):
+        for _, _, message in messages(reader, path, _STATIC[0]):
+            for item in message.transforms:
+                t, q = item.transform.translation, item.transform.rotation
+                placed = np.eye(4)
+                placed[:3, :3] = rotation_of(q.x, q.y, q.z, q.w)
+                placed[:3, 3] = (t.x, t.y, t.z)
+                found[item.child_frame_id.lstrip("/")] = (item.header.frame_id.lstrip("/"), placed)
+    return found
+
+
+def pose_in_dataset(
+    transforms: dict[str, tuple[str, Matrix]], base: str, optical: str
+) -> Matrix | None:
+    """The (3, 4) `robot_from_camera` of an optical frame; None if no chain leads to the base."""
+    placed, frame = np.eye(4), optical.lstrip("/")
+    for _ in range(len(transforms) + 1):
+        if frame == base:
+            return np.asarray(DATASET_FROM_ROBOTICS @ placed[:3], dtype=np.float64)
+        if frame not in transforms:
+            return None
+        frame, parent_from_child = transforms[frame]
+        with np.errstate(over="ignore", invalid="ignore"):  # no camera is so far away
+            placed = parent_from_child @ placed
+    return None  # a circle
+
+
+def rotation_of(qx: float, qy: float, qz: float, qw: float) -> Matrix:
+    """The rotation matrix of a quaternion of any length but zero; else a ValueError."""
+    q = np.array([qx, qy, qz, qw], dtype=np.float64)
+    largest = np.abs(q).max()
+    if not 0.0 < largest < np.inf:
+        raise ValueError(f"a rotation of {qx:g}, {qy:g}, {qz:g}, {qw:g}")
+    # Squares of very large or small numbers overflow or underflow.
+    return np.asarray(Rotation.from_quat(q / largest).as_matrix())
+
+
+def _field(message: Any, letter: str) -> Matrix:
+    """The numbers of a field of camera_info, which ROS 1 calls by a capital letter."""
+    name = letter.upper() if hasattr(message, letter.upper()) else letter
+    return np.array(getattr(message, name), dtype=np.float64)

@@ -9,7 +9,7 @@ import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -38,13 +38,7 @@ _BAYER = re.compile("bayer_(rggb|bggr|gbrg|grbg)_?[0-9]*")
 
 @contextmanager
 def opened_bag(path: Path) -> Iterator[AnyReader]:
-    """Open a bag.
-
-    Raises
-    ------
-    DetectError
-        If the package is not installed, or the bag cannot be read.
-    """
+    """Open a bag."""
     try:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
@@ -70,13 +64,7 @@ def opened_bag(path: Path) -> Iterator[AnyReader]:
 
 
 def messages(reader: AnyReader, path: Path, topic: str) -> Iterator[tuple[str, float, Any]]:
-    """The messages of a topic: type, time of recording (s), and content.
-
-    Raises
-    ------
-    DetectError
-        If the bag is damaged.
-    """
+    """The messages of a topic: type, time of recording (s), and content."""
     number = 0
     try:
         connections = [c for c in reader.connections if c.topic == topic]
@@ -93,13 +81,7 @@ def messages(reader: AnyReader, path: Path, topic: str) -> Iterator[tuple[str, f
 
 @contextmanager
 def understood(name: str) -> Iterator[None]:
-    """Work on a message: a bag brings its own definitions, which may be other than ROS's.
-
-    Raises
-    ------
-    DetectError
-        If the message lacks what ROS's has, or has something else there.
-    """
+    """Work on a message: a bag brings its own definitions, which may be other than ROS's."""
     try:
         yield
     except OneLineError:  # reported already
@@ -111,17 +93,11 @@ def understood(name: str) -> Iterator[None]:
 def chosen_topic(
     reader: AnyReader, path: Path, kinds: tuple[str, ...], named: str | None, what: str, flag: str
 ) -> str:
-    """The topic that was named, or the only one of some types.
-
-    Raises
-    ------
-    DetectError
-        If there is no such topic, or there are several and none was named.
-    """
+    """The topic that was named, or the only one of some types."""
     topics = sorted({c.topic for c in reader.connections if c.msgtype in kinds})
     listed = ", ".join(one_line(topic, LONGEST_NAME) for topic in topics[:6]) or "none"
     expected = " or ".join(kind.replace("/msg", "") for kind in kinds)
-    if named is not None:
+    if named:
         if named in topics:
             return named
         raise DetectError(f"{path}: no {what} in {named!r}: expected {expected}, of {listed}")
@@ -144,37 +120,11 @@ def _cause(error: Exception) -> str:
     return one_line(" ".join(str(error).split()) or type(error).__name__, _LONGEST_CAUSE)
 
 
-class ImageMessage(Protocol):
-    """The fields of a `sensor_msgs/Image` that are used."""
+def pixels_of_message(message: Any, name: object) -> NDArray[Any]:
+    """The pixels of a `sensor_msgs/Image`: grey values, or blue, green, red and perhaps opacity.
 
-    height: int
-    width: int
-    encoding: str
-    is_bigendian: int
-    step: int
-    data: NDArray[np.uint8]
-
-
-def pixels_of_message(message: ImageMessage, name: object) -> NDArray[Any]:
-    """The pixels of a raw image message.
-
-    Parameters
-    ----------
-    message : sensor_msgs/Image
-        Grey, colour, Bayer or YUV 4:2:2, of 8 or 16 bits.
-    name : object
-        The image's name in messages.
-
-    Returns
-    -------
-    (H, W), (H, W, 3) or (H, W, 4) uint8 or uint16 array
-        Grey values, or blue, green, red and perhaps opacity; of Bayer patterns and YUV the
-        brightness.
-
-    Raises
-    ------
-    FrameError
-        If the encoding is another, or there is less data than the message states.
+    Of Bayer patterns and YUV 4:2:2 they are the brightness. A FrameError is raised if the encoding
+    is another, or there is less data than the message states.
     """
     encoding, height, width = message.encoding, message.height, message.width
     bayer = _BAYER.fullmatch(encoding)
@@ -207,13 +157,7 @@ def pixels_of_message(message: ImageMessage, name: object) -> NDArray[Any]:
 
 
 def compressed_content(message: Any, name: object) -> bytes:
-    """The image file in a `sensor_msgs/CompressedImage`.
-
-    Raises
-    ------
-    FrameError
-        If it is none that can be decoded: compressed depth.
-    """
+    """The image file in a `sensor_msgs/CompressedImage`."""
     if "compressedDepth" in message.format:
         raise FrameError(f"{name}: format {excerpt(message.format)}: expected jpeg, png or tiff")
     return bytes(message.data)

@@ -23,8 +23,10 @@ import cv2
 from numpy.typing import NDArray
 
 from detect.errors import DetectError
+from detect.run import RunFrame
 from detect.sources.gray import gray_of_pixels
-from detect.sources.interface import Source, SourceImage, numbered_prefix
+from detect.sources.interface import Source, numbered_prefix
+from detect.sources.poses import step_of
 from detect.sources.video import quiet_opencv
 
 _log = logging.getLogger("redetect")
@@ -45,13 +47,7 @@ class Capture(Protocol):
 
 
 class LiveCamera(Source):
-    """Images of a camera as they come, named ``camera0.0000`` and so on; times are UNIX time.
-
-    Parameters
-    ----------
-    index : int
-        OpenCV's number of the camera.
-    """
+    """Images of a camera as they come, named ``camera0.0000`` and so on; times are UNIX time."""
 
     def __init__(self, index: int) -> None:
         self.name = f"camera:{index}"
@@ -59,7 +55,7 @@ class LiveCamera(Source):
         self._index = index
         _open_camera(index).release()
 
-    def images(self) -> Generator[SourceImage, None, None]:
+    def images(self) -> Generator[RunFrame, None, None]:
         """The camera's images from now on, until it is interrupted or gone."""
         newest = _Newest(_open_camera(self._index))
         try:
@@ -70,7 +66,8 @@ class LiveCamera(Source):
                         return
                     time_s, pixels = taken
                     prefix = numbered_prefix(f"camera{self._index}", number)
-                    yield SourceImage(prefix, time_s, content=gray_of_pixels(pixels, prefix))
+                    gray = gray_of_pixels(pixels, prefix)
+                    yield RunFrame(step_of(prefix), None, gray, time_s)
         finally:
             newest.close()
 

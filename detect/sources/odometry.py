@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Generator, Iterator
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 
 from detect.errors import DetectError
 from detect.run import Frames, RunFrame
 from detect.sources.image_names import NameIndex, last_part
-from detect.sources.interface import Source, SourceImage
+from detect.sources.interface import Source
 from detect.sources.poses import PosesOverTime, PoseStream, TimedPose, movement_between, step_of
-from landmarks import Step, iterate_steps
+from landmarks import Step, read_steps
 
 
 class SourceFrames:
@@ -34,9 +35,8 @@ class SourceFrames:
         with closing(self._source.images()) as images:
             yield from self._framed(images)
 
-    def _framed(self, images: Iterator[SourceImage]) -> Iterator[RunFrame]:
-        for image in images:
-            yield _frame(image, step_of(image.prefix, None))
+    def _framed(self, images: Iterator[RunFrame]) -> Iterator[RunFrame]:
+        return images
 
 
 class FramesAlongPoses(SourceFrames):
@@ -51,8 +51,8 @@ class FramesAlongPoses(SourceFrames):
         self._poses = poses
         self.why_left_out = f"images without a pose of {poses.name} at their time: left out"
 
-    def _framed(self, images: Iterator[SourceImage]) -> Iterator[RunFrame]:
-        with closing(iter(self._poses)) as stream:
+    def _framed(self, images: Iterator[RunFrame]) -> Iterator[RunFrame]:
+        with closing(self._poses.read()) as stream:
             poses = PosesOverTime(stream, self._poses.name)
             last: TimedPose | None = None
             for image in images:
@@ -61,7 +61,7 @@ class FramesAlongPoses(SourceFrames):
                     self.left_out += 1
                     continue
                 movement = None if last is None else movement_between(last, pose)
-                yield _frame(image, step_of(image.prefix, movement))
+                yield replace(image, step=step_of(image.step.prefix, movement))
                 last = pose
 
 
@@ -77,22 +77,23 @@ class FramesAlongRows(SourceFrames):
     def __init__(self, source: Source, path: Path) -> None:
         super().__init__(source)
         self._path = path
-        self._names = NameIndex(_encoded(_image_name(step)) for step in iterate_steps(path))
+        self._names = NameIndex(_encoded(_image_name(step)) for step in read_steps(path))
 
-    def _framed(self, images: Iterator[SourceImage]) -> Iterator[RunFrame]:
-        steps = iterate_steps(self._path)
+    def _framed(self, images: Iterator[RunFrame]) -> Iterator[RunFrame]:
+        steps = read_steps(self._path)
         for image in images:
-            if self._names.find(_encoded(image.prefix)) is None:
+            prefix = image.step.prefix
+            if self._names.find(_encoded(prefix)) is None:
                 self.left_out += 1
                 continue
             for step in steps:
-                if _image_name(step) == image.prefix:
-                    yield _frame(image, step)
+                if _image_name(step) == prefix:
+                    yield replace(image, step=step)
                     break
                 yield RunFrame(step, None)
             else:
                 raise DetectError(
-                    f"{self._path}: the row of {image.prefix} comes too early: "
+                    f"{self._path}: the row of {prefix} comes too early: "
                     "expected the STEP rows in the order of the images"
                 )
         for step in steps:
@@ -132,12 +133,6 @@ class FirstFrames:
                 yield frame
                 if number == self._count:
                     return
-
-
-def _frame(image: SourceImage, step: Step) -> RunFrame:
-    return RunFrame(
-        step, image.path, image.content, image.time_s, bits=image.bits, failure=image.failure
-    )
 
 
 def _image_name(step: Step) -> str:

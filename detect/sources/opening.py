@@ -92,22 +92,14 @@ def _open(name: Path, camera_path: Path | None, options: SourceOptions, *, posed
         # A run folder as the data set has them, with its own odometry.
         opened = open_run if posed else open_images
         return _shortened(opened(name, camera_path, bits=options.bits or None), options.frames)
-    from detect.sources.interface import Calibration
-
     source = _source(name, options)
-    if camera_path is not None:
-        calibration: Calibration | None = Calibration(read_camera(camera_path))
-    else:
-        calibration = source.calibration()
-    if posed and calibration is not None and calibration.why_no_pose is not None:
-        raise DetectError(calibration.why_no_pose)
+    camera = source.calibration(posed=posed) if camera_path is None else read_camera(camera_path)
     frames, odometry = _frames(source, options)
     base = source.output_base
     run = ImageRun(base.parent, frames, odometry, base, has_times=source.has_times)
     run = _shortened(run, options.frames)
-    if calibration is None:
+    if camera is None:
         return run
-    camera = calibration.camera
     if source.size is not None and source.size != (camera.width, camera.height):
         raise DetectError(
             f"{source.name}: is {source.size[0]}x{source.size[1]} px: expected "
@@ -119,7 +111,6 @@ def _open(name: Path, camera_path: Path | None, options: SourceOptions, *, posed
 
 def _source(name: Path, options: SourceOptions) -> Source:
     from detect.sources.bag import BAG_SUFFIXES, Bag
-    from detect.sources.bag_camera import BASE_FRAME
     from detect.sources.live import LiveCamera
     from detect.sources.pictures import WILDCARDS, ImageFiles
     from detect.sources.video import VideoFile
@@ -127,7 +118,7 @@ def _source(name: Path, options: SourceOptions) -> Source:
     bits = options.bits or None
     is_bag = _is_ros2_bag(name) or name.suffix.lower() in BAG_SUFFIXES
     if is_bag and name.exists():
-        return Bag(name, options.image_topic or None, bits, options.base_frame or BASE_FRAME)
+        return Bag(name, options.image_topic, bits, options.base_frame)
     if options.image_topic and not is_bag:
         raise DetectError(f"{name}: --image-topic {options.image_topic}: only bags have topics")
     if options.base_frame and not is_bag:
@@ -147,7 +138,7 @@ def _source(name: Path, options: SourceOptions) -> Source:
 def _frames(source: Source, options: SourceOptions) -> tuple[Frames, Path | None]:
     """The frames of a source along the odometry that was named, and the file of that."""
     from detect.sources.odometry import FramesAlongPoses, FramesAlongRows, SourceFrames
-    from detect.sources.poses import PoseStream, TumTrajectory
+    from detect.sources.poses import PoseStream, tum_poses
 
     named = options.odometry
     poses: PoseStream | None
@@ -156,7 +147,8 @@ def _frames(source: Source, options: SourceOptions) -> tuple[Frames, Path | None
     if named.startswith("/") and not (Path(named).suffix or Path(named).exists()):
         poses = source.poses(named)
     elif named.endswith(".tum"):
-        poses = TumTrajectory(Path(named), options.odometry_axes)
+        path, axes = Path(named), options.odometry_axes
+        poses = PoseStream(named, path, lambda: tum_poses(path, axes))
     elif named and named != "none":
         return FramesAlongRows(source, Path(named)), Path(named)
     else:

@@ -5,16 +5,13 @@ from __future__ import annotations
 from collections.abc import Generator
 from pathlib import Path
 
+from camera import Camera
 from detect.errors import DetectError
+from detect.run import RunFrame
 from detect.sources.gray import significant_bits_of_file
 from detect.sources.image_names import IMAGE_SUFFIXES, ImageNames, images_of_folder
-from detect.sources.interface import (
-    Calibration,
-    Source,
-    SourceImage,
-    frame_prefix,
-    only_calibration,
-)
+from detect.sources.interface import Source, frame_prefix, only_calibration
+from detect.sources.poses import step_of
 from detect.sources.times import read_image_times
 
 WILDCARDS = frozenset("*?[")
@@ -26,22 +23,9 @@ _SAMPLES = 5
 class ImageFiles(Source):
     """Images in natural order of their names.
 
-    Calibration and times are in the run's folder, and results are written there: the folder of the
-    images, or the one above ``images/``.
-
-    Parameters
-    ----------
-    name : path
-        A folder, an image or a pattern.
-    times : str
-        File of the images' times; empty: ``<folder>.times`` in the run's folder, if there is one.
-    bits : int or None
-        Significant bits of 16-bit images; by default what some of them need.
-
-    Raises
-    ------
-    DetectError
-        If there are no such images, or their times cannot be read.
+    Calibration and times (``<folder>.times``, if not named) are in the run's folder, and results
+    are written there: the folder of the images, or the one above ``images/``. 16-bit images have
+    the significant bits that some of them need, if not named.
     """
 
     ships_images = False
@@ -62,14 +46,14 @@ class ImageFiles(Source):
         self.has_times = bool(times) or times_file.is_file()
         self._bits = bits_of_images(self._names) if bits is None else bits
 
-    def images(self) -> Generator[SourceImage, None, None]:
+    def images(self) -> Generator[RunFrame, None, None]:
         """The images, by the names of their files."""
         for place in range(len(self._names)):
             path = self._names.path(place)
-            time_s = self._times.get(path.stem)
-            yield SourceImage(frame_prefix(path.stem), time_s, path, bits=self._bits)
+            step = step_of(frame_prefix(path.stem))
+            yield RunFrame(step, path, time_s=self._times.get(path.stem), bits=self._bits)
 
-    def calibration(self) -> Calibration | None:
+    def calibration(self, *, posed: bool) -> Camera | None:
         """The ``.cam`` file in the run's folder."""
         return only_calibration(self._home, self._home.resolve().name)
 

@@ -9,10 +9,10 @@ robot moves on the floor: of its attitude the heading is taken, of its position 
 from __future__ import annotations
 
 import math
-from collections.abc import Generator, Iterator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,19 +61,15 @@ class TimedPose:
     covariance: FloatArray | None = None
 
 
-class PoseStream(Protocol):
-    """Poses of the robot over time, as recorded; iterating again starts over."""
+class PoseStream(NamedTuple):
+    """Poses of the robot over time: their name in messages, their file, and how to read them."""
 
-    #: Its name in messages.
     name: str
-    #: The file that it is read from, which heads of files name.
     path: Path
+    read: Callable[[], Generator[TimedPose, None, None]]
 
-    def __iter__(self) -> Generator[TimedPose, None, None]: ...
 
-
-@dataclass(frozen=True)
-class Movement:
+class Movement(NamedTuple):
     """A movement in the data set's axes: (3,) left, backward, turn; (3, 3) covariance or None."""
 
     pose: FloatArray
@@ -119,7 +115,7 @@ def pose_between(before: TimedPose, after: TimedPose, time_s: float) -> TimedPos
     )
 
 
-def step_of(prefix: str, movement: Movement | None) -> Step:
+def step_of(prefix: str, movement: Movement | None = None) -> Step:
     """A STEP row; unknown values (the movement, its covariance) are zero."""
     pose, c = np.zeros(3), np.zeros((3, 3))
     if movement is not None:
@@ -161,41 +157,26 @@ class PosesOverTime:
         return pose_between(before, after, time_s)
 
 
-class TumTrajectory:
-    """A TUM trajectory, read on demand.
-
-    Parameters
-    ----------
-    path : path
-    axes : {"robotics", "dataset"}
-        The robot's: X forward and Y left, or X left and Y backward.
-    """
-
-    def __init__(self, path: Path, axes: Axes = "robotics") -> None:
-        self.path = path
-        self.name = str(path)
-        self._axes = axes
-
-    def __iter__(self) -> Generator[TimedPose, None, None]:
-        for number, words in text_rows(self.path, "TUM trajectory"):
-            place = f"{self.path}:{number}"
-            try:
-                time_s, x, y, _, *quaternion = values = [float(word) for word in words]
-            except ValueError:
-                values = []
-            if len(values) != 8 or not all(map(math.isfinite, values)):
-                raise DetectError(
-                    f"{place}: {' '.join(words)[:60]!r}: expected 8 numbers: t x y z qx qy qz qw"
-                )
-            if max(abs(x), abs(y)) > FARTHEST:
-                raise DetectError(f"{place}: expected x and y of at most {FARTHEST:g} m")
-            if abs(math.hypot(*quaternion) - 1.0) > _UNIT:
-                raise DetectError(f"{place}: qx qy qz qw: expected a unit quaternion")
-            theta = heading_rad(*quaternion)
-            if self._axes == "dataset":
-                # Only the robot's own axes differ; the fixed frame is the trajectory's.
-                theta -= 0.5 * math.pi
-            yield TimedPose(time_s, x, y, theta)
+def tum_poses(path: Path, axes: Axes = "robotics") -> Generator[TimedPose, None, None]:
+    """The poses of a TUM trajectory; `axes` are the robot's, as in `SourceOptions`."""
+    for number, words in text_rows(path, "TUM trajectory"):
+        place = f"{path}:{number}"
+        try:
+            time_s, x, y, _, *quaternion = values = [float(word) for word in words]
+        except ValueError:
+            values = []
+        if len(values) != 8 or not all(map(math.isfinite, values)):
+            raise DetectError(
+                f"{place}: {' '.join(words)[:60]!r}: expected 8 numbers: t x y z qx qy qz qw"
+            )
+        if max(abs(x), abs(y)) > FARTHEST:
+            raise DetectError(f"{place}: expected x and y of at most {FARTHEST:g} m")
+        if abs(math.hypot(*quaternion) - 1.0) > _UNIT:
+            raise DetectError(f"{place}: qx qy qz qw: expected a unit quaternion")
+        theta = heading_rad(*quaternion)
+        # Only the robot's own axes differ; the fixed frame is the trajectory's.
+        turned = 0.5 * math.pi if axes == "dataset" else 0.0
+        yield TimedPose(time_s, x, y, theta - turned)
 
 
 def heading_rad(qx: float, qy: float, qz: float, qw: float) -> float:

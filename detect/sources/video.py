@@ -12,34 +12,18 @@ from typing import Any
 
 import cv2
 
+from camera import Camera
 from detect.errors import DetectError
+from detect.run import RunFrame
 from detect.sources.gray import gray_of_pixels
-from detect.sources.interface import (
-    Calibration,
-    Source,
-    SourceImage,
-    numbered_prefix,
-    only_calibration,
-)
+from detect.sources.interface import Source, numbered_prefix, only_calibration
+from detect.sources.poses import step_of
 
 _log = logging.getLogger("redetect")
 
-# cv2.utils.logging.LOG_LEVEL_SILENT
-_SILENT = 0
-
 
 class VideoFile(Source):
-    """Frames of a video file, named ``<stem>.0000`` and so on; times count from its beginning.
-
-    Parameters
-    ----------
-    path : path
-
-    Raises
-    ------
-    DetectError
-        If OpenCV cannot read a video from it.
-    """
+    """Frames of a video file, named ``<stem>.0000`` and so on; times count from its beginning."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -47,13 +31,11 @@ class VideoFile(Source):
         self.output_base = path.with_name(f"{path.stem}.detected")
         with _opened(path) as capture:
             count = capture.get(cv2.CAP_PROP_FRAME_COUNT)
-            self.size = (
-                int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)),
-                int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT)),
-            )
+            width = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH))
+            self.size = (width, int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT)))
         self.expected = int(count) if math.isfinite(count) and 0 < count < 2**31 else None
 
-    def images(self) -> Generator[SourceImage, None, None]:
+    def images(self) -> Generator[RunFrame, None, None]:
         """The frames as grey values, with their presentation times."""
         with _opened(self.path) as capture:
             per_second = capture.get(cv2.CAP_PROP_FPS)
@@ -67,12 +49,12 @@ class VideoFile(Source):
                     time_s = number / per_second
                 prefix = numbered_prefix(self.path.stem, number)
                 gray = gray_of_pixels(pixels, f"{self.name}: {prefix}")
-                yield SourceImage(prefix, time_s, content=gray)
+                yield RunFrame(step_of(prefix), None, gray, time_s)
                 number, last_s = number + 1, time_s
         if self.expected is not None and number < self.expected:
             _log.info(f"{self.name}: only {number} of {self.expected} frames can be read")
 
-    def calibration(self) -> Calibration | None:
+    def calibration(self, *, posed: bool) -> Camera | None:
         """The ``.cam`` file beside it: of its name, or the only one."""
         return only_calibration(self.path.parent, self.path.stem)
 
@@ -100,7 +82,7 @@ def quiet_opencv() -> Iterator[None]:
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     levels: Any = getattr(cv2.utils, "logging", cv2)  # where OpenCV 4 has them
     before = levels.getLogLevel()
-    levels.setLogLevel(_SILENT)
+    levels.setLogLevel(0)  # silent
     try:
         yield
     finally:

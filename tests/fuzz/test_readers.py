@@ -118,7 +118,7 @@ NASTY = [
     ("network", b'{"cameras": {"a": {"calibration": "../../../etc/passwd"}}}', "is no .cam"),
     ("network", b'{"cameras": {"a": {"calibration": "/etc/passwd"}}}', "is no .cam file"),
     ("network", b'{"cameras": {"a": {"calibration": "a\\u0000.cam"}}}', "is no .cam file"),
-    ("tilts", b"TILT " + b"x" * 70_000, "too long"),
+    ("tilts", b"TILT " + b"x" * 70_000, "longer than 65536 bytes"),
     ("image header", b"II+\0\x08\0\0\0" + b"\xff" * 8, None),
     ("scan arrays", b"PK\x05\x06" + bytes(18), "no such array"),
     ("colmap", b"".join(b"%d PINHOLE 4 4 1 1 1 1\n" % k for k in range(999)), "it holds 0, 1, 2"),

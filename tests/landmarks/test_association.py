@@ -6,14 +6,13 @@ import itertools
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from landmarks import (
     Association,
     associate,
-    associate_bearings,
     associate_positions,
     associate_within_covariance,
     squared_mahalanobis,
@@ -183,14 +182,6 @@ def test_mahalanobis_distance_is_that_of_whitened_differences() -> None:
     np.testing.assert_allclose(
         squared_mahalanobis(offset, covariance), (whitened**2).sum(axis=1), rtol=1e-6
     )
-
-
-@given(st.floats(-7, 7), st.floats(-1e-3, 1e-3), st.integers(-3, 3))
-@example(np.pi, 5e-4, 0)
-def test_bearings_pair_across_the_turn(bearing: float, difference: float, turns: int) -> None:
-    other = bearing + difference + turns * 2 * np.pi
-    assert len(associate_bearings([bearing], [other], gate_rad=1.001e-3).first) == 1
-    assert len(associate_bearings([bearing], [other + 0.1], gate_rad=1.001e-3).first) == 0
 
 
 def test_angles_wrap_to_half_a_turn() -> None:

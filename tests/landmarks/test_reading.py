@@ -104,7 +104,7 @@ def test_a_trailing_backslash_continues_the_row(tmp_path: Path, line_end: str) -
 
 
 def test_a_comment_is_not_continued(tmp_path: Path) -> None:
-    assert len(read_steps(write(tmp_path, f"# C:\\data\\\n{STEP}\n"))) == 1
+    assert len(list(read_steps(write(tmp_path, f"# C:\\data\\\n{STEP}\n")))) == 1
 
 
 def test_names_that_are_no_utf8_survive(tmp_path: Path) -> None:
@@ -113,7 +113,7 @@ def test_names_that_are_no_utf8_survive(tmp_path: Path) -> None:
 
 
 def test_a_byte_order_mark_is_no_part_of_the_first_row(tmp_path: Path) -> None:
-    assert len(read_steps(write(tmp_path, b"\xef\xbb\xbf" + STEP.encode()))) == 1
+    assert len(list(read_steps(write(tmp_path, b"\xef\xbb\xbf" + STEP.encode())))) == 1
 
 
 def test_an_empty_file_has_no_frames(tmp_path: Path) -> None:
@@ -183,9 +183,9 @@ def test_rows_before_the_malformed_one_are_read_first(tmp_path: Path) -> None:
 
 def test_files_that_cannot_be_opened_are_named(tmp_path: Path) -> None:
     with pytest.raises(LandmarkFileError, match=r"missing\.circles: no such landmark file"):
-        read_steps(tmp_path / "missing.circles")
+        list(read_steps(tmp_path / "missing.circles"))
     with pytest.raises(LandmarkFileError, match="cannot be read as a landmark file"):
-        read_steps(tmp_path)
+        list(read_steps(tmp_path))
 
 
 ROW_LIKE = st.sampled_from([STEP, CIRCLE, "LANDMARK_L", "#", "\\", "\r", " ", "1e9", "XDETECTOR"])

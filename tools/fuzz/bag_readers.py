@@ -13,8 +13,7 @@ import numpy as np
 from camera import CameraError
 from detect.errors import DetectError
 from detect.sources import bag_messages
-from detect.sources.bag import Bag
-from detect.sources.bag_camera import pose_in_dataset, static_transforms
+from detect.sources.bag import Bag, pose_in_dataset, static_transforms
 from detect.sources.poses import movement_between, step_of
 from tools.fuzz.bag_cells import bag_with_edits
 from tools.fuzz.bag_types import known_types, opened_once
@@ -46,9 +45,9 @@ def _asked_of(path: Path) -> object:
     images = list(bag.images())
     for image in images:
         assert (image.content is None) != (image.failure is None)
-    bag.calibration()
+    bag.calibration(posed=False)
     odometry = bag.poses(None)
-    poses = [] if odometry is None else list(odometry)
+    poses = [] if odometry is None else list(odometry.read())
     steps = [step_of("e", movement_between(*pair)) for pair in pairwise(poses)]
     with bag_messages.opened_bag(path) as reader:
         transforms = static_transforms(reader, path)

@@ -25,7 +25,7 @@ _SETS = 64
 @contextmanager
 def opened_once(path: Path) -> Iterator[None]:
     """Open a bag once for all that asks for it within; what it gives is the same every time."""
-    from detect.sources import bag, bag_camera, bag_messages
+    from detect.sources import bag, bag_messages
 
     with bag_messages.opened_bag(path) as reader:
 
@@ -33,10 +33,7 @@ def opened_once(path: Path) -> Iterator[None]:
         def opened(_: Path) -> Iterator[AnyReader]:
             yield reader
 
-        with (
-            patch.object(bag, "opened_bag", opened),
-            patch.object(bag_camera, "opened_bag", opened),
-        ):
+        with patch.object(bag, "opened_bag", opened):
             yield
 
 

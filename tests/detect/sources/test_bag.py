@@ -55,7 +55,7 @@ def poses_of_steps(steps: list[Step]) -> list[tuple[float, float, float]]:
 def recorded(ros: Ros, run: Path, compressed: bool = False) -> list[Said]:
     """The small run with its odometry, as a bag has them."""
     said = []
-    for k, pose in enumerate(poses_of_steps(read_steps(run / "s.txt"))):
+    for k, pose in enumerate(poses_of_steps(list(read_steps(run / "s.txt")))):
         time_s = START_S + 0.2 * k
         file = run / "images" / f"{PREFIXES[k]}.png"
         image = np.asarray(cv2.imread(str(file), cv2.IMREAD_GRAYSCALE))
@@ -86,7 +86,7 @@ def test_a_bag_gives_the_rows_of_its_images(
     assert [row for row in rows(found) if row.startswith("LANDMARK_C")] == landmarks
     steps = [frame.step for frame in read_frames(found)]
     assert steps[0].dx == steps[0].dy == steps[0].cxx == 0.0  # before the first there is nothing
-    for step, wanted in zip(steps[1:], read_steps(small_run / "s.txt")[1:], strict=True):
+    for step, wanted in zip(steps[1:], list(read_steps(small_run / "s.txt"))[1:], strict=True):
         assert (step.dx, step.dy, step.dphi) == pytest.approx(
             (wanted.dx, wanted.dy, wanted.dphi), abs=1.1e-5
         )

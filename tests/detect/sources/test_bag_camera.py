@@ -19,7 +19,7 @@ from camera.formats.ros import ROS_NAMES
 from detect.cli import main
 from detect.errors import DetectError
 from detect.run import Run
-from detect.sources.bag_camera import pose_in_dataset, rotation_of
+from detect.sources.bag import pose_in_dataset, rotation_of
 from detect.sources.opening import open_calibrated, open_source
 from detect.sources.options import SourceOptions
 from landmarks import read_frames

@@ -15,7 +15,7 @@ from detect.errors import DetectError
 from detect.run import RunFrames
 from detect.sources.opening import open_source
 from detect.sources.options import SourceOptions
-from detect.sources.poses import TimedPose, TumTrajectory, movement_between, pose_between
+from detect.sources.poses import TimedPose, movement_between, pose_between, tum_poses
 from detect.sources.times import format_time, read_image_times
 from groundtruth.trajectories.streams import read_times
 from landmarks import read_frames
@@ -143,7 +143,7 @@ def test_headings_of_quaternions(tmp_path: Path) -> None:
     qy, qz = math.sin(pitch / 2) * math.cos(yaw / 2), math.cos(pitch / 2) * math.sin(yaw / 2)
     path = tmp_path / "a.tum"
     path.write_text(f"1 0 0 0 {qx} {qy} {qz} {qw}\n")
-    (pose,) = TumTrajectory(path)
+    (pose,) = tum_poses(path)
     assert pose.theta == pytest.approx(yaw)
 
 
