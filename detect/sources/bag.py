@@ -38,14 +38,13 @@ from detect.sources.bag_messages import (
     understood,
 )
 from detect.sources.gray import gray_of_pixels, significant_bits
-from detect.sources.interface import Source, numbered_prefix, only_calibration
+from detect.sources.interface import Source, numbered_prefix, only_calibration, still
 from detect.sources.poses import (
     DATASET_FROM_ROBOTICS,
     FARTHEST,
     PoseStream,
     TimedPose,
     heading_rad,
-    step_of,
 )
 from storage.messages import one_line
 
@@ -99,8 +98,7 @@ class Bag(Source):
             )
             self.expected = sum(c.msgcount for c in reader.connections if c.topic == self.topic)
 
-    def images(self) -> Generator[RunFrame, None, None]:
-        """The images of the topic: raw ones as grey values, compressed ones unchanged."""
+    def __iter__(self) -> Generator[RunFrame, None, None]:
         bits = self._bits
         with opened_bag(self.path) as reader:
             said = messages(reader, self.path, self.topic)
@@ -121,7 +119,7 @@ class Bag(Source):
                 except FrameError as error:
                     failure = str(error)
                 # Of compressed images the bits are those of PNG files: 16, or named.
-                step = step_of(prefix)
+                step = still(prefix)
                 yield RunFrame(step, None, content, time_s, self._bits or 16, failure)
 
     def calibration(self, *, posed: bool) -> Camera | None:

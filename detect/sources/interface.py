@@ -11,10 +11,13 @@ from camera import Camera, read_camera
 from detect.errors import DetectError
 from detect.run import RunFrame
 from detect.sources.poses import PoseStream
+from landmarks import Step
 
 
 class Source(ABC):
-    """Images in order.
+    """Images in order, as frames of a run in which the robot does not move.
+
+    Iterating again starts over (with a live camera: from then on).
 
     Attributes
     ----------
@@ -41,10 +44,11 @@ class Source(ABC):
     size: tuple[int, int] | None = None
     times_own = True
     has_times = True
+    left_out = 0
+    why_left_out = "images are left out"
 
     @abstractmethod
-    def images(self) -> Generator[RunFrame, None, None]:
-        """The images as frames without a movement: from the first one, of a camera from now."""
+    def __iter__(self) -> Generator[RunFrame, None, None]: ...
 
     def calibration(self, *, posed: bool) -> Camera | None:
         """The calibration beside it, or that it holds; None if there is none.
@@ -68,6 +72,11 @@ def frame_prefix(name: str) -> str:
 def numbered_prefix(stem: str, number: int) -> str:
     """The prefix of a frame that has no name, as the data set's are: ``e.0000``."""
     return f"{frame_prefix(stem)}.{number:04d}"
+
+
+def still(prefix: str) -> Step:
+    """The STEP row of a robot that does not move."""
+    return Step(prefix, *[0.0] * 9)
 
 
 def only_calibration(folder: Path, stem: str) -> Camera | None:

@@ -25,8 +25,7 @@ from numpy.typing import NDArray
 from detect.errors import DetectError
 from detect.run import RunFrame
 from detect.sources.gray import gray_of_pixels
-from detect.sources.interface import Source, numbered_prefix
-from detect.sources.poses import step_of
+from detect.sources.interface import Source, numbered_prefix, still
 from detect.sources.video import quiet_opencv
 
 _log = logging.getLogger("redetect")
@@ -55,8 +54,7 @@ class LiveCamera(Source):
         self._index = index
         _open_camera(index).release()
 
-    def images(self) -> Generator[RunFrame, None, None]:
-        """The camera's images from now on, until it is interrupted or gone."""
+    def __iter__(self) -> Generator[RunFrame, None, None]:
         newest = _Newest(_open_camera(self._index))
         try:
             with _stoppable() as stop:
@@ -67,7 +65,7 @@ class LiveCamera(Source):
                     time_s, pixels = taken
                     prefix = numbered_prefix(f"camera{self._index}", number)
                     gray = gray_of_pixels(pixels, prefix)
-                    yield RunFrame(step_of(prefix), None, gray, time_s)
+                    yield RunFrame(still(prefix), None, gray, time_s)
         finally:
             newest.close()
 

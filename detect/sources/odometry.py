@@ -1,7 +1,8 @@
-"""Combines images with steps: from poses over time, from a file of STEP rows, or none."""
+"""Combines images with steps: from poses over time, or from a file of STEP rows."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Generator, Iterator
 from contextlib import closing
 from dataclasses import replace
@@ -11,35 +12,29 @@ from detect.errors import DetectError
 from detect.run import Frames, RunFrame
 from detect.sources.image_names import NameIndex, last_part
 from detect.sources.interface import Source
-from detect.sources.poses import PosesOverTime, PoseStream, TimedPose, movement_between, step_of
+from detect.sources.poses import PosesOverTime, PoseStream, TimedPose, step_between
 from landmarks import Step, read_steps
 
 
-class SourceFrames:
-    """The frames of a source without odometry: their steps are zeros."""
-
-    why_left_out = "images are left out"
+class _FramesAlong(ABC):
+    """The frames of a source along its odometry."""
 
     def __init__(self, source: Source) -> None:
         self._source = source
         self.ships_images = source.ships_images
+        self.expected = source.expected
         self.left_out = 0
-
-    @property
-    def expected(self) -> int | None:
-        """Approximate number of frames; None if unknown."""
-        return self._source.expected
 
     def __iter__(self) -> Generator[RunFrame, None, None]:
         self.left_out = 0
-        with closing(self._source.images()) as images:
+        with closing(iter(self._source)) as images:
             yield from self._framed(images)
 
-    def _framed(self, images: Iterator[RunFrame]) -> Iterator[RunFrame]:
-        return images
+    @abstractmethod
+    def _framed(self, images: Iterator[RunFrame]) -> Iterator[RunFrame]: ...
 
 
-class FramesAlongPoses(SourceFrames):
+class FramesAlongPoses(_FramesAlong):
     """The frames of a source whose robot's poses are known over time.
 
     The pose of an image is that between the two poses before and after it. Images without a pose
@@ -60,12 +55,13 @@ class FramesAlongPoses(SourceFrames):
                 if pose is None:
                     self.left_out += 1
                     continue
-                movement = None if last is None else movement_between(last, pose)
-                yield replace(image, step=step_of(image.step.prefix, movement))
+                if last is not None:
+                    image = replace(image, step=step_between(image.step.prefix, last, pose))
+                yield image
                 last = pose
 
 
-class FramesAlongRows(SourceFrames):
+class FramesAlongRows(_FramesAlong):
     """The frames of a source whose STEP rows are in a file, in the same order.
 
     A row belongs to the image whose name is the last part of its prefix. Images without a row are
@@ -107,25 +103,13 @@ class FirstFrames:
         self._frames = frames
         self._count = count
         self.ships_images = frames.ships_images
-
-    @property
-    def expected(self) -> int | None:
-        """Approximate number of frames."""
-        expected = self._frames.expected
-        return self._count if expected is None else min(expected, self._count)
+        self.expected = count if frames.expected is None else min(frames.expected, count)
+        self.why_left_out = frames.why_left_out
 
     @property
     def left_out(self) -> int:
         """Images that are no part of the run, so far."""
         return self._frames.left_out
-
-    @property
-    def why_left_out(self) -> str:
-        """Why frames were left out; printed after their number."""
-        return self._frames.why_left_out
-
-    def __len__(self) -> int:
-        return self.expected or self._count
 
     def __iter__(self) -> Generator[RunFrame, None, None]:
         with closing(iter(self._frames)) as frames:

@@ -137,7 +137,7 @@ def _source(name: Path, options: SourceOptions) -> Source:
 
 def _frames(source: Source, options: SourceOptions) -> tuple[Frames, Path | None]:
     """The frames of a source along the odometry that was named, and the file of that."""
-    from detect.sources.odometry import FramesAlongPoses, FramesAlongRows, SourceFrames
+    from detect.sources.odometry import FramesAlongPoses, FramesAlongRows
     from detect.sources.poses import PoseStream, tum_poses
 
     named = options.odometry
@@ -154,7 +154,7 @@ def _frames(source: Source, options: SourceOptions) -> tuple[Frames, Path | None
     else:
         poses = None if named else source.poses(None)
     if poses is None:
-        return SourceFrames(source), None
+        return source, None
     if not source.has_times:
         raise DetectError(
             f"{source.name}: no times of the images: a trajectory needs them: "

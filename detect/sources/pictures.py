@@ -10,8 +10,7 @@ from detect.errors import DetectError
 from detect.run import RunFrame
 from detect.sources.gray import significant_bits_of_file
 from detect.sources.image_names import IMAGE_SUFFIXES, ImageNames, images_of_folder
-from detect.sources.interface import Source, frame_prefix, only_calibration
-from detect.sources.poses import step_of
+from detect.sources.interface import Source, frame_prefix, only_calibration, still
 from detect.sources.times import read_image_times
 
 WILDCARDS = frozenset("*?[")
@@ -46,11 +45,10 @@ class ImageFiles(Source):
         self.has_times = bool(times) or times_file.is_file()
         self._bits = bits_of_images(self._names) if bits is None else bits
 
-    def images(self) -> Generator[RunFrame, None, None]:
-        """The images, by the names of their files."""
+    def __iter__(self) -> Generator[RunFrame, None, None]:
         for place in range(len(self._names)):
             path = self._names.path(place)
-            step = step_of(frame_prefix(path.stem))
+            step = still(frame_prefix(path.stem))
             yield RunFrame(step, path, time_s=self._times.get(path.stem), bits=self._bits)
 
     def calibration(self, *, posed: bool) -> Camera | None:

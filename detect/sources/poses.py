@@ -69,35 +69,30 @@ class PoseStream(NamedTuple):
     read: Callable[[], Generator[TimedPose, None, None]]
 
 
-class Movement(NamedTuple):
-    """A movement in the data set's axes: (3,) left, backward, turn; (3, 3) covariance or None."""
-
-    pose: FloatArray
-    covariance: FloatArray | None
-
-
-def movement_between(before: TimedPose, after: TimedPose) -> Movement:
-    """How a robot moved from one pose to another.
+def step_between(prefix: str, before: TimedPose, after: TimedPose) -> Step:
+    """The STEP row of a robot's movement from one pose to another.
 
     The covariances of poses are assumed to grow with the path: that of the later pose is that
     of the earlier, carried along, plus that of the movement, independent of it. Where they have
-    not (a driver that publishes the same covariance all the time), that of the movement is unknown.
+    not (a driver that publishes the same covariance all the time), that of the movement is unknown:
+    zero.
     """
     cos, sin = np.cos(before.theta), np.sin(before.theta)
     moved = np.array([after.x - before.x, after.y - before.y])
     turn = wrap_angle(after.theta - before.theta)
     robot_from_fixed = np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
     pose = DATASET_FROM_ROBOTICS @ np.array([*(robot_from_fixed[:2, :2] @ moved), turn])
-    if before.covariance is None or after.covariance is None:
-        return Movement(pose, None)
-    carried = np.eye(3)
-    carried[:2, 2] = (-moved[1], moved[0])  # effect of an error of theta on the position
-    grown = after.covariance - carried @ before.covariance @ carried.T
-    scale = float(np.abs(after.covariance).max())
-    if float(np.linalg.eigvalsh(grown).min()) < -_INDEFINITE * scale:
-        return Movement(pose, None)
-    to_dataset = DATASET_FROM_ROBOTICS @ robot_from_fixed
-    return Movement(pose, to_dataset @ grown @ to_dataset.T)
+    c = np.zeros((3, 3))
+    if before.covariance is not None and after.covariance is not None:
+        carried = np.eye(3)
+        carried[:2, 2] = (-moved[1], moved[0])  # effect of an error of theta on the position
+        grown = after.covariance - carried @ before.covariance @ carried.T
+        scale = float(np.abs(after.covariance).max())
+        if float(np.linalg.eigvalsh(grown).min()) >= -_INDEFINITE * scale:
+            to_dataset = DATASET_FROM_ROBOTICS @ robot_from_fixed
+            c = to_dataset @ grown @ to_dataset.T
+    entries = (c[0, 0], c[0, 1], c[1, 1], c[0, 2], c[1, 2], c[2, 2])
+    return Step(prefix, *map(float, (*pose, *entries)))
 
 
 def pose_between(before: TimedPose, after: TimedPose, time_s: float) -> TimedPose:
@@ -113,16 +108,6 @@ def pose_between(before: TimedPose, after: TimedPose, time_s: float) -> TimedPos
         before.theta + share * float(wrap_angle(after.theta - before.theta)),
         covariance,
     )
-
-
-def step_of(prefix: str, movement: Movement | None = None) -> Step:
-    """A STEP row; unknown values (the movement, its covariance) are zero."""
-    pose, c = np.zeros(3), np.zeros((3, 3))
-    if movement is not None:
-        pose = movement.pose
-        c = c if movement.covariance is None else movement.covariance
-    entries = (c[0, 0], c[0, 1], c[1, 1], c[0, 2], c[1, 2], c[2, 2])
-    return Step(prefix, *map(float, (*pose, *entries)))
 
 
 class PosesOverTime:

@@ -16,8 +16,7 @@ from camera import Camera
 from detect.errors import DetectError
 from detect.run import RunFrame
 from detect.sources.gray import gray_of_pixels
-from detect.sources.interface import Source, numbered_prefix, only_calibration
-from detect.sources.poses import step_of
+from detect.sources.interface import Source, numbered_prefix, only_calibration, still
 
 _log = logging.getLogger("redetect")
 
@@ -35,8 +34,7 @@ class VideoFile(Source):
             self.size = (width, int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT)))
         self.expected = int(count) if math.isfinite(count) and 0 < count < 2**31 else None
 
-    def images(self) -> Generator[RunFrame, None, None]:
-        """The frames as grey values, with their presentation times."""
+    def __iter__(self) -> Generator[RunFrame, None, None]:
         with _opened(self.path) as capture:
             per_second = capture.get(cv2.CAP_PROP_FPS)
             number, last_s = 0, -math.inf
@@ -49,7 +47,7 @@ class VideoFile(Source):
                     time_s = number / per_second
                 prefix = numbered_prefix(self.path.stem, number)
                 gray = gray_of_pixels(pixels, f"{self.name}: {prefix}")
-                yield RunFrame(step_of(prefix), None, gray, time_s)
+                yield RunFrame(still(prefix), None, gray, time_s)
                 number, last_s = number + 1, time_s
         if self.expected is not None and number < self.expected:
             _log.info(f"{self.name}: only {number} of {self.expected} frames can be read")

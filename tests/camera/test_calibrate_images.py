@@ -127,7 +127,7 @@ def test_how_a_telephone_was_held_turns_no_video(tmp_path: Path) -> None:
     assert turned.shape[:2] == (64, 48)  # what OpenCV does unless told
     frames = [image for _, image in calibration_images([path], 1, 9)]
     assert len(frames) == 2
-    for frame in (*frames, *(image.content for image in VideoFile(path).images())):
+    for frame in (*frames, *(image.content for image in VideoFile(path))):
         assert isinstance(frame, np.ndarray)
         np.testing.assert_allclose(frame, picture, atol=30)
 

@@ -14,7 +14,7 @@ from camera import CameraError
 from detect.errors import DetectError
 from detect.sources import bag_messages
 from detect.sources.bag import Bag, pose_in_dataset, static_transforms
-from detect.sources.poses import movement_between, step_of
+from detect.sources.poses import step_between
 from tools.fuzz.bag_cells import bag_with_edits
 from tools.fuzz.bag_types import known_types, opened_once
 from tools.fuzz.reader import Reader
@@ -42,13 +42,13 @@ def _bag(path: Path) -> object:
 
 def _asked_of(path: Path) -> object:
     bag = Bag(path)
-    images = list(bag.images())
+    images = list(bag)
     for image in images:
         assert (image.content is None) != (image.failure is None)
     bag.calibration(posed=False)
     odometry = bag.poses(None)
     poses = [] if odometry is None else list(odometry.read())
-    steps = [step_of("e", movement_between(*pair)) for pair in pairwise(poses)]
+    steps = [step_between("e", *pair) for pair in pairwise(poses)]
     with bag_messages.opened_bag(path) as reader:
         transforms = static_transforms(reader, path)
     return images, steps, pose_in_dataset(transforms, "b", "o")

@@ -27,7 +27,7 @@ from detect.sources.gray import (
     gray_of_pixels,
     significant_bits_of_file,
 )
-from detect.sources.poses import movement_between, step_of, tum_poses
+from detect.sources.poses import step_between, tum_poses
 from detect.sources.times import read_image_times
 from lut.cache import cached_vertical_table
 from storage import OutputExistsError
@@ -82,7 +82,7 @@ def _calibration_image(path: Path) -> object:
 
 def _trajectory(path: Path) -> object:
     poses = list(tum_poses(path))
-    return [step_of("e", movement_between(*pair)) for pair in pairwise(poses)]
+    return [step_between("e", *pair) for pair in pairwise(poses)]
 
 
 @cache

@@ -124,7 +124,7 @@ def test_an_interrupt_finishes_cleanly(
     assert image is not None
     opened = plugged([np.asarray(image, np.uint8)])
     output = tmp_path / "live.circles"
-    framed = live.LiveCamera.images
+    framed = live.LiveCamera.__iter__
 
     def interrupted(self: live.LiveCamera) -> Any:
         for number, found in enumerate(framed(self)):
@@ -132,7 +132,7 @@ def test_an_interrupt_finishes_cleanly(
                 signal.raise_signal(signal.SIGINT)
             yield found
 
-    monkeypatch.setattr(live.LiveCamera, "images", interrupted)
+    monkeypatch.setattr(live.LiveCamera, "__iter__", interrupted)
     before = signal.getsignal(signal.SIGINT)
     arguments = ["circles", "camera:0", "--camera", str(small_run / "s.cam"), "-o", str(output)]
     assert main(arguments) == 0
@@ -148,7 +148,7 @@ def test_a_second_interrupt_is_meant(
 ) -> None:
     plugged([blank(40)])
     output = tmp_path / "live.circles"
-    framed = live.LiveCamera.images
+    framed = live.LiveCamera.__iter__
 
     def interrupted(self: live.LiveCamera) -> Any:
         for found in framed(self):
@@ -156,7 +156,7 @@ def test_a_second_interrupt_is_meant(
             signal.raise_signal(signal.SIGINT)
             yield found
 
-    monkeypatch.setattr(live.LiveCamera, "images", interrupted)
+    monkeypatch.setattr(live.LiveCamera, "__iter__", interrupted)
     arguments = ["circles", "camera:0", "--camera", str(small_run / "s.cam"), "-o", str(output)]
     assert main(arguments) == 130
     assert not output.exists()

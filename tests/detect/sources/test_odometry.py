@@ -15,7 +15,7 @@ from detect.errors import DetectError
 from detect.run import RunFrames
 from detect.sources.opening import open_source
 from detect.sources.options import SourceOptions
-from detect.sources.poses import TimedPose, movement_between, pose_between, tum_poses
+from detect.sources.poses import TimedPose, pose_between, step_between, tum_poses
 from detect.sources.times import format_time, read_image_times
 from groundtruth.trajectories.streams import read_times
 from landmarks import read_frames
@@ -156,8 +156,8 @@ poses = st.builds(TimedPose, st.just(0.0), finite, finite, angle)
 
 @given(poses, poses)
 def test_movements_lead_from_one_pose_to_the_other(before: TimedPose, after: TimedPose) -> None:
-    left, backward, turn = movement_between(before, after).pose
-    forward = -backward
+    step = step_between("e.0000", before, after)
+    left, forward, turn = step.dx, -step.dy, step.dphi
     x = before.x + math.cos(before.theta) * forward - math.sin(before.theta) * left
     y = before.y + math.sin(before.theta) * forward + math.cos(before.theta) * left
     assert (x, y) == pytest.approx((after.x, after.y), abs=1e-9)
@@ -184,8 +184,8 @@ def test_a_movements_covariance_is_what_random_drives_show() -> None:
     before = TimedPose(0.0, start[0], start[1], start[2], np.cov(starts.T))
     end = ends.mean(axis=0)
     after = TimedPose(1.0, end[0], end[1], end[2], np.cov(ends.T))
-    found = movement_between(before, after).covariance
-    assert found is not None
+    s = step_between("e.0000", before, after)
+    found = [[s.cxx, s.cxy, s.cxphi], [s.cxy, s.cyy, s.cyphi], [s.cxphi, s.cyphi, s.cphiphi]]
     to_dataset = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     expected = to_dataset @ step_covariance @ to_dataset.T
     np.testing.assert_allclose(found, expected, atol=8e-6)

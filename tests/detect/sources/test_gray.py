@@ -1,0 +1,73 @@
+"""Arrays of pixels: those that are taken, and those that are refused in one line."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from detect.errors import FrameError
+from detect.sources.gray import gray_of_pixels
+
+COLOURS = np.random.default_rng(3).integers(0, 256, (6, 8, 4)).astype(np.uint8)
+GRAY = COLOURS[:, :, 0]
+BGR = COLOURS[:, :, :3]
+DEEP = GRAY.astype(np.uint16) << 4
+
+
+def read_only(pixels: NDArray[Any]) -> NDArray[Any]:
+    copy = pixels.copy()
+    copy.flags.writeable = False
+    return copy
+
+
+@pytest.mark.parametrize(
+    ("pixels", "bits", "expected"),
+    [
+        (GRAY.copy(), 16, GRAY),
+        (read_only(GRAY), 16, GRAY),
+        (GRAY[::2, 1:5], 16, GRAY[::2, 1:5]),
+        (GRAY[::-1, ::-1], 16, GRAY[::-1, ::-1]),
+        (np.asfortranarray(GRAY), 16, GRAY),
+        (GRAY[:, :, np.newaxis], 16, GRAY),
+        (BGR, 16, cv2.cvtColor(BGR.copy(), cv2.COLOR_BGR2GRAY)),
+        (read_only(BGR)[::-1], 16, cv2.cvtColor(BGR[::-1].copy(), cv2.COLOR_BGR2GRAY)),
+        (BGR[:, ::-1], 16, cv2.cvtColor(BGR[:, ::-1].copy(), cv2.COLOR_BGR2GRAY)),
+        (COLOURS, 16, cv2.cvtColor(COLOURS, cv2.COLOR_BGRA2GRAY)),
+        (DEEP, 12, GRAY),
+        (DEEP.astype(">u2"), 12, GRAY),
+        (DEEP[::-1], 12, GRAY[::-1]),
+    ],
+)
+def test_arrays_that_are_taken(
+    pixels: NDArray[Any], bits: int, expected: NDArray[np.uint8]
+) -> None:
+    before = pixels.copy()
+    gray = gray_of_pixels(pixels, "image", bits)
+    np.testing.assert_array_equal(gray, expected)
+    np.testing.assert_array_equal(pixels, before)
+    assert gray.dtype == np.uint8
+    assert gray.flags.c_contiguous
+    assert gray.flags.writeable
+
+
+@pytest.mark.parametrize(
+    ("pixels", "told"),
+    [
+        (GRAY / 255.0, r"image: holds float64: expected images of 8 or 16 bits \(uint8, uint16\)"),
+        (GRAY > 9, "holds bool: expected images of 8 or 16 bits"),
+        (GRAY.astype(np.int16), "holds int16: expected"),
+        (GRAY[0], r"image: is an array of shape \(8,\): expected \(height, width\) grey values"),
+        (COLOURS[:, :, :2], r"shape \(6, 8, 2\): expected .* in the order blue, green, red"),
+        (COLOURS[np.newaxis], r"shape \(1, 6, 8, 4\): expected"),
+        (GRAY[:0], r"shape \(0, 8\): expected"),
+        (DEEP, "a value of [0-9]+ needs more than 10 bits"),
+    ],
+)
+def test_arrays_that_are_refused(pixels: NDArray[Any], told: str) -> None:
+    with pytest.raises(FrameError, match=told) as caught:
+        gray_of_pixels(pixels, "image", 10)
+    assert "\n" not in str(caught.value)
