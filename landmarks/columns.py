@@ -25,18 +25,7 @@ Value = str | float | int | tuple[int, ...] | None
 
 
 class Column(NamedTuple):
-    """A column of a table.
-
-    Attributes
-    ----------
-    name : str
-        Ends in the unit if it has one.
-    kind : str
-    unit : str
-        "1" for pure numbers, empty for text and identifiers.
-    meaning : str
-        Its description.
-    """
+    """A column of a table; its unit is 1 for pure numbers, empty for text and identifiers."""
 
     name: str
     kind: Kind

@@ -95,23 +95,16 @@ def write_map(
     *,
     overwrite: bool = False,
 ) -> None:
-    """Write a map.
+    """Write a map with columns as `MAP_COLUMNS`, numbers in full precision.
 
     Parameters
     ----------
     path : path
-        The file.
     landmark_map : LandmarkMap
-        What is written: columns as `MAP_COLUMNS`, numbers in full precision.
     comments : sequence of str
         Lines for the head.
     overwrite : bool
-        Whether an existing file may be replaced.
-
-    Raises
-    ------
-    storage.OutputExistsError
-        If the file exists and may not be replaced.
+        Whether an existing file may be replaced; else `storage.OutputExistsError` is raised.
     """
     rows = [
         (kind, int(number), *map(float, (*xy, c[0, 0], c[0, 1], c[1, 1])), int(count))
@@ -130,7 +123,7 @@ def read_map(path: str | os.PathLike[str]) -> LandmarkMap:
     ------
     LandmarkFileError
         If the file cannot be read, a row is malformed, a landmark is listed twice or a covariance
-        is negative; the message names file and line.
+        is negative; names file and line.
     """
     found: dict[str, dict[int, tuple[list[float], int]]] = {"disc": {}, "line": {}}
     what = "a map, map.csv, of `slam map`"
@@ -169,13 +162,7 @@ def write_path(
 
 
 def read_path(path: str | os.PathLike[str]) -> Path2D:
-    """Read a path that `write_path` wrote.
-
-    Raises
-    ------
-    LandmarkFileError
-        If the file cannot be read or a row is malformed; the message names file and line.
-    """
+    """Read a path that `write_path` wrote; errors are those of `read_map`."""
     prefixes, numbers = [], []
     what = "a path, path.csv, of `slam map`"
     for line, words in _read(path, what, PATH_COLUMNS, SHORT_PATH_COLUMNS):
@@ -249,14 +236,13 @@ def _finite(
     values = []
     for name, word in zip(names, words):
         try:
-            value = float(word)
+            values.append(float(word))
         except ValueError:
-            value = math.nan
-        if not math.isfinite(value):
+            values.append(math.nan)
+        if not math.isfinite(values[-1]):
             raise LandmarkFileError(
                 path, line, f"{name} is {word[:30]!r}: expected a finite number"
             )
-        values.append(value)
     return values
 
 

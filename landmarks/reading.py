@@ -20,7 +20,6 @@ from landmarks.records import (
     CIRCLE_NUMBERS,
     LINE_NUMBERS,
     MARKER_CORNER_NUMBERS,
-    MARKER_CORNERS,
     STEP_NUMBERS,
     CircleLandmark,
     DetectorSettings,
@@ -184,11 +183,7 @@ def _record(words: list[bytes]) -> Record | None:
         return None
     keyword = words[0]
     if keyword == b"STEP":
-        if len(words) != 2 + len(STEP_NUMBERS):
-            raise LandmarkError(
-                f"STEP with {len(words) - 1} values: expected {1 + len(STEP_NUMBERS)}: "
-                f"prefix {' '.join(STEP_NUMBERS)}"
-            )
+        _demand_count(words, 1 + len(STEP_NUMBERS), "prefix", *STEP_NUMBERS)
         return Step(decode(words[1]), *_numbers(words[2:], STEP_NUMBERS))
     # LANDMARK is what the comments at the head of the data set's files of circles call the row.
     if keyword in (b"LANDMARK_C", b"LANDMARK"):
@@ -198,7 +193,14 @@ def _record(words: list[bytes]) -> Record | None:
         xt, yt, xb, yb, alpha, beta, quality, sigma = _numbers_before_ids(words, LINE_NUMBERS)
         return LineLandmark(xt, yt, xb, yb, alpha, beta, quality, sigma, _ids(words[9:]))
     if keyword == b"LANDMARK_M":
-        return _marker(words)
+        named = " ".join(MARKER_CORNER_NUMBERS)
+        _demand_count(words, 23, "dictionary ID quality and four times", named)
+        (identifier,), (quality,) = _ids(words[2:3]), _numbers(words[3:], ("quality",))
+        first, second, third, fourth = (
+            MarkerCorner(*_numbers(words[start:], MARKER_CORNER_NUMBERS))
+            for start in range(4, 24, 5)
+        )
+        return MarkerLandmark(decode(words[1]), identifier, quality, (first, second, third, fourth))
     if keyword.endswith(b"DETECTOR"):
         return DetectorSettings(decode(keyword), tuple(map(decode, words[1:])))
     raise LandmarkError(
@@ -207,21 +209,11 @@ def _record(words: list[bytes]) -> Record | None:
     )
 
 
-def _marker(words: list[bytes]) -> MarkerLandmark:
-    per_corner = len(MARKER_CORNER_NUMBERS)
-    expected = 3 + len(MARKER_CORNERS) * per_corner
-    if len(words) != 1 + expected:
+def _demand_count(words: list[bytes], count: int, *names: str) -> None:
+    if len(words) != 1 + count:
         raise LandmarkError(
-            f"LANDMARK_M with {len(words) - 1} values: expected {expected}: dictionary ID quality "
-            f"and four times {' '.join(MARKER_CORNER_NUMBERS)}"
+            f"{decode(words[0])} with {len(words) - 1} values: expected {count}: {' '.join(names)}"
         )
-    (quality,) = _numbers(words[3:4], ("quality",))
-    first, second, third, fourth = (
-        MarkerCorner(*_numbers(words[start : start + per_corner], MARKER_CORNER_NUMBERS))
-        for start in range(4, 1 + expected, per_corner)
-    )
-    (identifier,) = _ids(words[2:3])
-    return MarkerLandmark(decode(words[1]), identifier, quality, (first, second, third, fourth))
 
 
 def _numbers_before_ids(words: list[bytes], names: tuple[str, ...]) -> list[float]:

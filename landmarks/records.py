@@ -1,7 +1,9 @@
 """The rows of landmark files as values.
 
 Robot frame: X left, Y backward (forward is -Y), origin on the floor below the robot's centre;
-metres and radians. The field names are the format's own.
+metres and radians. The field names are the format's own. A record that could not be read back from
+a file raises `LandmarkError`: numbers that are not finite, identifiers of more than 64 bits, names
+that are not one word.
 """
 
 from __future__ import annotations
@@ -37,11 +39,6 @@ class Step:
         Pose after the movement in the robot frame before it (m, m, rad).
     cxx, cxy, cyy, cxphi, cyphi, cphiphi : float
         Covariance of (dx, dy, dphi) (m^2, m rad, rad^2).
-
-    Raises
-    ------
-    LandmarkError
-        If a number is not finite, or the prefix could not be read back from a file.
     """
 
     prefix: str
@@ -74,11 +71,6 @@ class CircleLandmark:
         Covariance of (px, py) (m^2).
     ids : tuple of int
         The disc's identifiers: usually one, -1 where it is unknown, empty where the row has none.
-
-    Raises
-    ------
-    LandmarkError
-        If a number is not finite or an identifier does not fit in 64 bits.
     """
 
     px: float
@@ -117,11 +109,6 @@ class LineLandmark:
         Standard deviation of `alpha` (rad).
     ids : tuple of int
         The line's identifiers, as in `CircleLandmark`.
-
-    Raises
-    ------
-    LandmarkError
-        If a number is not finite or an identifier does not fit in 64 bits.
     """
 
     xtop: float
@@ -154,11 +141,6 @@ class MarkerCorner:
         Where it is seen, lens distortion included (px; the top left pixel's centre is 0, 0).
     cuu, cuv, cvv : float
         Covariance of (u, v) (px^2).
-
-    Raises
-    ------
-    LandmarkError
-        If a number is not finite.
     """
 
     u: float
@@ -185,12 +167,6 @@ class MarkerLandmark:
         How well the marker's cells agree with the pattern: 1 is perfect.
     corners : tuple of 4 MarkerCorner
         Top left, top right, bottom right, bottom left of the marker as it is printed.
-
-    Raises
-    ------
-    LandmarkError
-        If a number is not finite, the identifier is negative or too large, the corners are not
-        four, or the dictionary's name could not be read back from a file.
     """
 
     dictionary: str
@@ -219,11 +195,6 @@ class DetectorSettings:
         The row's first word, ending in DETECTOR.
     words : tuple of str
         The others, as they are.
-
-    Raises
-    ------
-    LandmarkError
-        If the row could not be read back from a file.
     """
 
     keyword: str

@@ -84,7 +84,6 @@ def write_frames(
     Parameters
     ----------
     path : path
-        Where the file will be.
     frames : iterable of Frame
         Written as they come: they need not be in memory at once.
     head : str
@@ -92,14 +91,7 @@ def write_frames(
     line_end : str
         LF, or CRLF as in the data set's own files.
     overwrite : bool
-        Whether an existing file may be replaced.
-
-    Raises
-    ------
-    storage.OutputExistsError
-        If `path` exists and `overwrite` is false.
-    OSError
-        If the folder cannot be written to.
+        Whether an existing file may be replaced; else `storage.OutputExistsError` is raised.
     """
     with write_whole(path, overwrite=overwrite) as stream:
         stream.write(format_head(head, line_end))
@@ -115,19 +107,12 @@ def write_rows(
     Parameters
     ----------
     path : path
-        Where the file will be; may be the one that the rows are being read from.
+        May be the file that the rows are being read from.
     rows : iterable of Row
         Rows that have their text are copied; the others are laid out by `format_record` and end
         like the row before them.
     overwrite : bool
-        Whether an existing file may be replaced.
-
-    Raises
-    ------
-    storage.OutputExistsError
-        If `path` exists and `overwrite` is false.
-    OSError
-        If the folder cannot be written to.
+        As in `write_frames`.
     """
     line_end = b"\n"
     text = line_end
