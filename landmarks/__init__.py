@@ -25,7 +25,6 @@ from landmarks.reading import (
 )
 from landmarks.records import (
     CircleLandmark,
-    DetectorSettings,
     Frame,
     Landmark,
     LineLandmark,
@@ -56,7 +55,6 @@ __all__ = [
     "Association",
     "CircleArrays",
     "CircleLandmark",
-    "DetectorSettings",
     "Frame",
     "FrameTilt",
     "Landmark",

@@ -60,7 +60,9 @@ def associate(costs: ArrayLike, allowed: ArrayLike) -> Association:
     # One forbidden pair costs more than all allowed ones together: no more are taken than must.
     scale = cost[gate].max(initial=0.0) or 1.0
     forbidden = 1.0 + min(cost.shape)
-    first, second = linear_sum_assignment(np.where(gate, cost / scale, forbidden))
+    weights = np.full(cost.shape, forbidden)
+    weights[gate] = cost[gate] / scale
+    first, second = linear_sum_assignment(weights)
     paired = gate[first, second]
     first, second = first[paired], second[paired]
     return Association(

@@ -22,7 +22,6 @@ from landmarks.records import (
     MARKER_CORNER_NUMBERS,
     STEP_NUMBERS,
     CircleLandmark,
-    DetectorSettings,
     Frame,
     Landmark,
     LineLandmark,
@@ -59,7 +58,8 @@ def read_rows(path: str | os.PathLike[str]) -> Iterator[Row]:
     Yields
     ------
     Row
-        Each row with its record (None for comments and blank lines) and its text.
+        Each row with its text and its record: None for comments, blank lines and the settings of a
+        detector, as the data set's files have them at their head.
 
     Raises
     ------
@@ -88,7 +88,7 @@ def read_steps(path: str | os.PathLike[str]) -> Iterator[Step]:
 
 
 def frames_of_rows(rows: Iterable[Row]) -> Iterator[Frame]:
-    """Gather rows to frames; detector settings are left out, and comments but ``# levelled``."""
+    """Gather rows to frames; comments are left out, but ``# levelled``."""
     step: Step | None = None
     landmarks: list[Landmark] = []
     levelled_by: tuple[float, float] | None = None
@@ -121,7 +121,7 @@ def parse_rows(stream: BinaryIO, name: str = "<stream>") -> Iterator[Row]:
 
 
 def parse_record(text: str) -> Record | None:
-    """Make a record of one row's text; None for a comment or a blank line.
+    """Make a record of one row's text; None for a comment, a blank line or detector settings.
 
     Raises
     ------
@@ -201,8 +201,9 @@ def _record(words: list[bytes]) -> Record | None:
             for start in range(4, 24, 5)
         )
         return MarkerLandmark(decode(words[1]), identifier, quality, (first, second, third, fourth))
+    # The data set has ``CIRCLEMARKDETECTOR <camfile> nohalf|half <radius> <threshold>``.
     if keyword.endswith(b"DETECTOR"):
-        return DetectorSettings(decode(keyword), tuple(map(decode, words[1:])))
+        return None
     raise LandmarkError(
         f"row starts with {excerpt(decode(keyword))}: expected STEP, LANDMARK_C, LANDMARK_L, "
         "LANDMARK_M or a # comment"

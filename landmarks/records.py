@@ -183,34 +183,8 @@ class MarkerLandmark:
             raise LandmarkError(f"marker has {len(self.corners)} corners: expected 4")
 
 
-@dataclass(frozen=True, slots=True)
-class DetectorSettings:
-    """How a detector was set, as the data set's files may say at their head.
-
-    The data set has ``CIRCLEMARKDETECTOR <camfile> nohalf|half <radius> <threshold>``.
-
-    Attributes
-    ----------
-    keyword : str
-        The row's first word, ending in DETECTOR.
-    words : tuple of str
-        The others, as they are.
-    """
-
-    keyword: str
-    words: tuple[str, ...]
-
-    def __post_init__(self) -> None:
-        for word in (self.keyword, *self.words):
-            _demand_word(word, "word of detector settings")
-        if not self.keyword.endswith("DETECTOR"):
-            raise LandmarkError(
-                f"keyword is {excerpt(self.keyword)}: expected one that ends in DETECTOR"
-            )
-
-
 Landmark = CircleLandmark | LineLandmark | MarkerLandmark
-Record = Step | Landmark | DetectorSettings
+Record = Step | Landmark
 
 
 @dataclass(frozen=True, slots=True)
@@ -253,7 +227,7 @@ class Row:
     Attributes
     ----------
     record : Record or None
-        None for comments and blank lines.
+        None for comments, blank lines and settings of a detector.
     source : bytes or None
         The row's text in the file, continuation lines and line end included; None for a row that
         was not read from a file, or was changed since.

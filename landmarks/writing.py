@@ -8,7 +8,6 @@ from typing import Literal
 
 from landmarks.records import (
     CircleLandmark,
-    DetectorSettings,
     Frame,
     MarkerLandmark,
     Record,
@@ -32,8 +31,6 @@ def format_record(record: Record) -> str:
             f"{record.cxx:.12f} {record.cxy:.12f} {record.cyy:.12f} "
             f"{record.cxphi:.12f} {record.cyphi:.12f} {record.cphiphi:.12f}"
         )
-    if isinstance(record, DetectorSettings):
-        return " ".join([record.keyword, *record.words])
     if isinstance(record, MarkerLandmark):
         corners = (f"{c.u:.4f} {c.v:.4f} {c.cuu:g} {c.cuv:g} {c.cvv:g}" for c in record.corners)
         head = f"LANDMARK_M {record.dictionary} {record.id:d} {record.quality:g}"

@@ -23,15 +23,10 @@ from storage.image_header import MOST_PIXELS, claimed_size, without_orientation
 #: Significant bits of a 16-bit image.
 BIT_DEPTHS = (8, 10, 12, 14, 16)
 
-#: Only files of these kinds can hold more than 8 bits.
-DEEP_SUFFIXES = frozenset({".png", ".pgm", ".ppm", ".tif", ".tiff"})
-
 # A file is at most as large as its uncompressed pixels, 16 bits in four channels, twice over for
 # formats that grow, plus thumbnails and other metadata that cameras write.
 _BYTES_PER_PIXEL = 16
 _BYTES_BESIDE = 1 << 23
-
-_JPEG_BEGIN, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
 
 
 def decode_gray(
@@ -61,7 +56,7 @@ def decode_gray(
     """
     if not content:
         raise FrameError(f"{name}: is empty: expected an image")
-    if content.startswith(_JPEG_BEGIN) and content.rfind(_JPEG_END, len(content) // 2) < 0:
+    if content.startswith(b"\xff\xd8") and content.rfind(b"\xff\xd9", len(content) // 2) < 0:
         raise FrameError(f"{name}: the JPEG is cut off: its end is missing")
     demand_bounded(content, name, size)
     image = _decoded(content)
@@ -129,8 +124,6 @@ def significant_bits(pixels: NDArray[Any]) -> int:
 
 def significant_bits_of_file(path: Path) -> int | None:
     """The significant bits of an image file; None if it is no image of 16 bits."""
-    if path.suffix.lower() not in DEEP_SUFFIXES:
-        return None
     try:
         content = bounded_content(path, path, None)
         demand_bounded(content, path, None)
@@ -150,15 +143,7 @@ def _decoded(content: bytes) -> NDArray[Any] | None:
 
 
 def bounded_content(path: Path | str, name: object, size: tuple[int, int] | None) -> bytes:
-    """The content of an image file, which is refused where it is no file or too large.
-
-    Parameters
-    ----------
-    path : path or str
-    name : object
-        The image's name in messages.
-    size : (int, int) or None
-        Width and height that are expected.
+    """The content of an image file; parameters as in `decode_gray`.
 
     Raises
     ------

@@ -43,20 +43,9 @@ def last_part(prefix: str) -> str:
 
 
 class ImageNames:
-    """Names of image files, in natural order: numbers by value.
+    """Names of a folder's image files that match a pattern, in natural order: numbers by value.
 
-    Parameters
-    ----------
-    folder : path
-        Where the images are. It is listed once.
-    pattern : str
-        What the names of files must match, as in `fnmatch`.
-
-    Attributes
-    ----------
-    folder : path
-    has_links : bool
-        Whether any of them is a symbolic link.
+    The folder is listed once; `has_links` says whether any of them is a symbolic link.
     """
 
     def __init__(self, folder: Path, pattern: str = "*") -> None:
@@ -95,11 +84,8 @@ class ImageNames:
     def place_of(self, prefix: str) -> int | None:
         """The place of a step's image, by its name alone; None if there is none.
 
-        Raises
-        ------
-        FrameError
-            If the step's prefix leads out of the run: a file of steps must not decide which other
-            files are read.
+        A prefix that leads out of the run is a FrameError: a file of steps must not decide which
+        other files are read.
         """
         name = prefix.strip('"')
         why = leads_out(name, *map(str, self._homes))
@@ -110,10 +96,7 @@ class ImageNames:
     def checked(self, index: int) -> tuple[Path, FileStamp | None]:
         """The image at a place, and its file's stamp: None if it is a link, or nothing is there.
 
-        Raises
-        ------
-        FrameError
-            If it is a link that leads out of the run.
+        A link that leads out of the run is a FrameError.
         """
         path = self.path(index)
         try:
@@ -131,13 +114,7 @@ class ImageNames:
 
 
 def images_of_folder(folder: Path) -> ImageNames:
-    """The images in ``images/`` or, failing that, in the folder itself.
-
-    Raises
-    ------
-    DetectError
-        If there are none.
-    """
+    """The images in ``images/`` or, failing that, in the folder itself."""
     for place in (folder / "images", folder):
         if place.is_dir():
             found = ImageNames(place)
@@ -148,12 +125,9 @@ def images_of_folder(folder: Path) -> ImageNames:
 
 
 class NameIndex:
-    """Finds the place of a name in a sequence; costs the width of the longest name and 4 bytes.
+    """Finds the place of a name in a sequence; of equal names, which have no NUL, the last one.
 
-    Parameters
-    ----------
-    names : iterable of bytes
-        Without NUL. Of equal ones the last counts.
+    It costs the width of the longest name and 4 bytes per name.
     """
 
     def __init__(self, names: Iterable[bytes]) -> None:
@@ -185,9 +159,9 @@ def _suffix(name: str) -> str:
 
 def _natural_order(name: str) -> str:
     """Sort key of names with numbers by value: before its digits, how many there are."""
-    key = re.sub("[0-9]+", lambda found: _by_value(found[0].lstrip("0")), name)
-    return f"{name[0].isdigit():d}{key}"
 
+    def by_value(found: re.Match[str]) -> str:
+        digits = found[0].lstrip("0")
+        return f"\0{chr(1 + len(digits))}{digits}"
 
-def _by_value(digits: str) -> str:
-    return f"\0{chr(1 + len(digits))}{digits}"
+    return f"{name[0].isdigit():d}{re.sub('[0-9]+', by_value, name)}"

@@ -33,8 +33,8 @@ _log = logging.getLogger("redetect")
 #: How long a camera may be silent (s).
 PATIENCE_S = 10.0
 
-# How often interrupts are noticed while no image comes (s).
-_LOOK_S = 0.1
+# How often a new image, or an interrupt, is noticed (s).
+_LOOK_S = 0.002
 
 
 class Capture(Protocol):
@@ -76,7 +76,6 @@ class _Newest:
     def __init__(self, capture: Capture) -> None:
         self._capture = capture
         self._image: deque[tuple[float, NDArray[Any]]] = deque(maxlen=1)
-        self._changed = threading.Event()
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._read, daemon=True)
         self._thread.start()
@@ -85,7 +84,6 @@ class _Newest:
         """Wait for an image that was not given yet; None when there will be none."""
         latest_s = time.monotonic() + PATIENCE_S
         while not stop.is_set():
-            self._changed.clear()
             ended = self._ended.is_set()
             if self._image:
                 return self._image.popleft()
@@ -95,7 +93,7 @@ class _Newest:
             if time.monotonic() >= latest_s:
                 _log.info(f"no image came within {PATIENCE_S:g} s: the results so far are written")
                 return None
-            self._changed.wait(_LOOK_S)
+            time.sleep(_LOOK_S)
         return None
 
     def close(self) -> None:
@@ -110,7 +108,6 @@ class _Newest:
                 self._image.append((time.time(), pixels))
             else:
                 self._ended.set()
-            self._changed.set()
 
 
 @contextmanager

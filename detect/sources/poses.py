@@ -41,17 +41,9 @@ _END_SLACK_S = 1e-3
 
 @dataclass(frozen=True, slots=True)
 class TimedPose:
-    """Where a robot was: X forward, Y left, counterclockwise, in a fixed frame.
+    """Where a robot was: X forward, Y left (m), counterclockwise (rad), in a fixed frame.
 
-    Attributes
-    ----------
-    time_s : float
-    x, y : float
-        Metres.
-    theta : float
-        Radians.
-    covariance : (3, 3) float64 or None
-        Of (x, y, theta) in the fixed frame, since the start; None if unknown.
+    The (3, 3) covariance is that of (x, y, theta) since the start; None if unknown.
     """
 
     time_s: float

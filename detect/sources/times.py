@@ -15,13 +15,7 @@ _LONGEST_ROW = 65536
 
 
 def read_image_times(path: Path) -> dict[str, float]:
-    """The times of images (s), by their prefixes.
-
-    Raises
-    ------
-    DetectError
-        If the file cannot be read or a row is malformed; it names file and line.
-    """
+    """The times of images (s), by their prefixes."""
     times = {}
     for number, words in text_rows(path, "file of times", "surrogateescape"):
         try:
@@ -42,13 +36,7 @@ def format_time(prefix: str, time_s: float) -> str:
 
 
 def text_rows(path: Path, what: str, errors: str = "strict") -> Iterator[tuple[int, list[str]]]:
-    """Number and words of each row of a text file, between blanks or commas, ``#`` comments.
-
-    Raises
-    ------
-    DetectError
-        If it cannot be read, or, with `errors` strict, is no text; `what` was expected.
-    """
+    """Number and words of each row of a text file, between blanks or commas, ``#`` comments."""
     try:
         with path.open(encoding="utf-8-sig", errors=errors) as stream:
             for number, line in enumerate(stream, start=1):

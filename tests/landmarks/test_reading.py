@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 
 from landmarks import (
     CircleLandmark,
-    DetectorSettings,
     Frame,
     LandmarkFileError,
     LineLandmark,
@@ -60,12 +59,11 @@ def test_the_heads_name_of_the_row_means_a_circle() -> None:
     assert parse_record(CIRCLE.replace("LANDMARK_C", "LANDMARK")) == parse_record(CIRCLE)
 
 
-def test_detector_settings_are_kept_apart_from_the_frames(tmp_path: Path) -> None:
+def test_detector_settings_are_rows_without_a_record(tmp_path: Path) -> None:
     path = write(tmp_path, f"CIRCLEMARKDETECTOR c.cam nohalf 0.10000 0.50000\n{STEP}\n")
     first, _ = read_rows(path)
-    assert first.record == DetectorSettings(
-        "CIRCLEMARKDETECTOR", ("c.cam", "nohalf", "0.10000", "0.50000")
-    )
+    assert first.record is None
+    assert first.source == b"CIRCLEMARKDETECTOR c.cam nohalf 0.10000 0.50000\n"
     assert len(list(read_frames(path))) == 1
 
 

@@ -9,7 +9,6 @@ import pytest
 
 from landmarks import (
     CircleLandmark,
-    DetectorSettings,
     Frame,
     LandmarkError,
     LineLandmark,
@@ -39,16 +38,6 @@ def test_no_number_may_be_infinite_or_nan(
 def test_prefixes_that_a_file_would_not_give_back_are_refused(prefix: str) -> None:
     with pytest.raises(LandmarkError, match="image prefix is"):
         Step(prefix, 0, 0, 0, 0, 0, 0, 0, 0, 0)
-
-
-@pytest.mark.parametrize(
-    ("keyword", "words"), [("RADIUS", ()), ("XDETECTOR", ("a b",)), ("XDETECTOR", ("",))]
-)
-def test_settings_that_a_file_would_not_give_back_are_refused(
-    keyword: str, words: tuple[str, ...]
-) -> None:
-    with pytest.raises(LandmarkError, match="expected one"):
-        DetectorSettings(keyword, words)
 
 
 def test_identifiers_have_64_bits() -> None:

@@ -21,7 +21,6 @@ from detect.runs.journal import digest_of, left_journal
 from detect.runs.outputs import demand_log_place
 from detect.sources.bag_messages import pixels_of_message
 from detect.sources.gray import (
-    DEEP_SUFFIXES,
     bounded_content,
     decode_gray,
     gray_of_pixels,
@@ -72,7 +71,6 @@ def _small(path: Path) -> bool:
 
 
 def _deep_image(path: Path) -> object:
-    assert path.suffix in DEEP_SUFFIXES
     return significant_bits_of_file(path) if _small(path) else None
 
 
