@@ -61,20 +61,7 @@ def polynomial_of(brown: Brown) -> Polynomial:
 
 
 def brown_shift(xy: FloatArray, brown: Brown) -> FloatArray:
-    """By how much Brown's terms move points, beside the rational distortion.
-
-    Parameters
-    ----------
-    xy : (..., 2) array
-        Undistorted normalised coordinates.
-    brown : tuple of 5 floats
-        k1, k2, p1, p2, k3.
-
-    Returns
-    -------
-    (..., 2) array
-        Normalised.
-    """
+    """By how much Brown's terms move (..., 2) points, beside the rational distortion."""
     k1, k2, p1, p2, k3 = brown
     q = np.array([p2, p1])
     squared = np.sum(xy * xy, axis=-1)
@@ -106,18 +93,6 @@ def one_to_one_radius(coef: Coef, brown: Brown) -> float:
 
     Without Brown's terms the rational distortion's `fold_radius`; with them the largest radius
     below which the Jacobian is positive definite in all directions, and at most `RADIUS_LIMIT`.
-
-    Parameters
-    ----------
-    coef : tuple of 5 floats
-        a2, a3, b1, b2, b3.
-    brown : tuple of 5 floats
-        k1, k2, p1, p2, k3.
-
-    Returns
-    -------
-    float
-        r_max > 0.
     """
     if not any(brown):
         return fold_radius(coef)
@@ -160,23 +135,6 @@ def straightened(distorted: FloatArray, coef: Coef, brown: Brown, r_max: float) 
     """Undistorted normalised coordinates of distorted ones, all terms undone.
 
     Newton's method from the radial inverse (`camera.brown_kernels.straightened_point`).
-
-    Parameters
-    ----------
-    distorted : (..., 2) array
-        Distorted normalised coordinates.
-    coef : tuple of 5 floats
-        a2, a3, b1, b2, b3.
-    brown : tuple of 5 floats
-        k1, k2, p1, p2, k3.
-    r_max : float
-        Of `one_to_one_radius`.
-
-    Returns
-    -------
-    (..., 2) array
-        They are seen there to 1e-12 of the larger of 1 and the distorted radius; both NaN where
-        nothing is seen.
     """
     from camera.brown_kernels import straighten_points
 

@@ -115,19 +115,7 @@ def straighten_points(
     start_radius: NDArray[np.float64],
     straight: NDArray[np.float64],
 ) -> None:
-    """`straightened_point` of many.
-
-    Parameters
-    ----------
-    lens : (11,) float64
-        As there.
-    seen : (N, 2) float64
-        Distorted normalised points.
-    start_radius : (N,) float64
-        About their undistorted radius.
-    straight : (N, 2) float64
-        Result.
-    """
+    """`straightened_point` of many."""
     for k in range(len(seen)):
         x, y = seen[k, 0], seen[k, 1]
         radius = math.sqrt(x * x + y * y)

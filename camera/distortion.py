@@ -90,18 +90,6 @@ def fold_radius(coef: Coef, polynomial: Polynomial = NO_POLYNOMIAL) -> float:
     """r_max, up to which g(r) grows: the first pole of f or zero of g'.
 
     Past it the image folds back on itself and the projection is undefined.
-
-    Parameters
-    ----------
-    coef : tuple of 5 floats
-        a2, a3, b1, b2, b3.
-    polynomial : tuple of 3 floats, optional
-        k1, k2, k3.
-
-    Returns
-    -------
-    float
-        r_max > 0; infinity where g grows without end.
     """
     a2, a3, b1, b2, b3 = coef
     r = PowerSeries([0.0, 1.0])
@@ -141,17 +129,7 @@ def inverse_table(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Distorted radii, growing, and the undistorted radii that are seen there.
 
-    Parameters
-    ----------
-    coef : tuple of 5 floats
-        a2, a3, b1, b2, b3.
-    polynomial : tuple of 3 floats, optional
-        k1, k2, k3.
-
-    Returns
-    -------
-    distorted, undistorted : (16384,) float64
-        Normalised radii, from 0 to the fold or `RADIUS_LIMIT`. Read only.
+    16384 of each, from 0 to the fold or `RADIUS_LIMIT`; read only.
     """
     limit = min(fold_radius(coef, polynomial), RADIUS_LIMIT)
     radius = np.tan(np.linspace(0.0, np.arctan(limit), _TABLE_NODES))

@@ -25,13 +25,7 @@ _PLACES = 65
 
 
 def check_numbers(camera: Camera) -> None:
-    """Refuse sizes, scales and coefficients that are impossible each for itself.
-
-    Raises
-    ------
-    CameraError
-        The message names what is wrong.
-    """
+    """Refuse sizes, scales and coefficients that are impossible each for itself."""
     for name, side in (("width", camera.width), ("height", camera.height)):
         if not 1 <= side <= _LARGEST_SIDE_PX:
             raise CameraError(f"{name} is {side}: expected 1 to {_LARGEST_SIDE_PX} pixels")
@@ -63,13 +57,7 @@ def check_numbers(camera: Camera) -> None:
 
 
 def check_one_to_one(camera: Camera) -> None:
-    """Refuse a distortion that folds so far inside the image that less than half of it is left.
-
-    Raises
-    ------
-    CameraError
-        The message says where it folds.
-    """
+    """Refuse a distortion that folds so far inside the image that less than half of it is left."""
     fold = _fold_inside(camera)
     share = seen_share(camera) if fold else 1.0
     if share < LEAST_SEEN_SHARE:

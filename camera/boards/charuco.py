@@ -8,17 +8,12 @@ by the image's border) are searched at positions predicted from their neighbours
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from camera.boards.board import Board
 from camera.errors import CalibrationError
-
-if TYPE_CHECKING:
-    import cv2
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -75,13 +70,7 @@ def find_charuco(image: GreyImage, board: Board) -> tuple[IntArray, FloatArray]:
 
 
 def dictionary_of(board: Board) -> cv2.aruco.Dictionary:
-    """The dictionary that a ChArUco board's markers are of.
-
-    Raises
-    ------
-    CalibrationError
-        If OpenCV has none of that name, or its markers are fewer than the board's.
-    """
+    """The dictionary that a ChArUco board's markers are of."""
     number = getattr(cv2.aruco, board.dictionary, None)
     if not board.dictionary.startswith("DICT_") or number is None:
         raise CalibrationError(
@@ -128,20 +117,9 @@ def _interpolated(image: GreyImage, board: Board) -> tuple[IntArray, FloatArray]
 
 
 def measured_corners(image: GreyImage, grid: FloatArray, marker_share: float) -> FloatArray:
-    """Measure a grid of corners on their edges, and search those that are missing.
+    """Measure a (rows, columns, 2) grid of corners on their edges, and search those that are NaN.
 
-    Parameters
-    ----------
-    image : (H, W) uint8 array
-    grid : (rows, columns, 2) array
-        About where the corners are; NaN where that is not known. At least four.
-    marker_share : float
-        Side of the markers in squares.
-
-    Returns
-    -------
-    (rows, columns, 2) array
-        NaN where there is none to be seen.
+    `marker_share` is the side of the markers in squares. Corners that cannot be seen stay NaN.
     """
     grey = image.astype(np.float64)
     gradient: FloatArray = np.empty((2, *grey.shape))
@@ -224,23 +202,9 @@ def _measured(
 ) -> FloatArray:
     """A corner as the point that its edges' gradients are at right angles to (Foerstner 1987).
 
-    Parameters
-    ----------
-    grey : (H, W) array
-    gradient : (2, H, W) array
-    start : (2,) array
-        Where it is about.
-    axes : (2, 2) array
-        Columns: pixels of one square to the right and one down, on the board.
-    white : float
-        Width of the white between edge and marker, in squares.
-    parity : int
-        0 where the square right below the corner is black, as the one beyond it.
-
-    Returns
-    -------
-    (2,) array
-        NaN if there is no such corner.
+    The columns of `axes` are the pixels of one square to the right and one down; `white` is the
+    width between edge and marker in squares; `parity` is 0 where the square right below the corner
+    is black. NaN if there is no such corner.
     """
     nothing = np.full(2, np.nan)
     area = abs(float(np.linalg.det(axes)))

@@ -122,20 +122,16 @@ def _refined(image: GreyImage, grid: NDArray[np.float32], share: float) -> Float
 
 def _spacing(grid: NDArray[np.float32]) -> FloatArray:
     """(rows, columns, 2) extent of a square at each corner along u and v, pixels."""
-    extent = np.full((*grid.shape, 2), np.inf)
+    extents = []
     for axis in (0, 1):
-        step = np.abs(np.diff(grid, axis=axis))
-        step = np.where(np.isfinite(step), step, np.inf)
-        ahead: list[slice] = [slice(None), slice(None)]
-        behind: list[slice] = [slice(None), slice(None)]
-        ahead[axis], behind[axis] = slice(None, -1), slice(1, None)
-        for where in (tuple(ahead), tuple(behind)):
-            extent[(*where, slice(None), axis)] = np.minimum(
-                extent[(*where, slice(None), axis)], step
-            )
+        step = np.abs(np.diff(grid, axis=axis)).astype(np.float64)
+        before = [(0, 0)] * 3
+        after = [(0, 0)] * 3
+        before[axis], after[axis] = (1, 0), (0, 1)
+        both = [np.pad(step, pad, constant_values=np.nan) for pad in (before, after)]
+        extents.append(np.fmin(*both))
     # A corner without neighbours gets the smallest windows.
-    extent = np.where(np.isfinite(extent), extent, 0.0)
-    return np.asarray(extent.max(axis=-1))
+    return np.asarray(np.nan_to_num(np.fmax(*extents)))
 
 
 def _in_order(image: GreyImage, grid: FloatArray) -> FloatArray:
@@ -224,32 +220,23 @@ def _of_half_height(pixels: FloatArray) -> FloatArray:
 
 
 def circle_centroids(image: GreyImage, grid: FloatArray) -> FloatArray:
-    """Centroids of dark circles near given places, weighted by how dark each pixel is.
+    """Area centroids of dark circles at most a radius from places of a (rows, columns, 2) grid.
 
-    Parameters
-    ----------
-    image : (H, W) uint8 array
-    grid : (rows, columns, 2) array
-        Where the circles are, to within their radii.
-
-    Returns
-    -------
-    (rows, columns, 2) array
-        The area centroid of each; places without a measurable circle are unchanged.
+    Places without a measurable circle are unchanged.
     """
     spacing = _least_spacing(grid.astype(np.float32))
     result = grid.copy()
     for index in np.ndindex(grid.shape[:2]):
         # Twice, because the first window is round the finder's centre.
         for _ in range(2):
-            moved = _centroid(image, result[index], 0.5 * spacing, cv2)
+            moved = _centroid(image, result[index], 0.5 * spacing)
             if moved is None:
                 break
             result[index] = moved
     return result
 
 
-def _centroid(image: GreyImage, at: FloatArray, reach: float, cv2: object) -> FloatArray | None:
+def _centroid(image: GreyImage, at: FloatArray, reach: float) -> FloatArray | None:
     """Centroid of the dark blob in the square window round `at`; None where there is none."""
     half = max(int(reach), 3)
     u, v = int(np.rint(at[0])), int(np.rint(at[1]))
@@ -264,7 +251,7 @@ def _centroid(image: GreyImage, at: FloatArray, reach: float, cv2: object) -> Fl
     # Paper and ink are flat; only the circle's edge, where a pixel holds both, counts in part.
     weight = np.clip((light - window) / (light - dark), 0.0, 1.0)
     weight[weight < 0.15] = 0.0
-    connected = _blob(weight, v - top, u - left, cv2)
+    connected = _blob(weight, v - top, u - left)
     if connected is None:
         return None
     weight = np.where(connected, weight, 0.0)
@@ -273,12 +260,12 @@ def _centroid(image: GreyImage, at: FloatArray, reach: float, cv2: object) -> Fl
     return np.array([np.sum(weight * columns) / total, np.sum(weight * rows) / total])
 
 
-def _blob(weight: FloatArray, row: int, column: int, cv2: object) -> NDArray[np.bool_] | None:
+def _blob(weight: FloatArray, row: int, column: int) -> NDArray[np.bool_] | None:
     """The blob at a place of the window, if it does not touch the window's edge."""
     mask = (weight > 0.0).astype(np.uint8)
     if not (0 <= row < mask.shape[0] and 0 <= column < mask.shape[1]) or not mask[row, column]:
         return None
-    _, labels = cv2.connectedComponents(mask, connectivity=4)  # type: ignore[attr-defined]
+    _, labels = cv2.connectedComponents(mask, connectivity=4)
     blob = np.asarray(labels == labels[row, column])
     edge = blob[0].any() or blob[-1].any() or blob[:, 0].any() or blob[:, -1].any()
     return None if edge else blob

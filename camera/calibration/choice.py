@@ -30,16 +30,7 @@ _POLYNOMIAL_WORTH = 20.0
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A fit with some coefficients free.
-
-    Attributes
-    ----------
-    adjusted : Adjusted
-    points : Points
-        The points that it was fitted to, corrected for the circles' shifts.
-    holdout_px : float
-        `holdout_error`.
-    """
+    """A fit with some coefficients free: to points without the circles' shifts, `holdout_error`."""
 
     adjusted: Adjusted
     points: Points
@@ -60,20 +51,6 @@ def choose_lens(
     function if, with the same tangential terms, it needs fewer coefficients for an error that is
     not worse, or lowers the error by more than it would by chance. Whether it needs tangential
     terms is then tested as well.
-
-    Parameters
-    ----------
-    start : Estimate
-    points : Points
-    settings : CalibrationSettings
-        `coefficients`, `tangential` and `polynomial` may leave no choice.
-    radius_m : float
-        Radius of the circles; 0 for points.
-
-    Returns
-    -------
-    FreeLens, Candidates
-        The chosen one, and all that were tried.
     """
     chosen, tried = _chosen_of_a_kind(start, points, settings, radius_m)
     if settings.polynomial is not None or settings.coefficients is not None:
@@ -183,19 +160,8 @@ def holdout_error(
 ) -> float:
     """RMS reprojection error in views that the intrinsics were not fitted to, pixels.
 
-    For held-out points only the poses are fitted.
-
-    Parameters
-    ----------
-    estimate : Estimate
-        Where each fit begins.
-    points : Points
-    settings : CalibrationSettings
-    lens : FreeLens
-        Which coefficients are free.
-    folds : sequence of int64 arrays, optional
-        The views that are held out together; each view in one of them. Else every `_FOLDS`-th
-        (each on its own where there are few).
+    For held-out points only the poses are fitted. Each view is in one of the `folds`, by default
+    every `_FOLDS`-th.
     """
     every = np.arange(len(points.starts))
     if folds is None:

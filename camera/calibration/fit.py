@@ -21,24 +21,7 @@ _OUTLINE_POINTS = 32
 def fit_points(
     start: Estimate, points: Points, settings: CalibrationSettings, lens: FreeLens, radius_m: float
 ) -> tuple[Adjusted, Points]:
-    """Adjust intrinsics and poses; of circles, to their centroids.
-
-    Parameters
-    ----------
-    start : Estimate
-    points : Points
-    settings : CalibrationSettings
-    lens : FreeLens
-        Which coefficients are free.
-    radius_m : float
-        Radius of the circles; 0 for points.
-
-    Returns
-    -------
-    fit : Adjusted
-    points : Points
-        Corrected for the circles' shifts (`circle_shifts`).
-    """
+    """Adjust intrinsics and poses to points, or to the centroids of circles of a radius above 0."""
     span = lens.span(settings.aspect)
     start = replace(start, intrinsics=_within(start.intrinsics, points, span, settings.aspect))
 
@@ -56,21 +39,8 @@ def fit_to_centres(
 ) -> tuple[Adjusted, Points]:
     """Fit to points; with circles, repeatedly, corrected for the shifts by the previous fit.
 
-    Parameters
-    ----------
-    adjusted : callable
-        From an estimate to begin with and points to the fit.
-    start : Estimate
-    points : Points
-        Where circles' centroids were seen.
-    radius_m : float
-        Radius of the circles; 0 for points.
-
-    Returns
-    -------
-    fit : Adjusted
-    points : Points
-        Corrected for the circles' shifts (`circle_shifts`).
+    `adjusted` fits points from an estimate to begin with. Also returned are the points as corrected
+    (`circle_shifts`).
     """
     fit = adjusted(start, points)
     corrected = points
@@ -95,20 +65,7 @@ def _within(
 
 
 def circle_shifts(estimate: Estimate, points: Points, radius_m: float) -> FloatArray:
-    """Where the centroids of circles' images lie, seen from the images of their centres.
-
-    Parameters
-    ----------
-    estimate : Estimate
-    points : Points
-    radius_m : float
-        Radius of the circles.
-
-    Returns
-    -------
-    (N, 2) array
-        Pixels; area centroids of the outlines' images, distortion included.
-    """
+    """From the images of circles' centres to the area centroids of their images, (N, 2) pixels."""
     angles = np.arange(_OUTLINE_POINTS) * (2.0 * np.pi / _OUTLINE_POINTS)
     ring = radius_m * np.stack([np.cos(angles), np.sin(angles), np.zeros_like(angles)], axis=-1)
     view = points.views

@@ -62,14 +62,8 @@ class FloorPose:
 def on_floor(board_points: FloatArray, origin_xy: tuple[float, float], yaw: float) -> FloatArray:
     """(N, 3) places in the robot frame of a board's (N, 3) points.
 
-    Parameters
-    ----------
-    board_points : (N, 3) array
-        In the board's frame (x right, y up, z out of the print), metres.
-    origin_xy : (float, float)
-        Where the board's middle lies, robot X and Y in metres.
-    yaw : float
-        Angle from the robot's X axis to the board's x axis, counterclockwise seen from above (rad).
+    The board's middle lies at `origin_xy`; `yaw` is the angle from the robot's X axis to the
+    board's x axis, counterclockwise seen from above (rad).
     """
     c, s = np.cos(yaw), np.sin(yaw)
     turned = board_points @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]).T
@@ -164,18 +158,7 @@ def with_pose(camera: Camera, pose: FloatArray) -> Camera:
 
 
 def read_floor_points(path: Path) -> tuple[FloatArray, FloatArray]:
-    """Read a CSV file of floor points with the header ``u,v,x,y``.
-
-    Returns
-    -------
-    pixels, floor_xy : (N, 2) arrays
-        Pixels, and metres in the robot frame.
-
-    Raises
-    ------
-    CalibrationError
-        If it cannot be read; the message names the line.
-    """
+    """(N, 2) pixels and (N, 2) floor places of a CSV file with the header ``u,v,x,y``."""
     try:
         lines = read_bounded(path, _LARGEST_FILE_BYTES).decode("utf-8-sig").splitlines()
         rows = list(csv.reader(lines))

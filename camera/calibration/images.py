@@ -26,21 +26,10 @@ VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpe
 def calibration_images(
     inputs: Sequence[Path], every: int, most: int
 ) -> Iterator[tuple[str, GreyImage]]:
-    """Names and grey images, one after the other.
+    """Names and grey images of photographs, folders of them, and videos, one after the other.
 
-    Parameters
-    ----------
-    inputs : sequence of Path
-        Images, folders of images, videos. A file that is named twice is used once.
-    every : int
-        Only every `every`-th frame of a video is used.
-    most : int
-        At most this many images are used, evenly spaced, and at most this many frames per video.
-
-    Raises
-    ------
-    CalibrationError
-        If there are none, or one cannot be read.
+    At most `most` images are used, evenly spaced, and at most `most` of every `every`-th frame of
+    each video. A file that is named twice is used once.
     """
     if every < 1 or most < 1:
         raise CalibrationError(f"--every {every} and --max-images {most}: expected 1 or more")
@@ -71,11 +60,6 @@ def read_grey(path: Path) -> GreyImage:
 
     How a camera was held, which telephones write beside a picture (Exif), turns nothing: a
     calibration is of the sensor's pixels, whichever way up they are shown.
-
-    Raises
-    ------
-    CalibrationError
-        If it cannot be read.
     """
     try:
         content = read_bounded(path, _LARGEST_FILE_BYTES)
@@ -95,11 +79,6 @@ def grey_of_content(content: bytes, name: object) -> GreyImage:
     """Decode the content of an image file as `read_grey` does; messages name it `name`.
 
     The memory that the image takes is not checked here: see `storage.image_header`.
-
-    Raises
-    ------
-    CalibrationError
-        If it cannot be read.
     """
     image = None
     with suppress(cv2.error):

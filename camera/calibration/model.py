@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from camera.brown import Brown, brown_jacobian, brown_shift, one_to_one_radius
 from camera.distortion import Coef, fold_radius, radial_factor
@@ -68,24 +69,11 @@ def brown_terms(intrinsics: FloatArray) -> Brown:
 def free_span(
     count: int, aspect: float | None, *, tangential: bool = False, polynomial: int = 0
 ) -> FloatArray:
-    """Directions in which intrinsics may change.
+    """(14, K) directions in which intrinsics may change.
 
-    Parameters
-    ----------
-    count : int
-        Number of free coefficients of the rational distortion, 0 to 5 (`FREE_COEFFICIENTS`).
-    aspect : float or None
-        scaleY / scaleX if that is known (1 for square pixels, 0.5 for single fields); None if both
-        scales are free.
-    tangential : bool
-        Whether p1 and p2 are free.
-    polynomial : int
-        Number of free ones of k1, k2, k3.
-
-    Returns
-    -------
-    (14, K) array
-        Its columns span the free parameters; each is a unit vector but that of tied scales.
+    Free are the principal point, the scales (`aspect` is scaleY / scaleX; None: each by itself),
+    `count` coefficients of the rational distortion (`FREE_COEFFICIENTS`), if `tangential` p1 and
+    p2, and the first `polynomial` of k1, k2, k3.
     """
     names = ["offsetX", "offsetY", *FREE_COEFFICIENTS[count], *(TANGENTIAL if tangential else ())]
     names += POLYNOMIAL[:polynomial]
@@ -209,14 +197,9 @@ def corner_radius(intrinsics: FloatArray, width: int, height: int) -> float:
 
 
 def rotation_of(vectors: FloatArray) -> FloatArray:
-    """(..., 3, 3) rotations of (..., 3) rotation vectors (Rodrigues)."""
-    angle = np.linalg.norm(vectors, axis=-1)[..., None, None]
-    cross = cross_matrices(vectors)
-    small = angle < 1e-8
-    safe = np.where(small, 1.0, angle)
-    first = np.where(small, 1.0, np.sin(safe) / safe)
-    second = np.where(small, 0.5, (1.0 - np.cos(safe)) / safe**2)
-    return np.asarray(np.eye(3) + first * cross + second * (cross @ cross))
+    """(..., 3, 3) rotations of (..., 3) rotation vectors."""
+    matrices = Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix()
+    return np.asarray(matrices).reshape(*vectors.shape, 3)
 
 
 def cross_matrices(vectors: FloatArray) -> FloatArray:

@@ -43,18 +43,8 @@ def projection_sigma(
 ) -> FloatArray:
     """Standard deviation of where directions are projected, whatever the camera's rotation.
 
-    Parameters
-    ----------
-    camera : Camera
-    covariance : (14, 14) array
-        Of its intrinsics.
-    columns, rows : int
-        Of the grid of pixels.
-
-    Returns
-    -------
-    (rows, columns) array
-        Root of the trace of each pixel's covariance (u and v together), pixels.
+    Root of the trace of each pixel's covariance (u and v together), (rows, columns) pixels, by the
+    (14, 14) covariance of the intrinsics.
     """
     rays = camera.unproject(pixel_grid(camera.width, camera.height, columns, rows))
     _, by_intrinsics, by_point = project_points(intrinsics_of(camera), rays)
@@ -68,20 +58,9 @@ def projection_sigma(
 def projection_difference(
     camera: Camera, other: Camera, *, rotate: bool = True, columns: int = 49, rows: int = 37
 ) -> FloatArray:
-    """How far apart two cameras project the same directions.
+    """How far apart two cameras project the same directions, (rows, columns) pixels.
 
-    Parameters
-    ----------
-    camera, other : Camera
-    rotate : bool
-        Turn the other camera so that it fits best.
-    columns, rows : int
-        Of the grid of pixels of `camera`.
-
-    Returns
-    -------
-    (rows, columns) array
-        Pixels; NaN where the other camera does not see the direction.
+    NaN where the other camera does not see the direction; with `rotate` it is turned to fit best.
     """
     pixels = pixel_grid(camera.width, camera.height, columns, rows)
     rays = camera.unproject(pixels)

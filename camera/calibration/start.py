@@ -29,18 +29,9 @@ _LOOSE = 1e-4
 
 
 def first_estimate(points: Points, aspect: float | None) -> Estimate:
-    """Intrinsics without prior knowledge, by trying focal lengths.
+    """The best of some focal lengths, with at most one coefficient; it projects all points.
 
-    Parameters
-    ----------
-    points : Points
-    aspect : float or None
-        scaleY / scaleX, None if unknown (then 1 to begin with).
-
-    Returns
-    -------
-    Estimate
-        The best fit with at most one coefficient; all points are projected by it.
+    `aspect` is scaleY / scaleX, None if unknown (then 1 to begin with).
     """
     chosen = np.unique(np.linspace(0, len(points.starts) - 1, _FEW_VIEWS).round().astype(np.int64))
     few = points.of(chosen)
@@ -109,14 +100,14 @@ def _pose_from_homography(board: FloatArray, xy: FloatArray) -> tuple[FloatArray
     return rotation, translation - rotation @ np.array([*middle, 0.0])
 
 
-def best_poses(estimate: Estimate, points: Points, sigma_px: float | None = None) -> Estimate:
+def best_poses(estimate: Estimate, points: Points) -> Estimate:
     """Each pose refined, from its start and from the same board tilted the other way.
 
     From afar a board and its mirror image in depth look almost alike, so that a start can be
     in the wrong minimum (Schweighofer and Pinz 2006).
     """
     candidates = [estimate, Estimate(estimate.intrinsics, *_mirrored(estimate, points))]
-    fits = [_poses_alone(candidate, points, sigma_px) for candidate in candidates]
+    fits = [_poses_alone(candidate, points) for candidate in candidates]
     errors = np.stack([_errors(fit, points) for fit in fits])
     use = np.argmin(errors, axis=0)
     every = np.arange(len(points.starts))
@@ -125,22 +116,18 @@ def best_poses(estimate: Estimate, points: Points, sigma_px: float | None = None
     return Estimate(estimate.intrinsics, rotations, translations)
 
 
-def _poses_alone(estimate: Estimate, points: Points, sigma_px: float | None) -> Estimate:
+def _poses_alone(estimate: Estimate, points: Points) -> Estimate:
     """Refine poses, all at once or, where one has no start, one by one; that one stays as it is."""
     nothing = np.zeros((COUNT, 0))
     try:
-        return adjust(estimate, points, nothing, sigma_px=sigma_px, tolerance=_LOOSE).estimate
+        return adjust(estimate, points, nothing, tolerance=_LOOSE).estimate
     except (StartError, np.linalg.LinAlgError):
         pass
     rotations, translations = estimate.rotations.copy(), estimate.translations.copy()
     for view in range(len(points.starts)):
-        one = Estimate(
-            estimate.intrinsics, rotations[view : view + 1], translations[view : view + 1]
-        )
+        one = Estimate(estimate.intrinsics, rotations[[view]], translations[[view]])
         try:
-            fit = adjust(
-                one, points.of(np.array([view])), nothing, sigma_px=sigma_px, tolerance=_LOOSE
-            ).estimate
+            fit = adjust(one, points.of(np.array([view])), nothing, tolerance=_LOOSE).estimate
         except (StartError, np.linalg.LinAlgError):
             continue
         rotations[view], translations[view] = fit.rotations[0], fit.translations[0]

@@ -9,7 +9,7 @@ from errno import ENOENT
 from math import degrees, radians
 from os import strerror
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,11 +17,7 @@ from numpy.typing import NDArray
 from camera.boards.board import Board
 from camera.boards.charuco import dictionary_of
 from camera.boards.points import find_board
-from camera.calibration.calibrate import (
-    BoardView,
-    Calibration,
-    calibrate,
-)
+from camera.calibration.calibrate import BoardView, Calibration, calibrate
 from camera.calibration.checks import coverage
 from camera.calibration.floor import (
     FloorPose,
@@ -38,7 +34,7 @@ from camera.calibration.settings import CalibrationSettings
 from camera.camfile import format_camera
 from camera.errors import CalibrationError, CameraError
 from camera.model import Camera
-from camera.options import Calibrate
+from camera.options import Calibrate, Floor
 from storage import OutputExistsError, write_whole
 
 FloatArray = NDArray[np.float64]
@@ -49,27 +45,21 @@ _IDENTITY = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
 
 def perform(options: Calibrate) -> int:
     """Carry the command out; returns the exit code."""
-    names = {name: _beside(options.output, name) for name in ("residuals", "views", "coverage")}
-    report = options.output.with_suffix(".json")
-    for path in (options.output, report, *names.values()):
+    output = options.output
+    kinds = ("residuals", "views", "coverage")
+    names = {kind: output.with_name(f"{output.stem}.{kind}.png") for kind in kinds}
+    report = output.with_suffix(".json")
+    for path in (output, report, *names.values()):
         if path.exists() and not options.force:
             raise OutputExistsError(path)
     # Checked first, not after minutes of work.
-    if report == options.output:
+    if report == output:
         raise CalibrationError(f"{report}: the report is written there: expected a name in .cam")
-    if not options.output.parent.exists():
-        raise FileNotFoundError(ENOENT, strerror(ENOENT), str(options.output))
+    if not output.parent.exists():
+        raise FileNotFoundError(ENOENT, strerror(ENOENT), str(output))
     if options.floor is not None and not options.floor.exists():
         raise CalibrationError(f"{options.floor}: no such picture or .csv of the floor")
-    board = Board(
-        kind=options.board,
-        columns=options.columns,
-        rows=options.rows,
-        square_m=options.square_m,
-        marker_m=options.marker_m,
-        dictionary=options.dictionary,
-        circle_m=options.circle_m,
-    )
+    board = board_of(options)
     settings = CalibrationSettings(
         aspect=None if options.free_aspect else 0.5 if options.half else 1.0,
         coefficients=None if options.coefficients == "auto" else int(options.coefficients),
@@ -79,20 +69,16 @@ def perform(options: Calibrate) -> int:
     )
     images = calibration_images(options.images, options.every, options.max_images)
     views, size = find_views(images, board)
-    on_the_floor: tuple[FloatArray, FloatArray, float] | None = None
-    if options.floor is not None:
-        on_the_floor = (
-            *floor_points(options.floor, board, options.floor_origin, options.floor_yaw, size),
-            radius_on_floor(options.floor, board),
-        )
+    # Found before the calibration, which takes minutes.
+    floor = None if options.floor is None else floor_points(options, options.floor, size)
     calibration = calibrate(views, board, size, settings)
     camera = camera_of(calibration)
     print(describe(calibration, camera))
 
     placed: FloorPose | None = None
-    if on_the_floor is not None:
-        pixels, floor_xy, radius_m = on_the_floor
-        placed = place_on_floor(camera, pixels, floor_xy, calibration.adjusted.covariance, radius_m)
+    if floor is not None:
+        covariance = calibration.adjusted.covariance
+        placed = place_on_floor(camera, floor.pixels, floor.xy, covariance, floor.radius_m)
         camera = with_pose(camera, placed.robot_from_camera)
         print(describe_pose(placed))
     else:
@@ -106,26 +92,29 @@ def perform(options: Calibrate) -> int:
             stream.write(drawn[name])
     with write_whole(report, overwrite=options.force) as stream:
         stream.write(report_text(options, calibration, camera, placed).encode())
-    with write_whole(options.output, overwrite=options.force) as stream:
+    with write_whole(output, overwrite=options.force) as stream:
         stream.write(format_camera(camera).encode())
-    print(f"written: {options.output}, {report.name}, {', '.join(p.name for p in names.values())}")
+    print(f"written: {output}, {report.name}, {', '.join(p.name for p in names.values())}")
     return 0
 
 
-def _beside(output: Path, name: str) -> Path:
-    return output.with_name(f"{output.stem}.{name}.png")
+def board_of(options: Calibrate | Floor) -> Board:
+    """The board that the flags describe."""
+    return Board(
+        kind=options.board,
+        columns=options.columns,
+        rows=options.rows,
+        square_m=options.square_m,
+        marker_m=options.marker_m,
+        dictionary=options.dictionary,
+        circle_m=options.circle_m,
+    )
 
 
 def find_views(
     images: Iterable[tuple[str, GreyImage]], board: Board
 ) -> tuple[list[BoardView], tuple[int, int]]:
-    """Find the board in images; those without it are listed on standard error.
-
-    Raises
-    ------
-    CalibrationError
-        If the pictures are not of one size, or none shows the board, or its markers are unknown.
-    """
+    """Find the board in images; those without it are listed on standard error."""
     if board.kind == "charuco":
         dictionary_of(board)
     views: list[BoardView] = []
@@ -173,18 +162,19 @@ def camera_of(calibration: Calibration) -> Camera:
         ) from None
 
 
-def floor_points(
-    path: Path, board: Board, origin: tuple[float, float], yaw_deg: float, size: tuple[int, int]
-) -> tuple[FloatArray, FloatArray]:
-    """Pixels and floor places (robot X, Y) of a .csv file or of a picture of the board.
+class FloorPoints(NamedTuple):
+    """(N, 2) pixels, (N, 2) places (robot X, Y in m), radius of the circles seen there (m) or 0."""
 
-    Raises
-    ------
-    CalibrationError
-        If the board is not found, shows no direction, or the picture has another size.
-    """
+    pixels: FloatArray
+    xy: FloatArray
+    radius_m: float = 0.0
+
+
+def floor_points(options: Calibrate | Floor, path: Path, size: tuple[int, int]) -> FloorPoints:
+    """Points on the floor of a .csv file, or of a picture of the board."""
     if path.suffix.lower() == ".csv":
-        return read_floor_points(path)
+        return FloorPoints(*read_floor_points(path))
+    board = board_of(options)
     if board.looks_turned:
         raise CalibrationError(
             f"a {board} looks the same turned by 180 degrees, so it can't say where the robot's "
@@ -200,12 +190,9 @@ def floor_points(
         indices, pixels = find_board(image, board)
     except CalibrationError as error:
         raise CalibrationError(f"{path}: {error}") from None
-    return pixels, on_floor(board.points[indices], origin, radians(yaw_deg))[:, :2]
-
-
-def radius_on_floor(path: Path, board: Board) -> float:
-    """Radius of the circles whose centroids `floor_points` gives (m); 0 for points."""
-    return 0.0 if path.suffix.lower() == ".csv" else 0.5 * board.circle_m
+    yaw = radians(options.floor_yaw)
+    places = on_floor(board.points[indices], options.floor_origin, yaw)[:, :2]
+    return FloorPoints(pixels, places, 0.5 * board.circle_m)
 
 
 def describe(calibration: Calibration, camera: Camera) -> str:

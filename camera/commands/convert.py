@@ -77,13 +77,7 @@ def perform(options: Convert) -> int:
 
 
 def read_text(path: Path) -> str:
-    """The text of a calibration file; of COLMAP's cameras.bin, that of its cameras.txt.
-
-    Raises
-    ------
-    ConversionError
-        If it cannot be read, is larger than any calibration, or no text.
-    """
+    """The text of a calibration file; of COLMAP's cameras.bin, that of its cameras.txt."""
     content = read_content(path)
     if path.suffix.lower() == ".bin":
         return text_of_binary(content, str(path))
@@ -103,13 +97,7 @@ def _label(camera: Camera) -> str:
 
 
 def format_of_name(path: Path) -> Format:
-    """The format that a file's name implies.
-
-    Raises
-    ------
-    ConversionError
-        If it does not say.
-    """
+    """The format that a file's name implies."""
     name = path.name.lower()
     if name.endswith(".cam"):
         return "cam"
@@ -135,13 +123,7 @@ _YAML_NAMES: dict[str, Format] = {
 
 
 def format_of_text(path: Path, text: str) -> Format:
-    """The format of a file, by its content.
-
-    Raises
-    ------
-    ConversionError
-        If it is none that is known.
-    """
+    """The format of a file, by its content."""
     if text.lstrip().startswith("{ SmRadial") or path.suffix.lower() == ".cam":
         return "cam"
     if path.suffix.lower() in (".txt", ".bin"):

@@ -62,13 +62,7 @@ _WRITTEN: dict[Model, str] = {
 
 
 def parse_colmap(text: str, name: str = "<text>", camera_name: str = "") -> ForeignCamera:
-    """A camera of the text of a cameras.txt; `camera_name` is its number.
-
-    Raises
-    ------
-    ConversionError
-        If it lacks something, holds several cameras and none is chosen, or has another model.
-    """
+    """A camera of the text of a cameras.txt; `camera_name` is its number."""
     rows: dict[str, tuple[int, list[str]]] = {}
     for number, line in enumerate(text.splitlines(), start=1):
         fields = line.split()
@@ -101,11 +95,6 @@ def parse_colmap(text: str, name: str = "<text>", camera_name: str = "") -> Fore
 
 def text_of_binary(content: bytes, name: str = "<bytes>") -> str:
     """The lines of a cameras.txt of the content of a cameras.bin.
-
-    Raises
-    ------
-    ConversionError
-        If it ends early, goes on behind its last camera, or has a model of unknown length.
 
     References
     ----------
@@ -144,13 +133,7 @@ def text_of_binary(content: bytes, name: str = "<bytes>") -> str:
 
 
 def camera_from_pycolmap(camera: pycolmap.Camera) -> ForeignCamera:
-    """A camera of a ``pycolmap.Camera``.
-
-    Raises
-    ------
-    ConversionError
-        If it has a model that can't be converted.
-    """
+    """A camera of a ``pycolmap.Camera``."""
     parameters = [float(value) for value in camera.params]
     model = camera.model.name
     return _from_parameters("pycolmap.Camera", model, camera.width, camera.height, parameters)
@@ -178,13 +161,7 @@ def _from_parameters(
 
 
 def colmap_parameters(camera: ForeignCamera) -> tuple[str, list[float]]:
-    """COLMAP's name of the model, and its parameters.
-
-    Raises
-    ------
-    ConversionError
-        If COLMAP has no such model (k3 without the rational terms is written as FULL_OPENCV).
-    """
+    """COLMAP's name of the model, and its parameters."""
     model, d = camera.model, camera.distortion
     if model == "radtan" and d[4] != 0.0:
         model, d = "rational", (*d, *(0.0,) * 7)
@@ -210,12 +187,6 @@ def format_colmap(camera: ForeignCamera, camera_name: str = "1") -> str:
 
 
 def pycolmap_from_camera(camera: ForeignCamera) -> pycolmap.Camera:
-    """A ``pycolmap.Camera`` of a camera.
-
-    Raises
-    ------
-    ConversionError
-        If COLMAP has no such model.
-    """
+    """A ``pycolmap.Camera`` of a camera."""
     name, parameters = colmap_parameters(camera)
     return pycolmap.Camera(model=name, width=camera.width, height=camera.height, params=parameters)

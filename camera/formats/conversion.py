@@ -253,13 +253,6 @@ def _wavy_start(start: FloatArray, radius: FloatArray, moved: FloatArray) -> Flo
 
     Least squares does not get there from a lens without distortion: the denominator has to dip
     towards the border. With the dip given, a2 and a3 are linear.
-
-    Parameters
-    ----------
-    start : (14,) array
-        Intrinsics without radial distortion.
-    radius, moved : (N,) arrays
-        Undistorted radii, and how far the distortion moves rays outward there.
     """
     reach = float(radius.max())
     b = np.array(_DIP) / reach ** np.array([1.0, 2.0, 3.0])

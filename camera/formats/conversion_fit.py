@@ -27,28 +27,11 @@ def least_squares(
     weights: FloatArray | None = None,
     steps: int = _STEPS,
 ) -> FloatArray:
-    """Parameters of a camera that sees rays nearest to given pixels (Levenberg-Marquardt).
+    """(P,) parameters of a camera that sees rays nearest to (N, 2) pixels (Levenberg-Marquardt).
 
-    Parameters
-    ----------
-    project : callable
-        From (P,) parameters to the (N, 2) pixels of the rays, and their (N, 2, P) derivatives.
-    start : (P,) float64
-        Parameters to begin with.
-    span : (P, F) float64
-        Directions in which they are free.
-    pixels : (N, 2) float64
-        Where the rays are to be seen.
-    possible : callable
-        Whether parameters are those of a camera: a step to others is not taken.
-    weights : (N,) float64, optional
-        Of the squared distances.
-    steps : int
-        The most that are taken.
-
-    Returns
-    -------
-    (P,) float64
+    `project` gives from parameters the (N, 2) pixels of the rays and their (N, 2, P) derivatives;
+    the columns of `span` are the free directions; steps to parameters that are not `possible` are
+    not taken; `weights` are of the squared distances.
     """
     root = np.ones(len(pixels)) if weights is None else np.sqrt(weights)
     parameters, damping = start, 1e-4

@@ -18,13 +18,7 @@ _NAME = re.compile(r"cam\d+", re.ASCII)
 
 
 def parse_kalibr(text: str, name: str = "<text>", camera_name: str = "") -> ForeignCamera:
-    """A camera of the text of a camchain; `camera_name` says which, such as ``cam0``.
-
-    Raises
-    ------
-    ConversionError
-        If it lacks something, holds several cameras and none is chosen, or has another model.
-    """
+    """A camera of the text of a camchain; `camera_name` says which, such as ``cam0``."""
     content = parse_yaml(text, name)
     cameras = {key: value for key, value in content.items() if isinstance(value, dict)}
     cameras = {key: value for key, value in cameras.items() if "intrinsics" in value}
@@ -72,13 +66,7 @@ def parse_kalibr(text: str, name: str = "<text>", camera_name: str = "") -> Fore
 
 
 def format_kalibr(camera: ForeignCamera, camera_name: str = "cam0") -> str:
-    """The text of a camchain of one camera: ``cam0``, unless `camera_name` is such a name.
-
-    Raises
-    ------
-    ConversionError
-        If Kalibr has no such model (rational, or k3 other than 0).
-    """
+    """The text of a camchain of one camera: ``cam0``, unless `camera_name` is such a name."""
     if camera.model == "rational" or any(camera.distortion[_COEFFICIENTS:]):
         raise ConversionError("Kalibr has no rational model and no k3: expected radtan or fisheye")
     d = ", ".join(shortest(value) for value in camera.distortion[:_COEFFICIENTS])

@@ -24,13 +24,7 @@ _FISHEYE = ("1", "true", "fisheye", "equidistant")
 
 
 def parse_opencv(text: str, name: str = "<text>") -> ForeignCamera:
-    """A camera of the text of an OpenCV YAML file.
-
-    Raises
-    ------
-    ConversionError
-        If it lacks something or cannot be read.
-    """
+    """A camera of the text of an OpenCV YAML file."""
     content = parse_yaml(text, name)
     sides = []
     for key, other in (("image_width", "image_Width"), ("image_height", "image_Height")):
@@ -50,13 +44,7 @@ def parse_opencv(text: str, name: str = "<text>") -> ForeignCamera:
 
 
 def opencv_model(coefficients: list[float], *, fisheye: bool, name: str) -> Model:
-    """The model that OpenCV uses for this number of coefficients.
-
-    Raises
-    ------
-    ConversionError
-        If it is none, or a tilted sensor's.
-    """
+    """The model that OpenCV uses for this number of coefficients."""
     count = len(coefficients)
     if fisheye:
         if count != COEFFICIENTS["fisheye"]:
@@ -83,13 +71,7 @@ def foreign(
     pinhole: tuple[float, float, float, float],
     coefficients: list[float],
 ) -> ForeignCamera:
-    """Make a camera; coefficients of the model that the file does not give are 0.
-
-    Raises
-    ------
-    ConversionError
-        If there can be no such camera; the message names the file.
-    """
+    """Make a camera; coefficients of the model that the file does not give are 0."""
     count = COEFFICIENTS[model]
     padded = (*coefficients, *(0.0,) * count)[:count]
     try:

@@ -20,13 +20,7 @@ _MOST_CAMERAS = 1000
 
 
 def read_content(path: Path) -> bytes:
-    """The content of a calibration file.
-
-    Raises
-    ------
-    ConversionError
-        If it cannot be read or is larger than any calibration.
-    """
+    """The content of a calibration file."""
     try:
         return read_bounded(path, _LARGEST_FILE_BYTES)
     except FileNotFoundError:
@@ -38,13 +32,7 @@ def read_content(path: Path) -> bytes:
 
 
 def text_of(content: bytes, name: str) -> str:
-    """The content of a calibration file as text.
-
-    Raises
-    ------
-    ConversionError
-        If it is none.
-    """
+    """The content of a calibration file as text."""
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError:
@@ -52,13 +40,7 @@ def text_of(content: bytes, name: str) -> str:
 
 
 def parse_yaml(text: str, name: str) -> dict[str, Any]:
-    """The first document of a YAML text, which must be a mapping.
-
-    Raises
-    ------
-    ConversionError
-        If it is no YAML, uses aliases, or is no mapping; the message names the line.
-    """
+    """The first document of a YAML text, which must be a mapping."""
 
     class Loader(yaml.SafeLoader):  # type: ignore[misc, unused-ignore]
         def compose_node(self, parent: Any, index: Any) -> Any:
@@ -100,13 +82,7 @@ def parse_yaml(text: str, name: str) -> dict[str, Any]:
 
 
 def numbers(value: Any, key: str, name: str) -> list[float]:
-    """The numbers of a list, of nested lists, or of a mapping with `data`, flat.
-
-    Raises
-    ------
-    ConversionError
-        If they are not numbers.
-    """
+    """The numbers of a list, of nested lists, or of a mapping with `data`, flat."""
     if isinstance(value, dict):
         value = value.get("data")
     flat: list[Any] = []
@@ -131,13 +107,7 @@ def numbers(value: Any, key: str, name: str) -> list[float]:
 
 
 def first_of(content: dict[str, Any], keys: tuple[str, ...], name: str) -> Any:
-    """The value of the first key that is there.
-
-    Raises
-    ------
-    ConversionError
-        If none is.
-    """
+    """The value of the first key that is there."""
     for key in keys:
         if key in content:
             return content[key]
@@ -145,26 +115,14 @@ def first_of(content: dict[str, Any], keys: tuple[str, ...], name: str) -> Any:
 
 
 def whole(value: Any, key: str, name: str) -> int:
-    """A whole number.
-
-    Raises
-    ------
-    ConversionError
-        If it is none.
-    """
+    """A whole number."""
     if isinstance(value, bool) or not isinstance(value, int):
         raise ConversionError(f"{name}: {key} is {excerpt(value)}: expected a whole number")
     return value
 
 
 def pinhole_matrix(value: Any, key: str, name: str) -> tuple[float, float, float, float]:
-    """fx, fy, cx, cy of a 3 x 3 camera matrix without skew.
-
-    Raises
-    ------
-    ConversionError
-        If it is none.
-    """
+    """fx, fy, cx, cy of a 3 x 3 camera matrix without skew."""
     m = numbers(value, key, name)
     if len(m) != 9 or m[3:4] + m[6:] != [0.0, 0.0, 0.0, 1.0]:
         raise ConversionError(

@@ -32,26 +32,7 @@ def camera_from_message(
     k: Sequence[float],
     name: str = "camera_info",
 ) -> ForeignCamera:
-    """A camera of the numbers of a ``sensor_msgs/CameraInfo`` message.
-
-    Parameters
-    ----------
-    width, height : int
-        Pixels.
-    distortion_model : str
-        `plumb_bob`, `rational_polynomial` or `equidistant`; empty with no coefficients.
-    d : sequence of float
-        The coefficients, in OpenCV's order.
-    k : 9 floats
-        The camera matrix of the raw image, row by row.
-    name : str
-        What errors call the message.
-
-    Raises
-    ------
-    ConversionError
-        If there can be no such camera; an uncalibrated one has a matrix of zeros.
-    """
+    """A camera of the numbers of a ``sensor_msgs/CameraInfo`` message."""
     if not any(k):
         raise ConversionError(f"{name}: the camera matrix is 0: the camera is not calibrated")
     pinhole = pinhole_matrix(list(k), "camera matrix", name)
@@ -72,13 +53,7 @@ def camera_from_message(
 
 
 def parse_ros(text: str, name: str = "<text>") -> ForeignCamera:
-    """A camera of the text of a camera_info YAML file, or of an echoed message.
-
-    Raises
-    ------
-    ConversionError
-        If it lacks something or cannot be read.
-    """
+    """A camera of the text of a camera_info YAML file, or of an echoed message."""
     content = parse_yaml(text, name)
     width = whole(first_of(content, ("image_width", "width"), name), "image_width", name)
     height = whole(first_of(content, ("image_height", "height"), name), "image_height", name)
