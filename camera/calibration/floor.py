@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from camera.calibration.adjustment import Adjusted, Estimate, Points, adjust, project_estimate
 from camera.calibration.fit import fit_to_centres
 from camera.calibration.model import COUNT, cross_matrices
-from camera.calibration.projection import intrinsics_of
+from camera.calibration.projection import IDENTITY, intrinsics_of
 from camera.calibration.start import best_poses, board_poses
 from camera.errors import CalibrationError
 from camera.model import Camera, Pose
@@ -152,9 +152,7 @@ def with_pose(camera: Camera, pose: FloatArray) -> Camera:
     identity, which says that the sensor is its own tool.
     """
     rows: Pose = tuple((float(a), float(b), float(c), float(d)) for a, b, c, d in pose)
-    identity: Pose = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
-    tcp = camera.sensor_to_tcp if camera.sensor_to_tcp is not None else identity
-    return replace(camera, robot_from_camera=rows, sensor_to_tcp=tcp)
+    return replace(camera, robot_from_camera=rows, sensor_to_tcp=camera.sensor_to_tcp or IDENTITY)
 
 
 def read_floor_points(path: Path) -> tuple[FloatArray, FloatArray]:

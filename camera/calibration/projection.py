@@ -7,14 +7,19 @@ absorbs it; so the component common with a rotation is removed, as in mrcal.
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from camera.calibration.model import COUNT, cross_matrices, project_points, rotation_of
-from camera.model import Camera
+from camera.model import Camera, Pose
 
 FloatArray = NDArray[np.float64]
+
+IDENTITY: Pose = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
+#: A camera without a pose, to be given intrinsics.
+UNPOSED = Camera(1, 1, 1.0, 1.0, 0.0, 0.0, (0.0,) * 5, IDENTITY, IDENTITY)
 
 
 def pixel_grid(width: int, height: int, columns: int = 49, rows: int = 37) -> FloatArray:
@@ -29,12 +34,12 @@ def intrinsics_of(camera: Camera) -> FloatArray:
     return np.array([*pinhole, *camera.coef, *camera.tangential, *camera.polynomial])
 
 
-def with_intrinsics(camera: Camera, intrinsics: FloatArray) -> Camera:
-    """The camera with other intrinsics, an array as of `intrinsics_of`."""
-    sx, sy, ox, oy, a2, a3, b1, b2, b3, p1, p2, *k = (float(x) for x in intrinsics)
+def with_intrinsics(camera: Camera, intrinsics: FloatArray, **changes: Any) -> Camera:
+    """The camera with other intrinsics, an array as of `intrinsics_of`, and other changes."""
+    sx, sy, ox, oy, a2, a3, b1, b2, b3, p1, p2, k1, k2, k3 = (float(x) for x in intrinsics)
     return replace(
         camera, scale_x=sx, scale_y=sy, offset_x=ox, offset_y=oy, coef=(a2, a3, b1, b2, b3),
-        tangential=(p1, p2), polynomial=(k[0], k[1], k[2]),
+        tangential=(p1, p2), polynomial=(k1, k2, k3), **changes,
     )  # fmt: skip
 
 

@@ -29,7 +29,7 @@ from camera.calibration.floor import (
 from camera.calibration.images import GreyImage, calibration_images, read_grey
 from camera.calibration.model import INTRINSICS
 from camera.calibration.pictures import pictures
-from camera.calibration.projection import projection_sigma
+from camera.calibration.projection import UNPOSED, projection_sigma, with_intrinsics
 from camera.calibration.settings import CalibrationSettings
 from camera.camfile import format_camera
 from camera.errors import CalibrationError, CameraError
@@ -40,7 +40,6 @@ from storage import OutputExistsError, write_whole
 FloatArray = NDArray[np.float64]
 
 _WHETHER = {"auto": None, "on": True, "off": False}
-_IDENTITY = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
 
 
 def perform(options: Calibrate) -> int:
@@ -146,15 +145,9 @@ def find_views(
 
 def camera_of(calibration: Calibration) -> Camera:
     """The calibrated camera, without a pose."""
-    sx, sy, ox, oy, a2, a3, b1, b2, b3, p1, p2, *k = (float(x) for x in calibration.intrinsics)
-    points = calibration.points
+    size = {"width": calibration.points.width, "height": calibration.points.height}
     try:
-        return Camera(
-            width=points.width, height=points.height,
-            scale_x=sx, scale_y=sy, offset_x=ox, offset_y=oy, coef=(a2, a3, b1, b2, b3),
-            robot_from_camera=_IDENTITY, sensor_to_tcp=_IDENTITY, tangential=(p1, p2),
-            polynomial=(k[0], k[1], k[2]),
-        )  # fmt: skip
+        return with_intrinsics(UNPOSED, calibration.intrinsics, **size)
     except CameraError as error:
         raise CalibrationError(
             f"the calibration is no possible camera: {error}; take pictures out to the image's "

@@ -7,7 +7,6 @@ principal point is moved by half a pixel on the way in and out.
 from __future__ import annotations
 
 import struct
-from typing import TYPE_CHECKING
 
 import pycolmap
 
@@ -17,39 +16,26 @@ from camera.formats.opencv import foreign
 from camera.formats.plain_yaml import shortest
 from storage.messages import excerpt, one_line
 
-if TYPE_CHECKING:
-    import pycolmap
-
 _HALF_PIXEL = 0.5
 _LONGEST_LIST = 100
 _DIGITS = frozenset("0123456789")
 
-#: COLMAP's models: ours, number of focal lengths, and where its distortion goes in our order.
-_MODELS: dict[str, tuple[Model, int, tuple[int, ...]]] = {
-    "SIMPLE_PINHOLE": ("radtan", 1, ()),
-    "PINHOLE": ("radtan", 2, ()),
-    "SIMPLE_RADIAL": ("radtan", 1, (0,)),
-    "RADIAL": ("radtan", 1, (0, 1)),
-    "OPENCV": ("radtan", 2, (0, 1, 2, 3)),
-    "FULL_OPENCV": ("rational", 2, (0, 1, 2, 3, 4, 5, 6, 7)),
-    "SIMPLE_RADIAL_FISHEYE": ("fisheye", 1, (0,)),
-    "RADIAL_FISHEYE": ("fisheye", 1, (0, 1)),
-    "OPENCV_FISHEYE": ("fisheye", 2, (0, 1, 2, 3)),
+#: COLMAP's models: its number, ours, number of focal lengths, where its distortion goes in ours.
+_MODELS: dict[str, tuple[int, Model, int, tuple[int, ...]]] = {
+    "SIMPLE_PINHOLE": (0, "radtan", 1, ()),
+    "PINHOLE": (1, "radtan", 2, ()),
+    "SIMPLE_RADIAL": (2, "radtan", 1, (0,)),
+    "RADIAL": (3, "radtan", 1, (0, 1)),
+    "OPENCV": (4, "radtan", 2, (0, 1, 2, 3)),
+    "FULL_OPENCV": (6, "rational", 2, (0, 1, 2, 3, 4, 5, 6, 7)),
+    "SIMPLE_RADIAL_FISHEYE": (8, "fisheye", 1, (0,)),
+    "RADIAL_FISHEYE": (9, "fisheye", 1, (0, 1)),
+    "OPENCV_FISHEYE": (5, "fisheye", 2, (0, 1, 2, 3)),
 }
-#: COLMAP's numbers of them, in cameras.bin.
-_NUMBERED = {
-    0: "SIMPLE_PINHOLE",
-    1: "PINHOLE",
-    2: "SIMPLE_RADIAL",
-    3: "RADIAL",
-    4: "OPENCV",
-    5: "OPENCV_FISHEYE",
-    6: "FULL_OPENCV",
-    8: "SIMPLE_RADIAL_FISHEYE",
-    9: "RADIAL_FISHEYE",
-}
-#: Those that can't be converted have to be passed over: names and numbers of parameters.
-_PASSED_OVER = {
+#: Names and numbers of parameters, by COLMAP's numbers; also of models that cannot be converted.
+_PARAMETERS = {
+    number: (name, focals + 2 + len(order)) for name, (number, _, focals, order) in _MODELS.items()
+} | {
     7: ("FOV", 5),
     10: ("THIN_PRISM_FISHEYE", 12),
     11: ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
@@ -106,18 +92,13 @@ def text_of_binary(content: bytes, name: str = "<bytes>") -> str:
         place = 8
         for camera in range(1, count + 1):
             number, model, width, height = struct.unpack_from("<IiQQ", content, place)
-            if model in _NUMBERED:
-                label = _NUMBERED[model]
-                _, focals, order = _MODELS[label]
-                length = focals + 2 + len(order)
-            elif model in _PASSED_OVER:
-                label, length = _PASSED_OVER[model]
-            else:
+            if model not in _PARAMETERS:
                 raise ConversionError(
                     f"{name}: camera {camera} has COLMAP's model {model}, which is unknown here: "
                     "expected one of 0 to 11; write it as text (colmap model_converter "
                     "--output_type TXT)"
                 )
+            label, length = _PARAMETERS[model]
             parameters = struct.unpack_from(f"<{length}d", content, place + 24)
             place += 24 + 8 * length
             values = " ".join(repr(value) for value in parameters)
@@ -146,11 +127,11 @@ def _from_parameters(
         raise ConversionError(
             f"{where}: model {excerpt(model_name)}: expected {', '.join(_MODELS)}"
         )
-    model, focals, order = _MODELS[model_name]
-    if len(parameters) != focals + 2 + len(order):
+    _, model, focals, order = _MODELS[model_name]
+    count = focals + 2 + len(order)
+    if len(parameters) != count:
         raise ConversionError(
-            f"{where}: {len(parameters)} parameters of {model_name}: expected "
-            f"{focals + 2 + len(order)}"
+            f"{where}: {len(parameters)} parameters of {model_name}: expected {count}"
         )
     fx, fy = parameters[0], parameters[focals - 1]
     cx, cy = (value - _HALF_PIXEL for value in parameters[focals : focals + 2])
@@ -168,7 +149,7 @@ def colmap_parameters(camera: ForeignCamera) -> tuple[str, list[float]]:
     if model == "rational" and any(d[8:]):
         raise ConversionError("COLMAP has no thin prism with the rational model")
     name = _WRITTEN[model]
-    order = _MODELS[name][2]
+    order = _MODELS[name][3]
     pinhole = [camera.fx, camera.fy, camera.cx + _HALF_PIXEL, camera.cy + _HALF_PIXEL]
     return name, [*pinhole, *(d[place] for place in order)]
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from camera.brown import NOT_TANGENTIAL, Tangential, brown_of, brown_shift
 from camera.calibration.model import free_span, is_possible, project_points
-from camera.calibration.projection import intrinsics_of
+from camera.calibration.projection import UNPOSED, intrinsics_of, with_intrinsics
 from camera.distortion import NO_POLYNOMIAL
 from camera.errors import CameraError, ConversionError
 from camera.formats.conversion_fit import EXACT_PX, least_squares, smallest_largest
@@ -22,7 +22,8 @@ FloatArray = NDArray[np.float64]
 AnyCamera = Camera | ForeignCamera
 Rows = Literal["same", "halve", "double"]
 
-_IDENTITY = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
+# From the source's rows to the target's.
+_FACTORS = {"same": 1.0, "halve": 0.5, "double": 2.0}
 
 # Grids of pixels: for the fit, and for the largest deviation.
 _FIT_GRID = (41, 31)
@@ -64,8 +65,7 @@ def target_size(source: AnyCamera, rows: Rows) -> tuple[int, int]:
 
 def source_pixels(pixels: FloatArray, rows: Rows) -> FloatArray:
     """The source's pixels of the target's: line v of the even lines is line 2 v of all."""
-    factor = {"same": 1.0, "halve": 2.0, "double": 0.5}[rows]
-    return np.asarray(pixels * np.array([1.0, factor]))
+    return np.asarray(pixels / [1.0, _FACTORS[rows]])
 
 
 def convert_to_foreign(
@@ -98,15 +98,10 @@ def convert_to_foreign(
     if model == "rational":
         number = min(number, _WITHOUT_PRISM)
     width, height = target_size(source, rows)
-    factor = {"same": 1.0, "halve": 0.5, "double": 2.0}[rows]
+    factor = _FACTORS[rows]
     if contained is not None:
-        exact = replace(
-            contained,
-            width=width,
-            height=height,
-            fy=contained.fy * factor,
-            cy=contained.cy * factor,
-        )
+        fy, cy = contained.fy * factor, contained.cy * factor
+        exact = replace(contained, width=width, height=height, fy=fy, cy=cy)
         return _measured(exact, _check(source, rows))
     check = _check(source, rows)
     pixels = _grid(width, height, _FIT_GRID)
@@ -179,18 +174,13 @@ def convert_to_camera(
     width, height = target_size(source, rows)
     if pose is None and isinstance(source, Camera):
         pose = source
-    placed = pose.robot_from_camera if pose is not None else _IDENTITY
-    tcp = pose.sensor_to_tcp if pose is not None else _IDENTITY
-    mount = pose.mount_index if pose is not None else 0
-    unknown = source.unknown if isinstance(source, Camera) else ()
-    factor = {"same": 1.0, "halve": 0.5, "double": 2.0}[rows]
+    factor = _FACTORS[rows]
 
-    def camera_of(p: FloatArray) -> Camera:
-        sx, sy, ox, oy, a2, a3, b1, b2, b3, p1, p2, k1, k2, k3 = (float(x) for x in p)
-        return Camera(
-            width, height, sx, sy, ox, oy, (a2, a3, b1, b2, b3), placed, tcp, mount, unknown,
-            tangential=(p1, p2), polynomial=(k1, k2, k3),
-        )  # fmt: skip
+    base = pose if pose is not None else UNPOSED
+    unknown = source.unknown if isinstance(source, Camera) else ()
+
+    def camera_of(intrinsics: FloatArray) -> Camera:
+        return with_intrinsics(base, intrinsics, width=width, height=height, unknown=unknown)
 
     fx, fy, cx, cy = _pinhole(source)
     start = np.array(

@@ -95,16 +95,20 @@ class ForeignCamera:
             )
 
     @property
-    def parameters(self) -> FloatArray:
-        """fx, fy, cx, cy and the coefficients."""
-        return np.array([self.fx, self.fy, self.cx, self.cy, *self.distortion])
+    def matrix(self) -> list[float]:
+        """The 9 numbers of the camera matrix, row by row."""
+        return [self.fx, 0.0, self.cx, 0.0, self.fy, self.cy, 0.0, 0.0, 1.0]
+
+    @property
+    def printed_distortion(self) -> tuple[float, ...]:
+        """The coefficients without a thin prism that is 0."""
+        d = self.distortion
+        return d[:8] if self.model == "rational" and not any(d[8:]) else d
 
     def distort(self, normalised: FloatArray) -> FloatArray:
         """(..., 2) pixels of (..., 2) undistorted normalised coordinates."""
         moved = distorted(self.model, self.distortion, normalised)
-        return np.asarray(
-            moved * np.array([self.fx, self.fy]) + np.array([self.cx, self.cy]), dtype=np.float64
-        )
+        return np.asarray(moved * [self.fx, self.fy] + [self.cx, self.cy], dtype=np.float64)
 
     def undistort(self, pixels: FloatArray) -> FloatArray:
         """(N, 2) undistorted normalised coordinates of (N, 2) pixels.
@@ -117,7 +121,7 @@ class ForeignCamera:
             If a pixel sees nothing: the distortion folds inside the image, or the lens sees 90
             degrees and more off its axis, where there are no such coordinates.
         """
-        target = (pixels - np.array([self.cx, self.cy])) / np.array([self.fx, self.fy])
+        target = (pixels - [self.cx, self.cy]) / [self.fx, self.fy]
         xy = np.zeros_like(target)
         with np.errstate(all="ignore"):
             for share in np.linspace(0.0, 1.0, _WALK + 1)[1:]:
@@ -140,16 +144,13 @@ class ForeignCamera:
 
     def _jacobian(self, xy: FloatArray) -> FloatArray:
         """(..., 2, 2) d(distorted) / d(x, y), by central differences."""
+        model, d = self.model, self.distortion
         step = _SMALLEST_STEP * (1.0 + np.linalg.norm(xy, axis=-1, keepdims=True))
-        columns = [
-            (
-                distorted(self.model, self.distortion, xy + step * axis)
-                - distorted(self.model, self.distortion, xy - step * axis)
-            )
-            / (2.0 * step)
+        differences = [
+            distorted(model, d, xy + step * axis) - distorted(model, d, xy - step * axis)
             for axis in np.eye(2)
         ]
-        return np.stack(columns, axis=-1)
+        return np.stack([difference / (2.0 * step) for difference in differences], axis=-1)
 
 
 def _determinant(m: FloatArray) -> FloatArray:

@@ -6,6 +6,8 @@ A fisheye camera has ``fisheye_model: 1``, as in the sample. The size of the ima
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from camera.errors import ConversionError
 from camera.formats.models import COEFFICIENTS, ForeignCamera, Model
 from camera.formats.plain_yaml import first_of, numbers, parse_yaml, pinhole_matrix, shortest, whole
@@ -82,18 +84,15 @@ def foreign(
 
 def format_opencv(camera: ForeignCamera) -> str:
     """The text of an OpenCV YAML file; OpenCV's FileStorage reads it."""
-    d = list(camera.distortion)
-    if camera.model == "rational" and not any(d[8:]):
-        d = d[:8]
-    matrix = [camera.fx, 0.0, camera.cx, 0.0, camera.fy, camera.cy, 0.0, 0.0, 1.0]
+    d = camera.printed_distortion
     lines = ["%YAML:1.0", "---", f"image_width: {camera.width}", f"image_height: {camera.height}"]
-    lines += _matrix("camera_matrix", 3, 3, matrix)
+    lines += _matrix("camera_matrix", 3, 3, camera.matrix)
     lines += _matrix("distortion_coefficients", len(d), 1, d)
     lines.append(f"fisheye_model: {int(camera.model == 'fisheye')}")
     return "\n".join([*lines, ""])
 
 
-def _matrix(key: str, rows: int, columns: int, values: list[float]) -> list[str]:
+def _matrix(key: str, rows: int, columns: int, values: Sequence[float]) -> list[str]:
     data = ", ".join(shortest(value) for value in values)
     return [
         f"{key}: !!opencv-matrix",

@@ -20,7 +20,6 @@ ROS_NAMES: dict[Model, str] = {
 _MODELS: dict[str, Model] = {name: model for model, name in ROS_NAMES.items()} | {
     "fisheye": "fisheye"
 }
-_RATIONAL_PRINTED = 8
 _NAME = re.compile(r"[A-Za-z_]\w*", re.ASCII)
 
 
@@ -64,10 +63,11 @@ def parse_ros(text: str, name: str = "<text>") -> ForeignCamera:
     _demand_whole_image(content.get("roi"), width, height, name)
     matrix = first_of(content, ("camera_matrix", "k", "K"), name)
     coefficients = first_of(content, ("distortion_coefficients", "d", "D"), name)
+    label = content.get("distortion_model", "plumb_bob")
     return camera_from_message(
         width,
         height,
-        _word(content.get("distortion_model", "plumb_bob")),
+        label if isinstance(label, str) else excerpt(label),
         numbers(coefficients, "distortion_coefficients", name),
         numbers(matrix, "camera_matrix", name),
         name,
@@ -86,19 +86,12 @@ def _demand_whole_image(roi: object, width: int, height: int, name: str) -> None
         )
 
 
-def _word(value: object) -> str:
-    return value if isinstance(value, str) else excerpt(value)
-
-
 def format_ros(camera: ForeignCamera, camera_name: str = "camera") -> str:
     """The text of a camera_info YAML file, as camera_calibration writes it.
 
     A name that is no word, such as a number, is left out for ``camera``.
     """
-    d = list(camera.distortion)
-    if camera.model == "rational" and not any(d[_RATIONAL_PRINTED:]):
-        d = d[:_RATIONAL_PRINTED]
-    matrix = [camera.fx, 0.0, camera.cx, 0.0, camera.fy, camera.cy, 0.0, 0.0, 1.0]
+    d, matrix = camera.printed_distortion, camera.matrix
     projection = [*matrix[:3], 0.0, *matrix[3:6], 0.0, *matrix[6:], 0.0]
     identity = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
     lines = [
@@ -114,6 +107,6 @@ def format_ros(camera: ForeignCamera, camera_name: str = "camera") -> str:
     return "\n".join([*lines, ""])
 
 
-def _matrix(key: str, rows: int, columns: int, values: list[float]) -> list[str]:
+def _matrix(key: str, rows: int, columns: int, values: Sequence[float]) -> list[str]:
     data = ", ".join(shortest(value) for value in values)
     return [f"{key}:", f"  rows: {rows}", f"  cols: {columns}", f"  data: [{data}]"]
