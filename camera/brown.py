@@ -87,6 +87,18 @@ def brown_jacobian(xy: FloatArray, brown: Brown) -> FloatArray:
     return np.asarray(jacobian)
 
 
+def distorted_jacobian(xy: FloatArray, coef: Coef, brown: Brown) -> FloatArray:
+    """(..., 2, 2) derivative of the whole distortion of (..., 2) points by x, y."""
+    radius = np.hypot(xy[..., 0], xy[..., 1])
+    factor = radial_factor(radius, coef)
+    slope = radial_factor_derivative(radius, coef)
+    # d(x f)/dx = f + f' x^2 / r; at r = 0 the second term vanishes.
+    unit = xy / np.where(radius > 0.0, radius, 1.0)[..., None]
+    outer = slope[..., None, None] * xy[..., :, None] * unit[..., None, :]
+    jacobian = factor[..., None, None] * np.eye(2) + outer
+    return jacobian + brown_jacobian(xy, brown) if any(brown) else jacobian
+
+
 @lru_cache(maxsize=256)
 def one_to_one_radius(coef: Coef, brown: Brown) -> float:
     """r_max: the undistorted radius up to which no two rays are seen at the same place.

@@ -155,17 +155,14 @@ def undistorted_radius(
     (At the fold itself g' vanishes, so there r is only as good as the last digit of g allows, 1e-8;
     g of the result is always right to the last digits.)
 
-    Newton's method inside a bracket from a table of g, bisecting where a step would leave it; so it
-    also converges close to the fold, where g' vanishes.
+    Newton's method, kept inside the cell of a table of g.
 
     Parameters
     ----------
     distorted : array
         Distorted normalised radii (>= 0).
-    coef : tuple of 5 floats
-        a2, a3, b1, b2, b3.
-    polynomial : tuple of 3 floats, optional
-        k1, k2, k3.
+    coef, polynomial
+        As in `radial_factor`.
 
     Returns
     -------
@@ -174,31 +171,21 @@ def undistorted_radius(
     """
     target = np.asarray(distorted, dtype=np.float64)
     table_g, table_r = inverse_table(coef, polynomial)
-    flat = target.ravel()
-    result = np.full(flat.shape, np.nan)
-    active = np.flatnonzero((flat >= 0.0) & (flat <= table_g[-1]))
-    goal = flat[active]
-
-    upper = np.clip(np.searchsorted(table_g, goal, side="left"), 1, len(table_g) - 1)
+    goal = np.where((target >= 0.0) & (target <= table_g[-1]), target, np.nan)
+    upper = np.clip(np.searchsorted(table_g, goal), 1, len(table_g) - 1)
     low, high = table_r[upper - 1], table_r[upper]
-    span = table_g[upper] - table_g[upper - 1]
-    share = np.divide(goal - table_g[upper - 1], span, out=np.zeros_like(goal), where=span > 0.0)
-    r = low + share * (high - low)
+    r = np.clip(np.interp(goal, table_g, table_r), low, high)
+    ended = np.isnan(goal)
     for _ in range(_NEWTON_STEPS):
         f = radial_factor(r, coef, polynomial)
-        error = r * f - goal
-        low = np.where(error <= 0.0, r, low)
-        high = np.where(error >= 0.0, r, high)
+        error = goal - r * f
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            newton = r - error / (f + r * radial_factor_derivative(r, coef, polynomial))
-        newton = np.where(error == 0.0, r, newton)
+            step = error / (f + r * radial_factor_derivative(r, coef, polynomial))
+        moved = np.clip(r + np.where(error == 0.0, 0.0, step), low, high)
         # Newton's error squares with each step: after one this small nothing is left to gain.
-        ended = np.abs(newton - r) <= _LAST_STEP * np.maximum(1.0, r)
-        inside = (newton >= low) & (newton <= high)
-        r = np.where(inside, newton, 0.5 * (low + high))
-        result[active] = np.where(ended, np.clip(newton, low, high), r)
-        going = ~ended
-        if not going.any():
+        small = np.abs(moved - r) <= _LAST_STEP * np.maximum(1.0, r)
+        r = np.where(ended, r, moved)
+        ended = ended | small
+        if ended.all():
             break
-        active, goal, r, low, high = active[going], goal[going], r[going], low[going], high[going]
-    return result.reshape(target.shape)
+    return np.asarray(r)

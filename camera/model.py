@@ -25,9 +25,9 @@ from camera.brown import (
     NOT_TANGENTIAL,
     Brown,
     Tangential,
-    brown_jacobian,
     brown_of,
     brown_shift,
+    distorted_jacobian,
     one_to_one_radius,
     straightened,
 )
@@ -36,7 +36,6 @@ from camera.distortion import (
     Coef,
     Polynomial,
     radial_factor,
-    radial_factor_derivative,
     undistorted_radius,
 )
 from camera.model_checks import (
@@ -255,17 +254,9 @@ class Camera:
         return self.distort(normalised)
 
     def unproject(self, pixels: ArrayLike) -> FloatArray:
-        """Directions (x, y, 1) in the camera frame that pixels see.
+        """(..., 3) directions (x, y, 1) in the camera frame that (..., 2) pixels see.
 
-        Parameters
-        ----------
-        pixels : (..., 2) array
-            u, v in pixels.
-
-        Returns
-        -------
-        (..., 3) array
-            Directions with z = 1; all NaN past the fold.
+        All NaN past the fold.
         """
         xy = self.undistort(pixels)
         ones = np.where(np.isnan(xy[..., :1]), np.nan, 1.0)
@@ -312,44 +303,19 @@ class Camera:
     # -- Jacobians --------------------------------------------------------------------------
 
     def distort_jacobian(self, normalised: ArrayLike) -> FloatArray:
-        """d(u, v) / d(x, y) of `distort`, analytic.
-
-        Parameters
-        ----------
-        normalised : (..., 2) array
-            Undistorted normalised coordinates.
-
-        Returns
-        -------
-        (..., 2, 2) array
-            Rows u, v; columns x, y; NaN past the fold.
-        """
+        """(..., 2, 2) derivatives of (u, v) of `distort` by (x, y), analytic; NaN past the fold."""
         xy = np.asarray(normalised, dtype=np.float64)
         radius = np.hypot(xy[..., 0], xy[..., 1])
         defined = (radius <= self.r_max) & np.isfinite(radius)
-        xy, radius = np.where(defined[..., None], xy, np.nan), np.where(defined, radius, np.nan)
-        factor = radial_factor(radius, self.coef)
-        slope = radial_factor_derivative(radius, self.coef)
-        # d(x f)/dx = f + f' x^2 / r; at r = 0 the second term vanishes.
-        unit = xy / np.where(radius > 0.0, radius, 1.0)[..., None]
-        outer = slope[..., None, None] * xy[..., :, None] * unit[..., None, :]
-        jacobian = factor[..., None, None] * np.eye(2) + outer
-        if any(self.brown):
-            jacobian = jacobian + brown_jacobian(xy, self.brown)
+        jacobian = distorted_jacobian(
+            np.where(defined[..., None], xy, np.nan), self.coef, self.brown
+        )
         return np.asarray(jacobian * np.array([[self.scale_x], [self.scale_y]]))
 
     def project_jacobian(self, points_camera: ArrayLike) -> FloatArray:
-        """d(u, v) / d(point) of `project`, analytic.
+        """(..., 2, 3) derivatives of (u, v) of `project` by the (..., 3) points, analytic.
 
-        Parameters
-        ----------
-        points_camera : (..., 3) array
-            Points in the camera frame, metres.
-
-        Returns
-        -------
-        (..., 2, 3) array
-            Pixels per metre; NaN where the projection is undefined.
+        Pixels per metre; NaN where the projection is undefined.
         """
         p = np.asarray(points_camera, dtype=np.float64)
         depth = np.where(p[..., 2] > 0.0, p[..., 2], np.nan)
@@ -362,17 +328,9 @@ class Camera:
         return np.asarray(self.distort_jacobian(xy) @ perspective)
 
     def floor_jacobian(self, pixels: ArrayLike) -> FloatArray:
-        """d(floor X, Y) / d(u, v) at pixels, analytic.
+        """(..., 2, 2) derivatives of the floor's (X, Y) by (u, v) at (..., 2) pixels, analytic.
 
-        Parameters
-        ----------
-        pixels : (..., 2) array
-            u, v in pixels.
-
-        Returns
-        -------
-        (..., 2, 2) array
-            Metres per pixel, rows X, Y, columns u, v; NaN where the pixel does not see the floor.
+        Metres per pixel; NaN where the pixel does not see the floor.
         """
         return self._floor_jacobian(self.floor_from_pixel(pixels), self.camera_from_robot)
 

@@ -29,28 +29,26 @@ def check_numbers(camera: Camera) -> None:
     for name, side in (("width", camera.width), ("height", camera.height)):
         if not 1 <= side <= _LARGEST_SIDE_PX:
             raise CameraError(f"{name} is {side}: expected 1 to {_LARGEST_SIDE_PX} pixels")
-    if len(camera.coef) != 5:
-        raise CameraError(f"coef has {len(camera.coef)} numbers: expected 5 (a2 a3 b1 b2 b3)")
-    if len(camera.tangential) != 2:
-        raise CameraError(f"tangential has {len(camera.tangential)} numbers: expected 2 (p1 p2)")
-    if len(camera.polynomial) != 3:
-        raise CameraError(f"polynomial has {len(camera.polynomial)} numbers: expected 3 (k1 k2 k3)")
-    for name, value in (
-        ("scaleX", camera.scale_x),
-        ("scaleY", camera.scale_y),
-        ("offsetX", camera.offset_x),
-        ("offsetY", camera.offset_y),
-        *((f"coef {symbol}", c) for symbol, c in zip(["a2", "a3", "b1", "b2", "b3"], camera.coef)),
-        *((f"tangential {symbol}", p) for symbol, p in zip(["p1", "p2"], camera.tangential)),
-        *((f"polynomial {symbol}", k) for symbol, k in zip(["k1", "k2", "k3"], camera.polynomial)),
-    ):
+    numbers = {
+        "scaleX": camera.scale_x,
+        "scaleY": camera.scale_y,
+        "offsetX": camera.offset_x,
+        "offsetY": camera.offset_y,
+    }
+    for name, symbols in (
+        ("coef", "a2 a3 b1 b2 b3"), ("tangential", "p1 p2"), ("polynomial", "k1 k2 k3"),
+    ):  # fmt: skip
+        values, expected = getattr(camera, name), symbols.split()
+        if len(values) != len(expected):
+            raise CameraError(
+                f"{name} has {len(values)} numbers: expected {len(expected)} ({symbols})"
+            )
+        if max(abs(c) for c in values) > LARGEST_COEFFICIENT and all(map(math.isfinite, values)):
+            raise CameraError(f"{name} is {values}: expected at most {LARGEST_COEFFICIENT:g} each")
+        numbers |= {f"{name} {symbol}": c for symbol, c in zip(expected, values)}
+    for name, value in numbers.items():
         if not math.isfinite(value):
             raise CameraError(f"{name} is {value}: expected a finite number")
-    for name, numbers in (
-        ("coef", camera.coef), ("tangential", camera.tangential), ("polynomial", camera.polynomial),
-    ):  # fmt: skip
-        if max(abs(c) for c in numbers) > LARGEST_COEFFICIENT:
-            raise CameraError(f"{name} is {numbers}: expected at most {LARGEST_COEFFICIENT:g} each")
     for name, value in (("scaleX", camera.scale_x), ("scaleY", camera.scale_y)):
         if value <= 0.0:
             raise CameraError(f"{name} is {value}: expected a positive number of pixels")

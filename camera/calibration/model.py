@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from camera.brown import Brown, brown_jacobian, brown_shift, one_to_one_radius
+from camera.brown import Brown, brown_shift, distorted_jacobian, one_to_one_radius
 from camera.distortion import Coef, fold_radius, radial_factor
 from camera.model_checks import border_pixels
 
@@ -104,17 +104,16 @@ def project_points(
         d(u, v) / d(point), pixels per metre.
     """
     scale, offset = intrinsics[:2], intrinsics[2:4]
-    a2, a3, b1, b2, b3 = coefficients(intrinsics)
+    coef = a2, a3, b1, b2, b3 = coefficients(intrinsics)
     z = np.where(points_camera[:, 2] > 0.0, points_camera[:, 2], np.nan)
     xy = points_camera[:, :2] / z[:, None]
     r = np.hypot(xy[:, 0], xy[:, 1])
     brown = brown_terms(intrinsics)
-    r = np.where(r <= one_to_one_radius((a2, a3, b1, b2, b3), brown), r, np.nan)
+    r = np.where(r <= one_to_one_radius(coef, brown), r, np.nan)
     numerator = r * (a2 + r * a3)
     denominator = 1.0 + r * (b1 + r * (b2 + r * b3))
     ratio = numerator / denominator
     factor = 1.0 + ratio
-    slope = (a2 + 2.0 * a3 * r - ratio * (b1 + r * (2.0 * b2 + 3.0 * b3 * r))) / denominator
 
     by_factor = scale * xy
     by_intrinsics = np.zeros((len(r), 2, COUNT))
@@ -139,13 +138,9 @@ def project_points(
     powers = np.stack([squared, squared**2, squared**3], axis=-1)
     by_intrinsics[:, :, 11:14] = by_factor[:, :, None] * powers[:, None, :]
 
-    unit = xy / np.where(r > 0.0, r, 1.0)[:, None]
-    by_xy = slope[:, None, None] * xy[:, :, None] * unit[:, None, :]
-    by_xy[:, 0, 0] += factor
-    by_xy[:, 1, 1] += factor
-    if any(brown):
-        by_xy += brown_jacobian(xy, brown)
-    by_xy *= scale[:, None]
+    by_xy = scale[:, None] * distorted_jacobian(
+        np.where(np.isnan(r)[:, None], np.nan, xy), coef, brown
+    )
     by_point = np.empty((len(r), 2, 3))
     by_point[:, :, :2] = by_xy / z[:, None, None]
     by_point[:, :, 2] = -(by_xy @ xy[:, :, None])[:, :, 0] / z[:, None]
