@@ -7,6 +7,9 @@ from collections.abc import Iterable
 from typing import Literal
 
 from landmarks.records import (
+    CIRCLE_NUMBERS,
+    LINE_NUMBERS,
+    STEP_NUMBERS,
     CircleLandmark,
     Frame,
     MarkerLandmark,
@@ -26,26 +29,18 @@ def format_record(record: Record) -> str:
     landmarks have 6 significant digits, as C's ``%g``; corners of markers, in pixels, 4 decimals.
     """
     if isinstance(record, Step):
-        return (
-            f"STEP {record.prefix} {record.dx:8.5f} {record.dy:8.5f} {record.dphi:8.5f} "
-            f"{record.cxx:.12f} {record.cxy:.12f} {record.cyy:.12f} "
-            f"{record.cxphi:.12f} {record.cyphi:.12f} {record.cphiphi:.12f}"
-        )
+        pose = [f"{getattr(record, name):8.5f}" for name in STEP_NUMBERS[:3]]
+        covariance = [f"{getattr(record, name):.12f}" for name in STEP_NUMBERS[3:]]
+        return " ".join(["STEP", record.prefix, *pose, *covariance])
     if isinstance(record, MarkerLandmark):
         corners = (f"{c.u:.4f} {c.v:.4f} {c.cuu:g} {c.cuv:g} {c.cvv:g}" for c in record.corners)
         head = f"LANDMARK_M {record.dictionary} {record.id:d} {record.quality:g}"
         return " ".join([head, *corners])
-    if isinstance(record, CircleLandmark):
-        text = (
-            f"LANDMARK_C {record.px:g} {record.py:g} {record.quality:g} "
-            f"{record.cxx:g} {record.cxy:g} {record.cyy:g}"
-        )
-    else:
-        text = (
-            f"LANDMARK_L {record.xtop:g} {record.ytop:g} {record.xbottom:g} {record.ybottom:g} "
-            f"{record.alpha:g} {record.beta:g} {record.quality:g} {record.sigma:g}"
-        )
-    return " ".join([text, *(f"{identifier:d}" for identifier in record.ids)])
+    is_circle = isinstance(record, CircleLandmark)
+    names = CIRCLE_NUMBERS if is_circle else LINE_NUMBERS
+    numbers = [f"{getattr(record, name):g}" for name in names]
+    ids = [f"{identifier:d}" for identifier in record.ids]
+    return " ".join(["LANDMARK_C" if is_circle else "LANDMARK_L", *numbers, *ids])
 
 
 def format_levelling(levelled_by: tuple[float, float]) -> str:
