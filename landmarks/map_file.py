@@ -8,6 +8,7 @@ import math
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,8 @@ from storage.bounded import read_bounded
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
+FilePath = str | os.PathLike[str]
+N = TypeVar("N", int, float)
 
 MAP_COLUMNS = ("kind", "id", "x_m", "y_m", "cxx_m2", "cxy_m2", "cyy_m2", "rows")
 #: Of a map of discs whose places are exact.
@@ -89,7 +92,7 @@ def no_landmarks() -> Landmarks:
 
 
 def write_map(
-    path: str | os.PathLike[str],
+    path: FilePath,
     landmark_map: LandmarkMap,
     comments: Sequence[str] = (),
     *,
@@ -114,7 +117,7 @@ def write_map(
     _write(path, MAP_COLUMNS, rows, comments, overwrite)
 
 
-def read_map(path: str | os.PathLike[str]) -> LandmarkMap:
+def read_map(path: FilePath) -> LandmarkMap:
     """Read a map that `write_map` wrote, or one made by hand with the same columns.
 
     The columns may also be `SHORT_MAP_COLUMNS`: discs without covariances, which are 0.
@@ -133,9 +136,9 @@ def read_map(path: str | os.PathLike[str]) -> LandmarkMap:
         kind = words[0]
         if kind not in found:
             raise LandmarkFileError(path, line, f"kind is {kind[:20]!r}: expected disc or line")
-        number = _whole(path, line, "id", words[1])
+        number = _number(path, line, "id", words[1], int)
         values = _finite(path, line, MAP_COLUMNS[2:7], words[2:7])
-        rows = _whole(path, line, "rows", words[7])
+        rows = _number(path, line, "rows", words[7], int)
         if number in found[kind]:
             raise LandmarkFileError(path, line, f"{kind} {number} is in the map already")
         _, _, cxx, cxy, cyy = values
@@ -146,7 +149,7 @@ def read_map(path: str | os.PathLike[str]) -> LandmarkMap:
 
 
 def write_path(
-    path: str | os.PathLike[str],
+    path: FilePath,
     poses: Path2D,
     comments: Sequence[str] = (),
     *,
@@ -156,12 +159,12 @@ def write_path(
     columns, table = SHORT_PATH_COLUMNS, poses.poses
     if poses.covariance is not None:
         columns = PATH_COLUMNS
-        table = np.hstack([table, poses.covariance.reshape(len(table), -1)])
+        table = np.hstack([table, poses.covariance.reshape(-1, 9)])
     rows = [(prefix, *row) for prefix, row in zip(poses.prefixes, table.tolist())]
     _write(path, columns, rows, comments, overwrite)
 
 
-def read_path(path: str | os.PathLike[str]) -> Path2D:
+def read_path(path: FilePath) -> Path2D:
     """Read a path that `write_path` wrote; errors are those of `read_map`."""
     prefixes, numbers = [], []
     what = "a path, path.csv, of `slam map`"
@@ -187,7 +190,7 @@ def _landmarks(found: dict[int, tuple[list[float], int]]) -> Landmarks:
 
 
 def _write(
-    path: str | os.PathLike[str],
+    path: FilePath,
     columns: Sequence[str],
     rows: Sequence[Sequence[object]],
     comments: Sequence[str],
@@ -201,7 +204,7 @@ def _write(
 
 
 def _read(
-    path: str | os.PathLike[str], what: str, columns: Sequence[str], fewer: Sequence[str]
+    path: FilePath, what: str, columns: Sequence[str], fewer: Sequence[str]
 ) -> Iterator[tuple[int, list[str]]]:
     """Rows of a file with their line numbers, under a head of either set of columns."""
     try:
@@ -230,27 +233,19 @@ def _read(
         )
 
 
-def _finite(
-    path: str | os.PathLike[str], line: int, names: Sequence[str], words: Sequence[str]
-) -> list[float]:
-    values = []
-    for name, word in zip(names, words):
-        try:
-            values.append(float(word))
-        except ValueError:
-            values.append(math.nan)
-        if not math.isfinite(values[-1]):
-            raise LandmarkFileError(
-                path, line, f"{name} is {word[:30]!r}: expected a finite number"
-            )
-    return values
+def _finite(path: FilePath, line: int, names: Sequence[str], words: Sequence[str]) -> list[float]:
+    return [_number(path, line, name, word, float) for name, word in zip(names, words)]
 
 
-def _whole(path: str | os.PathLike[str], line: int, name: str, word: str) -> int:
+def _number(path: FilePath, line: int, name: str, word: str, kind: type[N]) -> N:
+    """A finite float, or an integer of 64 bits."""
+    limit, expected = (2**63, "whole") if kind is int else (math.inf, "finite")
     try:
-        value = int(word)
+        value = kind(word)
     except ValueError:
-        value = 2**63
-    if abs(value) >= 2**63:
-        raise LandmarkFileError(path, line, f"{name} is {word[:30]!r}: expected a whole number")
+        value = None
+    if value is None or not abs(value) < limit:
+        raise LandmarkFileError(
+            path, line, f"{name} is {word[:30]!r}: expected a {expected} number"
+        )
     return value
