@@ -133,7 +133,7 @@ def parse_record(text: str) -> Record | None:
 
 @contextmanager
 def opened(path: str | os.PathLike[str], kind: str) -> Iterator[BinaryIO]:
-    """Open a file of a kind for reading; errors of the system become `LandmarkFileError`s."""
+    """Open a file of a kind for reading; an error of the system becomes a `LandmarkFileError`."""
     try:
         with Path(path).open("rb") as stream:
             yield stream
