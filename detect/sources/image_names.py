@@ -51,7 +51,7 @@ class ImageNames:
     def __init__(self, folder: Path, pattern: str = "*") -> None:
         self.folder = folder
         # Where a run's images may be: in their folder, or that of the run.
-        own = folder.absolute()
+        own = Path(os.path.abspath(folder))  # noqa: PTH100 - links are not followed yet
         self._homes = (own, own.parent) if own.name == "images" else (own,)
         matches = re.compile(fnmatch.translate(pattern)).match
         with os.scandir(folder) as entries:

@@ -6,9 +6,11 @@ import re
 import tempfile
 from pathlib import Path
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from detect.errors import FrameError
 from detect.sources.image_names import ImageNames, NameIndex
 
 # Short alphabets make names that begin alike; long names are known by their digest.
@@ -54,3 +56,14 @@ def test_images_are_in_natural_order(names: set[str]) -> None:
             )
         assert images.find("c") is None
         assert images.find("notes") is None
+
+
+def test_a_prefix_may_go_up_within_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "run" / "images").mkdir(parents=True)
+    (tmp_path / "run" / "images" / "a.png").touch()
+    (tmp_path / "other").mkdir()
+    monkeypatch.chdir(tmp_path / "other")
+    images = ImageNames(Path("../run/images"))
+    assert images.place_of("../images/a") == images.place_of('"a.png"') == 0
+    with pytest.raises(FrameError, match="the prefix leads out of the folder: expected an image"):
+        images.place_of("../../other/a")
