@@ -10,8 +10,8 @@ none of this project's.
 
 from __future__ import annotations
 
+import codecs
 import csv
-import io
 import shutil
 import tempfile
 from collections.abc import Iterable, Iterator
@@ -43,7 +43,7 @@ _TYPES = {
 
 def write_csv(stream: BinaryIO, table: TableName, rows: Iterable[TableRow]) -> int:
     """Write a table; rows of other tables are passed over. Returns how many rows were written."""
-    text = io.TextIOWrapper(stream, "utf-8", "surrogateescape", newline="")
+    text = codecs.getwriter("utf-8")(stream, "surrogateescape")
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(column.name for column in TABLES[table])
     count = 0
@@ -51,7 +51,6 @@ def write_csv(stream: BinaryIO, table: TableName, rows: Iterable[TableRow]) -> i
         if row.table == table:
             writer.writerow(_csv_value(value) for value in row.all_values)
             count += 1
-    text.detach()
     return count
 
 

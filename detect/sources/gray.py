@@ -100,11 +100,11 @@ def gray_of_pixels(pixels: NDArray[Any], name: object, bits: int = 16) -> NDArra
         )
     # Numba would compile every kernel once more for arrays that are read-only, as in messages.
     gray: NDArray[Any] = np.require(pixels, dtype, ["C", "W"])
-    if channels == 1:
-        gray = gray.reshape(gray.shape[:2])
-    else:
+    if channels != 1:
         code = cv2.COLOR_BGR2GRAY if channels == 3 else cv2.COLOR_BGRA2GRAY
         gray = np.asarray(cv2.cvtColor(gray, code), dtype)
+    elif gray.ndim == 3:
+        gray = gray[:, :, 0]
     if dtype == np.uint8:
         return gray
     largest = int(gray.max())
