@@ -85,9 +85,7 @@ class Calibration:
     @property
     def view_rms_px(self) -> FloatArray:
         """(V,) RMS residual of each view."""
-        squares = np.sum(self.adjusted.residuals**2, axis=1)
-        mean = np.add.reduceat(squares, self.points.starts) / self.points.counts
-        return np.asarray(np.sqrt(mean))
+        return _view_rms(self.adjusted, self.points)
 
 
 def calibrate(

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,6 +39,8 @@ class Candidate:
 
 
 Candidates = dict[FreeLens, Candidate]
+#: From an estimate to begin with, and lenses, to fits of these.
+Fitted = Callable[[Estimate, Iterable[FreeLens]], Candidates]
 
 
 def choose_lens(
@@ -52,66 +55,61 @@ def choose_lens(
     not worse, or lowers the error by more than it would by chance. Whether it needs tangential
     terms is then tested as well.
     """
-    chosen, tried = _chosen_of_a_kind(start, points, settings, radius_m)
+    fitted = partial(_fitted, points, settings, radius_m)
+    chosen, tried = _chosen_of_a_kind(fitted, start, settings)
     if settings.polynomial is not None or settings.coefficients is not None:
         return chosen, tried
     counts = (2, 3)  # one coefficient, a3, is k1
     others = [FreeLens(0, chosen.tangential, count) for count in counts]
-    polynomials = _tried(start, points, settings, radius_m, others)
+    polynomials = fitted(start, others)
     other = _fewest_needed(polynomials)
     # Coefficients that the pictures do not need make the projection unsure where nothing was seen.
     worth = -_WORTH if other.polynomial < chosen.coefficients else _POLYNOMIAL_WORTH
     if _is_lower(polynomials[other], tried[chosen], worth):
         chosen = other
         if not chosen.tangential:
-            chosen, polynomials = _with_tangential(start, points, settings, radius_m, polynomials)
+            chosen, polynomials = _with_tangential(fitted, start, settings, polynomials)
     return chosen, tried | polynomials
 
 
 def _chosen_of_a_kind(
-    start: Estimate, points: Points, settings: CalibrationSettings, radius_m: float
+    fitted: Fitted, start: Estimate, settings: CalibrationSettings
 ) -> tuple[FreeLens, Candidates]:
     """`choose_lens` among rational functions, or polynomials."""
     counts = range(settings.most + 1) if settings.coefficients is None else [settings.most]
     if settings.tangential is True:
         decentred = [settings.lens(count, tangential=True) for count in counts]
-        tried = _tried(start, points, settings, radius_m, decentred)
+        tried = fitted(start, decentred)
         return _fewest_needed(tried), tried
-    tried = _tried(start, points, settings, radius_m, [settings.lens(count) for count in counts])
-    return _with_tangential(start, points, settings, radius_m, tried)
+    tried = fitted(start, [settings.lens(count) for count in counts])
+    return _with_tangential(fitted, start, settings, tried)
 
 
 def _with_tangential(
-    start: Estimate,
-    points: Points,
-    settings: CalibrationSettings,
-    radius_m: float,
-    radial: Candidates,
+    fitted: Fitted, start: Estimate, settings: CalibrationSettings, radial: Candidates
 ) -> tuple[FreeLens, Candidates]:
     """Choose among radial lenses, and tangential terms where they are worth it."""
     chosen = _fewest_needed(radial)
     if settings.tangential is False:
         return chosen, radial
     beside = chosen._replace(tangential=True)
-    estimate = radial[chosen].adjusted.estimate
-    tried = radial | _tried(estimate, points, settings, radius_m, [beside])
+    tried = radial | fitted(radial[chosen].adjusted.estimate, [beside])
     if not _is_worth_it(tried[chosen], tried[beside]):
         return chosen, tried
     others = [lens._replace(tangential=True) for lens in radial if lens != chosen]
-    more = {beside: tried[beside]} | _tried(start, points, settings, radius_m, others)
+    more = {beside: tried[beside]} | fitted(start, others)
     return _fewest_needed(more), tried | more
 
 
-def _tried(
-    start: Estimate,
+def _fitted(
     points: Points,
     settings: CalibrationSettings,
     radius_m: float,
+    estimate: Estimate,
     lenses: Iterable[FreeLens],
 ) -> Candidates:
-    """Each fitted from where the last ended."""
+    """Each lens fitted from where the last ended."""
     tried: Candidates = {}
-    estimate = start
     for lens in lenses:
         adjusted, seen = fit_points(estimate, points, settings, lens, radius_m)
         estimate = adjusted.estimate

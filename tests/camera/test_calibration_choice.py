@@ -67,10 +67,10 @@ def test_the_fewest_coefficients_that_explain_what_was_held_out(
     chosen: FreeLens,
 ) -> None:
     def tried(
-        start: Estimate,
         points: Points,
         settings: CalibrationSettings,
         radius_m: float,
+        start: Estimate,
         lenses: Iterable[FreeLens],
     ) -> Candidates:
         return {lens: fitted(lens) for lens in lenses}
@@ -86,7 +86,7 @@ def test_the_fewest_coefficients_that_explain_what_was_held_out(
         radial = errors[lens.coefficients, lens.polynomial]
         return Candidate(fit, POINTS, radial[lens.tangential])
 
-    monkeypatch.setattr(calibration_choice, "_tried", tried)
+    monkeypatch.setattr(calibration_choice, "_fitted", tried)
     found, candidates = choose_lens(START, POINTS, CalibrationSettings(tangential=tangential), 0.0)
     assert found == chosen
     assert found in candidates
