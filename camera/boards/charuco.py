@@ -38,25 +38,9 @@ _FEWEST_FOUND = 4
 
 
 def find_charuco(image: GreyImage, board: Board) -> tuple[IntArray, FloatArray]:
-    """Find the corners of a ChArUco board in an image.
+    """Which of a ChArUco board's points are in an image, ascending, and their (K, 2) pixels.
 
-    Parameters
-    ----------
-    image : (H, W) uint8 array
-    board : Board
-        Of kind `charuco`.
-
-    Returns
-    -------
-    indices : (K,) int64 array
-        Which of `Board.points`; ascending. K may be 0.
-    pixels : (K, 2) array
-        Where they are (the top left pixel's centre is 0, 0).
-
-    Raises
-    ------
-    CalibrationError
-        If the board's dictionary is unknown, or too small for it.
+    K may be 0. A dictionary that is unknown, or too small for the board, is refused.
     """
     rows, columns = board.rows - 1, board.columns - 1
     grid = np.full((rows, columns, 2), np.nan)
