@@ -7,37 +7,32 @@ it; the command line shows it on stderr.
 from __future__ import annotations
 
 import logging
-import sys
 from collections.abc import Callable
 from functools import cache
 
 _log = logging.getLogger("redetect")
 
 
-class _ToStderr(logging.Handler):
-    def emit(self, record: logging.LogRecord) -> None:
-        print(record.getMessage(), file=sys.stderr, flush=True)
-
-
-_to_stderr = _ToStderr()
-
-
 def show_announcements() -> None:
     """Show announcements on stderr."""
     _log.setLevel(logging.INFO)
-    if _to_stderr not in _log.handlers:
-        _log.addHandler(_to_stderr)
+    _log.handlers = [logging.StreamHandler()]
 
 
 def announcements_are_shown() -> bool:
     """Whether announcements go to stderr."""
-    return _to_stderr in _log.handlers
+    return bool(_log.handlers)
 
 
 @cache
 def announce_compiling() -> None:
     """Have it announced when the first kernel is compiled instead of loaded."""
-    on_first_compilation(lambda: _log.info("compiling kernels, once: about a minute"))
+    on_first_compilation(say_compiling)
+
+
+def say_compiling() -> None:
+    """Announce that kernels are compiled."""
+    _log.info("compiling kernels, once: about a minute")
 
 
 def on_first_compilation(call: Callable[[], object]) -> None:

@@ -14,7 +14,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from detect import __version__
 from detect.drawing.inputs import read_head
 from detect.errors import EXIT_FRAMES_FAILED, DetectError, FrameError, WorkerError
 from detect.options import All, Circles, DetectorFlags, DiscIdOptions, Lines, Markers
@@ -56,9 +55,7 @@ def perform(command: DetectorFlags) -> int:
     job = _job_of(command)
     log = log_place(job.named_after or next(iter(job.places.values())))
     name = type(command).__name__.lower()
-    conduct = Conduct(
-        __version__, command.force, job.crlf, log, name, command.strict, command.resume
-    )
+    conduct = Conduct(command.force, job.crlf, log, name, command.strict, command.resume)
     with progress_bar(job.label, job.run.frames.expected) as advance:
         summary = detect_run(
             job.run,
