@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from camera import Camera, read_camera
 from detect.errors import DetectError, FrameError
 from detect.sources.gray import bounded_content, decode_gray
-from detect.sources.image_names import IMAGE_SUFFIXES, FileStamp, ImageNames, images_of_folder
+from detect.sources.image_names import IMAGE_SUFFIXES, ImageNames, images_of_folder
 from landmarks import Step, iterate_prefixes, iterate_steps
 
 
@@ -46,8 +46,6 @@ class RunFrame:
         Significant bits of a file with more than 8.
     failure : str or None
         Why there is no image, although there should be.
-    stamp : (int, int) or None
-        The file's size and time of change, if they are known.
     """
 
     step: Step
@@ -56,49 +54,41 @@ class RunFrame:
     time_s: float | None = None
     bits: int = 16
     failure: str | None = None
-    stamp: FileStamp | None = field(default=None, compare=False, repr=False)
 
 
 class Frames(Protocol):
     """The frames of a run, made on demand.
 
     Iterating again starts over (with a live camera: from then on).
+
+    Attributes
+    ----------
+    ships_images : bool
+        Whether frames carry contents of images, not paths.
+    expected : int or None
+        Approximate number of frames, if it is known.
+    left_out : int
+        How many images, so far, are no part of the run.
+    why_left_out : str
+        Why; printed after their number.
     """
 
-    #: Whether frames carry contents of images, not paths.
     ships_images: bool
 
     @property
-    def expected(self) -> int | None:
-        """Approximate number of frames; None if unknown."""
-        ...
+    def expected(self) -> int | None: ...
 
     @property
-    def left_out(self) -> int:
-        """How many images, so far, are no part of the run."""
-        ...
+    def left_out(self) -> int: ...
 
     @property
-    def why_left_out(self) -> str:
-        """Why frames were left out; printed after their number."""
-        ...
+    def why_left_out(self) -> str: ...
 
     def __iter__(self) -> Generator[RunFrame, None, None]: ...
 
 
 class RunFrames:
-    """The frames of a run folder: in the order of the odometry, or of names.
-
-    Parameters
-    ----------
-    images : ImageNames
-    odometry : path or None
-        The file of STEP rows.
-    expected, left_out : int
-        How many frames there are, and images that the odometry does not name.
-    bits : int
-        Significant bits of 16-bit images.
-    """
+    """The frames of a run folder: in the order of the odometry, or of names."""
 
     ships_images = False
     why_left_out = "images are not named by a STEP row: left out"
@@ -120,10 +110,10 @@ class RunFrames:
     def _frame(self, step: Step, place: int | None = None) -> RunFrame:
         try:
             found = self._images.place_of(step.prefix) if place is None else place
-            image, stamp = (None, None) if found is None else self._images.checked(found)
+            image = None if found is None else self._images.checked(found)[0]
         except FrameError as error:
             return RunFrame(step, None, failure=str(error))
-        return RunFrame(step, image, bits=self._bits, stamp=stamp)
+        return RunFrame(step, image, bits=self._bits)
 
 
 @dataclass(frozen=True)
@@ -135,13 +125,12 @@ class ImageRun:
     folder : path
         The run folder; of another source the folder that it is in.
     frames : Frames
-        In the order of the odometry, or of the images' names.
     odometry : path or None
         Where the STEP rows come from.
     output_base : path
         Results are called this, with an ending of their own.
     has_times : bool
-        Whether the frames' times are known and to be written beside the results.
+        Whether the frames' times are known and written beside the results.
     """
 
     folder: Path
@@ -209,27 +198,10 @@ def open_run(folder: Path, camera_path: Path | None = None, *, bits: int | None 
 def open_images(
     folder: Path, camera_path: Path | None = None, *, bits: int | None = None
 ) -> ImageRun:
-    """Read a run folder that may be without a calibration.
-
-    Parameters
-    ----------
-    folder, camera_path, bits
-        As in `open_run`.
-
-    Returns
-    -------
-    ImageRun
-        A `Run` if there is a calibration.
-
-    Raises
-    ------
-    DetectError, camera.CameraError, landmarks.LandmarkFileError
-        As `open_run`, except for a missing calibration.
-    """
+    """Read a run folder as `open_run` does; without a calibration it is no `Run`."""
     _demand_folder(folder)
-    if camera_path is None and not any(folder.glob("*.cam")):
-        return _image_run(folder, bits)
-    return open_run(folder, camera_path, bits=bits)
+    has_camera = camera_path is not None or any(folder.glob("*.cam"))
+    return open_run(folder, camera_path, bits=bits) if has_camera else _image_run(folder, bits)
 
 
 def _demand_folder(folder: Path) -> None:
@@ -276,7 +248,7 @@ def read_image(
     Returns
     -------
     (H, W) uint8 array
-        Of colours the brightness, of 16 bits the upper 8 (see `detect.sources.gray`).
+        Brightness; 16 bits are brought to 8 (see `detect.sources.gray`).
 
     Raises
     ------
@@ -306,16 +278,8 @@ def read_image(
 
 
 def camera_in(folder: Path) -> Camera | None:
-    """The calibration in a run folder; None where there is none.
-
-    Raises
-    ------
-    DetectError, camera.CameraError
-        If there are several to choose from, or it cannot be read.
-    """
-    if not any(folder.glob("*.cam")):
-        return None
-    return read_camera(_only_camera(folder))
+    """The calibration in a run folder; None where there is none."""
+    return read_camera(_only_camera(folder)) if any(folder.glob("*.cam")) else None
 
 
 def _only_camera(folder: Path) -> Path:

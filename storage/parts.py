@@ -44,15 +44,7 @@ class NotAFileError(OSError):
 
 
 def demand_place(path: Path, *, overwrite: bool) -> None:
-    """Refuse a path that no result can be written to.
-
-    Raises
-    ------
-    FileNotFoundError, IsADirectoryError, NotAFileError
-        If its folder does not exist, or it is a folder, device, pipe or socket.
-    OutputExistsError
-        If it exists and must not be overwritten.
-    """
+    """Refuse a path where no result can be, or where there is one that must not be replaced."""
     if not path.parent.is_dir():
         raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path))
     if path.is_dir():
@@ -64,18 +56,10 @@ def demand_place(path: Path, *, overwrite: bool) -> None:
 
 
 class PartFile:
-    """A hidden file that this process has locked.
+    """A hidden file that this process has locked, and a stream to read and write it.
 
-    As a context manager it is removed at the end, unless it was closed or has taken its place.
-
-    Attributes
-    ----------
-    place : path
-        Where it is.
-    number : int
-        Which of the files of this kind it is; 0 unless others were being written.
-    stream : binary stream
-        For reading and writing; its errors name the result.
+    Its number is 0 unless others were being written. As a context manager it is removed at the end,
+    unless it was closed or has taken the result's place. Errors of the stream name the result.
     """
 
     def __init__(self, result: Path, place: Path, number: int, handle: int) -> None:
@@ -95,13 +79,7 @@ class PartFile:
             os.fsync(self.stream.fileno())
 
     def replace(self, path: Path, *, overwrite: bool) -> None:
-        """Move it to a result's path.
-
-        Raises
-        ------
-        OutputExistsError
-            If there is a file that must not be overwritten.
-        """
+        """Move it to the result's path, unless there is a file that must not be overwritten."""
         with _naming(path):
             if overwrite:
                 self.place.replace(os.path.realpath(path))
@@ -138,21 +116,9 @@ class _NamedFile(io.FileIO):
 
 
 def new_part(path: Path, suffix: str = "part", named: Path | None = None) -> PartFile:
-    """A new hidden file; those that killed processes left are removed.
+    """A new hidden file beside `path`; those that killed processes left are removed.
 
-    Parameters
-    ----------
-    path : path
-        The result that it belongs to.
-    suffix : str
-        Ending of its name.
-    named : path, optional
-        What errors name instead of `path`.
-
-    Raises
-    ------
-    OSError
-        If the folder cannot be written to.
+    Errors name `named`, by default the path.
     """
     for number in range(_NUMBERS):
         left = left_part(path, suffix, number)

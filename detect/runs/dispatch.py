@@ -57,15 +57,6 @@ def detect_chunks(
 ) -> Generator[list[tuple[FrameTask, FrameRows]], None, None]:
     """Work on frames, some at a time.
 
-    Parameters
-    ----------
-    tasks : iterable of FrameTask
-        The frames; taken from as they are needed.
-    plan : FramePlan
-        The plan for each.
-    workers : Workers
-        By whom.
-
     Yields
     ------
     list of (FrameTask, FrameRows)

@@ -96,16 +96,13 @@ class FrameDetections:
     ----------
     image : (H, W) uint8 or None
         None where it cannot be read.
-    lines : LineDetections or None
     tilt : FrameTilt or None
-        None also if too few lines determine it.
-    seen : CircleDetections or None
-        The discs where they would be on a level robot.
-    discs : CircleDetections or None
-        The same, corrected for the tilt where there is one and the plan says so.
+        By the lines, or known before; None also if too few lines determine it.
+    seen, discs : CircleDetections or None
+        The discs where they would be on a level robot, and corrected for the tilt where there is
+        one and the plan says so.
     outline_tilt : FrameTilt or None
         The tilt by the outlines of the discs, if a run is levelled by all frames.
-    markers : MarkerDetections or None
     error : str or None
         Why the frame cannot be worked on.
     """
@@ -130,8 +127,8 @@ class FrameDetections:
 class Tables:
     """The tables by the calibration that a plan needs."""
 
-    verticals: VerticalTable | None
-    discs: DiscTable | None
+    verticals: VerticalTable | None = None
+    discs: DiscTable | None = None
 
 
 def detect_batch(
@@ -141,21 +138,7 @@ def detect_batch(
 
     Every stage is done with all frames before the next one: a decoder and the detectors drive each
     other's instructions and tables out of the processor's caches. A frame that cannot be worked on
-    costs itself only.
-
-    Parameters
-    ----------
-    tasks : sequence of FrameTask
-        The frames; as many images are in memory at once.
-    plan : FramePlan
-        The landmarks to detect.
-    tables : Tables
-        See `tables_of`.
-
-    Returns
-    -------
-    list of FrameDetections
-        One for each.
+    costs itself only. As many images are in memory at once as there are tasks.
     """
     batch = [FrameDetections() for _ in tasks]
     paths = [_path(task, found, plan, tables) for task, found in zip(tasks, batch)]
@@ -167,52 +150,42 @@ def detect_batch(
 def _path(
     task: FrameTask, found: FrameDetections, plan: FramePlan, tables: Tables
 ) -> Iterator[None]:
-    """The path of one image; at each `yield`, the others of a batch catch up."""
+    """The path of one image from top to bottom; at each `yield`, the others of a batch catch up."""
+    camera, prefix = plan.camera, task.frame.step.prefix
     try:
-        yield from _stages(task, found, plan, tables)
+        image = found.image = read_image(task.frame, camera, plan.working_folder)
+        yield
+
+        found.tilt = task.known.tilt
+        if plan.lines is not None and tables.verticals is not None:
+            from detect.lines import detect_lines
+
+            found.lines = detect_lines(image, tables.verticals, plan.lines)
+            found.tilt = tilt_of_lines(prefix, found.lines)
+        yield
+
+        if plan.circles is not None and tables.discs is not None and camera is not None:
+            from detect.circles import detect_circles
+            from detect.discs.outline_tilt import tilt_of_outlines
+            from detect.levelling import levelled
+
+            by_frame = found.tilt if plan.levelling == "frame" else None
+            level = by_frame is None and plan.levelling != "run"
+            settings = plan.circles if level else _without_tilt(plan.circles)
+            found.seen = found.discs = detect_circles(image, camera, tables.discs, settings)
+            if by_frame is not None:
+                found.discs = levelled(found.seen, camera, by_frame)
+            if plan.levelling == "run":
+                tilt = tilt_of_outlines(image, camera, found.seen.floor_xy, plan.circles.radius_m)
+                found.outline_tilt = None if tilt is None else FrameTilt(prefix, *tilt)
+        yield
+
+        if plan.markers is not None:
+            from detect.markers.detect import detect_markers
+
+            found.markers = detect_markers(image, plan.markers, camera)
     except COSTS_THE_FRAME as error:
         found.error = reason_of(error, task)
-
-
-def _stages(
-    task: FrameTask, found: FrameDetections, plan: FramePlan, tables: Tables
-) -> Iterator[None]:
-    image = found.image = read_image(task.frame, plan.camera, plan.working_folder)
-    prefix = task.frame.step.prefix
-    yield
-
-    found.tilt = task.known.tilt
-    if plan.lines is not None:
-        from detect.lines import detect_lines
-
-        assert tables.verticals is not None
-        found.lines = detect_lines(image, tables.verticals, plan.lines)
-        found.tilt = tilt_of_lines(prefix, found.lines)
-    yield
-
-    if plan.circles is not None:
-        from detect.circles import detect_circles
-        from detect.discs.outline_tilt import tilt_of_outlines
-        from detect.levelling import levelled
-
-        assert tables.discs is not None
-        assert plan.camera is not None
-        by_frame = found.tilt if plan.levelling == "frame" else None
-        # Levelling adds the tilt to the covariances, where there is any.
-        is_level = by_frame is None and plan.levelling != "run"
-        settings = plan.circles if is_level else _without_tilt(plan.circles)
-        found.seen = found.discs = detect_circles(image, plan.camera, tables.discs, settings)
-        if by_frame is not None:
-            found.discs = levelled(found.seen, plan.camera, by_frame)
-        if plan.levelling == "run":
-            tilt = tilt_of_outlines(image, plan.camera, found.seen.floor_xy, plan.circles.radius_m)
-            found.outline_tilt = None if tilt is None else FrameTilt(prefix, *tilt)
-    yield
-
-    if plan.markers is not None:
-        from detect.markers.detect import detect_markers
-
-        found.markers = detect_markers(image, plan.markers, plan.camera)
 
 
 def reason_of(error: Exception, task: FrameTask) -> str:
@@ -235,7 +208,7 @@ def tilt_of_lines(prefix: str, lines: LineDetections) -> FrameTilt | None:
 
 @lru_cache(maxsize=4)
 def _without_tilt(settings: CircleSettings) -> CircleSettings:
-    """The same, but the tilt adds nothing to covariances."""
+    """The same, but the tilt adds nothing to covariances: levelling does."""
     return dataclasses.replace(settings, tilt_sigma_deg=0.0)
 
 

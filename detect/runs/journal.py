@@ -141,8 +141,6 @@ def _file_of(frame: RunFrame) -> object:
     """What identifies the current state of a frame's image file."""
     if frame.image is None:
         return None
-    if frame.stamp is not None:
-        return (frame.image.name, *frame.stamp)
     try:
         status = frame.image.stat()
     except (OSError, ValueError):

@@ -94,15 +94,10 @@ class Known:
 
 
 class FramesByImage:
-    """The frames of a landmark file, by the name of their image.
+    """The frames of a landmark file, by the name of their image; of equal names the last counts.
 
     The file is read once for the offset of each frame, and again there when a frame is requested:
-    its rows are not kept in memory. Of frames with one name the last counts.
-
-    Parameters
-    ----------
-    path : path
-        The file.
+    its rows are not kept in memory.
 
     Raises
     ------
@@ -132,15 +127,7 @@ class FramesByImage:
 class MapByImage:
     """The discs of a map that the frames of a path should see, by the name of their image.
 
-    Parameters
-    ----------
-    map_path, path_path : path
-        As `slam map` writes them (`landmarks.read_map`, `landmarks.read_path`).
-
-    Raises
-    ------
-    landmarks.LandmarkFileError
-        If a file cannot be read or a row is malformed; names file and line.
+    Map and path are files of `slam map`; as them, malformed ones raise a `LandmarkFileError`.
     """
 
     def __init__(self, map_path: Path, path_path: Path) -> None:

@@ -23,26 +23,11 @@ def level_run(
     summary: RunSummary,
     read: Callable[[], Iterable[Mapping[str, str]]],
 ) -> Iterator[Mapping[str, str]]:
-    """Level the discs of a run, once they are all there.
+    """The rows of each frame with levelled discs, and `RUN_TILT`.
 
     Where too few frames have a tilt to learn from (`detect.run_tilt.LEAST_FRAMES`), each frame is
-    levelled by its own.
-
-    Parameters
-    ----------
-    camera : Camera
-    tilt_sigma_rad : float
-        Standard deviation of pitch and roll of frames whose tilt is unknown.
-    summary : RunSummary
-        Is given the tilt of the run, if there is one.
-    read : callable
-        Reads the rows of all frames, by kind: "tilt" has a frame's tilt, "circles" its discs as
-        seen. Called twice.
-
-    Yields
-    ------
-    mapping
-        The rows of each frame: those that were read, but with levelled "circles", and `RUN_TILT`.
+    levelled by its own; `tilt_sigma_rad` is the standard deviation of an unknown one. The summary
+    is given the tilt of the run. `read` gives the rows of all frames as seen, and is called twice.
     """
     frames: list[_Tilted] = []
     outlines: list[FrameTilt | None] = []

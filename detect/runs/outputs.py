@@ -74,20 +74,7 @@ class Conduct:
 
 @dataclass(frozen=True)
 class Output:
-    """A file that a run is written to.
-
-    Attributes
-    ----------
-    path : path
-    kind : str
-        Which of `FrameRows.rows` go into it: of a kind that they do not have, none do.
-    head, tail : str
-        Text before and after the rows of all frames.
-    between : str
-        Text between the rows of two frames.
-    crlf : bool
-        Whether lines end with CR and LF, as in the data set's own files.
-    """
+    """A file of a run: `FrameRows.rows` of a kind, between head and tail and separated."""
 
     path: Path
     kind: str
@@ -96,24 +83,19 @@ class Output:
     between: str = ""
     crlf: bool = False
 
+    def encoded(self, text: str) -> bytes:
+        """A part of its content, as bytes."""
+        text = text.replace("\n", "\r\n") if self.crlf else text
+        return text.encode("utf-8", "surrogateescape")
+
 
 def outputs_of(
     run: ImageRun, plan: FramePlan, places: Mapping[str, Path], *, crlf: bool, levelled: bool
 ) -> list[Output]:
-    """The files of a run, in the order in which they take their places.
+    """The files of a run (see `detect.runs.stream.detect_run`).
 
-    Parameters
-    ----------
-    run : ImageRun
-        The run.
-    plan : FramePlan
-        What is detected in it.
-    places : mapping
-        Where files of each kind go: "circles", "lines", "tilt", "markers", "json".
-    crlf : bool
-        Whether the lines of files of landmarks end with CR and LF.
-    levelled : bool
-        Whether discs are corrected for the tilt.
+    `crlf` is how the lines of files of landmarks end; `levelled`, whether discs are corrected for
+    the tilt.
     """
     outputs = []
     by_run = plan.levelling == "run" and plan.lines is not None
@@ -255,20 +237,14 @@ def log_place(output: Path) -> Path:
 
 
 def demand_log_place(place: Path, *, overwrite: bool) -> None:
-    """Refuse to write a log over a file that is none.
-
-    Raises
-    ------
-    storage.OutputExistsError
-        If there is a file that is no log and must not be overwritten.
-    """
+    """Refuse to write a log over a file that is none (`OutputExistsError`)."""
     if overwrite or not os.path.lexists(place):
         return
-    if place.is_symlink() or not place.is_file():
-        raise OutputExistsError(place)
-    with place.open("rb") as stream:
-        if stream.read(len(_LOG_BEGIN)) != _LOG_BEGIN:
-            raise OutputExistsError(place)
+    if not place.is_symlink() and place.is_file():
+        with place.open("rb") as stream:
+            if stream.read(len(_LOG_BEGIN)) == _LOG_BEGIN:
+                return
+    raise OutputExistsError(place)
 
 
 def log_text(
@@ -278,19 +254,7 @@ def log_text(
     failures: Sequence[Mapping[str, object]],
     written: Sequence[Mapping[str, object]],
 ) -> str:
-    """The content of a log.
-
-    Parameters
-    ----------
-    plan : FramePlan
-    command : str
-        What the run is called.
-    summary : RunSummary
-    failures : sequence of mapping
-        Of each frame that could not be processed its place in the run, from 0, its prefix and why.
-    written : sequence of mapping
-        Name, size and hash of each file.
-    """
+    """The content of a log: `failures` of frames, and what was `written`."""
     settings = {"circles": plan.circles, "lines": plan.lines, "markers": plan.markers}
     document = {
         "program": "redetect",

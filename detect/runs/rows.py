@@ -6,6 +6,7 @@ This is all that a worker sends back, whichever process or machine it runs on: s
 from __future__ import annotations
 
 import json
+import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -119,20 +120,7 @@ class RunSummary:
 
 
 def rows_of_frames(tasks: Sequence[FrameTask], plan: FramePlan, tables: Tables) -> list[FrameRows]:
-    """Work on frames, as many at a time as fit in memory.
-
-    Parameters
-    ----------
-    tasks : sequence of FrameTask
-    plan : FramePlan
-    tables : Tables
-        See `detect.runs.frame.tables_of`.
-
-    Returns
-    -------
-    list of FrameRows
-        In the order of the tasks.
-    """
+    """The rows of frames; as many are worked on at a time as fit in memory."""
     camera = plan.camera
     at_once = 1
     if camera is not None and plan.drawing is None and not plan.draw_response:
@@ -153,10 +141,10 @@ def _rows_of(task: FrameTask, found: FrameDetections, plan: FramePlan, tables: T
             task.frame.step.prefix,
             _rows_by_kind(task, found, plan),
             {
-                "discs": 0 if found.discs is None else len(found.discs),
-                "lines": 0 if found.lines is None else len(found.lines),
+                "discs": len(found.discs or ()),
+                "lines": len(found.lines or ()),
                 "tilts": int(found.lines is not None and found.tilt is not None),
-                "markers": 0 if found.markers is None else len(found.markers),
+                "markers": len(found.markers or ()),
             },
             _NONE if found.markers is None else dict(sorted(found.markers.rejected.items())),
             pictures=tuple(_drawn(Path(task.frame.step.prefix).name, found, plan, tables)),
@@ -202,15 +190,7 @@ def rows_of_failure(task: FrameTask, reason: str) -> FrameRows:
 def landmark_rows(
     keyword: str, numbers: NDArray[np.float64], ids: Sequence[tuple[int, ...]]
 ) -> str:
-    """Rows of landmarks, as `landmarks.format_record` formats them.
-
-    Parameters
-    ----------
-    keyword : str
-    numbers : (N, K) float64
-        The numbers after the keyword.
-    ids : sequence of N tuples of int
-        The IDs at the end.
+    """Rows of landmarks, as `landmarks.format_record` formats them, of (N, K) numbers and N IDs.
 
     Raises
     ------
@@ -276,17 +256,18 @@ def _json(record: dict[str, object]) -> str:
 
 
 def _disc_records(found: CircleDetections) -> list[dict[str, object]]:
+    rows = disc_numbers(found.floor_xy, found.quality, found.covariance).tolist()
     return [
         {
-            "pixel": [int(u), int(v)],
-            "x_m": float(x),
-            "y_m": float(y),
-            "quality": float(quality),
-            "evidence": float(evidence) if np.isfinite(evidence) else None,
-            "covariance_m2": [float(c[0, 0]), float(c[0, 1]), float(c[1, 1])],
+            "pixel": pixel,
+            "x_m": x,
+            "y_m": y,
+            "quality": quality,
+            "evidence": evidence if math.isfinite(evidence) else None,
+            "covariance_m2": covariance,
         }
-        for (u, v), (x, y), c, quality, evidence in zip(
-            found.pixels, found.floor_xy, found.covariance, found.quality, found.evidence
+        for pixel, (x, y, quality, *covariance), evidence in zip(
+            found.pixels.tolist(), rows, found.evidence.tolist()
         )
     ]
 

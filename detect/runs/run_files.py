@@ -47,22 +47,7 @@ class FailedFrameError(DetectError):
 
 
 class RunFiles:
-    """The files of a run: a context manager that begins or resumes its journal, and ends it.
-
-    Parameters
-    ----------
-    outputs : sequence of Output
-        The files.
-    plan : FramePlan
-        The plan for every frame.
-    conduct : Conduct
-        Whether there are a log and a run to be resumed.
-
-    Raises
-    ------
-    OSError, OutputExistsError, DetectError
-        On entering, if a file cannot be written, or must not be.
-    """
+    """The files of a run: a context manager that begins or resumes its journal, and ends it."""
 
     def __init__(self, outputs: Sequence[Output], plan: FramePlan, conduct: Conduct) -> None:
         self._outputs, self._plan, self._conduct = outputs, plan, conduct
@@ -162,20 +147,7 @@ class RunFiles:
     def take_over(
         self, tasks: Iterator[FrameTask], count: Callable[[FrameRows], None]
     ) -> Iterator[FrameTask]:
-        """Take over the frames that are done already.
-
-        Parameters
-        ----------
-        tasks : iterator of FrameTask
-            The frames of the run.
-        count : callable
-            Called with the rows of each frame that is taken over.
-
-        Returns
-        -------
-        iterator of FrameTask
-            The frames that remain to be done.
-        """
+        """Take over the frames that are done already, counting each; returns the remaining ones."""
         if not self._resumes:
             return tasks
         beyond: list[FrameTask] = []
@@ -202,15 +174,7 @@ class RunFiles:
         return self._overwrite or (self._resumes and self._frames == self._taken_over)
 
     def add(self, frames: Sequence[tuple[FrameTask, FrameRows]]) -> None:
-        """Note frames, the next ones.
-
-        Raises
-        ------
-        OSError
-            If they cannot be written.
-        FailedFrameError
-            If one of them could not be worked on, and every frame is demanded.
-        """
+        """Note the next frames."""
         for _, rows in frames:
             if rows.error is not None and self._conduct.strict:
                 self._journal.file.remove()
@@ -221,41 +185,39 @@ class RunFiles:
     # -- ending -----------------------------------------------------------------------------
 
     def finish(self, summary: RunSummary, second_pass: SecondPass | None = None) -> None:
-        """Write the results, and move them to their final paths.
-
-        Raises
-        ------
-        OSError, OutputExistsError
-            If they cannot.
-        """
+        """Write the results, and move them to their final paths."""
         if not self._journal.file.is_in_place():
             # Another folder may have come in its place: nothing in it is touched.
             raise FileNotFoundError(errno.ENOENT, "the run's journal is gone", str(self._paths[0]))
         with ExitStack() as stack:
             parts = [stack.enter_context(new_part(path)) for path in self._paths]
-            files = [_Result(output, part) for output, part in zip(self._outputs, parts)]
+            results = list(zip(self._outputs, parts))
+            for output, part in results:
+                part.stream.write(output.encoded(output.head))
+            separators = dict.fromkeys((output.kind for output in self._outputs), "")
             for rows in self._rows() if second_pass is None else second_pass(self._rows):
-                for file in files:
-                    file.add(rows.get(file.output.kind, ""))
-            written = [file.end() for file in files]
+                for output, part in results:
+                    if text := rows.get(output.kind):
+                        part.stream.write(output.encoded(separators[output.kind] + text))
+                        separators[output.kind] = output.between
+            for output, part in results:
+                part.stream.write(output.encoded(output.tail))
             if self._conduct.log is not None:
-                text = log_text(
-                    self._plan, self._conduct.command, summary, self._failures(), written
-                )
+                written = [_described(output, part) for output, part in results]
+                failures = [
+                    {"frame": number, "prefix": rows.prefix, "reason": rows.error}
+                    for number, (_, rows) in enumerate(self._journal.frames())
+                    if rows.error is not None
+                ]
+                text = log_text(self._plan, self._conduct.command, summary, failures, written)
                 parts[-1].stream.write(text.encode())
-                parts[-1].sync()
+            for part in parts:
+                part.sync()
             self._place(parts)
         self._done = True
 
     def _rows(self) -> Iterator[Mapping[str, str]]:
         return (rows.rows for _, rows in self._journal.frames())
-
-    def _failures(self) -> list[dict[str, object]]:
-        return [
-            {"frame": number, "prefix": rows.prefix, "reason": rows.error}
-            for number, (_, rows) in enumerate(self._journal.frames())
-            if rows.error is not None
-        ]
 
     def _place(self, parts: Sequence[PartFile]) -> None:
         with folder_locked(self._paths[-1].parent):
@@ -289,31 +251,9 @@ class RunFiles:
             _log.info("%d frames are kept: --resume goes on after them", self._frames)
 
 
-class _Result:
-    """A result while it is written."""
-
-    def __init__(self, output: Output, part: PartFile) -> None:
-        self.output, self._part = output, part
-        self._size, self._digest, self._between = 0, hashlib.sha256(), ""
-        self._write(output.head)
-
-    def add(self, rows: str) -> None:
-        """Write the rows of a frame."""
-        if rows:
-            self._write(self._between + rows)
-            self._between = self.output.between
-
-    def end(self) -> dict[str, object]:
-        """Bring all of it to the disk; returns name, size and hash, for the log."""
-        self._write(self.output.tail)
-        self._part.sync()
-        sha256 = self._digest.hexdigest()
-        return {"name": self.output.path.name, "bytes": self._size, "sha256": sha256}
-
-    def _write(self, text: str) -> None:
-        if self.output.crlf:
-            text = text.replace("\n", "\r\n")
-        content = text.encode("utf-8", "surrogateescape")
-        self._part.stream.write(content)
-        self._size += len(content)
-        self._digest.update(content)
+def _described(output: Output, part: PartFile) -> dict[str, object]:
+    """Name, size and hash of a result, for the log."""
+    size = part.stream.tell()
+    part.stream.seek(0)
+    sha256 = hashlib.file_digest(part.stream, "sha256").hexdigest()
+    return {"name": output.path.name, "bytes": size, "sha256": sha256}

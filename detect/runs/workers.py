@@ -59,19 +59,9 @@ def default_jobs(frames: int) -> int:
 
 
 def local_workers(jobs: int, *, large: bool = False) -> Workers:
-    """Workers on this machine.
+    """Processes of this machine; 1 is this process itself.
 
-    Parameters
-    ----------
-    jobs : int
-        How many processes; 1 is this process itself.
-    large : bool
-        Whether tasks carry images, or bring pictures back: they have one frame each then.
-
-    Raises
-    ------
-    WorkerError
-        If `jobs` is less than 1.
+    Of `large` tasks, which carry images or bring pictures back, each has one frame.
     """
     if jobs < 1:
         raise WorkerError(f"jobs is {jobs}: expected 1 or more")
@@ -83,22 +73,15 @@ def local_workers(jobs: int, *, large: bool = False) -> Workers:
 
 
 def cluster_workers(address: str, *, large: bool = False) -> Workers:
-    """The workers of a dask cluster.
+    """The workers of a dask cluster, whose scheduler has an `address` as ``tcp://host:8786``.
 
     They have this program installed, in the same version, and see the images under the same
-    paths.
-
-    Parameters
-    ----------
-    address : str
-        The scheduler's, as ``tcp://host:8786``.
-    large : bool
-        Whether tasks carry images, or bring pictures back: they have one frame each then.
+    paths. Of `large` tasks, which carry images or bring pictures back, each has one frame.
 
     Raises
     ------
     WorkerError
-        If the address of the scheduler is invalid, or the package for clusters is not installed.
+        If the address is invalid, or the package for clusters is not installed.
     """
     if not re.fullmatch(r"[a-z]+://\S+:[0-9]+", address):
         raise WorkerError(f"cluster is {address!r}: expected the scheduler's tcp://host:port")
