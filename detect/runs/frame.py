@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from detect.markers.detections import MarkerDetections
     from detect.markers.settings import MarkerSettings
     from detect.settings import CircleSettings, Levelling
-    from lut import DiscShape, DiscTable, VerticalTable
+    from lut import DiscTable, VerticalTable
 
 Drawing = Literal["discs", "lines", "tracks", "markers"]
 
@@ -212,6 +212,7 @@ def _without_tilt(settings: CircleSettings) -> CircleSettings:
     return dataclasses.replace(settings, tilt_sigma_deg=0.0)
 
 
+@lru_cache(maxsize=4)
 def tables_of(plan: FramePlan) -> Tables:
     """The tables that a plan needs: a process makes them or takes them from the cache once.
 
@@ -220,21 +221,14 @@ def tables_of(plan: FramePlan) -> Tables:
     lut.TableError
         If there can be none for the camera and the settings.
     """
-    shape = None
-    if plan.circles is not None:
+    verticals = discs = None
+    if plan.camera is not None and plan.lines is not None:
+        from lut import cached_vertical_table
+
+        verticals = cached_vertical_table(plan.camera)
+    if plan.camera is not None and plan.circles is not None:
         from detect.circles import disc_shape
+        from lut import cached_disc_table
 
-        shape = disc_shape(plan.circles)
-    return _tables(plan.camera, plan.lines is not None, shape)
-
-
-@lru_cache(maxsize=4)
-def _tables(camera: Camera | None, verticals: bool, shape: DiscShape | None) -> Tables:
-    if camera is None:
-        return Tables(None, None)
-    from lut import cached_disc_table, cached_vertical_table
-
-    return Tables(
-        verticals=cached_vertical_table(camera) if verticals else None,
-        discs=None if shape is None else cached_disc_table(camera, shape),
-    )
+        discs = cached_disc_table(plan.camera, disc_shape(plan.circles))
+    return Tables(verticals, discs)

@@ -56,8 +56,6 @@ class FrameRows(NamedTuple):
 
     Attributes
     ----------
-    prefix : str
-        Its image's prefix.
     rows : mapping
         Its rows in files of each kind: "circles", "lines", "tilt", "markers", "json", "times".
     found : mapping
@@ -67,7 +65,6 @@ class FrameRows(NamedTuple):
     error : str or None
         Why the frame could not be worked on: its STEP stays, without landmarks.
     pictures : tuple of (name, PNG)
-        Drawings.
     """
 
     prefix: str
@@ -84,16 +81,12 @@ class RunSummary:
 
     Attributes
     ----------
-    frames : int
-        Frames processed.
-    found : Counter
-        How many "discs", "lines" and "markers" were found in them, and "tilts".
-    rejected : Counter
-        How many candidates for markers were rejected, by cause.
-    failed : int
-        Frames that could not be worked on.
+    frames, failed : int
+        Frames of the run, and those of them that could not be worked on.
+    found, rejected : Counter
+        Sums of these of `FrameRows`.
     failures : list of str
-        A line for each of the first `KEPT_FAILURES` of them.
+        A line for each of the first `KEPT_FAILURES` frames that failed.
     images_without_step : int
         Images that are no part of the run: the odometry does not have them.
     tilt : RunTilt or None

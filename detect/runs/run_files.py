@@ -39,13 +39,6 @@ RowsOfFrames = Iterable[Mapping[str, str]]
 SecondPass = Callable[[Callable[[], RowsOfFrames]], RowsOfFrames]
 
 
-class FailedFrameError(DetectError):
-    """A frame that could not be worked on, where every frame is demanded."""
-
-    def __init__(self, reason: str) -> None:
-        super().__init__(f"{reason} (--strict: nothing is written)")
-
-
 class RunFiles:
     """The files of a run: a context manager that begins or resumes its journal, and ends it."""
 
@@ -157,7 +150,7 @@ class RunFiles:
                 beyond = [] if task is None else [task]
                 break
             if rows.error is not None and self._conduct.strict:
-                raise FailedFrameError(rows.error)
+                raise DetectError(f"{rows.error} (--strict: nothing is written)")
             self._frames += 1
             count(rows)
         self._journal.cut()
@@ -167,10 +160,7 @@ class RunFiles:
 
     @property
     def may_replace_pictures(self) -> bool:
-        """Whether pictures of the next frame may be replaced.
-
-        The run that is resumed may have drawn it before it ended.
-        """
+        """Whether pictures may be replaced: a resumed run may have drawn the next ones."""
         return self._overwrite or (self._resumes and self._frames == self._taken_over)
 
     def add(self, frames: Sequence[tuple[FrameTask, FrameRows]]) -> None:
@@ -178,7 +168,7 @@ class RunFiles:
         for _, rows in frames:
             if rows.error is not None and self._conduct.strict:
                 self._journal.file.remove()
-                raise FailedFrameError(rows.error)
+                raise DetectError(f"{rows.error} (--strict: nothing is written)")
         self._journal.write_frames(frames)
         self._frames += len(frames)
 

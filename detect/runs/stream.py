@@ -9,10 +9,11 @@ all.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import replace
 from functools import partial
+from itertools import chain
 from pathlib import Path
 
 from detect.errors import DetectError
@@ -101,14 +102,12 @@ def detect_run(
     with ExitStack() as stack:
         files = stack.enter_context(RunFiles(outputs, plan, conduct))
         tasks = files.take_over(stack.enter_context(closing(_tasks(run, known))), count)
-        for chunk in stack.enter_context(closing(detect_chunks(tasks, plan, workers))):
-            # A frame whose picture is there is noted before the next picture is.
-            for frames in [chunk] if pictures is None else [[frame] for frame in chunk]:
-                if pictures is not None:
-                    _write_pictures(frames[0][1], pictures, overwrite=files.may_replace_pictures)
-                files.add(frames)
-                for _, rows in frames:
-                    count(rows)
+        for frames in stack.enter_context(closing(detect_chunks(tasks, plan, workers))):
+            if pictures is not None:
+                _write_pictures(frames, pictures, overwrite=files.may_replace_pictures)
+            files.add(frames)
+            for _, rows in frames:
+                count(rows)
         summary.images_without_step = run.images_without_step
         files.finish(summary, _second_pass(plan, summary))
     return summary
@@ -130,8 +129,10 @@ def _tasks(run: ImageRun, known: Known) -> Generator[FrameTask, None, None]:
             yield FrameTask(frame, known.of(frame.step.prefix))
 
 
-def _write_pictures(rows: FrameRows, folder: Path, *, overwrite: bool) -> None:
-    for name, picture in rows.pictures:
+def _write_pictures(
+    frames: Sequence[tuple[FrameTask, FrameRows]], folder: Path, *, overwrite: bool
+) -> None:
+    for name, picture in chain.from_iterable(rows.pictures for _, rows in frames):
         with write_whole(folder / name, overwrite=overwrite) as stream:
             stream.write(picture)
 

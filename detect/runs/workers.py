@@ -6,7 +6,6 @@ Each is a standard executor with its number of frames per task, put together as
 
 from __future__ import annotations
 
-import math
 import multiprocessing
 import os
 import re
@@ -16,6 +15,7 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from contextlib import contextmanager, suppress
+from functools import lru_cache
 from multiprocessing.connection import wait
 from multiprocessing.synchronize import Lock
 from typing import TYPE_CHECKING, ParamSpec, TypeVar, cast
@@ -91,13 +91,18 @@ def cluster_workers(address: str, *, large: bool = False) -> Workers:
         raise WorkerError(
             "a cluster needs the package distributed: install it by pip install 'redetect[cluster]'"
         ) from None
-    size = _ClusterSize()
-    return Workers(
-        lambda plan: _cluster(address, size),
-        chunk=1 if large else _TOGETHER,
-        window=size.window,
-        died=(KilledWorker,),
-    )
+    clients: list[Client] = []
+
+    @lru_cache(maxsize=1)
+    def threads(_: object) -> int:
+        return sum(sum(client.nthreads().values()) for client in clients)
+
+    def window() -> int:  # a cluster grows
+        time_and_client = (time.monotonic() // _CLUSTER_LOOK_S, len(clients))
+        return 2 + _WINDOW_PER_WORKER * max(1, threads(time_and_client))
+
+    chunk = 1 if large else _TOGETHER
+    return Workers(lambda _: _cluster(address, clients), chunk, window, died=(KilledWorker,))
 
 
 # -- this process ---------------------------------------------------------------------------
@@ -215,23 +220,8 @@ def _end_with_parent() -> None:
 # -- a cluster ------------------------------------------------------------------------------
 
 
-class _ClusterSize:
-    """How many tasks a cluster may have under way; updated from time to time."""
-
-    def __init__(self) -> None:
-        self.client: Client | None = None
-        self._threads, self._looked_s = 1, -math.inf
-
-    def window(self) -> int:
-        now_s = time.monotonic()
-        if self.client is not None and now_s - self._looked_s > _CLUSTER_LOOK_S:
-            self._looked_s = now_s
-            self._threads = max(1, sum(self.client.nthreads().values()))
-        return 2 + _WINDOW_PER_WORKER * self._threads
-
-
 @contextmanager
-def _cluster(address: str, size: _ClusterSize) -> Iterator[Executor]:
+def _cluster(address: str, clients: list[Client]) -> Iterator[Executor]:
     from distributed import Client
 
     try:
@@ -245,6 +235,6 @@ def _cluster(address: str, size: _ClusterSize) -> Iterator[Executor]:
             raise WorkerError(
                 f"{address}: no worker came within {_CLUSTER_PATIENCE_S:g} s"
             ) from None
-        size.client = client
+        clients[:] = [client]
         # The same frame twice is not the same task: nothing is kept between runs.
         yield client.get_executor(pure=False)
