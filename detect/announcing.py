@@ -27,27 +27,24 @@ def announcements_are_shown() -> bool:
 @cache
 def announce_compiling() -> None:
     """Have it announced when the first kernel is compiled instead of loaded."""
-    on_first_compilation(say_compiling)
+    on_compilation(say_compiling)
 
 
+@cache
 def say_compiling() -> None:
-    """Announce that kernels are compiled."""
+    """Announce, once, that kernels are compiled."""
     _log.info("compiling kernels, once: about a minute")
 
 
-def on_first_compilation(call: Callable[[], object]) -> None:
-    """Have something called before this process compiles its first kernel."""
+def on_compilation(call: Callable[[], object]) -> None:
+    """Have something called before this process compiles a kernel."""
     from numba.core import event
 
-    class FirstCompilation(event.Listener):
-        called = False
-
+    class Compilation(event.Listener):
         def on_start(self, _: object) -> None:
-            if not self.called:
-                self.called = True
-                call()
+            call()
 
         def on_end(self, _: object) -> None:
             pass
 
-    event.register("numba:compile", FirstCompilation())
+    event.register("numba:compile", Compilation())

@@ -145,7 +145,7 @@ class _Crew:
         return isinstance(future.exception(), self.died)
 
     def alone(self, chunk: Chunk) -> list[FrameRows]:
-        """The rows of a chunk during which a worker died."""
+        """The rows of a chunk during which a worker died: once more, then frame by frame."""
         for _ in range(2 if len(chunk) == 1 else 1):
             try:
                 return self.finished(self.submit(chunk))

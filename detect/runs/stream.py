@@ -23,7 +23,7 @@ from detect.runs.frame import FramePlan, FrameTask
 from detect.runs.known import Known
 from detect.runs.outputs import Conduct, outputs_of
 from detect.runs.rows import FrameRows, RunSummary
-from detect.runs.run_files import RunFiles, SecondPass
+from detect.runs.run_files import RunFiles
 from detect.runs.workers import local_workers
 from storage import write_whole
 
@@ -109,7 +109,13 @@ def detect_run(
             for _, rows in frames:
                 count(rows)
         summary.images_without_step = run.images_without_step
-        files.finish(summary, _second_pass(plan, summary))
+        second_pass = None
+        if plan.levelling == "run" and plan.camera and plan.lines and plan.circles:
+            from detect.runs.level_run import level_run
+
+            sigma_rad = math.radians(plan.circles.tilt_sigma_deg)
+            second_pass = partial(level_run, plan.camera, sigma_rad, summary)
+        files.finish(summary, second_pass)
     return summary
 
 
@@ -135,12 +141,3 @@ def _write_pictures(
     for name, picture in chain.from_iterable(rows.pictures for _, rows in frames):
         with write_whole(folder / name, overwrite=overwrite) as stream:
             stream.write(picture)
-
-
-def _second_pass(plan: FramePlan, summary: RunSummary) -> SecondPass | None:
-    """The second pass over the files of the frames, if there is one."""
-    if plan.levelling != "run" or not (plan.camera and plan.lines and plan.circles):
-        return None
-    from detect.runs.level_run import level_run
-
-    return partial(level_run, plan.camera, math.radians(plan.circles.tilt_sigma_deg), summary)

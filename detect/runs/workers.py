@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, ParamSpec, TypeVar, cast
 from detect.announcing import (
     announce_compiling,
     announcements_are_shown,
-    on_first_compilation,
+    on_compilation,
     say_compiling,
     show_announcements,
 )
@@ -174,7 +174,7 @@ class _ProcessPool(ProcessPoolExecutor):
                 manager.join(_GRACE_S)
 
 
-#: Held by the process that compiles kernels, until its task is done.
+#: Held by the process that compiles kernels, until it has done what it needs them for.
 _compiling: list[Lock] = []
 
 
@@ -187,17 +187,17 @@ def _begin(plan: FramePlan, tables: Lock, kernels: Lock, show: bool) -> None:
     import cv2
 
     cv2.setNumThreads(1)
-    on_first_compilation(lambda: _compile_or_wait(kernels))
+    on_compilation(lambda: _compile_or_wait(kernels))
     with suppress(Exception), tables:  # any error recurs, and is reported, with the first task
-        tables_of(plan)
+        _in_worker(tables_of, plan)
 
 
 def _compile_or_wait(kernels: Lock) -> None:
-    if kernels.acquire(block=False):
+    if not _compiling and kernels.acquire(block=False):
         _compiling.append(kernels)
         say_compiling()
-    else:
-        # All kernels but the one that is met first will be loaded: the first process has kept them.
+    elif not _compiling:
+        # All kernels but this one will be loaded: the other process has kept them.
         with kernels:
             pass
 
