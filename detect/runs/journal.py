@@ -48,7 +48,7 @@ class Journal:
         self._digest, self._end = hashlib.sha256(), 0
 
     def write(self, *records: object) -> None:
-        """Write records behind those that were taken over or written last."""
+        """Append records to those that were taken over or written."""
         self.file.stream.seek(self._end)
         for record in records:
             line = json.dumps(record, separators=(",", ":")).encode()

@@ -67,9 +67,9 @@ def local_workers(jobs: int, *, large: bool = False) -> Workers:
         raise WorkerError(f"jobs is {jobs}: expected 1 or more")
     chunk = 1 if large else _TOGETHER
     if jobs == 1:
-        return Workers(_in_process, chunk, window=lambda: 1)
+        return Workers(lambda _: _InProcess(), chunk, window=lambda: 1)
     window = 2 + _WINDOW_PER_WORKER * jobs
-    return Workers(lambda plan: _processes(jobs, plan), chunk, lambda: window)
+    return Workers(lambda plan: _ProcessPool(jobs, plan), chunk, lambda: window)
 
 
 def cluster_workers(address: str, *, large: bool = False) -> Workers:
@@ -111,16 +111,13 @@ def cluster_workers(address: str, *, large: bool = False) -> Workers:
 class _InProcess(Executor):
     """Runs each task immediately, before it returns the future."""
 
+    def __init__(self) -> None:
+        announce_compiling()
+
     def submit(self, fn: Callable[P, R], /, *args: P.args, **kwargs: P.kwargs) -> Future[R]:
         future: Future[R] = Future()
         future.set_result(fn(*args, **kwargs))
         return future
-
-
-@contextmanager
-def _in_process(plan: FramePlan) -> Iterator[Executor]:
-    announce_compiling()
-    yield _InProcess()
 
 
 # -- processes of this machine ---------------------------------------------------------------
@@ -131,18 +128,11 @@ def _in_process(plan: FramePlan) -> Iterator[Executor]:
 # by themselves.
 
 
-@contextmanager
-def _processes(count: int, plan: FramePlan) -> Iterator[Executor]:
-    """Processes that get ready for a plan; they have ended when the block has."""
-    pool = _ProcessPool(count, plan)
-    try:
-        yield pool
-    finally:
-        pool.end()
-
-
 class _ProcessPool(ProcessPoolExecutor):
-    """Processes that inherit a blocked interrupt: it would reach them even while they start."""
+    """Processes that get ready for a plan; as a context manager it ends them.
+
+    They inherit a blocked interrupt: it would reach them even while they start.
+    """
 
     def __init__(self, count: int, plan: FramePlan) -> None:
         context = multiprocessing.get_context("spawn")
@@ -154,7 +144,7 @@ class _ProcessPool(ProcessPoolExecutor):
         with interrupts_deferred():  # else one would be left half started
             return super().submit(_in_worker, fn, *args, **kwargs)
 
-    def end(self) -> None:
+    def __exit__(self, *_: object) -> None:
         """End them, whatever they are doing; a further interrupt waits for that.
 
         The thread that manages them is joined: an interrupted program leaves threads behind, and
