@@ -157,18 +157,21 @@ def _path(
         yield
 
         found.tilt = task.known.tilt
-        if plan.lines is not None and tables.verticals is not None:
+        if plan.lines is not None:
             from detect.lines import detect_lines
 
+            assert tables.verticals is not None
             found.lines = detect_lines(image, tables.verticals, plan.lines)
             found.tilt = tilt_of_lines(prefix, found.lines)
         yield
 
-        if plan.circles is not None and tables.discs is not None and camera is not None:
+        if plan.circles is not None:
             from detect.circles import detect_circles
             from detect.discs.outline_tilt import tilt_of_outlines
             from detect.levelling import levelled
 
+            assert tables.discs is not None
+            assert camera is not None
             by_frame = found.tilt if plan.levelling == "frame" else None
             level = by_frame is None and plan.levelling != "run"
             settings = plan.circles if level else _without_tilt(plan.circles)
