@@ -59,7 +59,7 @@ class RunFiles:
     # -- beginning ------------------------------------------------------------------------
 
     def __enter__(self) -> RunFiles:
-        places = [Path(os.path.realpath(path.parent), path.name) for path in self._paths]
+        places = [os.path.realpath(path) for path in self._paths]
         for path, place in zip(self._paths, places):
             if places.count(place) > 1:  # the last one would be all there is
                 raise DetectError(f"{path}: named for two results: expected a file for each")

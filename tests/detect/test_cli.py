@@ -294,6 +294,15 @@ def test_what_is_no_regular_file_is_refused(
     assert not path.is_file()
 
 
+def test_two_links_to_one_file(small_run: Path, tmp_path: Path, capsys: Captured) -> None:
+    for name in ("one", "two"):
+        (tmp_path / name).symlink_to(tmp_path / "rows")
+    arguments = ["circles", str(small_run), "-o", str(tmp_path / "one"), "--force"]
+    assert main([*arguments, "--json", str(tmp_path / "two")]) == 1
+    assert "named for two results" in capsys.readouterr().err
+    assert not (tmp_path / "rows").exists()
+
+
 @pytest.mark.parametrize("there", [True, False])
 def test_a_link_is_written_through(small_run: Path, tmp_path: Path, there: bool) -> None:
     """It stays a link; its target, in another folder, is replaced whole."""
