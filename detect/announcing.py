@@ -7,52 +7,44 @@ it; the command line shows it on stderr.
 from __future__ import annotations
 
 import logging
-import sys
 from collections.abc import Callable
 from functools import cache
 
 _log = logging.getLogger("redetect")
 
 
-class _ToStderr(logging.Handler):
-    def emit(self, record: logging.LogRecord) -> None:
-        print(record.getMessage(), file=sys.stderr, flush=True)
-
-
-_to_stderr = _ToStderr()
-
-
 def show_announcements() -> None:
     """Show announcements on stderr."""
     _log.setLevel(logging.INFO)
-    if _to_stderr not in _log.handlers:
-        _log.addHandler(_to_stderr)
+    _log.handlers = [logging.StreamHandler()]
 
 
 def announcements_are_shown() -> bool:
     """Whether announcements go to stderr."""
-    return _to_stderr in _log.handlers
+    return bool(_log.handlers)
 
 
 @cache
 def announce_compiling() -> None:
     """Have it announced when the first kernel is compiled instead of loaded."""
-    on_first_compilation(lambda: _log.info("compiling kernels, once: about a minute"))
+    on_compilation(say_compiling)
 
 
-def on_first_compilation(call: Callable[[], object]) -> None:
-    """Have something called before this process compiles its first kernel."""
+@cache
+def say_compiling() -> None:
+    """Announce, once, that kernels are compiled."""
+    _log.info("compiling kernels, once: about a minute")
+
+
+def on_compilation(call: Callable[[], object]) -> None:
+    """Have something called before this process compiles a kernel."""
     from numba.core import event
 
-    class FirstCompilation(event.Listener):
-        called = False
-
+    class Compilation(event.Listener):
         def on_start(self, _: object) -> None:
-            if not self.called:
-                self.called = True
-                call()
+            call()
 
         def on_end(self, _: object) -> None:
             pass
 
-    event.register("numba:compile", FirstCompilation())
+    event.register("numba:compile", Compilation())

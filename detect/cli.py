@@ -14,10 +14,9 @@ import os
 import sys
 from collections.abc import Sequence
 
-import tyro
+from tyro import MISSING
 
 from detect.announcing import show_announcements
-from detect.errors import WorkerError
 from detect.exports.options import Export
 from detect.interrupts import interrupts_noted
 from detect.line_settings import PRESETS as LINE_PRESETS
@@ -29,7 +28,7 @@ from detect.settings import PRESETS as CIRCLE_PRESETS
 from detect.settings import CircleSettings
 from detect.viewing_options import Draw, Report, Tune, View
 from storage.command_line import Program
-from storage.exit_codes import of_kernel_cache, say_error, say_interrupted
+from storage.exit_codes import EXIT_INTERRUPTED, exit_code_of
 
 Command = Circles | Lines | Markers | All | Compare | Export | Draw | View | Report | Tune
 
@@ -50,27 +49,15 @@ PROGRAM = Program(
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
-    with interrupts_noted() as interrupted:
-        try:
-            try:
-                command = parsed(sys.argv[1:] if arguments is None else arguments)
-                return carry_out(command)
-            finally:
-                sys.stdout.flush()
-        except KeyboardInterrupt:
-            pass
-        except (ValueError, OSError, WorkerError) as error:
-            if not interrupted.is_set():
-                return say_error(error)
-        except BaseException as error:
-            if not interrupted.is_set():
-                if of_kernel_cache(error):
-                    return say_error(error)
-                raise
-    code = say_interrupted()
-    if arguments is None:
+
+    def work() -> int:
+        with interrupts_noted():
+            return carry_out(parsed(sys.argv[1:] if arguments is None else arguments))
+
+    code = exit_code_of(work)
+    if code == EXIT_INTERRUPTED and arguments is None:
         # Left to itself, Python dies of an interrupt that passed through an `exec` of some
-        # library's, although it was caught here.
+        # library's, although it was caught.
         atexit._run_exitfuncs()
         os._exit(code)
     return code
@@ -91,12 +78,12 @@ def parsed(arguments: Sequence[str]) -> Command:
     markers = MARKER_PRESETS.get(preset, MarkerSettings())
     command: Command = PROGRAM.parsed(
         arguments,
-        {
-            Circles: Circles(run=tyro.MISSING, settings=circles),
-            Lines: Lines(run=tyro.MISSING, settings=lines),
-            Markers: Markers(run=tyro.MISSING, settings=markers),
-            All: All(run=tyro.MISSING, circles=circles, lines=lines),
-        },
+        (
+            Circles(run=MISSING, settings=circles),
+            Lines(run=MISSING, settings=lines),
+            Markers(run=MISSING, settings=markers),
+            All(run=MISSING, circles=circles, lines=lines),
+        ),
     )
     return command
 
@@ -106,9 +93,9 @@ def _with_radius_found(arguments: Sequence[str]) -> list[str]:
     found, rest = [], list(arguments)
     while rest:
         word = rest.pop(0)
-        name, equals, value = word.partition("=")
+        name, _, value = word.partition("=")
         if name in ("--radius-m", "--circles.radius-m"):
-            if not equals and rest[:1] == ["auto"]:
+            if word == name and rest[:1] == ["auto"]:
                 value = rest.pop(0)
             if value == "auto":
                 word = "--find-radius"
@@ -118,9 +105,9 @@ def _with_radius_found(arguments: Sequence[str]) -> list[str]:
 
 def _preset(arguments: Sequence[str]) -> str:
     """The preset that a command line names: it decides the other flags' defaults."""
-    for position, argument in enumerate(arguments):
-        if argument == "--preset" and position + 1 < len(arguments):
-            return arguments[position + 1]
-        if argument.startswith("--preset="):
-            return argument.partition("=")[2]
+    for word, following in zip(arguments, [*arguments[1:], ""]):
+        if word == "--preset":
+            return following
+        if word.startswith("--preset="):
+            return word.partition("=")[2]
     return "default"

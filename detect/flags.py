@@ -48,7 +48,7 @@ class PickedFrames:
     Parameters
     ----------
     every : int
-        Only every so manieth frame.
+        Only every n-th frame.
     frames : tuple of str
         Only these frames: names of images, positions in the run, and ranges FROM:TO or
         FROM:TO:STEP of positions without the last.

@@ -13,28 +13,30 @@ from __future__ import annotations
 import signal
 import threading
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
-from types import FrameType
-from typing import Any, NoReturn
+from contextlib import contextmanager
+from typing import NoReturn
 
 _received = threading.Event()
 
 
 @contextmanager
-def interrupts_noted() -> Iterator[threading.Event]:
-    """Record interrupts during a block; yields an event that an interrupt sets."""
+def interrupts_noted() -> Iterator[None]:
+    """Record interrupts during a block; whatever it raises after one becomes an interrupt."""
     _received.clear()
     if threading.current_thread() is not threading.main_thread():
-        yield _received
+        yield
         return
 
-    def note(_: int, __: FrameType | None) -> NoReturn:
+    def note(*_: object) -> NoReturn:
         _received.set()
         raise KeyboardInterrupt
 
     before = signal.signal(signal.SIGINT, note)
     try:
-        yield _received
+        yield
+    except BaseException:
+        raise_if_interrupted()
+        raise
     finally:
         signal.signal(signal.SIGINT, before)
 
@@ -45,53 +47,22 @@ def interrupts_deferred() -> Iterator[None]:
 
     Processes started meanwhile inherit a blocked interrupt. That alone would not do: an interrupt
     that this thread blocks is taken by another one, and raised in this one all the same.
-
-    Raises
-    ------
-    KeyboardInterrupt
-        At the end of the block, if there was one during it.
     """
+    deferred = threading.Event()
     before = signal.getsignal(signal.SIGINT)
-    if threading.current_thread() is not threading.main_thread() or not callable(before):
-        with _interrupts_blocked():
-            yield
-        return
-    waiting = threading.Event()
-
-    def note(_: int, __: FrameType | None) -> None:
-        waiting.set()
-
-    signal.signal(signal.SIGINT, note)
+    handled = threading.current_thread() is threading.main_thread() and callable(before)
+    if handled:
+        signal.signal(signal.SIGINT, lambda *_: deferred.set())
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
-        with _interrupts_blocked():
-            yield
+        yield
     finally:
-        signal.signal(signal.SIGINT, before)
-    if waiting.is_set():
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        if handled:
+            signal.signal(signal.SIGINT, before)
+    if deferred.is_set():
         _received.set()
         raise KeyboardInterrupt
-
-
-def interrupts_deferred_in(kernel: Any) -> AbstractContextManager[None]:
-    """Defer interrupts while a compiled kernel runs that returns named tuples.
-
-    Numba makes these by Python code and does not check whether an interrupt ended it. A kernel that
-    is not compiled yet may take a minute, which nobody should have to wait for: then an interrupt
-    ends the compiling.
-    """
-    return interrupts_deferred() if kernel.signatures else nullcontext()
-
-
-@contextmanager
-def _interrupts_blocked() -> Iterator[None]:
-    if not hasattr(signal, "pthread_sigmask"):  # Windows
-        yield
-        return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def raise_if_interrupted() -> None:

@@ -14,6 +14,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Generator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
@@ -24,7 +25,7 @@ from numpy.typing import NDArray
 from camera import Camera, read_camera
 from detect.errors import DetectError, FrameError
 from detect.sources.gray import bounded_content, decode_gray
-from detect.sources.image_names import IMAGE_SUFFIXES, FileStamp, ImageNames, images_of_folder
+from detect.sources.image_names import IMAGE_SUFFIXES, ImageNames, images_of_folder
 from landmarks import Step, read_steps
 
 
@@ -45,8 +46,6 @@ class RunFrame:
         Significant bits of a file with more than 8.
     failure : str or None
         Why there is no image, although there should be.
-    stamp : (int, int) or None
-        The file's size and time of change, if they are known.
     """
 
     step: Step
@@ -55,89 +54,66 @@ class RunFrame:
     time_s: float | None = None
     bits: int = 16
     failure: str | None = None
-    stamp: FileStamp | None = field(default=None, compare=False, repr=False)
 
 
 class Frames(Protocol):
     """The frames of a run, made on demand.
 
     Iterating again starts over (with a live camera: from then on).
+
+    Attributes
+    ----------
+    ships_images : bool
+        Whether frames carry contents of images, not paths.
+    expected : int or None
+        Approximate number of frames, if it is known.
+    left_out : int
+        How many images, so far, are no part of the run.
+    why_left_out : str
+        Why; printed after their number.
     """
 
-    #: Whether frames carry contents of images, not paths.
     ships_images: bool
 
     @property
-    def expected(self) -> int | None:
-        """Approximate number of frames; None if unknown."""
-        ...
+    def expected(self) -> int | None: ...
 
     @property
-    def left_out(self) -> int:
-        """How many images, so far, are no part of the run."""
-        ...
+    def left_out(self) -> int: ...
 
     @property
-    def why_left_out(self) -> str:
-        """Why frames were left out; printed after their number."""
-        ...
+    def why_left_out(self) -> str: ...
 
     def __iter__(self) -> Generator[RunFrame, None, None]: ...
 
 
 class RunFrames:
-    """The frames of a run folder: in the order of the odometry, or of names.
-
-    Parameters
-    ----------
-    images : ImageNames
-    odometry : path or None
-        The file of STEP rows.
-    count, left_out : int
-        How many frames there are, and images that the odometry does not name.
-    bits : int
-        Significant bits of 16-bit images.
-    """
+    """The frames of a run folder: in the order of the odometry, or of names."""
 
     ships_images = False
     why_left_out = "images are not named by a STEP row: left out"
 
     def __init__(
-        self, images: ImageNames, odometry: Path | None, count: int, left_out: int, bits: int
+        self, images: ImageNames, odometry: Path | None, expected: int, left_out: int, bits: int
     ) -> None:
-        self._images = images
-        self._odometry = odometry
-        self._count = count
-        self._bits = bits
-        self.left_out = left_out
-
-    def __len__(self) -> int:
-        return self._count
-
-    @property
-    def expected(self) -> int | None:
-        """How many frames there are."""
-        return self._count
+        self._images, self._odometry, self._bits = images, odometry, bits
+        self.expected, self.left_out = expected, left_out
 
     def __iter__(self) -> Generator[RunFrame, None, None]:
         if self._odometry is None:
             for place in range(len(self._images)):
-                step = _standing_still(self._images.path(place).stem)
-                try:
-                    path, stamp = self._images.checked(place)
-                except FrameError as error:
-                    yield RunFrame(step, None, failure=str(error))
-                    continue
-                yield RunFrame(step, path, bits=self._bits, stamp=stamp)
-            return
-        for step in read_steps(self._odometry):
-            try:
-                found = self._images.place_of(step.prefix)
-                image, stamp = (None, None) if found is None else self._images.checked(found)
-            except FrameError as error:
-                yield RunFrame(step, None, failure=str(error))
-                continue
-            yield RunFrame(step, image, bits=self._bits, stamp=stamp)
+                yield self._frame(_standing_still(self._images.path(place).stem), place)
+        else:
+            for step in read_steps(self._odometry):
+                yield self._frame(step)
+
+    def _frame(self, step: Step, place: int | None = None) -> RunFrame:
+        try:
+            found = self._images.place_of(step.prefix) if place is None else place
+            image = None if found is None else self._images.checked(found)[0]
+        except FrameError as error:
+            return RunFrame(step, None, failure=str(error))
+        return RunFrame(step, image, bits=self._bits)
 
 
 @dataclass(frozen=True)
@@ -149,13 +125,12 @@ class ImageRun:
     folder : path
         The run folder; of another source the folder that it is in.
     frames : Frames
-        In the order of the odometry, or of the images' names.
     odometry : path or None
         Where the STEP rows come from.
     output_base : path
         Results are called this, with an ending of their own.
     has_times : bool
-        Whether the frames' times are known and to be written beside the results.
+        Whether the frames' times are known and written beside the results.
     """
 
     folder: Path
@@ -181,24 +156,12 @@ class ImageRun:
 
     def calibrated(self, camera: Camera) -> Run:
         """The run with a calibration."""
-        return Run(
-            self.folder,
-            self.frames,
-            self.odometry,
-            self.output_base,
-            self.has_times,
-            camera=camera,
-        )
+        return Run(**vars(self), camera=camera)
 
 
 @dataclass(frozen=True)
 class Run(ImageRun):
-    """A run with a calibration.
-
-    Attributes
-    ----------
-    camera : Camera
-    """
+    """A run with a calibration."""
 
     camera: Camera = field(kw_only=True)
 
@@ -235,27 +198,10 @@ def open_run(folder: Path, camera_path: Path | None = None, *, bits: int | None 
 def open_images(
     folder: Path, camera_path: Path | None = None, *, bits: int | None = None
 ) -> ImageRun:
-    """Read a run folder that may be without a calibration.
-
-    Parameters
-    ----------
-    folder, camera_path, bits
-        As in `open_run`.
-
-    Returns
-    -------
-    ImageRun
-        A `Run` if there is a calibration.
-
-    Raises
-    ------
-    DetectError, camera.CameraError, landmarks.LandmarkFileError
-        As `open_run`, except for a missing calibration.
-    """
+    """Read a run folder as `open_run` does; without a calibration it is no `Run`."""
     _demand_folder(folder)
-    if camera_path is None and not any(folder.glob("*.cam")):
-        return _image_run(folder, bits)
-    return open_run(folder, camera_path, bits=bits)
+    has_camera = camera_path is not None or any(folder.glob("*.cam"))
+    return open_run(folder, camera_path, bits=bits) if has_camera else _image_run(folder, bits)
 
 
 def _demand_folder(folder: Path) -> None:
@@ -269,22 +215,20 @@ def _image_run(folder: Path, bits: int | None) -> ImageRun:
     images = images_of_folder(folder)
     odometry = _odometry(folder)
     bits = bits_of_images(images) if bits is None else bits
-    if odometry is None:
-        frames = RunFrames(images, None, len(images), 0, bits)
-    else:
+    count, left_out = len(images), 0
+    if odometry is not None:
         named = np.zeros(len(images), bool)
         count = 0
         for step in read_steps(odometry):
             count += 1
-            try:
+            with suppress(FrameError):  # reported when the frame is processed
                 found = images.place_of(step.prefix)
                 if found is not None:
                     if images.has_links:
                         images.checked(found)
                     named[found] = True
-            except FrameError:
-                continue  # reported when the frame is processed
-        frames = RunFrames(images, odometry, count, int(np.count_nonzero(~named)), bits)
+        left_out = int(np.count_nonzero(~named))
+    frames = RunFrames(images, odometry, count, left_out, bits)
     return ImageRun(folder, frames, odometry, folder / "detected")
 
 
@@ -293,19 +237,18 @@ def read_image(
 ) -> NDArray[np.uint8]:
     """The grey image of a frame.
 
-    Colour images are converted, 16-bit images brought to 8 bits (see `detect.sources.gray`).
-
     Parameters
     ----------
     frame : RunFrame
     camera : Camera or None
         Whose size the image must have, if any.
     working_folder : path, optional
-        What relative paths are relative to, if not the process's own working folder.
+        Folder that relative paths start from, if not the process's own working folder.
 
     Returns
     -------
     (H, W) uint8 array
+        Brightness; 16 bits are brought to 8 (see `detect.sources.gray`).
 
     Raises
     ------
@@ -323,11 +266,8 @@ def read_image(
     elif frame.image is None:
         raise FrameError(f"{frame.step.prefix}: no image of that name in the run")
     else:
-        path = os.fspath(frame.image)
-        if working_folder is not None:
-            path = os.path.join(working_folder, path)  # noqa: PTH118 - a Path costs several times that
-        content = bounded_content(path, frame.image, size)
-        image = decode_gray(content, name, frame.bits, size)
+        path = os.path.join(working_folder or "", frame.image)  # noqa: PTH118 - faster than a Path
+        image = decode_gray(bounded_content(path, frame.image, size), name, frame.bits, size)
     if camera is not None and image.shape != (camera.height, camera.width):
         raise FrameError(
             f"{name}: is {image.shape[1]}x{image.shape[0]} px: "
@@ -338,16 +278,8 @@ def read_image(
 
 
 def camera_in(folder: Path) -> Camera | None:
-    """The calibration in a run folder; None where there is none.
-
-    Raises
-    ------
-    DetectError, camera.CameraError
-        If there are several to choose from, or it cannot be read.
-    """
-    if not any(folder.glob("*.cam")):
-        return None
-    return read_camera(_only_camera(folder))
+    """The calibration in a run folder; None where there is none."""
+    return read_camera(_only_camera(folder)) if any(folder.glob("*.cam")) else None
 
 
 def _only_camera(folder: Path) -> Path:

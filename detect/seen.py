@@ -31,8 +31,7 @@ def image_positions(
     floor_xy : (..., 2) array_like
         Robot X and Y, metres.
     levelled_by : (float, float), optional
-        Pitch and roll (rad) that turned the positions level, about the origin of the robot frame
-        (`landmarks.Frame.levelled_by`); None: nothing did.
+        Pitch and roll (rad) that turned the positions level (`landmarks.Frame.levelled_by`).
     raised_m : float
         How much higher the camera is than calibrated, metres.
 
@@ -52,19 +51,10 @@ def image_positions(
 def level_seen(
     camera: Camera, floor_xy: ArrayLike, levelled_by: Tilt, raised_m: float = 0.0
 ) -> FloatArray:
-    """Level positions of discs that the calibrated camera sees at `floor_xy`.
+    """Level positions (m) of discs that the calibrated camera sees at `floor_xy`, (N, 2).
 
-    Parameters
-    ----------
-    camera, levelled_by, raised_m
-        As in `image_positions`.
-    floor_xy : (N, 2) array_like
-        Positions computed without knowledge of tilt and height, metres.
-
-    Returns
-    -------
-    (N, 2) float64
-        Metres; NaN where the levelled ray does not meet the floor.
+    The other parameters are as in `image_positions`; NaN where the levelled ray does not meet the
+    floor.
     """
     xy = np.asarray(floor_xy, dtype=np.float64).reshape(-1, 2)
     turn = level_matrix(levelled_by)
@@ -92,13 +82,7 @@ def circle_on_floor(centre_xy: ArrayLike, radius_m: float, points: int = _POINTS
 class FrameView:
     """How reference and detected rows of one frame come back into its image.
 
-    Attributes
-    ----------
-    camera : Camera
-    radius_m : float
-        Of the discs.
-    reference_by, detected_by : (float, float) or None
-        Tilts by which the rows of either side were levelled.
+    `reference_by` and `detected_by` are the tilts by which the rows of either side were levelled.
     """
 
     camera: Camera

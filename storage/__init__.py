@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
-from storage.parts import OutputExistsError, new_part
+from storage.parts import OutputExistsError, demand_place, new_part
 
 __all__ = ["OutputExistsError", "write_whole"]
 
@@ -20,9 +20,9 @@ __all__ = ["OutputExistsError", "write_whole"]
 def write_whole(path: str | os.PathLike[str], *, overwrite: bool) -> Iterator[BinaryIO]:
     """Open a binary stream whose content appears at `path` only once it is complete.
 
-    The bytes go to a temporary file in the same folder (see `storage.parts`), which takes the place
-    of `path` in one step when the block ends, and is removed when the block raises. What a killed
-    process left of the same result is removed.
+    The bytes go to a hidden file in the same folder (see `storage.parts`), which takes the place of
+    `path` in one step when the block ends, and is removed when the block raises. If `path` is a
+    symbolic link, its target is written.
 
     Parameters
     ----------
@@ -41,12 +41,12 @@ def write_whole(path: str | os.PathLike[str], *, overwrite: bool) -> Iterator[Bi
     OutputExistsError
         If `path` exists and `overwrite` is false.
     OSError
-        If the folder cannot be written to, or the disk is full; names `path`.
+        If `path` is no regular file, its folder cannot be written to, or the disk is full; names
+        `path`.
     """
     path = Path(path)
-    if not overwrite and os.path.lexists(path):
-        raise OutputExistsError(path)
+    demand_place(path, overwrite=overwrite)
     with new_part(path) as part:
         yield part.stream
         part.sync()
-        part.place(overwrite=overwrite)
+        part.replace(path, overwrite=overwrite)

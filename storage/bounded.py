@@ -17,10 +17,6 @@ def read_bounded(path: str | os.PathLike[str], largest_bytes: int) -> bytes:
     largest_bytes : int
         A larger file is refused before it is read.
 
-    Returns
-    -------
-    bytes
-
     Raises
     ------
     OSError
@@ -39,8 +35,7 @@ def read_bounded(path: str | os.PathLike[str], largest_bytes: int) -> bytes:
             raise OSError(errno.EINVAL, "is a pipe, socket or device: expected a file")
         if state.st_size > largest_bytes:
             raise OSError(errno.EFBIG, f"larger than {largest_bytes} bytes")
-        # `read` allocates what is asked for, even if the file is shorter; and some file systems
-        # return only part of it in one call.
+        # Some file systems return only part of what is asked for in one call.
         content = os.read(handle, state.st_size + 1)
         while more := os.read(handle, state.st_size + 1 - len(content)):
             content += more

@@ -8,27 +8,18 @@ NaN is always refused; infinity is refused unless it means "no limit".
 from __future__ import annotations
 
 import math
-import operator
 from dataclasses import dataclass
+from numbers import Integral
 from typing import Any
 
 from storage.messages import excerpt
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Bounds:
-    """The numbers that one setting may have.
+    """The numbers that a setting may have: an interval, in words and by its ends.
 
-    Attributes
-    ----------
-    expected : str
-        In words.
-    least, most : float
-        Both ends, which may be reached
-    above, below : bool
-        unless these say that they may not.
-    whole : bool
-        Whether only whole numbers will do.
+    `above` and `below` exclude the ends; `whole` demands whole numbers.
     """
 
     expected: str
@@ -40,12 +31,11 @@ class Bounds:
 
     def hold(self, value: Any) -> bool:
         """Whether a value is such a number."""
-        if isinstance(value, bool):
+        if isinstance(value, bool) or (self.whole and not isinstance(value, Integral)):
             return False
         try:
-            number = operator.index(value) if self.whole else value
-            high_enough = number > self.least if self.above else number >= self.least
-            low_enough = number < self.most if self.below else number <= self.most
+            high_enough = value > self.least if self.above else value >= self.least
+            low_enough = value < self.most if self.below else value <= self.most
         except TypeError:
             return False
         return bool(high_enough and low_enough)
@@ -79,21 +69,16 @@ PROBABILITY = inside(0.0, 1.0)
 
 
 def demand(settings: object, error: type[Exception], /, **bounds: Bounds) -> None:
-    """Refuse settings with a number that cannot be.
+    """Refuse settings with a number out of its bounds.
 
     Parameters
     ----------
     settings : object
         Has the numbers as attributes; each number of a tuple is checked.
     error : type of exception
-        The exception to raise.
+        What is raised: names the setting, its value and what was expected.
     bounds : Bounds
         By the attributes' names.
-
-    Raises
-    ------
-    error
-        If a number is out of its bounds: its name, its value, and what was expected.
     """
     for name, allowed in bounds.items():
         value = getattr(settings, name)

@@ -12,9 +12,6 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import Annotated, Any, Union
 
-import tyro
-from tyro.conf import arg, subcommand
-
 from storage.exit_codes import exit_code_of
 from storage.version import __version__
 
@@ -44,26 +41,27 @@ class Program:
         given = sys.argv[1:] if arguments is None else arguments
         return exit_code_of(lambda: self.carry_out(self.parsed(given)))
 
-    def parsed(
-        self, arguments: Sequence[str], defaults: Mapping[type, object] | None = None
-    ) -> Any:
-        """Parse a command line; exits after `--help` and on errors.
+    def parsed(self, arguments: Sequence[str], defaults: Sequence[object] = ()) -> Any:
+        """Parse a command line; exits after `--help`, `--version` and on errors.
 
         Parameters
         ----------
         arguments : sequence of str
-        defaults : mapping, optional
-            Commands that flags change, for some of the classes.
+        defaults : sequence of commands
+            What the flags of these commands start from.
         """
-        commands: list[Any] = []
-        for kind in self.performed_by:
-            name, known = kind.__name__.lower(), defaults or {}
-            named = subcommand(name, default=known[kind]) if kind in known else subcommand(name)
-            commands.append(Annotated[kind, named])
+        import tyro
+        from tyro.conf import arg, subcommand
+
         if list(arguments) == ["--version"]:
             print(f"{self.name} {__version__}")
             raise SystemExit(0)
-        choice: Any = Union.__getitem__(tuple(commands))
+        known: dict[type, Any] = {type(c): {"default": c} for c in defaults}
+        commands: Any = tuple(
+            Annotated[kind, subcommand(kind.__name__.lower(), **known.get(kind, {}))]
+            for kind in self.performed_by
+        )
+        choice: Any = Union.__getitem__(commands)
         return tyro.cli(
             Annotated[choice, arg(name="")],
             prog=self.name,

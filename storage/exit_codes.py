@@ -9,7 +9,7 @@ import traceback
 from collections.abc import Callable
 from pathlib import Path
 
-from storage.messages import one_line
+from storage.messages import OneLineError, one_line
 
 #: The command could not be carried out.
 EXIT_ERROR = 1
@@ -19,7 +19,7 @@ EXIT_INTERRUPTED = 130
 EXIT_UNREAD = 141
 
 _NUMBAS_CACHING = os.path.join("numba", "core", "caching.py")  # noqa: PTH118 - part of a path
-_WHERE_KERNELS_GO = (
+_ADVICE = (
     "free some disk space, delete those of another version of this program (*.nbi in __pycache__), "
     "or set the environment variable NUMBA_CACHE_DIR to another folder"
 )
@@ -28,8 +28,8 @@ _WHERE_KERNELS_GO = (
 def exit_code_of(work: Callable[[], int]) -> int:
     """Run a command and report its errors on one line.
 
-    All packages raise subclasses of ValueError, the system raises OSErrors. Anything else is a bug
-    and shows its traceback.
+    All packages raise `OneLineError`, the system raises OSErrors, libraries ValueErrors. Anything
+    else is a bug and shows its traceback.
 
     Parameters
     ----------
@@ -49,23 +49,13 @@ def exit_code_of(work: Callable[[], int]) -> int:
             sys.stdout.flush()
     except KeyboardInterrupt:
         return say_interrupted()
-    except (ValueError, OSError) as error:
-        return say_error(error)
     except Exception as error:
-        if of_kernel_cache(error):
-            return say_error(error)
-        raise
-
-
-def say_error(error: BaseException | str) -> int:
-    """Print an error on one line and return the exit code.
-
-    Nothing is printed if the reader of the output has gone.
-    """
-    if isinstance(error, BrokenPipeError) and _is_unread():
-        return EXIT_UNREAD
-    print(f"error: {one_line(_said(error))}", file=sys.stderr)
-    return EXIT_ERROR
+        if isinstance(error, BrokenPipeError) and _is_unread():
+            return EXIT_UNREAD
+        if not isinstance(error, OneLineError | ValueError | OSError) and not _is_of_cache(error):
+            raise
+        print(f"error: {one_line(_message(error))}", file=sys.stderr)
+        return EXIT_ERROR
 
 
 def say_interrupted() -> int:
@@ -91,21 +81,19 @@ def _is_unread() -> bool:
     return True
 
 
-def _said(error: BaseException | str) -> str:
+def _message(error: Exception) -> str:
     """The error's message, with advice if a folder is missing or kernels cannot be cached."""
     if isinstance(error, FileNotFoundError) and isinstance(error.filename, str | os.PathLike):
         folder = Path(error.filename).parent
         if not folder.is_dir():
             return f"{error.filename}: no such folder: {folder}: make it first, or name another"
-    if isinstance(error, BaseException) and of_kernel_cache(error):
-        return (
-            f"compiled kernels cannot be {'kept' if isinstance(error, OSError) else 'loaded'}: "
-            f"{error}: {_WHERE_KERNELS_GO}"
-        )
+    if _is_of_cache(error):
+        lost = "kept" if isinstance(error, OSError) else "loaded"
+        return f"compiled kernels cannot be {lost}: {error}: {_ADVICE}"
     return str(error)
 
 
-def of_kernel_cache(error: BaseException) -> bool:
+def _is_of_cache(error: Exception) -> bool:
     """Whether Numba raised it over its cache of compiled kernels, here or in a worker.
 
     There is no folder for it, no space left in it, or its index names classes of another version of

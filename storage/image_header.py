@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 import struct
 from collections.abc import Iterator
+from contextlib import suppress
 
 #: The largest image that there can be: it fills as many bytes as grey values.
 MOST_PIXELS = 1 << 27
@@ -30,18 +31,10 @@ _ORDINARY_TILE = 1 << 22
 
 
 def claimed_size(content: bytes) -> tuple[int, int] | None:
-    """Width and height that the header of an image file claims.
+    """Width and height (pixels) that the header of an image file claims.
 
-    Parameters
-    ----------
-    content : bytes
-        The file.
-
-    Returns
-    -------
-    (int, int) or None
-        Pixels; of a TIFF with enormous tiles that are larger than the image, those of a tile. None
-        if this is no JPEG, PNG, PNM, BMP or TIFF, or its header is damaged.
+    Of a TIFF with enormous tiles that are larger than the image, those of a tile. None if this is
+    no JPEG, PNG, PNM, BMP or TIFF, or its header is damaged.
     """
     try:
         if content.startswith(b"\xff\xd8"):
@@ -137,30 +130,15 @@ def _tiff_numbers(content: bytes) -> Iterator[tuple[int, str | None, int]]:
 
 
 def without_orientation(content: bytes) -> bytes:
-    """An image file's content with orientation metadata that makes decoders rotate it removed.
+    """The content of an image file, with a TIFF's orientation tag set to "not rotated".
 
     On request, OpenCV ignores the orientation of JPEG and PNG, but not that of TIFF.
-
-    Parameters
-    ----------
-    content : bytes
-        The file.
-
-    Returns
-    -------
-    bytes
-        The same content, with a TIFF's orientation tag set to "not rotated".
     """
     if not content.startswith(_TIFF):
         return content
-    changed = None
-    try:
+    changed = bytearray(content)
+    with suppress(struct.error, OverflowError):  # damaged: the decoder reports it
         for tag, number, place in _tiff_numbers(content):
             if tag == _TIFF_ORIENTATION and number is not None:
-                (turn,) = struct.unpack_from(number, content, place)
-                if turn != 1:
-                    changed = changed if changed is not None else bytearray(content)
-                    struct.pack_into(number, changed, place, 1)
-    except (struct.error, OverflowError):  # damaged: the decoder reports it
-        pass
-    return content if changed is None else bytes(changed)
+                struct.pack_into(number, changed, place, 1)
+    return bytes(changed)

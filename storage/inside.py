@@ -8,12 +8,9 @@ import re
 from pathlib import Path
 
 _DRIVE = re.compile(r"[A-Za-z]:")
-# What Windows takes for a device in any folder, whatever the ending.
-_DEVICES = "(?:con|prn|aux|nul|com[0-9]|lpt[0-9])"
-_DEVICE = re.compile(rf"(?:\A|/){_DEVICES}(?: *\.[^/]*)?(?:/|\Z)", re.IGNORECASE)
-# Most names: one match is enough.
-_PLAIN = re.compile(
-    rf"(?!{_DEVICES}(?:\.|\Z))[0-9a-z_-]++(?:\.[0-9a-z_-]++)*+", re.IGNORECASE | re.ASCII
+#: What Windows takes for a device in any folder, whatever the ending.
+_DEVICE = re.compile(
+    r"(?:\A|/)(?:con|prn|aux|nul|com[0-9]|lpt[0-9])(?: *\.[^/]*)?(?:/|\Z)", re.IGNORECASE
 )
 
 
@@ -33,31 +30,24 @@ def leads_out(name: str, *folders: str) -> str | None:
     str or None
         What is wrong with the name, as the end of a message that starts with it; None if nothing.
     """
-    if _PLAIN.fullmatch(name):
-        return None
     parts = name.replace("\\", "/")
     if "\0" in name:
         return "has a NUL in it"
     if parts.startswith("/") or _DRIVE.match(parts):
         return "is an absolute path"
-    if ".." in parts and not any(_within(parts, home) for home in folders or ("/any/folder",)):
+    if ".." in parts and not any(
+        _within(posixpath.normpath(f"{home}/{parts}"), home) for home in folders or ("/any/folder",)
+    ):
         return "leads out of the folder"
     if _DEVICE.search(parts):
         return "is the name of a device"
     return None
 
 
-def _within(name: str, home: str) -> bool:
-    return posixpath.normpath(f"{home}/{name}").startswith(home.rstrip("/") + "/")
-
-
 def link_out(path: Path, *folders: Path) -> bool:
     """Whether a path is in none of the folders, after all links are resolved."""
     real = os.path.realpath(path)
-    return not any(
-        real == home or real.startswith(home.rstrip("/") + "/")
-        for home in (os.path.realpath(folder) for folder in folders)
-    )
+    return not any(real == home or _within(real, home) for home in map(os.path.realpath, folders))
 
 
 def path_inside(folder: Path, name: str) -> Path:
@@ -74,3 +64,7 @@ def path_inside(folder: Path, name: str) -> Path:
     if why is not None:
         raise ValueError(why)
     return folder / name
+
+
+def _within(path: str, folder: str) -> bool:
+    return path.startswith(folder.rstrip("/") + "/")

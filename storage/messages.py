@@ -13,26 +13,19 @@ LONGEST_MESSAGE = 1000
 _LONGEST_EXCERPT = 60
 _ELLIPSIS = " ... "
 
+_SHORT = reprlib.Repr()
+_SHORT.maxlevel = 3
+_SHORT.maxstring = _SHORT.maxother = _SHORT.maxlong = 40
+
 
 def one_line(text: str, longest: int = LONGEST_MESSAGE) -> str:
-    """Make a text printable: control characters escaped, the middle left out where it is too long.
-
-    Parameters
-    ----------
-    text : str
-    longest : int
-        Characters that are left at most.
-
-    Returns
-    -------
-    str
-        Printable text is returned unchanged.
-    """
+    """Make a text printable: control characters escaped, and at most `longest` characters kept."""
     if len(text) > longest:
         # Escapes make a text longer, never shorter: no more than this can be shown.
         text = text[:longest] + _ELLIPSIS + text[-longest:]
-    if not text.isprintable():
-        text = "".join(c if c.isprintable() else _escaped(c) for c in text)
+    text = "".join(
+        c if c.isprintable() else c.encode("unicode_escape", "surrogatepass").decode() for c in text
+    )
     if len(text) > longest:
         tail = (longest - len(_ELLIPSIS)) // 3
         text = text[: longest - len(_ELLIPSIS) - tail] + _ELLIPSIS + text[len(text) - tail :]
@@ -48,22 +41,7 @@ def excerpt(value: object) -> str:
 
 
 class OneLineError(Exception):
-    """An error whose message is one printable line of bounded length.
-
-    Parameters
-    ----------
-    message : str
-        Passed through `one_line`.
-    """
+    """An error whose message is one printable line of bounded length (`one_line`)."""
 
     def __init__(self, message: str = "") -> None:
         super().__init__(one_line(message))
-
-
-def _escaped(character: str) -> str:
-    return character.encode("unicode_escape", "surrogatepass").decode("ascii")
-
-
-_SHORT = reprlib.Repr()
-_SHORT.maxlevel = 3
-_SHORT.maxstring = _SHORT.maxother = _SHORT.maxlong = 40

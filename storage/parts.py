@@ -1,32 +1,32 @@
-"""Partial files, renamed when they are complete.
+"""Hidden files beside a result, locked while they are written.
 
-A result is written to ``.NAME.part`` in the folder of ``NAME``, and renamed in one step when it is
-complete. The writing process holds a lock on the partial file, which the operating system releases
-however the process ends: an unlocked one was left by a killed process. The next process that writes
-the same result removes it. While one is being written, the next partial file is ``.NAME.1.part``.
+A result is written to ``.NAME.part`` in its folder and renamed in one step when it is complete. The
+operating system releases the lock however the writing process ends: an unlocked file was left by a
+killed process, and the next process that writes the same result removes it. While one is being
+written, the next one is ``.NAME.1.part``. Of a symbolic link, the target is the result.
 """
 
 from __future__ import annotations
 
-import contextlib
+import errno
+import fcntl
 import io
 import os
 import stat
-import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from _typeshed import ReadableBuffer
 
-#: Number of names of partial files that are checked for leftovers of killed processes.
-_PLACES_LOOKED_AT = 8
+#: Number of names that are searched for files of killed processes.
+_NUMBERS = 8
 
-_NEW = os.O_RDWR | os.O_CREAT | os.O_EXCL | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
-# The path of a part may be anything: follow no link and wait for no pipe.
-_OLD = os.O_RDWR | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
+_NEW = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
+# Anything may have been put there: follow no link and wait for no pipe.
+_OLD = os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
 
 
 class OutputExistsError(FileExistsError):
@@ -43,188 +43,145 @@ class NotAFileError(OSError):
         super().__init__(f"{path}: is a device, pipe or socket: expected the name of a file")
 
 
-class PartFile:
-    """A result while it is written: locked, and removed by `discard` unless it took its place.
+def demand_place(path: Path, *, overwrite: bool) -> None:
+    """Refuse a path where no result can be, or where there is one that must not be replaced."""
+    if not path.parent.is_dir():
+        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path))
+    if path.is_dir():
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    if path.exists() and not path.is_file():
+        raise NotAFileError(path)
+    if not overwrite and os.path.lexists(path):
+        raise OutputExistsError(path)
 
-    Attributes
-    ----------
-    path : path
-        Where the result will be.
-    temporary : path
-        Where it is written.
-    number : int
-        Which of the parts of this result it is; 0 unless others were being written.
-    stream : binary stream
-        What is written to it becomes the result. Its errors name the result, not the part.
+
+class PartFile:
+    """A hidden file that this process has locked, and a stream to read and write it.
+
+    Its number is 0 unless others were being written. As a context manager it is removed at the end,
+    unless it was closed or has taken the result's place. Errors of the stream name the result.
     """
 
-    def __init__(self, path: Path, number: int, handle: int) -> None:
-        self.path = path
-        self.number = number
-        self.temporary = part_place(path, number)
-        self.stream = io.BufferedWriter(_NamedFile(handle, path))
+    def __init__(self, result: Path, place: Path, number: int, handle: int) -> None:
+        self._result, self.place, self.number = result, place, number
+        self.stream = io.BufferedRandom(_NamedFile(handle, result))
 
     def __enter__(self) -> PartFile:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.discard()
+        self.remove()
 
     def sync(self) -> None:
-        """Have it on the disk."""
+        """Bring what is written to the disk."""
         self.stream.flush()
-        try:
+        with _naming(self._result):
             os.fsync(self.stream.fileno())
-        except OSError as error:
-            raise named(error, self.path) from None
 
-    def place(self, *, overwrite: bool) -> None:
-        """Move the part to the result's path; if that is a link, to the link's target.
-
-        Raises
-        ------
-        OutputExistsError
-            If there is a file that must not be overwritten.
-        """
-        if sys.platform == "win32":
-            self.close()  # a file that is open keeps its name there
-        try:
+    def replace(self, path: Path, *, overwrite: bool) -> None:
+        """Move it to the result's path, unless there is a file that must not be overwritten."""
+        with _naming(path):
             if overwrite:
-                self.temporary.replace(os.path.realpath(self.path))
+                self.place.replace(os.path.realpath(path))
             else:
-                _place_new(self.temporary, self.path)
-        except OutputExistsError:
-            raise
-        except OSError as error:
-            raise named(error, self.path) from None
+                _link_new(self.place, path)
 
-    def discard(self) -> None:
-        """Remove it, unless it took its place."""
+    def is_in_place(self) -> bool:
+        """Whether it is still there; it may have been moved or removed with its folder."""
+        return _is_at(self.stream.fileno(), self.place)
+
+    def remove(self) -> None:
+        """Remove it, unless it was closed or has taken its place."""
         if not self.stream.closed:
-            if is_at(self.stream.fileno(), self.temporary):
-                self.temporary.unlink(missing_ok=True)
+            if self.is_in_place():
+                self.place.unlink(missing_ok=True)
             self.close()
 
     def close(self) -> None:
-        """Leave it where it is, and take the lock off."""
-        with contextlib.suppress(OSError):  # what is written but not flushed goes with it
+        """Leave it where it is, unlocked."""
+        with suppress(OSError):  # what cannot be flushed is lost
             self.stream.close()
 
 
 class _NamedFile(io.FileIO):
-    """A descriptor for writing whose errors name the result."""
+    """A descriptor whose errors name the result."""
 
-    def __init__(self, handle: int, path: Path) -> None:
-        super().__init__(handle, "wb")
-        self._path = path
+    def __init__(self, handle: int, result: Path) -> None:
+        super().__init__(handle, "r+b")
+        self._result = result
 
     def write(self, content: ReadableBuffer, /) -> int:
-        try:
+        with _naming(self._result):
             return super().write(content)
-        except OSError as error:
-            raise named(error, self._path) from None
 
 
-def new_part(path: Path) -> PartFile:
-    """An empty part for a result; parts that killed processes left are removed.
+def new_part(path: Path, suffix: str = "part", named: Path | None = None) -> PartFile:
+    """A new hidden file beside `path`; those that killed processes left are removed.
 
-    Raises
-    ------
-    NotAFileError
-        If the path exists and is no regular file.
-    OSError
-        If the folder cannot be written to; names the result.
+    Errors name `named`, by default the path.
     """
-    demand_file(path)
+    for number in range(_NUMBERS):
+        left = left_part(path, suffix, number)
+        if left is not None:
+            left.remove()
+    named = path if named is None else named
+    number = 0
+    while True:
+        place = _place(path, suffix, number)
+        with _naming(named), suppress(FileExistsError):
+            handle = os.open(place, _NEW, 0o666)
+            if _lock(handle) is not False and _is_at(handle, place):
+                return PartFile(named, place, number, handle)
+            os.close(handle)  # another process took it for one that was left
+        number += 1
+
+
+def left_part(
+    path: Path, suffix: str = "part", number: int = 0, named: Path | None = None
+) -> PartFile | None:
+    """A hidden file that an ended process left; None if there is none or it is in use."""
+    place = _place(path, suffix, number)
     try:
-        number = 0
-        while (handle := new_locked(part_place(path, number))) is None:
-            number += 1
-        for other in range(number + 1, _PLACES_LOOKED_AT):
-            if os.path.lexists(part_place(path, other)) and (left := left_part(path, other)):
-                left.discard()
-    except OSError as error:
-        raise named(error, path) from None
-    return PartFile(path, number, handle)
-
-
-def demand_file(path: Path) -> None:
-    """Refuse to replace a device, a pipe or a socket (`NotAFileError`)."""
-    if path.exists() and not (path.is_file() or path.is_dir()):
-        raise NotAFileError(path)
-
-
-def left_part(path: Path, number: int = 0) -> PartFile | None:
-    """The part of a result that an ended process left; None if there is none or it is in use."""
-    handle = old_locked(part_place(path, number))
-    return None if handle is None else PartFile(path, number, handle)
-
-
-def part_place(path: Path, number: int) -> Path:
-    """Where the parts of a result are."""
-    return path.with_name(f".{path.name}.{number}.part" if number else f".{path.name}.part")
-
-
-def named(error: OSError, path: Path) -> OSError:
-    """The error with the name of the result: that of its part would mean nothing to a reader."""
-    return type(error)(error.errno, error.strerror, str(path))
+        handle = os.open(place, _OLD)
+    except OSError:
+        return None
+    if stat.S_ISREG(os.fstat(handle).st_mode) and _lock(handle) and _is_at(handle, place):
+        return PartFile(path if named is None else named, place, number, handle)
+    os.close(handle)
+    return None
 
 
 @contextmanager
 def folder_locked(folder: Path) -> Iterator[None]:
     """Lock a folder for the duration of a block; waits for other processes that hold the lock."""
-    if sys.platform == "win32":
-        yield
-        return
-    import fcntl
-
     handle = os.open(folder, os.O_RDONLY | os.O_CLOEXEC)
     try:
         # Without locks on this file system, results of runs at once may be mixed; each is whole.
-        with contextlib.suppress(OSError):
+        with suppress(OSError):
             fcntl.flock(handle, fcntl.LOCK_EX)
         yield
     finally:
         os.close(handle)
 
 
-def new_locked(place: Path) -> int | None:
-    """A new file, locked; None if another process writes it, or the existing file is no part."""
-    while True:
-        try:
-            handle = os.open(place, _NEW, 0o666)
-        except FileExistsError:
-            left = old_locked(place)
-            if left is None:
-                if not os.path.lexists(place):
-                    continue  # it has just taken its place
-                return None
-            place.unlink(missing_ok=True)
-            os.close(left)
-            continue
-        if _lock(handle) is not False and is_at(handle, place):
-            return handle
-        os.close(handle)  # mistaken for a leftover file before it was locked
-
-
-def old_locked(place: Path) -> int | None:
-    """A file that was left behind, locked; None if there is none or it is no such file."""
+@contextmanager
+def _naming(result: Path) -> Iterator[None]:
+    """Let errors name the result: the name of a hidden file would mean nothing to a reader."""
     try:
-        handle = os.open(place, _OLD)
-    except OSError:
-        return None
-    if stat.S_ISREG(os.fstat(handle).st_mode) and _lock(handle) and is_at(handle, place):
-        return handle  # no process writes it any more
-    os.close(handle)
-    return None
+        yield
+    except (OutputExistsError, NotAFileError):
+        raise
+    except OSError as error:
+        raise type(error)(error.errno, error.strerror, str(result)) from None
+
+
+def _place(path: Path, suffix: str, number: int) -> Path:
+    real = Path(os.path.realpath(path))
+    return real.with_name(f".{real.name}.{number}.{suffix}" if number else f".{real.name}.{suffix}")
 
 
 def _lock(handle: int) -> bool | None:
     """Lock a file: False if another process holds the lock, None if locks are not supported."""
-    if sys.platform == "win32":
-        return None
-    import fcntl
-
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
@@ -234,7 +191,7 @@ def _lock(handle: int) -> bool | None:
     return True
 
 
-def is_at(handle: int, place: Path) -> bool:
+def _is_at(handle: int, place: Path) -> bool:
     """Whether an open file is the one at a path."""
     try:
         return os.path.samestat(os.fstat(handle), os.lstat(place))
@@ -242,18 +199,18 @@ def is_at(handle: int, place: Path) -> bool:
         return False
 
 
-def _place_new(temporary: Path, path: Path) -> None:
-    """Give the file its name unless the name was taken meanwhile."""
+def _link_new(part: Path, path: Path) -> None:
+    """Give a file its name unless the name was taken meanwhile."""
     try:
-        os.link(temporary, path)
+        os.link(part, path)
     except FileExistsError:
-        if not path.is_file() or not temporary.samefile(path):
+        if not path.is_file() or not part.samefile(path):
             raise OutputExistsError(path) from None
-        # Else a process was killed after it had placed the file.
+        # Else a process was killed after it had given it the name.
     except OSError:  # a file system without hard links: the name is taken first
         try:
             os.close(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL))
         except FileExistsError:
             raise OutputExistsError(path) from None
-        temporary.replace(path)
-    temporary.unlink(missing_ok=True)
+        part.replace(path)
+    part.unlink(missing_ok=True)

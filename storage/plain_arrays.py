@@ -28,11 +28,6 @@ def read_plain_array(
     largest_bytes : int
         Arrays of more are refused before memory is taken.
 
-    Returns
-    -------
-    array
-        Row by row.
-
     Raises
     ------
     ValueError

@@ -14,7 +14,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from detect import __version__
 from detect.drawing.inputs import read_head
 from detect.errors import EXIT_FRAMES_FAILED, DetectError, FrameError, WorkerError
 from detect.options import All, Circles, DetectorFlags, DiscIdOptions, Lines, Markers
@@ -39,7 +38,7 @@ _FEWEST_FRAMES, _OTHER_RADIUS = 10, 0.15
 
 
 class _Job(NamedTuple):
-    """Parameters of a run: see `detect.runs.stream.detect_run`."""
+    """What a command does: see `detect.runs.stream.detect_run`."""
 
     label: str
     run: ImageRun
@@ -48,16 +47,19 @@ class _Job(NamedTuple):
     known: Known | None = None
     pictures: Path | None = None
     crlf: bool = False
-    named_after: Path | None = None  # whose name the log has, if it is not the output
+    log: Path | None = None  # beside the first of the places, if it is not named
 
 
 def perform(command: DetectorFlags) -> int:
     """Carry a command out; returns the exit code."""
     job = _job_of(command)
-    log = log_place(job.named_after or next(iter(job.places.values())))
-    name = type(command).__name__.lower()
     conduct = Conduct(
-        __version__, command.force, job.crlf, log, name, command.strict, command.resume
+        overwrite=command.force,
+        crlf=job.crlf,
+        log=job.log or log_place(next(iter(job.places.values()))),
+        command=type(command).__name__.lower(),
+        strict=command.strict,
+        resume=command.resume,
     )
     with progress_bar(job.label, job.run.frames.expected) as advance:
         summary = detect_run(
@@ -70,10 +72,9 @@ def perform(command: DetectorFlags) -> int:
             on_progress=advance,
             conduct=conduct,
         )
-    _tell_results(job, summary)
-    _tell_blind_to_verticals(job, summary)
-    _tell_folded_lens(job)
-    _advise(job, summary)
+    _print_results(job, summary)
+    for hint in _hints(job, summary):
+        print(hint, file=sys.stderr)
     if summary.images_without_step:
         print(f"{summary.images_without_step} {job.run.frames.why_left_out}")
     print_failures(summary.failed, summary.failures)
@@ -98,49 +99,40 @@ def _circles(command: Circles, run: Run) -> _Job:
         places["json"] = command.json
     drawing: Drawing | None = None if command.draw is None else "discs"
     settings = _with_radius(command.settings, run) if command.find_radius else command.settings
-    return _Job(
-        "discs",
-        run,
-        FramePlan(run.camera, circles=settings, drawing=drawing),
-        places,
-        _known(command.ids, tilts=command.tilt),
-        command.draw,
-        command.line_ends == "crlf",
+    plan = FramePlan(run.camera, circles=settings, drawing=drawing)
+    known = replace(
+        _known_discs(command.ids), tilts=None if command.tilt is None else read_tilts(command.tilt)
     )
+    return _Job("discs", run, plan, places, known, command.draw, command.line_ends == "crlf")
 
 
 def _lines(command: Lines, run: Run) -> _Job:
     output = _output(command, run, "lines")
     settings = command.settings
+    drawing: Drawing | None = None
     if command.join_threshold is not None:
         # On the horizon straight ahead, a bearing of one radian is scale_x pixels wide.
         settings = replace(settings, join_px=command.join_threshold * run.camera.scale_x)
-    plan = FramePlan(run.camera, lines=settings)
     if command.draw is not None:
-        drawing: Drawing = "tracks" if command.rejected else "lines"
-        plan = replace(plan, drawing=drawing, draw_response=command.response)
-    return _Job(
-        "lines",
-        run,
-        plan,
-        {"lines": output, "tilt": command.tilt or output.with_suffix(".tilt")},
-        _known(lines=command.ids_from),
-        command.draw,
-        command.line_ends == "crlf",
+        drawing = "tracks" if command.rejected else "lines"
+    plan = FramePlan(
+        run.camera,
+        lines=settings,
+        drawing=drawing,
+        draw_response=command.draw is not None and command.response,
     )
+    places = {"lines": output, "tilt": command.tilt or output.with_suffix(".tilt")}
+    known = Known(lines=_frames(command.ids_from))
+    return _Job("lines", run, plan, places, known, command.draw, command.line_ends == "crlf")
 
 
 def _markers(command: Markers) -> _Job:
     run = open_source(command.run, command.camera, command.source)
     camera = run.camera if isinstance(run, Run) else None
     drawing: Drawing | None = None if command.draw is None else "markers"
-    return _Job(
-        "markers",
-        run,
-        FramePlan(camera, markers=command.settings, drawing=drawing),
-        {"markers": _output(command, run, "markers")},
-        pictures=command.draw,
-    )
+    plan = FramePlan(camera, markers=command.settings, drawing=drawing)
+    places = {"markers": _output(command, run, "markers")}
+    return _Job("markers", run, plan, places, pictures=command.draw)
 
 
 def _all(command: All, run: Run) -> _Job:
@@ -156,9 +148,9 @@ def _all(command: All, run: Run) -> _Job:
         run,
         FramePlan(run.camera, lines=command.lines, circles=circles, levelling=command.tilt),
         places,
-        _known(command.ids, lines=command.line_ids_from),
+        replace(_known_discs(command.ids), lines=_frames(command.line_ids_from)),
         crlf=command.line_ends == "crlf",
-        named_after=places["lines"].with_suffix(""),
+        log=log_place(places["lines"].with_suffix("")),
     )
 
 
@@ -199,23 +191,22 @@ def _output(command: DetectorFlags, run: ImageRun, kind: str) -> Path:
     return output
 
 
-def _known(
-    discs: DiscIdOptions | None = None, *, lines: Path | None = None, tilts: Path | None = None
-) -> Known:
-    """Prior data on the frames from files."""
-    discs = DiscIdOptions() if discs is None else discs
-    if (discs.ids_from_map is None) != (discs.path is None):
+def _frames(path: Path | None) -> FramesByImage | None:
+    return None if path is None else FramesByImage(path)
+
+
+def _known_discs(options: DiscIdOptions) -> Known:
+    """Discs with IDs from files."""
+    if (options.ids_from_map is None) != (options.path is None):
         raise DetectError("--ids-from-map and --path: expected both or neither")
     mapped = None
-    if discs.ids_from_map is not None and discs.path is not None:
-        mapped = MapByImage(discs.ids_from_map, discs.path)
+    if options.ids_from_map is not None and options.path is not None:
+        mapped = MapByImage(options.ids_from_map, options.path)
     return Known(
-        tilts=None if tilts is None else read_tilts(tilts),
-        lines=None if lines is None else FramesByImage(lines),
-        discs=None if discs.ids_from is None else FramesByImage(discs.ids_from),
-        discs_level=discs.ids_from is not None and read_head(discs.ids_from).level,
+        discs=_frames(options.ids_from),
+        discs_level=options.ids_from is not None and read_head(options.ids_from).level,
         mapped=mapped,
-        slack_m=discs.id_slack_m,
+        slack_m=options.id_slack_m,
     )
 
 
@@ -231,7 +222,7 @@ def _workers(command: DetectorFlags, job: _Job) -> Workers:
     return local_workers(jobs, large=large)
 
 
-def _tell_results(job: _Job, summary: RunSummary) -> None:
+def _print_results(job: _Job, summary: RunSummary) -> None:
     found, places = summary.found, job.places
     if "lines" in places:
         print(f"{places['lines']}: {found['lines']} lines in {summary.frames} frames")
@@ -251,17 +242,6 @@ def _tell_results(job: _Job, summary: RunSummary) -> None:
         print(f"rejected: {causes}")
 
 
-def _tell_folded_lens(job: _Job) -> None:
-    """Say so where part of the image sees nothing."""
-    camera = job.plan.camera
-    if camera is not None and camera.seen_share < 1.0:
-        print(
-            f"as it is calibrated, the lens folds in the image: {100 * camera.seen_share:.0f} % of "
-            "the pixels see anything; nothing is detected in the others",
-            file=sys.stderr,
-        )
-
-
 def _other_frames(plan: FramePlan, summary: RunSummary) -> str:
     """What is done with the discs of frames that have no tilt, if there are any."""
     others = summary.frames - summary.failed - summary.found["tilts"]
@@ -272,49 +252,53 @@ def _other_frames(plan: FramePlan, summary: RunSummary) -> str:
     return f"; the other {others} count as level within {plan.circles.tilt_sigma_deg:g} degrees"
 
 
-def _advise(job: _Job, summary: RunSummary) -> None:
-    """Say what to try where hardly any discs were found."""
-    settings, run, found = job.plan.circles, job.run, summary.found["discs"]
-    hardly_any = summary.frames >= _FEWEST_FRAMES and 3 * found < summary.frames
-    if settings is None or not settings.verify or not isinstance(run, Run) or not hardly_any:
+def _hints(job: _Job, summary: RunSummary) -> Iterator[str]:
+    """Why hardly anything was found, and what to try."""
+    plan, camera, found = job.plan, job.plan.camera, summary.found
+    if camera is None:
         return
-    if run.frames.expected is None:
+    if plan.lines is not None and not found["lines"]:
+        from lut import cached_vertical_table
+
+        if not cached_vertical_table(camera).usable.any():
+            yield (
+                "no verticals: as it is calibrated, the camera looks too far past the horizon, or "
+                "lies on its side"
+            )
+    if camera.seen_share < 1.0:
+        yield (
+            f"as it is calibrated, the lens folds in the image: {100 * camera.seen_share:.0f} % of "
+            "the pixels see anything; nothing is detected in the others"
+        )
+    hardly_any = summary.frames >= _FEWEST_FRAMES and 3 * found["discs"] < summary.frames
+    if plan.circles is not None and plan.circles.verify and hardly_any:
+        yield from _hints_on_discs(job, plan.circles, summary)
+
+
+def _hints_on_discs(job: _Job, settings: CircleSettings, summary: RunSummary) -> Iterator[str]:
+    if not isinstance(job.run, Run) or job.run.frames.expected is None:
         return
     from detect.discs.radius import find_radius
 
-    images = list(_some_images(run))
-    likely = find_radius(images, run.camera, replace(settings, polarity="any"))
-    words = f"{found} discs of radius {settings.radius_m:g} m in {summary.frames} frames. "
+    images = list(_some_images(job.run))
+    likely = find_radius(images, job.run.camera, replace(settings, polarity="any"))
+    discs = (
+        f"{summary.found['discs']} discs of radius {settings.radius_m:g} m in {summary.frames} "
+        "frames. "
+    )
     if likely is None:
-        words += (
+        yield discs + (
             f"At no radius are more found in {len(images)} of the images: is the calibration that "
             "of this camera (`detect draw` shows outlines), are the images much blurred "
             "(--blur-px), are there discs in view?"
         )
     elif abs(math.log(likely.radius_m / settings.radius_m)) > _OTHER_RADIUS:
-        words += (
+        yield discs + (
             f"It looks as if their radius were {likely.radius_m:.3f} m: {likely.discs} of them are "
             f"found in {len(images)} of the images. Try --radius-m {likely.radius_m:.3f}."
         )
     elif settings.polarity != "any":
-        words += (
+        yield discs + (
             f"Lighter and darker ones together are {likely.discs} in {len(images)} of the images: "
             "try --polarity any."
-        )
-    else:
-        return
-    print(words, file=sys.stderr)
-
-
-def _tell_blind_to_verticals(job: _Job, summary: RunSummary) -> None:
-    """Say so where there are no lines for no line can be seen."""
-    if job.plan.lines is None or job.plan.camera is None or summary.found["lines"]:
-        return
-    from lut import cached_vertical_table
-
-    if not cached_vertical_table(job.plan.camera).usable.any():
-        print(
-            "no verticals: as it is calibrated, the camera looks too far past the horizon, or lies "
-            "on its side",
-            file=sys.stderr,
         )

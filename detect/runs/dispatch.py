@@ -44,31 +44,18 @@ class Workers:
         How many tasks may be under way; called repeatedly, as clusters grow.
     died : tuple of exception types
         What a task raises, besides `BrokenExecutor`, when its worker has died.
-    tell_of_tables : bool
-        Whether the first task reports errors in the tables of a plan: this process then need not
-        compute them and starts sooner.
     """
 
     start: Callable[[FramePlan], AbstractContextManager[Executor]]
     chunk: int
     window: Callable[[], int]
     died: tuple[type[BaseException], ...] = ()
-    tell_of_tables: bool = False
 
 
 def detect_chunks(
     tasks: Iterable[FrameTask], plan: FramePlan, workers: Workers
 ) -> Generator[list[tuple[FrameTask, FrameRows]], None, None]:
     """Work on frames, some at a time.
-
-    Parameters
-    ----------
-    tasks : iterable of FrameTask
-        The frames; taken from as they are needed.
-    plan : FramePlan
-        The plan for each.
-    workers : Workers
-        By whom.
 
     Yields
     ------
@@ -80,11 +67,14 @@ def detect_chunks(
     ------
     WorkerError
         If workers die with any frame, disappear, or do not have this program.
+    lut.TableError
+        If there can be no table for the camera.
     """
     source = iter(tasks)
     chunks = iter(lambda: tuple(islice(source, workers.chunk)), ())
-    with _Crew(workers, plan) as crew:
-        # A chunk without a future is suspect: to be processed alone.
+    with ExitStack() as started:
+        crew = _Crew(workers, plan, started)
+        # A chunk without a future is suspect: to be processed while nothing else is under way.
         under_way: deque[tuple[Chunk, Future[list[FrameRows]] | None]] = deque()
         while True:
             suspects = any(future is None for _, future in under_way)
@@ -96,7 +86,7 @@ def detect_chunks(
             try:
                 rows = crew.alone(chunk) if future is None else crew.finished(future)
             except crew.died as error:
-                crew.bury(error)
+                crew.dismiss(error)
                 under_way.appendleft((chunk, None))
                 under_way = deque((c, None if crew.lost(f) else f) for c, f in under_way)
                 continue
@@ -111,19 +101,11 @@ def work_on_chunk(plan: FramePlan, chunk: Chunk) -> list[FrameRows]:
 class _Crew:
     """The workers of a run: replaced when one of them has died."""
 
-    def __init__(self, workers: Workers, plan: FramePlan) -> None:
+    def __init__(self, workers: Workers, plan: FramePlan, started: ExitStack) -> None:
         self.died: tuple[type[BaseException], ...] = (BrokenExecutor, *workers.died)
-        self._workers = workers
-        self._plan = plan
-        self._started = ExitStack()
+        self._workers, self._plan, self._started = workers, plan, started
         self._executor: Executor | None = None
         self._deadly = 0
-
-    def __enter__(self) -> _Crew:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._started.close()
 
     def submit(self, chunk: Chunk) -> Future[list[FrameRows]]:
         try:
@@ -136,7 +118,7 @@ class _Crew:
             return failed
 
     def finished(self, future: Future[list[FrameRows]]) -> list[FrameRows]:
-        """The rows of a chunk that was worked on beside others."""
+        """The rows of a chunk."""
         try:
             rows = future.result()
         except ImportError as error:
@@ -148,14 +130,14 @@ class _Crew:
         self._deadly = 0
         return rows
 
-    def bury(self, error: BaseException) -> None:
-        """End the remaining broken workers; the next chunk gets new ones."""
+    def dismiss(self, error: BaseException) -> None:
+        """End the rest of broken workers; the next chunk gets new ones."""
         if isinstance(error, BrokenExecutor):
             self._executor = None
             self._started.close()
 
     def lost(self, future: Future[list[FrameRows]] | None) -> bool:
-        """Whether a chunk went down with the workers that it was given to."""
+        """Whether a chunk was lost with its worker."""
         if future is None or future.cancelled():
             return True
         if not future.done():
@@ -163,12 +145,12 @@ class _Crew:
         return isinstance(future.exception(), self.died)
 
     def alone(self, chunk: Chunk) -> list[FrameRows]:
-        """The rows of a chunk during which a worker died; nothing else is under way."""
+        """The rows of a chunk during which a worker died: once more, then frame by frame."""
         for _ in range(2 if len(chunk) == 1 else 1):
             try:
                 return self.finished(self.submit(chunk))
             except self.died as error:
-                self.bury(error)
+                self.dismiss(error)
         if len(chunk) > 1:
             return [rows for task in chunk for rows in self.alone((task,))]
         (task,) = chunk

@@ -1,15 +1,12 @@
-"""Frames of a run: their images in, their verticals, tilts, discs and markers out.
-
-`STAGES` are the stages that a frame passes, in order; `detect_batch` runs them for any number of
-frames, one by one or many together.
-"""
+"""The path of one frame: its image in, its verticals, tilts, discs and markers out."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
@@ -20,7 +17,7 @@ from camera import Camera
 from detect.errors import FrameError
 from detect.run import RunFrame, read_image
 from detect.runs.known import NOTHING, KnownOfFrame
-from landmarks import FrameTilt, Step, tilt_as_written
+from landmarks import FrameTilt, tilt_as_written
 
 # Detectors and tables are imported on demand: loading them takes a tenth of a second each, and a
 # process that delegates the work needs neither them nor a compiler.
@@ -31,7 +28,7 @@ if TYPE_CHECKING:
     from detect.markers.detections import MarkerDetections
     from detect.markers.settings import MarkerSettings
     from detect.settings import CircleSettings, Levelling
-    from lut import DiscShape, DiscTable, VerticalTable
+    from lut import DiscTable, VerticalTable
 
 Drawing = Literal["discs", "lines", "tracks", "markers"]
 
@@ -41,7 +38,7 @@ COSTS_THE_FRAME = (FrameError, ArithmeticError, np.linalg.LinAlgError, MemoryErr
 
 @dataclass(frozen=True)
 class FramePlan:
-    """The plan for every frame of a run. Small: it is sent with every task.
+    """What is done with every frame of a run. Small: it is sent with every task.
 
     Attributes
     ----------
@@ -54,7 +51,7 @@ class FramePlan:
     markers : MarkerSettings or None
         Which square markers are detected, if any.
     json : bool
-        Whether the discs are wanted as JSON as well: `detect_run` sees to it.
+        Whether the discs are written as JSON as well; set by `detect_run`.
     drawing : {"discs", "lines", "tracks", "markers"} or None
         What is drawn into the image; "tracks" are all tracks of lines, with the reason of those
         that are no lines.
@@ -64,7 +61,8 @@ class FramePlan:
         By what the discs are corrected for the tilt: by nothing, by the frame's own, or, when all
         frames are done, by the run's (`detect.runs.level_run`).
     working_folder : path or None
-        What relative image paths are relative to, on whatever machine; by default a process's own.
+        Folder that relative image paths start from, on whatever machine; by default a process's
+        own.
     """
 
     camera: Camera | None
@@ -98,16 +96,13 @@ class FrameDetections:
     ----------
     image : (H, W) uint8 or None
         None where it cannot be read.
-    lines : LineDetections or None
     tilt : FrameTilt or None
-        None also if too few lines determine it.
-    seen : CircleDetections or None
-        The discs where they would be on a level robot.
-    discs : CircleDetections or None
-        The same, corrected for the tilt where there is one and the plan says so.
+        By the lines, or known before; None also if too few lines determine it.
+    seen, discs : CircleDetections or None
+        The discs where they would be on a level robot, and corrected for the tilt where there is
+        one and the plan says so.
     outline_tilt : FrameTilt or None
         The tilt by the outlines of the discs, if a run is levelled by all frames.
-    markers : MarkerDetections or None
     error : str or None
         Why the frame cannot be worked on.
     """
@@ -132,8 +127,8 @@ class FrameDetections:
 class Tables:
     """The tables by the calibration that a plan needs."""
 
-    verticals: VerticalTable | None
-    discs: DiscTable | None
+    verticals: VerticalTable | None = None
+    discs: DiscTable | None = None
 
 
 def detect_batch(
@@ -141,33 +136,59 @@ def detect_batch(
 ) -> list[FrameDetections]:
     """Detect the landmarks of a plan in the images of some frames.
 
-    Every stage is done with all frames before the next one: a decoder, the detectors and Python
-    drive each other's instructions and tables out of the processor's caches. A frame that cannot be
-    worked on costs itself only.
-
-    Parameters
-    ----------
-    tasks : sequence of FrameTask
-        The frames; as many images are in memory at once.
-    plan : FramePlan
-        The landmarks to detect.
-    tables : Tables
-        See `tables_of`.
-
-    Returns
-    -------
-    list of FrameDetections
-        One for each.
+    Every stage is done with all frames before the next one: a decoder and the detectors drive each
+    other's instructions and tables out of the processor's caches. A frame that cannot be worked on
+    costs itself only. As many images are in memory at once as there are tasks.
     """
     batch = [FrameDetections() for _ in tasks]
-    for stage in STAGES:
-        for task, found in zip(tasks, batch):
-            if found.error is None:
-                try:
-                    stage(task, found, plan, tables)
-                except COSTS_THE_FRAME as error:
-                    found.error = reason_of(error, task)
+    paths = [_path(task, found, plan, tables) for task, found in zip(tasks, batch)]
+    for _ in zip_longest(*paths):  # advances each of them to its next `yield` in turn
+        pass
     return batch
+
+
+def _path(
+    task: FrameTask, found: FrameDetections, plan: FramePlan, tables: Tables
+) -> Iterator[None]:
+    """The path of one image from top to bottom; at each `yield`, the others of a batch catch up."""
+    camera, prefix = plan.camera, task.frame.step.prefix
+    try:
+        image = found.image = read_image(task.frame, camera, plan.working_folder)
+        yield
+
+        found.tilt = task.known.tilt
+        if plan.lines is not None:
+            from detect.lines import detect_lines
+
+            assert tables.verticals is not None
+            found.lines = detect_lines(image, tables.verticals, plan.lines)
+            found.tilt = tilt_of_lines(prefix, found.lines)
+        yield
+
+        if plan.circles is not None:
+            from detect.circles import detect_circles
+            from detect.discs.outline_tilt import tilt_of_outlines
+            from detect.levelling import levelled
+
+            assert tables.discs is not None
+            assert camera is not None
+            by_frame = found.tilt if plan.levelling == "frame" else None
+            level = by_frame is None and plan.levelling != "run"
+            settings = plan.circles if level else _without_tilt(plan.circles)
+            found.seen = found.discs = detect_circles(image, camera, tables.discs, settings)
+            if by_frame is not None:
+                found.discs = levelled(found.seen, camera, by_frame)
+            if plan.levelling == "run":
+                tilt = tilt_of_outlines(image, camera, found.seen.floor_xy, plan.circles.radius_m)
+                found.outline_tilt = None if tilt is None else FrameTilt(prefix, *tilt)
+        yield
+
+        if plan.markers is not None:
+            from detect.markers.detect import detect_markers
+
+            found.markers = detect_markers(image, plan.markers, camera)
+    except COSTS_THE_FRAME as error:
+        found.error = reason_of(error, task)
 
 
 def reason_of(error: Exception, task: FrameTask) -> str:
@@ -175,84 +196,6 @@ def reason_of(error: Exception, task: FrameTask) -> str:
     if isinstance(error, FrameError):
         return str(error)
     return f"{task.name}: {type(error).__name__}: {error}"
-
-
-def _decode(task: FrameTask, found: FrameDetections, plan: FramePlan, _: Tables) -> None:
-    found.image = read_image(task.frame, plan.camera, plan.working_folder)
-
-
-def _find_lines(_: FrameTask, found: FrameDetections, plan: FramePlan, tables: Tables) -> None:
-    if plan.lines is not None:
-        from detect.lines import detect_lines
-
-        assert tables.verticals is not None
-        found.lines = detect_lines(found.pixels, tables.verticals, plan.lines)
-
-
-def _tell_tilt(task: FrameTask, found: FrameDetections, _: FramePlan, __: Tables) -> None:
-    found.tilt = task.known.tilt
-    if found.lines is not None:
-        found.tilt = tilt_of_lines(task.frame.step.prefix, found.lines)
-
-
-def _find_discs(_: FrameTask, found: FrameDetections, plan: FramePlan, tables: Tables) -> None:
-    if plan.circles is not None:
-        from detect.circles import detect_circles
-
-        assert tables.discs is not None
-        assert plan.camera is not None
-        levelled = plan.levelling == "run" or (plan.levelling == "frame" and found.tilt is not None)
-        settings = _without_tilt(plan.circles) if levelled else plan.circles
-        found.seen = detect_circles(found.pixels, plan.camera, tables.discs, settings)
-
-
-def _level_discs(_: FrameTask, found: FrameDetections, plan: FramePlan, __: Tables) -> None:
-    found.discs = found.seen
-    if found.seen is not None and found.tilt is not None and plan.levelling == "frame":
-        from detect.levelling import levelled
-
-        assert plan.camera is not None
-        found.discs = levelled(found.seen, plan.camera, found.tilt)
-
-
-def _tell_tilt_by_outlines(
-    task: FrameTask, found: FrameDetections, plan: FramePlan, _: Tables
-) -> None:
-    if found.seen is not None and plan.levelling == "run":
-        from detect.discs.outline_tilt import tilt_of_outlines
-
-        assert plan.camera is not None
-        assert plan.circles is not None
-        tilt = tilt_of_outlines(
-            found.pixels, plan.camera, found.seen.floor_xy, plan.circles.radius_m
-        )
-        if tilt is not None:
-            found.outline_tilt = FrameTilt(task.frame.step.prefix, *tilt)
-
-
-def _find_markers(_: FrameTask, found: FrameDetections, plan: FramePlan, __: Tables) -> None:
-    if plan.markers is not None:
-        from detect.markers.detect import detect_markers
-
-        found.markers = detect_markers(found.pixels, plan.markers, plan.camera)
-
-
-#: The stages that a frame passes: each can use the results of those before it.
-STAGES: tuple[Callable[[FrameTask, FrameDetections, FramePlan, Tables], None], ...] = (
-    _decode,
-    _find_lines,
-    _tell_tilt,
-    _find_discs,
-    _level_discs,
-    _tell_tilt_by_outlines,
-    _find_markers,
-)
-
-
-@lru_cache(maxsize=4)
-def _without_tilt(settings: CircleSettings) -> CircleSettings:
-    """The same, but the tilt adds nothing to covariances: levelling does."""
-    return dataclasses.replace(settings, tilt_sigma_deg=0.0)
 
 
 def tilt_of_lines(prefix: str, lines: LineDetections) -> FrameTilt | None:
@@ -266,6 +209,13 @@ def tilt_of_lines(prefix: str, lines: LineDetections) -> FrameTilt | None:
     )
 
 
+@lru_cache(maxsize=4)
+def _without_tilt(settings: CircleSettings) -> CircleSettings:
+    """The same, but the tilt adds nothing to covariances: levelling does."""
+    return dataclasses.replace(settings, tilt_sigma_deg=0.0)
+
+
+@lru_cache(maxsize=4)
 def tables_of(plan: FramePlan) -> Tables:
     """The tables that a plan needs: a process makes them or takes them from the cache once.
 
@@ -274,58 +224,14 @@ def tables_of(plan: FramePlan) -> Tables:
     lut.TableError
         If there can be none for the camera and the settings.
     """
-    shape = None
-    if plan.circles is not None:
+    verticals = discs = None
+    if plan.camera is not None and plan.lines is not None:
+        from lut import cached_vertical_table
+
+        verticals = cached_vertical_table(plan.camera)
+    if plan.camera is not None and plan.circles is not None:
         from detect.circles import disc_shape
+        from lut import cached_disc_table
 
-        shape = disc_shape(plan.circles)
-    return _tables(plan.camera, plan.lines is not None, shape)
-
-
-@lru_cache(maxsize=4)
-def _tables(camera: Camera | None, verticals: bool, shape: DiscShape | None) -> Tables:
-    if camera is None:
-        return Tables(None, None)
-    from lut import cached_disc_table, cached_vertical_table
-
-    return Tables(
-        verticals=cached_vertical_table(camera) if verticals else None,
-        discs=None if shape is None else cached_disc_table(camera, shape),
-    )
-
-
-def import_detectors(plan: FramePlan) -> None:
-    """Import the modules that a plan needs, while other processes compute its tables."""
-    if plan.lines is not None:
-        import detect.lines
-    if plan.circles is not None:
-        import detect.circles
-    if plan.markers is not None:
-        import detect.markers.detect  # noqa: F401
-
-
-def rehearse(plan: FramePlan) -> None:
-    """Work on a made-up image, so that all tables and kernels that a plan needs are there."""
-    tables = tables_of(plan)
-    if plan.markers is not None:
-        from detect.markers.detect import detect_markers
-        from detect.markers.templates import specimen_image
-
-        detect_markers(specimen_image(plan.markers), plan.markers)
-    if plan.camera is None:
-        return
-    column = np.arange(plan.camera.width)
-    bars = np.where(column // 40 % 2, 180, 60).astype(np.uint8)
-    image = np.repeat(bars[None, :], plan.camera.height, axis=0)
-    if plan.circles is not None and tables.discs is not None:
-        pitch = 6.0 * plan.circles.radius_m
-        seen = tables.discs.floor_xy
-        floor = np.isfinite(seen).all(axis=-1)
-        off = np.hypot(*(np.mod(seen[floor], pitch) - 0.5 * pitch).T)
-        image[floor] = np.where(off < plan.circles.radius_m, 200, 60)
-    step = Step("rehearsal", *[0.0] * 9)
-    task = FrameTask(RunFrame(step, None, content=image))
-    (found,) = detect_batch([task], dataclasses.replace(plan, markers=None), tables)
-    if found.discs is not None:  # tilts may come from a file as well
-        found.tilt = FrameTilt("rehearsal", 0.0, 0.0, 1e-6, 0.0, 1e-6, 0)
-        _level_discs(task, found, dataclasses.replace(plan, levelling="frame"), tables)
+        discs = cached_disc_table(plan.camera, disc_shape(plan.circles))
+    return Tables(verticals, discs)

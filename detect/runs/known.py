@@ -53,21 +53,18 @@ NOTHING = KnownOfFrame()
 
 @dataclass(frozen=True)
 class Known:
-    """Prior data on the frames of a run.
+    """Prior data on the frames of a run, by the prefixes of their images.
 
     Attributes
     ----------
     tilts : mapping, optional
-        Tilts by image prefix, for frames whose verticals are not detected.
-    lines : mapping, optional
-        Frames by image prefix whose lines have IDs: carried over where the match is unambiguous.
-    discs : mapping, optional
-        Frames by image prefix whose discs have IDs: carried over to the rows of the same discs.
+        Tilts of frames whose verticals are not detected.
+    lines, discs : mapping, optional
+        Frames whose lines or discs have IDs: carried over to the rows of the same landmarks.
     discs_level : bool
-        Whether these are corrected for the tilt.
+        Whether these discs are corrected for the tilt.
     mapped : mapping, optional
-        Discs of a map by image prefix: rows without an ID by `discs` get the ID of the one that
-        they fall on.
+        Discs of a map: rows without an ID by `discs` get the ID of the one that they fall on.
     slack_m : float
         Standard deviation of where these are, besides their covariances, metres.
     """
@@ -84,30 +81,23 @@ class Known:
 
     def of(self, prefix: str) -> KnownOfFrame:
         """Prior data on a frame."""
-        if all(source is None for source in (self.tilts, self.lines, self.discs, self.mapped)):
-            return NOTHING
-        lines = None if self.lines is None else self.lines.get(prefix)
-        discs = None if self.discs is None else self.discs.get(prefix)
+        lines = self.lines.get(prefix) if self.lines else None
+        discs = self.discs.get(prefix) if self.discs else None
         return KnownOfFrame(
-            None if self.tilts is None else self.tilts.get(prefix),
-            () if lines is None else lines.lines,
-            () if discs is None else discs.circles,
+            self.tilts.get(prefix) if self.tilts else None,
+            lines.lines if lines else (),
+            discs.circles if discs else (),
             self.discs_level,
-            () if self.mapped is None else tuple(self.mapped.get(prefix) or ()),
+            tuple(self.mapped.get(prefix) or ()) if self.mapped else (),
             self.slack_m,
         )
 
 
 class FramesByImage:
-    """The frames of a landmark file, by the name of their image.
+    """The frames of a landmark file, by the name of their image; of equal names the last counts.
 
     The file is read once for the offset of each frame, and again there when a frame is requested:
-    its rows are not kept in memory. Of frames with one name the last counts.
-
-    Parameters
-    ----------
-    path : path
-        The file.
+    its rows are not kept in memory.
 
     Raises
     ------
@@ -137,23 +127,13 @@ class FramesByImage:
 class MapByImage:
     """The discs of a map that the frames of a path should see, by the name of their image.
 
-    Parameters
-    ----------
-    map_path, path_path : path
-        As `slam map` writes them (`landmarks.read_map`, `landmarks.read_path`).
-
-    Raises
-    ------
-    landmarks.LandmarkFileError
-        If a file cannot be read or a row is malformed; names file and line.
+    Map and path are files of `slam map`; as them, malformed ones raise a `LandmarkFileError`.
     """
 
     def __init__(self, map_path: Path, path_path: Path) -> None:
         self._discs = read_map(map_path).discs
-        poses = read_path(path_path)
-        self._poses = {
-            image_name(prefix): pose for prefix, pose in zip(poses.prefixes, poses.poses)
-        }
+        path = read_path(path_path)
+        self._poses = dict(zip(map(image_name, path.prefixes), path.poses))
 
     def get(self, prefix: str) -> Sequence[MappedDisc] | None:
         """The discs within reach of a frame's pose; None if the path does not have the frame."""

@@ -10,11 +10,12 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from detect import __version__
 from detect.errors import EXIT_FRAMES_FAILED
 from detect.run import ImageRun
 from detect.runs.frame import FramePlan
@@ -30,8 +31,6 @@ LANDMARK_SUFFIXES = frozenset({".circles", ".lines", ".markers"})
 LEVEL = "level robot frame"
 LEVELLED = "corrected for the tilt of the frames that have one"
 
-#: The kind of the log.
-LOG = "log"
 #: The kind of the tilts that a second pass makes (`detect.runs.level_run`).
 RUN_TILT = "run tilt"
 
@@ -51,8 +50,6 @@ class Conduct:
 
     Attributes
     ----------
-    version : str
-        The program's version, for the heads of files.
     overwrite : bool
         Whether existing files may be replaced.
     crlf : bool
@@ -67,7 +64,6 @@ class Conduct:
         Whether the frames that an unfinished run kept are taken over.
     """
 
-    version: str = ""
     overwrite: bool = False
     crlf: bool = False
     log: Path | None = None
@@ -78,69 +74,51 @@ class Conduct:
 
 @dataclass(frozen=True)
 class Output:
-    """A file that a run is written to.
-
-    Attributes
-    ----------
-    path : path
-    kind : str
-        Which of `FrameRows.rows` go into it: of a kind that they do not have, none do.
-    head, tail : bytes
-        Text before and after the rows of all frames.
-    between : bytes
-        Text between the rows of two frames.
-    crlf : bool
-        Whether lines end with CR and LF, as in the data set's own files.
-    """
+    """A file of a run: `FrameRows.rows` of a kind, between head and tail and separated."""
 
     path: Path
     kind: str
-    head: bytes = b""
-    tail: bytes = b""
-    between: bytes = b""
+    head: str = ""
+    tail: str = ""
+    between: str = ""
     crlf: bool = False
+
+    def encoded(self, text: str) -> bytes:
+        """A part of its content, as bytes."""
+        text = text.replace("\n", "\r\n") if self.crlf else text
+        return text.encode("utf-8", "surrogateescape")
 
 
 def outputs_of(
-    run: ImageRun, plan: FramePlan, places: Mapping[str, Path], conduct: Conduct, *, levelled: bool
+    run: ImageRun, plan: FramePlan, places: Mapping[str, Path], *, crlf: bool, levelled: bool
 ) -> list[Output]:
-    """The files of a run.
+    """The files of a run (see `detect.runs.stream.detect_run`).
 
-    Parameters
-    ----------
-    run : ImageRun
-        The run.
-    plan : FramePlan
-        What is detected in it.
-    places : mapping
-        Where files of each kind go: "circles", "lines", "tilt", "markers", "json".
-    conduct : Conduct
-        Says the version and how lines end.
-    levelled : bool
-        Whether discs are corrected for the tilt.
+    `crlf` is how the lines of files of landmarks end; `levelled`, whether discs are corrected for
+    the tilt.
     """
     outputs = []
-    crlf, by_run = conduct.crlf, plan.levelling == "run" and plan.lines is not None
+    by_run = plan.levelling == "run" and plan.lines is not None
+
+    def add(path: Path, kind: str, *head: str, crlf: bool = False) -> None:
+        text = format_head("\n".join(head)).decode("utf-8", "surrogateescape")
+        outputs.append(Output(path, kind, text, crlf=crlf))
+
     if "json" in places:
-        outputs.append(_json_file(places["json"], plan, conduct.version))
+        outputs.append(_json_file(places["json"], plan))
     if "tilt" in places:
         path = frames_tilt_place(places["tilt"]) if by_run else places["tilt"]
-        outputs.append(Output(path, "tilt", _head(_tilt_text(conduct.version, by_run=by_run))))
+        add(path, "tilt", *_tilt_text(by_run=by_run))
     if "lines" in places:
-        head = _head(_lines_text(run, plan, conduct.version))
-        outputs.append(Output(places["lines"], "lines", head, crlf=crlf))
+        add(places["lines"], "lines", *_lines_text(run, plan), crlf=crlf)
     if "tilt" in places and "circles" in places and by_run:
-        head = _head(_run_tilt_text(conduct.version))
-        outputs.append(Output(places["tilt"], RUN_TILT, head))
+        add(places["tilt"], RUN_TILT, *_run_tilt_text())
     if "circles" in places:
-        head = _head(_circles_text(run, plan, conduct.version, levelled=levelled))
-        outputs.append(Output(places["circles"], "circles", head, crlf=crlf))
+        add(places["circles"], "circles", *_circles_text(run, plan, levelled=levelled), crlf=crlf)
     if "markers" in places:
-        head = _head(_markers_text(run, plan, conduct.version))
-        outputs.append(Output(places["markers"], "markers", head))
+        add(places["markers"], "markers", *_markers_text(run, plan))
     if run.has_times:
-        place = _times_place([output.path for output in outputs])
-        outputs.append(Output(place, "times", _head([TIMES_HEAD])))
+        add(_times_place([output.path for output in outputs]), "times", TIMES_HEAD)
     return outputs
 
 
@@ -160,13 +138,13 @@ def _times_place(results: list[Path]) -> Path:
     return path.with_name(f"{path.stem if len(landmarks) > 1 else path.name}.times")
 
 
-def _circles_text(run: ImageRun, plan: FramePlan, version: str, *, levelled: bool) -> list[str]:
+def _circles_text(run: ImageRun, plan: FramePlan, *, levelled: bool) -> list[str]:
     assert plan.circles is not None
     refined = plan.circles.refine
     position = "fitted to the grey values" if refined else "that of the pixel in the middle"
     level = f"  positions are {LEVELLED}: # levelled <pitch> <roll>"
     return [
-        f"Discs on the floor, detected by redetect {version}.",
+        f"Discs on the floor, detected by redetect {__version__}.",
         *(_ROBOT, _STEP, _odometry(run)),
         "LANDMARK_C <pX> <pY> <quality> <cXX> <cXY> <cYY> <ID>",
         f"  position {position}; quality is Otsu's, 0 to 1; ID -1: unknown",
@@ -175,13 +153,13 @@ def _circles_text(run: ImageRun, plan: FramePlan, version: str, *, levelled: boo
     ]
 
 
-def _lines_text(run: ImageRun, plan: FramePlan, version: str) -> list[str]:
+def _lines_text(run: ImageRun, plan: FramePlan) -> list[str]:
     assert plan.lines is not None
     sign = "compensated for the tilt"
     if plan.lines.alpha == "published":
         sign += ", with the data set's own sign"
     return [
-        f"Verticals of the building, detected by redetect {version}.",
+        f"Verticals of the building, detected by redetect {__version__}.",
         *(_ROBOT, _STEP, _odometry(run)),
         "LANDMARK_L <xTop> <yTop> <xBottom> <yBottom> <alpha> <beta> <quality> <sigma> <ID>",
         "  ends: undistorted normalised coordinates; beta: inclination of the plane's normal",
@@ -190,9 +168,9 @@ def _lines_text(run: ImageRun, plan: FramePlan, version: str) -> list[str]:
     ]
 
 
-def _markers_text(run: ImageRun, plan: FramePlan, version: str) -> list[str]:
+def _markers_text(run: ImageRun, plan: FramePlan) -> list[str]:
     return [
-        f"Square markers, detected by redetect {version}.",
+        f"Square markers, detected by redetect {__version__}.",
         *(_STEP, _odometry(run)),
         "LANDMARK_M <dictionary> <ID> <quality>, and for each corner <u> <v> <cUU> <cUV> <cVV>",
         "  corners top left, top right, bottom right, bottom left of the marker as printed;",
@@ -201,10 +179,10 @@ def _markers_text(run: ImageRun, plan: FramePlan, version: str) -> list[str]:
     ]
 
 
-def _tilt_text(version: str, *, by_run: bool) -> list[str]:
+def _tilt_text(*, by_run: bool) -> list[str]:
     outlines = "TILT_D <image> ... <discs>: the same by the outlines of the frame's discs"
     return [
-        f"Pitch and roll of each frame from the building's verticals, by redetect {version}.",
+        f"Pitch and roll of each frame from the building's verticals, by redetect {__version__}.",
         *_TILT_ROWS,
         "  and the number of verticals that agree with it",
         "NOTILT <image> <lines>: too few lines agree",
@@ -212,9 +190,9 @@ def _tilt_text(version: str, *, by_run: bool) -> list[str]:
     ]
 
 
-def _run_tilt_text(version: str) -> list[str]:
+def _run_tilt_text() -> list[str]:
     return [
-        f"Pitch and roll that the discs of each frame were levelled by, by redetect {version}:",
+        f"Pitch and roll that the discs of each frame were levelled by, by redetect {__version__}:",
         "  the constant lean of the run and the frame's estimated deviation from it",
         *_TILT_ROWS,
         "  and the number of verticals that agree with the tilt of the frame by itself",
@@ -222,18 +200,18 @@ def _run_tilt_text(version: str) -> list[str]:
     ]
 
 
-def _json_file(path: Path, plan: FramePlan, version: str) -> Output:
+def _json_file(path: Path, plan: FramePlan) -> Output:
     """The text that `json.dumps` with an indent of 1 gives."""
     assert plan.circles is not None
     assert plan.camera is not None
     document = {
-        "version": version,
+        "version": __version__,
         "settings": dataclasses.asdict(plan.circles),
         "camera": plan.camera.content_hash,
         "frames": [],
     }
     head, tail = json.dumps(document, indent=1).rsplit("]", 1)
-    return Output(path, "json", head.encode(), f"\n ]{tail}\n".encode(), b",")
+    return Output(path, "json", head, f"\n ]{tail}\n", ",")
 
 
 def _odometry(run: ImageRun) -> str:
@@ -250,10 +228,6 @@ def _made_with(plan: FramePlan, settings: Any) -> tuple[str, str]:
     return f"camera {camera}", f"settings {values}"
 
 
-def _head(lines: Iterable[str]) -> bytes:
-    return format_head("\n".join(lines), "\n")
-
-
 # -- the log --------------------------------------------------------------------------------
 
 
@@ -263,56 +237,40 @@ def log_place(output: Path) -> Path:
 
 
 def demand_log_place(place: Path, *, overwrite: bool) -> None:
-    """Refuse to write a log over a file that is none.
-
-    Raises
-    ------
-    storage.OutputExistsError
-        If there is a file that is no log and must not be overwritten.
-    """
+    """Refuse to write a log over a file that is none (`OutputExistsError`)."""
     if overwrite or not os.path.lexists(place):
         return
-    if place.is_symlink() or not place.is_file():
-        raise OutputExistsError(place)
-    with place.open("rb") as stream:
-        if stream.read(len(_LOG_BEGIN)) != _LOG_BEGIN:
-            raise OutputExistsError(place)
+    if not place.is_symlink() and place.is_file():
+        with place.open("rb") as stream:
+            if stream.read(len(_LOG_BEGIN)) == _LOG_BEGIN:
+                return
+    raise OutputExistsError(place)
 
 
-def log_head(plan: FramePlan, conduct: Conduct) -> bytes:
-    """The text before the failures."""
+def log_text(
+    plan: FramePlan,
+    command: str,
+    summary: RunSummary,
+    failures: Sequence[Mapping[str, object]],
+    written: Sequence[Mapping[str, object]],
+) -> str:
+    """The content of a log: `failures` of frames, and what was `written`."""
     settings = {"circles": plan.circles, "lines": plan.lines, "markers": plan.markers}
-    document: dict[str, Any] = {
+    document = {
         "program": "redetect",
-        "version": conduct.version,
-        "command": conduct.command,
+        "version": __version__,
+        "command": command,
         "camera": None if plan.camera is None else plan.camera.content_hash,
         "settings": {
-            name: dataclasses.asdict(values)
-            for name, values in settings.items()
-            if values is not None
+            kind: dataclasses.asdict(values) for kind, values in settings.items() if values
         },
-        "failures": [],
+        "failures": failures,
+        "frames": summary.frames,
+        "failed": summary.failed,
+        "images_left_out": summary.images_without_step,
+        "found": {kind: summary.found[kind] for kind in ("discs", "lines", "tilts", "markers")},
+        "rejected": dict(sorted(summary.rejected.items())),
+        "outputs": written,
+        "exit_code": EXIT_FRAMES_FAILED if summary.failed else 0,
     }
-    return json.dumps(document, indent=1).rsplit("]", 1)[0].encode()
-
-
-def log_failure(place: int, prefix: str, reason: str) -> bytes:
-    """A frame that could not be worked on: its place in the run, from 0, its name and why."""
-    record = json.dumps({"frame": place, "prefix": prefix, "reason": reason})
-    return f"\n  {record}".encode()
-
-
-def log_tail(found: RunSummary, outputs: Sequence[Mapping[str, object]]) -> bytes:
-    """The text after the failures; of each output the name, the size and the hash."""
-    document = {
-        "frames": found.frames,
-        "failed": found.failed,
-        "images_left_out": found.images_without_step,
-        "found": {kind: found.found[kind] for kind in ("discs", "lines", "tilts", "markers")},
-        "rejected": dict(sorted(found.rejected.items())),
-        "outputs": outputs,
-        "exit_code": EXIT_FRAMES_FAILED if found.failed else 0,
-    }
-    end = "\n ]," if found.failed else "],"
-    return f"{end}{json.dumps(document, indent=1)[1:]}\n".encode()
+    return f"{json.dumps(document, indent=1)}\n"

@@ -25,32 +25,24 @@ _SHOWN_FAILURES = 10
 def progress_bar(label: str, total: int | None) -> Iterator[Callable[[], None]]:
     """A progress bar with the rate, on a terminal; yields what to call after every frame.
 
-    Calling it raises an interrupt that was lost (see `detect.interrupts`).
-
-    Without a total, it shows how many there were.
-
-    It appears with the first frame: until then, workers may have something to say.
+    Calling it raises an interrupt that was lost (see `detect.interrupts`). The bar appears with the
+    first frame: until then, workers may have something to say.
     """
     if not sys.stderr.isatty():
         yield raise_if_interrupted
         return
-    progress = Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[rate]}", justify="right"),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-        console=Console(stderr=True),
+    columns = (
+        *(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()),
+        *(TextColumn("{task.fields[rate]}"), TimeElapsedColumn(), TimeRemainingColumn()),
     )
+    progress = Progress(*columns, console=Console(stderr=True))
     task = progress.add_task(label, total=total, rate="")
 
     def advance() -> None:
         raise_if_interrupted()
         progress.start()  # nothing happens if it has
-        progress.advance(task)
         speed = progress.tasks[0].finished_speed or progress.tasks[0].speed
-        progress.update(task, rate=f"{speed:.1f} images/s" if speed else "")
+        progress.update(task, advance=1, rate=f"{speed:.1f} images/s" if speed else "")
 
     try:
         yield advance

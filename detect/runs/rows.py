@@ -1,4 +1,4 @@
-"""Output of one frame: rows, JSON and pictures, as bytes.
+"""Output of one frame: rows, JSON and pictures.
 
 This is all that a worker sends back, whichever process or machine it runs on: some kilobytes.
 """
@@ -6,10 +6,10 @@ This is all that a worker sends back, whichever process or machine it runs on: s
 from __future__ import annotations
 
 import json
+import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import islice
 from pathlib import Path
 from textwrap import indent
 from typing import TYPE_CHECKING, NamedTuple
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 #: Largest number of pixels that are decoded at once.
 PIXELS_AT_ONCE = 1 << 25
 
-#: Number of failures whose messages are kept.
+#: Number of failures whose messages a summary keeps.
 KEPT_FAILURES = 100
 
 _NONE: Mapping[str, int] = {}
@@ -62,17 +62,17 @@ class FrameRows(NamedTuple):
         How many "discs", "lines", "tilts" and "markers" there are.
     rejected : mapping
         How many candidates for markers were rejected, by cause.
-    pictures : tuple of (name, PNG)
-        Drawings.
     error : str or None
         Why the frame could not be worked on: its STEP stays, without landmarks.
+    pictures : tuple of (name, PNG)
     """
 
-    rows: Mapping[str, bytes]
+    prefix: str
+    rows: Mapping[str, str]
     found: Mapping[str, int] = _NONE
     rejected: Mapping[str, int] = _NONE
-    pictures: tuple[tuple[str, bytes], ...] = ()
     error: str | None = None
+    pictures: tuple[tuple[str, bytes], ...] = ()
 
 
 @dataclass
@@ -81,16 +81,12 @@ class RunSummary:
 
     Attributes
     ----------
-    frames : int
-        Frames processed.
-    found : Counter
-        How many "discs", "lines" and "markers" were found in them, and "tilts".
-    rejected : Counter
-        How many candidates for markers were rejected, by cause.
-    failed : int
-        Frames that could not be worked on.
+    frames, failed : int
+        Frames of the run, and those of them that could not be worked on.
+    found, rejected : Counter
+        Sums of these of `FrameRows`.
     failures : list of str
-        A line for each of the first `KEPT_FAILURES` of them.
+        A line for each of the first `KEPT_FAILURES` frames that failed.
     images_without_step : int
         Images that are no part of the run: the odometry does not have them.
     tilt : RunTilt or None
@@ -117,29 +113,14 @@ class RunSummary:
 
 
 def rows_of_frames(tasks: Sequence[FrameTask], plan: FramePlan, tables: Tables) -> list[FrameRows]:
-    """Work on some frames; an image that cannot be worked on costs its frame only.
-
-    Parameters
-    ----------
-    tasks : sequence of FrameTask
-        The frames.
-    plan : FramePlan
-        The plan for each.
-    tables : Tables
-        See `detect.runs.frame.tables_of`.
-
-    Returns
-    -------
-    list of FrameRows
-        One for each.
-    """
+    """The rows of frames; as many are worked on at a time as fit in memory."""
     camera = plan.camera
-    at_once = PIXELS_AT_ONCE // (camera.width * camera.height) if camera is not None else 1
-    if plan.drawing is not None or plan.draw_response:
-        at_once = 1
+    at_once = 1
+    if camera is not None and plan.drawing is None and not plan.draw_response:
+        at_once = max(1, PIXELS_AT_ONCE // (camera.width * camera.height))
     rows: list[FrameRows] = []
-    source = iter(tasks)
-    while batch := tuple(islice(source, max(1, at_once))):
+    for first in range(0, len(tasks), at_once):
+        batch = tasks[first : first + at_once]
         found = detect_batch(batch, plan, tables)
         rows += [_rows_of(task, each, plan, tables) for task, each in zip(batch, found)]
     return rows
@@ -150,66 +131,59 @@ def _rows_of(task: FrameTask, found: FrameDetections, plan: FramePlan, tables: T
         return rows_of_failure(task, found.error)
     try:
         return FrameRows(
+            task.frame.step.prefix,
             _rows_by_kind(task, found, plan),
             {
-                "discs": 0 if found.discs is None else len(found.discs),
-                "lines": 0 if found.lines is None else len(found.lines),
+                "discs": len(found.discs or ()),
+                "lines": len(found.lines or ()),
                 "tilts": int(found.lines is not None and found.tilt is not None),
-                "markers": 0 if found.markers is None else len(found.markers),
+                "markers": len(found.markers or ()),
             },
             _NONE if found.markers is None else dict(sorted(found.markers.rejected.items())),
-            tuple(_drawn(Path(task.frame.step.prefix).name, found, plan, tables)),
+            pictures=tuple(_drawn(Path(task.frame.step.prefix).name, found, plan, tables)),
         )
     except COSTS_THE_FRAME as error:
         return rows_of_failure(task, reason_of(error, task))
 
 
-def _rows_by_kind(task: FrameTask, found: FrameDetections, plan: FramePlan) -> dict[str, bytes]:
+def _rows_by_kind(task: FrameTask, found: FrameDetections, plan: FramePlan) -> dict[str, str]:
     step = task.frame.step
-    head = encoded(format_record(step))
+    head = f"{format_record(step)}\n"
     rows = {"times": _time_row(task)}
     if found.lines is not None:
         rows["lines"] = head + _line_rows(found.lines, task.known)
-        if found.tilt is None:
-            rows["tilt"] = encoded(format_no_tilt(step.prefix, len(found.lines)))
-        else:
-            rows["tilt"] = encoded(format_tilt(found.tilt))
+        tilt = found.tilt
+        own = format_no_tilt(step.prefix, len(found.lines)) if tilt is None else format_tilt(tilt)
+        rows["tilt"] = f"{own}\n"
         if found.outline_tilt is not None:
-            rows["tilt"] += encoded(format_outline_tilt(found.outline_tilt))
+            rows["tilt"] += f"{format_outline_tilt(found.outline_tilt)}\n"
     if found.discs is not None and found.seen is not None:
         level = found.discs.levelled_by
-        head_of_discs = head if level is None else head + encoded(format_levelling(level))
-        rows["circles"] = head_of_discs + _disc_rows(found.discs, found.seen, task.known)
+        note = "" if level is None else f"{format_levelling(level)}\n"
+        rows["circles"] = head + note + _disc_rows(found.discs, found.seen, task.known)
         if plan.json:
             rows["json"] = _json({"frame": step.prefix, "discs": _disc_records(found.discs)})
     if found.markers is not None:
-        markers = [encoded(format_record(marker)) for marker in found.markers.landmarks()]
-        rows["markers"] = b"".join([head, *markers])
+        rows["markers"] = head + "".join(
+            f"{format_record(marker)}\n" for marker in found.markers.landmarks()
+        )
     return rows
 
 
 def rows_of_failure(task: FrameTask, reason: str) -> FrameRows:
     """Output of a frame that could not be processed."""
     step = task.frame.step
-    rows = dict.fromkeys(("circles", "lines", "markers"), encoded(format_record(step)))
-    rows["tilt"] = encoded(format_no_tilt(step.prefix, 0))
+    rows = dict.fromkeys(("circles", "lines", "markers"), f"{format_record(step)}\n")
+    rows["tilt"] = f"{format_no_tilt(step.prefix, 0)}\n"
     rows["json"] = _json({"frame": step.prefix, "error": reason})
     rows["times"] = _time_row(task)
-    return FrameRows(rows, error=reason)
+    return FrameRows(step.prefix, rows, error=reason)
 
 
 def landmark_rows(
     keyword: str, numbers: NDArray[np.float64], ids: Sequence[tuple[int, ...]]
-) -> bytes:
-    """Rows of landmarks, as `landmarks.format_record` formats them.
-
-    Parameters
-    ----------
-    keyword : str
-    numbers : (N, K) float64
-        The numbers after the keyword.
-    ids : sequence of N tuples of int
-        The IDs at the end.
+) -> str:
+    """Rows of landmarks, as `landmarks.format_record` formats them, of (N, K) numbers and N IDs.
 
     Raises
     ------
@@ -219,91 +193,74 @@ def landmark_rows(
     if not np.isfinite(numbers).all():
         raise FrameError(f"{keyword}: a number of it is not finite")
     row = keyword + " %g" * numbers.shape[1]
-    rows = "".join([" ".join([row, *map(str, own)]) + "\n" for own in ids])
-    return (rows % tuple(numbers.ravel().tolist())).encode()
+    rows = "".join(" ".join([row, *map(str, own)]) + "\n" for own in ids)
+    return rows % tuple(numbers.ravel().tolist())
 
 
 def disc_numbers(
     floor_xy: NDArray[np.float64], quality: NDArray[np.float64], covariance: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """The (N, 6) numbers of rows of discs: x, y, quality, cxx, cxy, cyy."""
-    numbers = np.empty((len(quality), 6))
-    numbers[:, :2], numbers[:, 2] = floor_xy, quality
-    numbers[:, 3:5], numbers[:, 5] = covariance[:, 0], covariance[:, 1, 1]
-    return numbers
+    return np.column_stack([floor_xy, quality, covariance[:, 0], covariance[:, 1, 1]])
 
 
-def _line_rows(found: LineDetections, known: KnownOfFrame) -> bytes:
+def _line_rows(found: LineDetections, known: KnownOfFrame) -> str:
     ids: list[tuple[int, ...]] = [(-1,)] * len(found)
     if known.lines:
         from detect.verticals.detections import carry_ids
 
         ids = [row.ids for row in carry_ids(found.landmarks(), known.lines)]
-    ends_and_angles, sigma = found.line_numbers[:6], found.line_numbers[6:7]
-    numbers = np.concatenate([ends_and_angles, np.zeros_like(sigma), sigma]).T
-    return landmark_rows("LANDMARK_L", numbers, ids)
+    no_quality = np.zeros(len(found))
+    columns = [found.ends, found.alpha_rad, found.beta_rad, no_quality, found.sigma_rad]
+    return landmark_rows("LANDMARK_L", np.column_stack(columns), ids)
 
 
-def _disc_rows(discs: CircleDetections, seen: CircleDetections, known: KnownOfFrame) -> bytes:
+def _disc_rows(discs: CircleDetections, seen: CircleDetections, known: KnownOfFrame) -> str:
+    """The rows, with the IDs of a known row of the same disc, or of a map's, or -1."""
     numbers = disc_numbers(discs.floor_xy, discs.quality, discs.covariance)
     ids: list[tuple[int, ...]] = [(-1,)] * len(discs)
-    if known.discs or known.mapped:
-        ids = _ids_of_discs(discs, seen, known)
+    if known.discs:
+        from detect.discs.identity import ids_of_rows
+
+        alike = discs if known.discs_level else seen
+        named = ids_of_rows(alike.floor_xy, known.discs)
+        by_pixel = dict(zip(map(tuple, alike.pixels.tolist()), named))
+        ids = [by_pixel[u, v] or (-1,) for u, v in discs.pixels.tolist()]
+    if known.mapped:
+        from detect.discs.identity import ids_of_map
+
+        taken = {number for own in ids for number in own}
+        left = [disc for disc in known.mapped if disc.id not in taken]
+        rows = [k for k, own in enumerate(ids) if own == (-1,)]
+        found = ids_of_map(discs.floor_xy[rows], discs.covariance[rows], left, known.slack_m)
+        for k, number in zip(rows, found.tolist()):
+            ids[k] = (number,)
     return landmark_rows("LANDMARK_C", numbers, ids)
 
 
-def _ids_of_discs(
-    discs: CircleDetections, seen: CircleDetections, known: KnownOfFrame
-) -> list[tuple[int, ...]]:
-    """The IDs of each row: those of a known row of the same disc, or of a map's, or -1."""
-    from detect.discs.identity import ids_of_map, ids_of_rows
-
-    ids: list[tuple[int, ...]] = [()] * len(discs)
-    if known.discs:
-        alike = discs if known.discs_level else seen
-        by_pixel = dict(
-            zip(map(tuple, alike.pixels.tolist()), ids_of_rows(alike.floor_xy, known.discs))
-        )
-        ids = [by_pixel[u, v] for u, v in discs.pixels.tolist()]
-    if known.mapped:
-        taken = {number for own in ids for number in own}
-        left = [disc for disc in known.mapped if disc.id not in taken]
-        open_rows = [k for k, own in enumerate(ids) if own in ((), (-1,))]
-        named = ids_of_map(
-            discs.floor_xy[open_rows], discs.covariance[open_rows], left, known.slack_m
-        )
-        for k, number in zip(open_rows, named.tolist()):
-            ids[k] = (number,)
-    return [own or (-1,) for own in ids]
-
-
-def _time_row(task: FrameTask) -> bytes:
+def _time_row(task: FrameTask) -> str:
     frame = task.frame
-    return b"" if frame.time_s is None else encoded(format_time(frame.step.prefix, frame.time_s))
+    return "" if frame.time_s is None else f"{format_time(frame.step.prefix, frame.time_s)}\n"
 
 
-def encoded(row: str) -> bytes:
-    """A row as bytes of a file, with its line end."""
-    return f"{row}\n".encode("utf-8", "surrogateescape")
-
-
-def _json(record: dict[str, object]) -> bytes:
-    """A record as bytes in the list of frames of an indented document."""
-    return b"\n" + indent(json.dumps(record, indent=1), "  ").encode()
+def _json(record: dict[str, object]) -> str:
+    """A record in the list of frames of an indented document."""
+    return "\n" + indent(json.dumps(record, indent=1), "  ")
 
 
 def _disc_records(found: CircleDetections) -> list[dict[str, object]]:
+    rows = disc_numbers(found.floor_xy, found.quality, found.covariance).tolist()
     return [
         {
-            "pixel": [int(u), int(v)],
-            "x_m": float(x),
-            "y_m": float(y),
-            "quality": float(quality),
-            "evidence": float(evidence) if np.isfinite(evidence) else None,
-            "covariance_m2": [float(c[0, 0]), float(c[0, 1]), float(c[1, 1])],
+            "pixel": pixel,
+            "x_m": x,
+            "y_m": y,
+            "quality": quality,
+            "evidence": evidence if math.isfinite(evidence) else None,
+            "covariance_m2": covariance,
         }
-        for (u, v), (x, y), c, quality, evidence in zip(
-            found.pixels, found.floor_xy, found.covariance, found.quality, found.evidence
+        for pixel, (x, y, quality, *covariance), evidence in zip(
+            found.pixels.tolist(), rows, found.evidence.tolist()
         )
     ]
 
@@ -341,5 +298,4 @@ def _drawn(
 def _png(picture: NDArray[np.uint8]) -> bytes:
     import cv2
 
-    _, encoded_picture = cv2.imencode(".png", picture)
-    return encoded_picture.tobytes()
+    return cv2.imencode(".png", picture)[1].tobytes()

@@ -9,7 +9,7 @@ after them:
 
 When all frames are done, the results are written from the journal to parts (`storage.parts`) and
 brought to the disk; the journal says so; they take their places. A process killed in between leaves
-this last step to the next run. A run without a log has a journal without a name.
+this last step to the next run. The journal of a run without a log is never resumed.
 """
 
 from __future__ import annotations
@@ -19,203 +19,140 @@ import hashlib
 import logging
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing, suppress
+from contextlib import ExitStack
 from itertools import chain
 from pathlib import Path
-from types import TracebackType
 
 from detect.errors import DetectError
 from detect.runs.frame import FramePlan, FrameTask
-from detect.runs.journal import (
-    Journal,
-    JournalFrame,
-    JournalHead,
-    journal_place,
-    left_journal,
-    made_by,
-    new_journal,
-    record_of,
-    task_digest,
-    unnamed_journal,
-)
-from detect.runs.outputs import (
-    LOG,
-    Conduct,
-    Output,
-    demand_log_place,
-    log_failure,
-    log_head,
-    log_tail,
-)
+from detect.runs.journal import Journal, made_by, task_digest
+from detect.runs.outputs import Conduct, Output, demand_log_place, log_text
 from detect.runs.rows import FrameRows, RunSummary
 from storage import OutputExistsError
-from storage.parts import PartFile, folder_locked, left_part, new_part
+from storage.parts import PartFile, demand_place, folder_locked, left_part, new_part
 
 _log = logging.getLogger("redetect")
 
 #: Rows of each frame, by kind, in the order of the run.
-RowsOfFrames = Iterable[Mapping[str, bytes]]
+RowsOfFrames = Iterable[Mapping[str, str]]
 #: Makes the rows that are written from those of the frames, which can be read more than once.
 SecondPass = Callable[[Callable[[], RowsOfFrames]], RowsOfFrames]
 
 
-class FailedFrameError(DetectError):
-    """A frame that could not be worked on, where every frame is demanded."""
-
-    def __init__(self, reason: str) -> None:
-        super().__init__(f"{reason} (--strict: nothing is written)")
-
-
 class RunFiles:
-    """The files of a run: a context manager that begins or resumes its journal, and ends it.
-
-    Parameters
-    ----------
-    outputs : sequence of Output
-        The files.
-    plan : FramePlan
-        The plan for every frame.
-    conduct : Conduct
-        Whether there are a log and a run to be resumed.
-
-    Raises
-    ------
-    OSError, OutputExistsError, DetectError
-        On entering, if a file cannot be written, or must not be.
-    """
+    """The files of a run: a context manager that begins or resumes its journal, and ends it."""
 
     def __init__(self, outputs: Sequence[Output], plan: FramePlan, conduct: Conduct) -> None:
-        self._conduct = conduct
-        self._made_by = made_by(outputs, plan, conduct)
-        self._outputs = list(outputs)
+        self._outputs, self._plan, self._conduct = outputs, plan, conduct
+        self._paths = [output.path for output in outputs]
+        base = self._paths[0]
         if conduct.log is not None:
-            self._outputs.append(Output(conduct.log, LOG, log_head(plan, conduct), between=b","))
-        self._kinds = [output.kind for output in self._outputs]
-        self._journal: Journal | None = None
+            self._paths.append(conduct.log)
+            base = conduct.log.with_name(conduct.log.name.removesuffix(".log.json"))
+        self._base, self._made_by = base, made_by(outputs, plan)
+        self._overwrite = conduct.overwrite
+        self._resumable = conduct.log is not None
         self._frames = self._taken_over = 0
         self._resumes = self._done = False
+        self._journal: Journal
 
     # -- beginning ------------------------------------------------------------------------
 
     def __enter__(self) -> RunFiles:
-        places = [Path(os.path.realpath(o.path.parent), o.path.name) for o in self._outputs]
-        for output, place in zip(self._outputs, places):
+        places = [os.path.realpath(path) for path in self._paths]
+        for path, place in zip(self._paths, places):
             if places.count(place) > 1:  # the last one would be all there is
-                raise DetectError(f"{output.path}: named for two results: expected a file for each")
-        log, result, left = self._conduct.log, self._outputs[0].path, None
-        if log is not None:
-            left = left_journal(journal_place(log), result)
-        if left is not None:
-            try:
-                self._look_at(left)
-            finally:
-                if left is not self._journal:
-                    left.close()
-        if self._journal is None:
-            self._demand_new()
-            self._journal = self._begun(None if log is None else journal_place(log), result)
-            try:
-                self._journal.write(JournalHead(self._made_by, self._conduct.overwrite))
-            except BaseException:
-                self._journal.remove()
-                raise
+                raise DetectError(f"{path}: named for two results: expected a file for each")
+        left = left_part(self._base, "journal", named=self._paths[0])
+        if left is None:
+            self._demand_places()
+            self._begin()
+            return self
+        with ExitStack() as unless_taken_over:
+            unless_taken_over.callback(left.close)
+            journal = Journal(left)
+            resumes = self._conduct.resume and journal.is_by(self._made_by)
+            complete = journal.complete()
+            if complete is not None:
+                self._complete(*complete)
+                self._overwrite |= resumes  # the files are its own
+                if not resumes:
+                    left.remove()
+            self._demand_places()
+            if resumes:
+                self._journal, self._resumes = journal, True
+                unless_taken_over.pop_all()
+                return self
+            if self._conduct.resume:
+                _log.info(
+                    "what an unfinished run left was made with other settings, another camera or "
+                    "version: beginning anew"
+                )
+            elif complete is None:
+                _log.info(
+                    "removing what an unfinished run left (--resume would have gone on with it)"
+                )
+            left.remove()
+        self._begin()
         return self
 
-    def _begun(self, place: Path | None, result: Path) -> Journal:
-        journal = None if place is None else new_journal(place, result)
-        if journal is not None:
-            return journal
-        if place is not None and not self._conduct.overwrite:
-            raise DetectError(
-                f"{place}: another run is writing these files: wait for it, or, if it was killed "
-                "on another machine, remove this file"
-            )
-        if place is not None:
-            _log.info("another run is writing these files: this one cannot be resumed")
-        return unnamed_journal(result)
+    def _complete(self, numbers: Sequence[int], overwrite: bool) -> None:
+        """Complete a run that was killed while its files took their places."""
+        _log.info("the files of a run that was killed at its very end take their places")
+        for path, number in zip(self._paths, numbers):
+            part = left_part(path, number=number)
+            if part is not None:
+                with part:
+                    part.replace(path, overwrite=overwrite or self._may_replace(path))
 
-    def _demand_new(self) -> None:
+    def _begin(self) -> None:
+        file = new_part(self._base, "journal", named=self._paths[0])
+        if file.number > 0 and self._resumable:
+            self._resumable = False
+            if not self._overwrite:
+                file.remove()
+                place = self._base.with_name(f".{self._base.name}.journal")
+                raise DetectError(
+                    f"{place}: another run is writing these files: wait for it, or, if it was "
+                    "killed on another machine, remove this file"
+                )
+            _log.info("another run is writing these files: this one cannot be resumed")
+        self._journal = Journal(file)
+        try:
+            self._journal.write([self._made_by])
+        except BaseException:
+            file.remove()
+            raise
+
+    def _demand_places(self) -> None:
         """Refuse to replace what must not be, or cannot be."""
-        for path in (output.path for output in self._outputs):
-            if not path.parent.is_dir():
-                raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path))
-            if path.is_dir() and not path.is_symlink():
-                raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
-            if not self._may_replace(path) and os.path.lexists(path):
-                raise OutputExistsError(path)
+        for path in self._paths:
+            demand_place(path, overwrite=self._may_replace(path))
         if self._conduct.log is not None:
-            demand_log_place(self._conduct.log, overwrite=self._conduct.overwrite)
+            demand_log_place(self._conduct.log, overwrite=self._overwrite)
 
     def _may_replace(self, path: Path) -> bool:
         """Whether an existing file may be replaced: the log always, if it is one."""
-        return self._conduct.overwrite or path == self._conduct.log
-
-    def _look_at(self, left: Journal) -> None:
-        """Complete, take over, or remove what an interrupted run left."""
-        head, parts = left.head(), left.parts()
-        fits = head is not None and head.made_by == self._made_by
-        resume = self._conduct.resume and head is not None
-        if head is not None and parts is not None and len(parts) == len(self._outputs):
-            _log.info("the files of a run that was killed at its very end take their places")
-            for output, number in zip(self._outputs, parts):
-                part = left_part(output.path, number)
-                if part is not None:
-                    with closing(part):
-                        part.place(overwrite=head.overwrite or self._may_replace(output.path))
-            if fits and resume:
-                self._journal, self._done = left, True
-            else:
-                left.remove()
-            return
-        self._demand_new()
-        if fits and resume:
-            self._journal, self._resumes = left, True
-            return
-        if resume:
-            _log.info(
-                "what an unfinished run left was made with other settings, another camera or "
-                "version: beginning anew"
-            )
-        else:
-            _log.info("removing what an unfinished run left (--resume would have gone on with it)")
-        left.remove()
+        return self._overwrite or path == self._conduct.log
 
     # -- frames -----------------------------------------------------------------------------
 
     def take_over(
         self, tasks: Iterator[FrameTask], count: Callable[[FrameRows], None]
     ) -> Iterator[FrameTask]:
-        """Take over the frames that are done already.
-
-        Parameters
-        ----------
-        tasks : iterator of FrameTask
-            The frames of the run.
-        count : callable
-            Called with the rows of each frame that is taken over.
-
-        Returns
-        -------
-        iterator of FrameTask
-            The frames that remain to be done.
-        """
-        assert self._journal is not None
-        if self._done:
-            for frame in self._journal.frames():
-                count(frame.frame_rows())
-            return iter(())
+        """Take over the frames that are done already, counting each; returns the remaining ones."""
         if not self._resumes:
             return tasks
         beyond: list[FrameTask] = []
-        for frame in self._journal.frames():
+        for digest, rows in self._journal.frames():
             task = next(tasks, None)
-            if task is None or frame.task != task_digest(task):
+            if task is None or digest != task_digest(task):
                 beyond = [] if task is None else [task]
                 break
-            if frame.error is not None and self._conduct.strict:
-                raise FailedFrameError(frame.error)
+            if rows.error is not None and self._conduct.strict:
+                raise DetectError(f"{rows.error} (--strict: nothing is written)")
             self._frames += 1
-            count(frame.frame_rows())
+            count(rows)
         self._journal.cut()
         self._taken_over = self._frames
         _log.info("%d frames of an unfinished run are taken over", self._frames)
@@ -223,138 +160,90 @@ class RunFiles:
 
     @property
     def may_replace_pictures(self) -> bool:
-        """Whether pictures of the next frame may be replaced.
+        """Whether pictures may be replaced: a resumed run may have drawn the next ones."""
+        return self._overwrite or (self._resumes and self._frames == self._taken_over)
 
-        The run that is resumed may have drawn it before it ended.
-        """
-        return self._conduct.overwrite or (self._resumes and self._frames == self._taken_over)
-
-    def add(self, frames: Iterable[tuple[FrameTask, FrameRows]]) -> None:
-        """Note frames, the next ones.
-
-        Raises
-        ------
-        OSError
-            If they cannot be written.
-        FailedFrameError
-            If one of them could not be worked on, and every frame is demanded.
-        """
-        assert self._journal is not None
-        records: list[JournalFrame] = []
-        for task, rows in frames:
-            if rows.error is not None:
-                if self._conduct.strict:
-                    self._journal.remove()
-                    raise FailedFrameError(rows.error)
-                place = self._frames + len(records)
-                failure = log_failure(place, task.frame.step.prefix, rows.error)
-                rows = rows._replace(rows={**rows.rows, LOG: failure})
-            records.append(record_of(task, rows, self._kinds))
-        self._journal.write(*records)
-        self._frames += len(records)
+    def add(self, frames: Sequence[tuple[FrameTask, FrameRows]]) -> None:
+        """Note the next frames."""
+        for _, rows in frames:
+            if rows.error is not None and self._conduct.strict:
+                self._journal.file.remove()
+                raise DetectError(f"{rows.error} (--strict: nothing is written)")
+        self._journal.write_frames(frames)
+        self._frames += len(frames)
 
     # -- ending -----------------------------------------------------------------------------
 
-    def finish(self, found: RunSummary, second_pass: SecondPass | None = None) -> None:
-        """Write the results, and move them to their final paths.
-
-        Raises
-        ------
-        OSError, OutputExistsError
-            If they cannot.
-        """
-        assert self._journal is not None
-        if self._done:  # by a run that was killed at its very end
-            return
-        if self._journal.place is not None and not self._journal.is_in_place():
+    def finish(self, summary: RunSummary, second_pass: SecondPass | None = None) -> None:
+        """Write the results, and move them to their final paths."""
+        if not self._journal.file.is_in_place():
             # Another folder may have come in its place: nothing in it is touched.
-            raise FileNotFoundError(
-                errno.ENOENT, "the run's journal is gone", str(self._outputs[0].path)
-            )
+            raise FileNotFoundError(errno.ENOENT, "the run's journal is gone", str(self._paths[0]))
         with ExitStack() as stack:
-            files = [_Result(o, stack.enter_context(new_part(o.path))) for o in self._outputs]
+            parts = [stack.enter_context(new_part(path)) for path in self._paths]
+            results = list(zip(self._outputs, parts))
+            for output, part in results:
+                part.stream.write(output.encoded(output.head))
+            separators = dict.fromkeys((output.kind for output in self._outputs), "")
             for rows in self._rows() if second_pass is None else second_pass(self._rows):
-                for file in files:
-                    file.add(rows.get(file.output.kind, b""))
-            written: list[dict[str, object]] = []
-            for file in files:
-                is_log = file.output.kind == LOG
-                file.end(log_tail(found, written) if is_log else file.output.tail)
-                written.append(file.described())
-            self._place(files)
+                for output, part in results:
+                    if text := rows.get(output.kind):
+                        part.stream.write(output.encoded(separators[output.kind] + text))
+                        separators[output.kind] = output.between
+            for output, part in results:
+                part.stream.write(output.encoded(output.tail))
+            if self._conduct.log is not None:
+                written = [_described(output, part) for output, part in results]
+                failures = [
+                    {"frame": number, "prefix": rows.prefix, "reason": rows.error}
+                    for number, (_, rows) in enumerate(self._journal.frames())
+                    if rows.error is not None
+                ]
+                text = log_text(self._plan, self._conduct.command, summary, failures, written)
+                parts[-1].stream.write(text.encode())
+            for part in parts:
+                part.sync()
+            self._place(parts)
         self._done = True
 
-    def _rows(self) -> Iterator[Mapping[str, bytes]]:
-        assert self._journal is not None
-        return (frame.frame_rows().rows for frame in self._journal.frames())
+    def _rows(self) -> Iterator[Mapping[str, str]]:
+        return (rows.rows for _, rows in self._journal.frames())
 
-    def _place(self, files: Sequence[_Result]) -> None:
-        assert self._journal is not None
-        with folder_locked(self._outputs[-1].path.parent), ExitStack() as replaced:
-            for path in (output.path for output in self._outputs):
-                if not self._may_replace(path) and os.path.lexists(path):
-                    raise OutputExistsError(path)
-                # The disk space of a replaced file is freed when no process has it open any
-                # more. That takes much longer than to replace it, and so happens behind the last
-                # one: hardly any kill falls between the calls that replace them.
-                if path.is_file():
-                    with suppress(OSError):
-                        replaced.enter_context(path.open("rb"))
-            self._journal.complete([file.part.number for file in files])
+    def _place(self, parts: Sequence[PartFile]) -> None:
+        with folder_locked(self._paths[-1].parent):
+            for path in self._paths:
+                demand_place(path, overwrite=self._may_replace(path))
+            self._journal.write_complete([part.number for part in parts], overwrite=self._overwrite)
             try:
-                for file in files:
-                    file.part.place(overwrite=self._may_replace(file.output.path))
+                for path, part in zip(self._paths, parts):
+                    part.replace(path, overwrite=self._may_replace(path))
             except OutputExistsError:
                 raise
             except BaseException:
-                for file in files:
-                    file.part.close()  # the next run goes on with it
+                for part in parts:
+                    part.close()  # the next run goes on with it
                 raise
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None
-    ) -> None:
-        assert self._journal is not None
-        worth_keeping = (
-            not self._done
-            and not isinstance(error, OutputExistsError)  # another process was faster
-            and self._journal.is_in_place()
-            and (self._frames > 0 or self._resumes)
-        )
-        if not worth_keeping:
-            self._journal.remove()
+    def __exit__(self, kind: object, error: BaseException | None, _: object) -> None:
+        journal = self._journal.file
+        if (
+            self._done
+            or not self._resumable
+            or isinstance(error, OutputExistsError)  # another process was faster
+            or not (self._frames or self._resumes)
+            or journal.stream.closed
+            or not journal.is_in_place()
+        ):
+            journal.remove()
             return
-        self._journal.close()
+        journal.close()
         if self._frames:
             _log.info("%d frames are kept: --resume goes on after them", self._frames)
 
 
-class _Result:
-    """A result while it is written."""
-
-    def __init__(self, output: Output, part: PartFile) -> None:
-        self.output, self.part = output, part
-        self._size, self._digest, self._has_rows = 0, hashlib.sha256(), False
-        self._write(output.head)
-
-    def add(self, rows: bytes) -> None:
-        """Write the rows of a frame."""
-        if rows:
-            self._write(self.output.between + rows if self._has_rows else rows)
-            self._has_rows = True
-
-    def end(self, tail: bytes) -> None:
-        """Write what comes behind them, and bring all of it to the disk."""
-        self._write(tail)
-        self.part.sync()
-
-    def described(self) -> dict[str, object]:
-        """Name, size and hash, for the log."""
-        sha256 = self._digest.hexdigest()
-        return {"name": self.output.path.name, "bytes": self._size, "sha256": sha256}
-
-    def _write(self, text: bytes) -> None:
-        content = text.replace(b"\n", b"\r\n") if self.output.crlf else text
-        self.part.stream.write(content)
-        self._size += len(content)
-        self._digest.update(content)
+def _described(output: Output, part: PartFile) -> dict[str, object]:
+    """Name, size and hash of a result, for the log."""
+    size = part.stream.tell()
+    part.stream.seek(0)
+    sha256 = hashlib.file_digest(part.stream, "sha256").hexdigest()
+    return {"name": output.path.name, "bytes": size, "sha256": sha256}

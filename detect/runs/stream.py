@@ -9,21 +9,21 @@ all.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import replace
 from functools import partial
+from itertools import chain
 from pathlib import Path
 
 from detect.errors import DetectError
-from detect.markers.templates import templates_of
 from detect.run import ImageRun
 from detect.runs.dispatch import Workers, detect_chunks
-from detect.runs.frame import FramePlan, FrameTask, tables_of
+from detect.runs.frame import FramePlan, FrameTask
 from detect.runs.known import Known
 from detect.runs.outputs import Conduct, outputs_of
 from detect.runs.rows import FrameRows, RunSummary
-from detect.runs.run_files import RunFiles, SecondPass
+from detect.runs.run_files import RunFiles
 from detect.runs.workers import local_workers
 from storage import write_whole
 
@@ -64,8 +64,8 @@ def detect_run(
     on_progress : callable, optional
         Called once after every frame.
     conduct : Conduct, optional
-        Whether files may be replaced, whether there are a log and a journal, how bad frames are
-        met, and whether an unfinished run is resumed.
+        Whether files may be replaced, whether there is a log, what bad frames cost, and whether an
+        unfinished run is resumed.
 
     Returns
     -------
@@ -87,14 +87,11 @@ def detect_run(
     conduct = Conduct() if conduct is None else conduct
     plan = replace(plan, json="json" in places, working_folder=Path.cwd())
     levelled = plan.levelling != "none" and (plan.lines is not None or known.tilts is not None)
-    outputs = outputs_of(run, plan, places, conduct, levelled=levelled)
-    files = RunFiles(outputs, plan, conduct)
+    outputs = outputs_of(run, plan, places, crlf=conduct.crlf, levelled=levelled)
     if pictures is not None:
         make_folder(pictures)
     if workers is None:
-        large = pictures is not None or run.frames.ships_images
-        workers = local_workers(1, large=large)
-    _demand_possible(plan, workers)
+        workers = local_workers(1, large=pictures is not None or run.frames.ships_images)
     summary = RunSummary()
 
     def count(rows: FrameRows) -> None:
@@ -103,18 +100,22 @@ def detect_run(
             on_progress()
 
     with ExitStack() as stack:
-        stack.enter_context(files)
+        files = stack.enter_context(RunFiles(outputs, plan, conduct))
         tasks = files.take_over(stack.enter_context(closing(_tasks(run, known))), count)
-        for chunk in stack.enter_context(closing(detect_chunks(tasks, plan, workers))):
-            # A frame whose picture is there is noted before the next picture is.
-            for frames in [chunk] if pictures is None else [[frame] for frame in chunk]:
-                if pictures is not None:
-                    _write_pictures(frames[0][1], pictures, overwrite=files.may_replace_pictures)
-                files.add(frames)
-                for _, rows in frames:
-                    count(rows)
+        for frames in stack.enter_context(closing(detect_chunks(tasks, plan, workers))):
+            if pictures is not None:
+                _write_pictures(frames, pictures, overwrite=files.may_replace_pictures)
+            files.add(frames)
+            for _, rows in frames:
+                count(rows)
         summary.images_without_step = run.images_without_step
-        files.finish(summary, _second_pass(plan, summary))
+        second_pass = None
+        if plan.levelling == "run" and plan.camera and plan.lines and plan.circles:
+            from detect.runs.level_run import level_run
+
+            sigma_rad = math.radians(plan.circles.tilt_sigma_deg)
+            second_pass = partial(level_run, plan.camera, sigma_rad, summary)
+        files.finish(summary, second_pass)
     return summary
 
 
@@ -128,30 +129,15 @@ def make_folder(folder: Path) -> None:
         ) from None
 
 
-def _demand_possible(plan: FramePlan, workers: Workers) -> None:
-    """Refuse what would fail for every frame, as far as this process can check quickly."""
-    if plan.markers is not None:
-        templates_of(plan.markers.dictionary, plan.markers.ids)
-    if not workers.tell_of_tables:
-        tables_of(plan)
-
-
-def _second_pass(plan: FramePlan, summary: RunSummary) -> SecondPass | None:
-    """The second pass over the files of the frames, if there is one."""
-    if plan.levelling != "run" or not (plan.camera and plan.lines and plan.circles):
-        return None
-    from detect.runs.level_run import level_run
-
-    return partial(level_run, plan.camera, math.radians(plan.circles.tilt_sigma_deg), summary)
-
-
-def _write_pictures(rows: FrameRows, folder: Path, *, overwrite: bool) -> None:
-    for name, picture in rows.pictures:
-        with write_whole(folder / name, overwrite=overwrite) as stream:
-            stream.write(picture)
-
-
 def _tasks(run: ImageRun, known: Known) -> Generator[FrameTask, None, None]:
     with closing(iter(run.frames)) as frames:
         for frame in frames:
             yield FrameTask(frame, known.of(frame.step.prefix))
+
+
+def _write_pictures(
+    frames: Sequence[tuple[FrameTask, FrameRows]], folder: Path, *, overwrite: bool
+) -> None:
+    for name, picture in chain.from_iterable(rows.pictures for _, rows in frames):
+        with write_whole(folder / name, overwrite=overwrite) as stream:
+            stream.write(picture)

@@ -14,21 +14,23 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager, suppress
+from functools import lru_cache
 from multiprocessing.connection import wait
-from multiprocessing.synchronize import Event, Lock
-from typing import TYPE_CHECKING, NamedTuple, ParamSpec, TypeVar, cast
+from multiprocessing.synchronize import Lock
+from typing import TYPE_CHECKING, ParamSpec, TypeVar, cast
 
 from detect.announcing import (
     announce_compiling,
     announcements_are_shown,
-    on_first_compilation,
+    on_compilation,
+    say_compiling,
     show_announcements,
 )
 from detect.errors import WorkerError
 from detect.interrupts import interrupts_deferred
 from detect.runs.dispatch import Workers
-from detect.runs.frame import FramePlan, import_detectors, rehearse, tables_of
+from detect.runs.frame import FramePlan, tables_of
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -57,46 +59,29 @@ def default_jobs(frames: int) -> int:
 
 
 def local_workers(jobs: int, *, large: bool = False) -> Workers:
-    """Workers on this machine.
+    """Processes of this machine; 1 is this process itself.
 
-    Parameters
-    ----------
-    jobs : int
-        How many processes; 1 is this process itself.
-    large : bool
-        Whether tasks carry images, or bring pictures back: they have one frame each then.
-
-    Raises
-    ------
-    WorkerError
-        If `jobs` is less than 1.
+    Of `large` tasks, which carry images or bring pictures back, each has one frame.
     """
     if jobs < 1:
         raise WorkerError(f"jobs is {jobs}: expected 1 or more")
     chunk = 1 if large else _TOGETHER
     if jobs == 1:
-        return Workers(_in_process, chunk, window=lambda: 1)
+        return Workers(lambda _: _InProcess(), chunk, window=lambda: 1)
     window = 2 + _WINDOW_PER_WORKER * jobs
-    return Workers(lambda plan: _processes(jobs, plan), chunk, lambda: window, tell_of_tables=True)
+    return Workers(lambda plan: _ProcessPool(jobs, plan), chunk, lambda: window)
 
 
 def cluster_workers(address: str, *, large: bool = False) -> Workers:
-    """The workers of a dask cluster.
+    """The workers of a dask cluster, whose scheduler has an `address` as ``tcp://host:8786``.
 
     They have this program installed, in the same version, and see the images under the same
-    paths.
-
-    Parameters
-    ----------
-    address : str
-        The scheduler's, as ``tcp://host:8786``.
-    large : bool
-        Whether tasks carry images, or bring pictures back: they have one frame each then.
+    paths. Of `large` tasks, which carry images or bring pictures back, each has one frame.
 
     Raises
     ------
     WorkerError
-        If the address of the scheduler is invalid, or the package for clusters is not installed.
+        If the address is invalid, or the package for clusters is not installed.
     """
     if not re.fullmatch(r"[a-z]+://\S+:[0-9]+", address):
         raise WorkerError(f"cluster is {address!r}: expected the scheduler's tcp://host:port")
@@ -106,13 +91,18 @@ def cluster_workers(address: str, *, large: bool = False) -> Workers:
         raise WorkerError(
             "a cluster needs the package distributed: install it by pip install 'redetect[cluster]'"
         ) from None
-    size = _ClusterSize()
-    return Workers(
-        lambda plan: _cluster(address, size),
-        chunk=1 if large else _TOGETHER,
-        window=size.window,
-        died=(KilledWorker,),
-    )
+    clients: list[Client] = []
+
+    @lru_cache(maxsize=1)
+    def threads(_: object) -> int:
+        return sum(sum(client.nthreads().values()) for client in clients)
+
+    def window() -> int:  # a cluster grows
+        time_and_client = (time.monotonic() // _CLUSTER_LOOK_S, len(clients))
+        return 2 + _WINDOW_PER_WORKER * max(1, threads(time_and_client))
+
+    chunk = 1 if large else _TOGETHER
+    return Workers(lambda _: _cluster(address, clients), chunk, window, died=(KilledWorker,))
 
 
 # -- this process ---------------------------------------------------------------------------
@@ -121,16 +111,13 @@ def cluster_workers(address: str, *, large: bool = False) -> Workers:
 class _InProcess(Executor):
     """Runs each task immediately, before it returns the future."""
 
+    def __init__(self) -> None:
+        announce_compiling()
+
     def submit(self, fn: Callable[P, R], /, *args: P.args, **kwargs: P.kwargs) -> Future[R]:
         future: Future[R] = Future()
         future.set_result(fn(*args, **kwargs))
         return future
-
-
-@contextmanager
-def _in_process(plan: FramePlan) -> Iterator[Executor]:
-    announce_compiling()
-    yield _InProcess()
 
 
 # -- processes of this machine ---------------------------------------------------------------
@@ -141,32 +128,23 @@ def _in_process(plan: FramePlan) -> Iterator[Executor]:
 # by themselves.
 
 
-@contextmanager
-def _processes(count: int, plan: FramePlan) -> Iterator[Executor]:
-    """Processes that get ready for a plan; they have ended when the block has."""
-    with ExitStack() as ending:
-        with interrupts_deferred():  # else one would be left half started
-            pool = _ProcessPool(count, plan)
-            ending.callback(pool.end)
-        yield pool
-
-
 class _ProcessPool(ProcessPoolExecutor):
-    """Processes that inherit a blocked interrupt: it would reach them even while they start."""
+    """Processes that get ready for a plan; as a context manager it ends them.
+
+    They inherit a blocked interrupt: it would reach them even while they start.
+    """
 
     def __init__(self, count: int, plan: FramePlan) -> None:
         context = multiprocessing.get_context("spawn")
-        beginning = _Beginning(context.Lock(), context.Event(), context.Event())
-        show = announcements_are_shown()
-        super().__init__(
-            count, mp_context=context, initializer=_begin, initargs=(plan, beginning, show)
-        )
+        locks = (context.Lock(), context.Lock())
+        arguments = (plan, *locks, announcements_are_shown())
+        super().__init__(count, mp_context=context, initializer=_begin, initargs=arguments)
 
     def submit(self, fn: Callable[P, R], /, *args: P.args, **kwargs: P.kwargs) -> Future[R]:
-        with interrupts_deferred():
-            return super().submit(fn, *args, **kwargs)
+        with interrupts_deferred():  # else one would be left half started
+            return super().submit(_in_worker, fn, *args, **kwargs)
 
-    def end(self) -> None:
+    def __exit__(self, *_: object) -> None:
         """End them, whatever they are doing; a further interrupt waits for that.
 
         The thread that manages them is joined: an interrupted program leaves threads behind, and
@@ -174,40 +152,24 @@ class _ProcessPool(ProcessPoolExecutor):
         """
         with interrupts_deferred():
             processes = list((self._processes or {}).values())
-            caretaker = cast("threading.Thread | None", self._executor_manager_thread)
+            manager = cast("threading.Thread | None", self._executor_manager_thread)
             self.shutdown(wait=False, cancel_futures=True)
             latest_s = time.monotonic() + _GRACE_S
             for process in processes:
                 process.join(max(0.0, latest_s - time.monotonic()))
-            for process in processes:  # they may still be starting
-                process.terminate()
             for process in processes:
-                process.join(_GRACE_S)
-                if process.is_alive():
-                    process.kill()
-                    process.join()
-            if caretaker is not None:
-                caretaker.join(_GRACE_S)
+                process.kill()
+                process.join()
+            if manager is not None:
+                manager.join(_GRACE_S)
 
 
-class _Beginning(NamedTuple):
-    """What new worker processes share: one of them fills the caches for all.
-
-    Attributes
-    ----------
-    first : Lock
-        Taken by that one.
-    tables, kernels : Event
-        Set when tables are in the cache, and when kernels are.
-    """
-
-    first: Lock
-    tables: Event
-    kernels: Event
+#: Held by the process that compiles kernels, until it has done what it needs them for.
+_compiling: list[Lock] = []
 
 
-def _begin(plan: FramePlan, beginning: _Beginning, show: bool) -> None:
-    """Make a new process a worker."""
+def _begin(plan: FramePlan, tables: Lock, kernels: Lock, show: bool) -> None:
+    """Make a new process a worker; the first one to need them fills the caches for all."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     if show:
@@ -215,26 +177,27 @@ def _begin(plan: FramePlan, beginning: _Beginning, show: bool) -> None:
     import cv2
 
     cv2.setNumThreads(1)
-    with suppress(Exception):  # any error recurs, and is reported, with the first task
-        _rehearse_together(plan, beginning)
+    on_compilation(lambda: _compile_or_wait(kernels))
+    with suppress(Exception), tables:  # any error recurs, and is reported, with the first task
+        _in_worker(tables_of, plan)
 
 
-def _rehearse_together(plan: FramePlan, beginning: _Beginning) -> None:
-    if beginning.first.acquire(block=False):
-        announce_compiling()
-        try:
-            tables_of(plan)
-            beginning.tables.set()
-            rehearse(plan)
-        finally:  # the other processes find the error themselves
-            beginning.tables.set()
-            beginning.kernels.set()
-        return
-    # All kernels but the one that is met first are loaded then: the first process has kept them.
-    on_first_compilation(beginning.kernels.wait)
-    import_detectors(plan)
-    beginning.tables.wait()
-    rehearse(plan)
+def _compile_or_wait(kernels: Lock) -> None:
+    if not _compiling and kernels.acquire(block=False):
+        _compiling.append(kernels)
+        say_compiling()
+    elif not _compiling:
+        # All kernels but this one will be loaded: the other process has kept them.
+        with kernels:
+            pass
+
+
+def _in_worker(fn: Callable[P, R], /, *args: P.args, **kwargs: P.kwargs) -> R:
+    try:
+        return fn(*args, **kwargs)
+    finally:
+        while _compiling:
+            _compiling.pop().release()
 
 
 def _end_with_parent() -> None:
@@ -247,28 +210,8 @@ def _end_with_parent() -> None:
 # -- a cluster ------------------------------------------------------------------------------
 
 
-class _ClusterSize:
-    """How many tasks a cluster may have under way; updated from time to time."""
-
-    def __init__(self) -> None:
-        self._client: Client | None = None
-        self._threads = 1
-        self._looked_s = 0.0
-
-    def watch(self, client: Client) -> None:
-        self._client = client
-        self._looked_s = 0.0
-
-    def window(self) -> int:
-        now_s = time.monotonic()
-        if self._client is not None and now_s - self._looked_s > _CLUSTER_LOOK_S:
-            self._looked_s = now_s
-            self._threads = max(1, sum(self._client.nthreads().values()))
-        return 2 + _WINDOW_PER_WORKER * self._threads
-
-
 @contextmanager
-def _cluster(address: str, size: _ClusterSize) -> Iterator[Executor]:
+def _cluster(address: str, clients: list[Client]) -> Iterator[Executor]:
     from distributed import Client
 
     try:
@@ -282,6 +225,6 @@ def _cluster(address: str, size: _ClusterSize) -> Iterator[Executor]:
             raise WorkerError(
                 f"{address}: no worker came within {_CLUSTER_PATIENCE_S:g} s"
             ) from None
-        size.watch(client)
+        clients[:] = [client]
         # The same frame twice is not the same task: nothing is kept between runs.
         yield client.get_executor(pure=False)

@@ -82,7 +82,9 @@ def tune_run(
             kind = "circles" if plan.circles is not None else "lines"
             with closing(detect_chunks(tasks, plan, same())) as chunks:
                 for _, each in chain.from_iterable(chunks):
-                    found += frames_of_rows(parse_rows(io.BytesIO(each.rows[kind])))
+                    found += frames_of_rows(
+                        parse_rows(io.BytesIO(each.rows[kind].encode("utf-8", "surrogateescape")))
+                    )
                     failures += [] if each.error is None else [each.error]
                     if on_progress is not None:
                         on_progress()

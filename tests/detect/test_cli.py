@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -273,6 +274,50 @@ def test_places_where_nothing_can_be_written(
     assert last.startswith("error: ")
     assert told in last
     assert files_in(tmp_path) == before
+
+
+@pytest.mark.parametrize("force", [(), ("--force",)])
+@pytest.mark.parametrize("flag", ["-o", "--json"])
+@pytest.mark.parametrize("name", ["null", "pipe"])
+def test_what_is_no_regular_file_is_refused(
+    small_run: Path, capsys: Captured, name: str, flag: str, force: tuple[str, ...]
+) -> None:
+    """Before any work is done, and also with `--force`."""
+    path = Path("/dev/null")
+    if name == "pipe":
+        path = small_run.parent / "pipe"
+        os.mkfifo(path)
+    line = assert_refused(
+        ["circles", str(small_run), flag, str(path), *force], small_run, "", capsys
+    )
+    assert f"{path}: is a device, pipe or socket: expected the name of a file" in line
+    assert not path.is_file()
+
+
+def test_two_links_to_one_file(small_run: Path, tmp_path: Path, capsys: Captured) -> None:
+    for name in ("one", "two"):
+        (tmp_path / name).symlink_to(tmp_path / "rows")
+    arguments = ["circles", str(small_run), "-o", str(tmp_path / "one"), "--force"]
+    assert main([*arguments, "--json", str(tmp_path / "two")]) == 1
+    assert "named for two results" in capsys.readouterr().err
+    assert not (tmp_path / "rows").exists()
+
+
+@pytest.mark.parametrize("there", [True, False])
+def test_a_link_is_written_through(small_run: Path, tmp_path: Path, there: bool) -> None:
+    """It stays a link; its target, in another folder, is replaced whole."""
+    (tmp_path / "elsewhere").mkdir()
+    target, link = tmp_path / "elsewhere" / "rows.circles", tmp_path / "link.circles"
+    if there:
+        target.write_text("what was there before")
+    link.symlink_to(target)
+    assert main(["circles", str(small_run), "-o", str(link)]) == 1
+    assert target.exists() == there
+    assert main(["circles", str(small_run), "-o", str(link), "--force"]) == 0
+    assert link.is_symlink()
+    assert len(list(read_frames(target))) == 3
+    assert [path.name for path in target.parent.iterdir()] == ["rows.circles"]
+    assert not list(tmp_path.glob(".*"))
 
 
 @pytest.mark.parametrize(

@@ -33,9 +33,7 @@ def detected(
     opened = open_run(run)
     plan = FramePlan(opened.camera, circles=settings)
     ids = Known() if known is None else Known(discs=FramesByImage(known))
-    return detect_run(
-        opened, plan, {"circles": output}, known=ids, conduct=Conduct("test", crlf=crlf)
-    )
+    return detect_run(opened, plan, {"circles": output}, known=ids, conduct=Conduct(crlf=crlf))
 
 
 def redetected(run: Path, settings: CircleSettings, folder: Path) -> DiscComparison:

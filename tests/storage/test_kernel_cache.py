@@ -1,4 +1,4 @@
-"""Compiled kernels: what is said where they cannot be loaded, and of the first that is compiled."""
+"""Compiled kernels: what is said where they cannot be loaded, or are compiled."""
 
 from __future__ import annotations
 
@@ -25,11 +25,12 @@ def of(first, second):
 
 PROGRAM = """
 import sys
-from detect.announcing import on_first_compilation
+from functools import cache
+from detect.announcing import on_compilation
 from storage.exit_codes import exit_code_of
 from kernels import of
 
-on_first_compilation(lambda: print("compiles"))
+on_compilation(cache(lambda: print("compiles")))
 sys.exit(exit_code_of(lambda: print(of(1.0, 2.0), of(1, 2)) or 0))
 """
 

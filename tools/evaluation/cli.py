@@ -434,16 +434,14 @@ def _print_tilt_errors(run: Path, tilts: dict[str, FrameTilt]) -> None:
 
 
 def _detect_lines(run: Path, settings: LineSettings, output: Path) -> None:
-    from detect import __version__
     from detect.run import open_run
     from detect.runs.frame import FramePlan
-    from detect.runs.outputs import Conduct
     from detect.runs.stream import detect_run
 
     opened = open_run(run)
     places = {"lines": output, "tilt": output.with_suffix(".tilt")}
     plan = FramePlan(opened.camera, lines=settings)
-    summary = detect_run(opened, plan, places, conduct=Conduct(__version__))
+    summary = detect_run(opened, plan, places)
     for failure in summary.failures:
         print(failure, file=sys.stderr)
 
@@ -451,11 +449,9 @@ def _detect_lines(run: Path, settings: LineSettings, output: Path) -> None:
 def _detect(
     run: Path, settings: CircleSettings, output: Path, tilts: dict[str, FrameTilt] | None = None
 ) -> None:
-    from detect import __version__
     from detect.run import open_run
     from detect.runs.frame import FramePlan
     from detect.runs.known import Known
-    from detect.runs.outputs import Conduct
     from detect.runs.stream import detect_run
 
     opened = open_run(run)
@@ -464,7 +460,6 @@ def _detect(
         FramePlan(opened.camera, circles=settings),
         {"circles": output},
         known=Known(tilts=tilts),
-        conduct=Conduct(__version__),
     )
     for failure in summary.failures:
         print(failure, file=sys.stderr)

@@ -17,7 +17,7 @@ from camera import CameraError, parse_camera
 from camera.calibration.images import read_grey
 from detect.drawing.inputs import read_head
 from detect.errors import DetectError, FrameError
-from detect.runs.journal import digest_of, left_journal
+from detect.runs.journal import Journal
 from detect.runs.outputs import demand_log_place
 from detect.sources.bag_messages import pixels_of_message
 from detect.sources.gray import (
@@ -31,6 +31,7 @@ from detect.sources.times import read_image_times
 from lut.cache import cached_vertical_table
 from storage import OutputExistsError
 from storage.image_header import claimed_size
+from storage.parts import left_part
 from tools.fuzz.reader import Reader
 from tools.fuzz.words import CAMERA_TEXT, NUMBERS
 
@@ -127,20 +128,21 @@ def _head(path: Path) -> object:
 
 
 def _journal(path: Path) -> object:
-    journal = left_journal(path, path)
-    assert journal is not None
+    file = left_part(path.with_name("detected"), "journal")
+    assert file is not None
     try:
-        return journal.head(), journal.parts(), [frame.frame_rows() for frame in journal.frames()]
+        journal = Journal(file)
+        return journal.is_by("ab"), journal.complete(), list(journal.frames())
     finally:
-        journal.close()
+        file.close()
 
 
 def _journal_of(*records: bytes) -> bytes:
-    """Records, each behind its digest."""
-    lines, check = [], b""
+    """Records, each behind the digest of it and all before it."""
+    lines, digest = [], hashlib.sha256()
     for record in records:
-        check = digest_of([check, record]).encode()
-        lines.append(check + b" " + record + b"\n")
+        digest.update(record)
+        lines.append(digest.hexdigest()[:16].encode() + b" " + record + b"\n")
     return b"".join(lines)
 
 
@@ -263,8 +265,10 @@ DETECT_READERS: tuple[Reader, ...] = (
         _journal,
         (),
         (
-            _journal_of(b'["ab",false]', b'["d",{"a":"b"},{"c":1},{},null]', b'["complete",[0]]'),
-            _journal_of(b'["ab",true]', b'["d",{},{},{"size":2},"no image"]'),
+            _journal_of(
+                b'["ab"]', b'["d","e",{"a":"b"},{"c":1},{},null]', b'["complete",[0],true]'
+            ),
+            _journal_of(b'["ab"]', b'["d","e",{},{},{"size":2},"no image"]'),
         ),
         (b"[", b"]", b",", b'"', b"null", b"true", b"-1", b"1" * 30, b"1e999", b"NaN", b"{}"),
     ),

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from camera import Camera
+from detect import __version__
 from detect.run import Run, open_run
 from detect.runs.frame import FramePlan
 from detect.runs.outputs import Conduct
@@ -34,7 +35,7 @@ def detected(
     places = {"circles": output}
     if "json_output" in others:
         places["json"] = others.pop("json_output")
-    conduct = Conduct("1.2.3", overwrite=overwrite)
+    conduct = Conduct(overwrite=overwrite)
     return detect_run(run, plan, places, conduct=conduct, **others)
 
 
@@ -99,7 +100,7 @@ def test_head_tells_how_rows_were_made(small_run: Path) -> None:
     head = [row.source.decode() for row in rows if row.record is None and row.source is not None]
     assert all(line.startswith("#") and not line.startswith("# #") for line in head)
     text = "".join(head)
-    assert "redetect 1.2.3" in text
+    assert f"redetect {__version__}" in text
     assert "odometry: s.txt" in text
     for name, value in dataclasses.asdict(settings).items():
         assert f" {name}={value}" in text
@@ -154,7 +155,7 @@ def test_json_says_what_the_rows_say_and_more(small_run: Path, tmp_path: Path) -
     run = open_run(small_run)
     detected(run, CircleSettings(), output, json_output=as_json)
     document = json.loads(as_json.read_text())
-    assert document["version"] == "1.2.3"
+    assert document["version"] == __version__
     assert document["settings"] == dataclasses.asdict(CircleSettings())
     assert document["camera"] == run.camera.content_hash
     for record, frame in zip(document["frames"], read_frames(output), strict=True):

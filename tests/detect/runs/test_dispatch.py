@@ -33,11 +33,12 @@ def number_of(task: FrameTask) -> int:
 
 
 def rows_of(task: FrameTask) -> FrameRows:
-    return FrameRows({"circles": task.frame.step.prefix.encode()})
+    prefix = task.frame.step.prefix
+    return FrameRows(prefix, {"circles": prefix})
 
 
-def expected(count: int) -> list[bytes]:
-    return [task.frame.step.prefix.encode() for task in tasks(count)]
+def expected(count: int) -> list[str]:
+    return [task.frame.step.prefix for task in tasks(count)]
 
 
 def detect_frames(
@@ -46,7 +47,7 @@ def detect_frames(
     """The frames of all chunks, one by one; each comes with its own task."""
     with closing(detect_chunks(tasks, plan, workers)) as chunks:
         for task, rows in chain.from_iterable(chunks):
-            assert task.frame.step.prefix.encode() in rows.rows["circles"]
+            assert task.frame.step.prefix in rows.rows["circles"]
             yield rows
 
 
@@ -185,7 +186,7 @@ def test_a_frame_that_kills_its_worker_costs_itself(
         if number in deadly:
             assert rows.error is not None
             assert rows.error.startswith(f"k.{number:04d}.png: every worker died")
-            assert rows.rows["circles"].startswith(b"STEP ")
+            assert rows.rows["circles"].startswith("STEP ")
         else:
             assert rows.rows["circles"] == sound
     assert hired.started == hired.ended > len(deadly)

@@ -223,7 +223,7 @@ def test_killed_while_files_take_their_places(
     code, _ = runs.ended(command(run_folder, output), DieAtPlacing(placed))
     assert code == -signal.SIGKILL
     if resume:
-        assert resumed(run_folder, output, capsys) == 0
+        assert resumed(run_folder, output, capsys) == FRAMES
     else:
         assert main(["all", str(run_folder), "-o", str(output)]) == 1
         assert "exists already" in capsys.readouterr().err

@@ -29,9 +29,11 @@ def level(camera: Camera, frames: int) -> dict[str, bytes]:
     for k in range(frames):
         pitch, roll = np.array(LEAN) + 1e-4 * rng.standard_normal(2)
         tilt = f"TILT {k} {pitch:.6f} {roll:.6f} 1e-8 0 1e-8 9\n" if k else "NOTILT 0 2\n"
-        seen.append({"tilt": tilt.encode(), "circles": (STEP.format(k) + DISC).encode()})
+        seen.append({"tilt": tilt, "circles": STEP.format(k) + DISC})
     written = list(level_run(camera, 0.0, RunSummary(), lambda: seen))
-    return {kind: b"".join(rows[kind] for rows in written) for kind in ("run tilt", "circles")}
+    return {
+        kind: "".join(rows[kind] for rows in written).encode() for kind in ("run tilt", "circles")
+    }
 
 
 def test_discs_come_out_level_also_in_a_frame_without_verticals(published_camera: Camera) -> None:

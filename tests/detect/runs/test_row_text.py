@@ -25,7 +25,7 @@ def test_discs_are_written_as_their_records(
     numbers = np.array([values for values, _ in rows]).reshape(-1, 6)
     written = landmark_rows("LANDMARK_C", numbers, [ids for _, ids in rows])
     records = [CircleLandmark(x, y, q, a, b, c, ids) for (x, y, q, a, b, c), ids in rows]
-    assert written == "".join(f"{format_record(record)}\n" for record in records).encode()
+    assert written == "".join(f"{format_record(record)}\n" for record in records)
 
 
 def test_lines_are_written_as_their_records() -> None:
@@ -33,7 +33,7 @@ def test_lines_are_written_as_their_records() -> None:
     rows: list[Any] = numbers.tolist()
     records = [replace(LineLandmark(*row), ids=(-1,)) for row in rows]
     written = landmark_rows("LANDMARK_L", numbers, [(-1,)] * 5)
-    assert written == "".join(f"{format_record(record)}\n" for record in records).encode()
+    assert written == "".join(f"{format_record(record)}\n" for record in records)
 
 
 def test_numbers_of_discs_stand_in_the_order_of_their_rows() -> None:
