@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from detect.circles import CircleDetections
     from detect.line_settings import LineSettings
     from detect.lines import LineDetections
-    from detect.markers.detections import MarkerDetections
+    from detect.markers.detect import MarkerDetections
     from detect.markers.settings import MarkerSettings
     from detect.settings import CircleSettings, Levelling
     from lut import DiscShape, DiscTable, VerticalTable
@@ -309,7 +309,7 @@ def rehearse(plan: FramePlan) -> None:
     tables = tables_of(plan)
     if plan.markers is not None:
         from detect.markers.detect import detect_markers
-        from detect.markers.templates import specimen_image
+        from detect.markers.dictionaries import specimen_image
 
         detect_markers(specimen_image(plan.markers), plan.markers)
     if plan.camera is None:

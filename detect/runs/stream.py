@@ -16,7 +16,7 @@ from functools import partial
 from pathlib import Path
 
 from detect.errors import DetectError
-from detect.markers.templates import templates_of
+from detect.markers.dictionaries import templates_of
 from detect.run import ImageRun
 from detect.runs.dispatch import Workers, detect_chunks
 from detect.runs.frame import FramePlan, FrameTask, tables_of

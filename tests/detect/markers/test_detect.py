@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 from camera import Camera
 from detect.errors import DetectError, FrameError
 from detect.markers import candidates as regions
+from detect.markers import edges, quadrangle
 from detect.markers import identification as identities
-from detect.markers import quadrangle, refinement
-from detect.markers.detect import detect_markers
-from detect.markers.detections import MarkerDetections
+from detect.markers.detect import MarkerDetections, detect_markers
 from detect.markers.dictionaries import dictionary_names, marker_dictionary
 from detect.markers.settings import PUBLISHED, MarkerSettings
 from tests.detect.markers.rendering import View, exposed, render, view_corners
@@ -309,7 +308,7 @@ def test_the_published_filters_count_holes_and_their_share() -> None:
 def test_cells_too_small_for_the_blur_are_not_guessed() -> None:
     image, _ = picture(view=View(24.0), blur=2.6, noise=0.3)
     found = squares(image)
-    assert {identities.TOO_SMALL, identities.NO_PATTERN, refinement.NO_EDGE} & set(found.rejected)
+    assert {identities.TOO_SMALL, identities.NO_PATTERN, edges.NO_EDGE} & set(found.rejected)
 
 
 def test_a_marker_that_is_its_own_half_turn_is_ambiguous() -> None:
