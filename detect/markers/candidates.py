@@ -77,18 +77,10 @@ class Mask:
 
 
 class Region(NamedTuple):
-    """A dark region that may be a marker.
+    """A dark region that may be a marker."""
 
-    Attributes
-    ----------
-    scale : int
-        Pixels of the image per pixel of the layer that it was found in.
-    hull : (N, 2) float64
-        Convex hull of its pixels' centres, pixels (u, v) of the image.
-    """
-
-    scale: int
-    hull: FloatArray
+    scale: int  # pixels of the image per pixel of the layer that it was found in
+    hull: FloatArray  # (N, 2) convex hull of its pixels' centres, pixels of the image
 
 
 def closing(grey: GreyImage, radius: int) -> GreyImage:
@@ -109,9 +101,8 @@ def candidate_regions(
     share of white in a dictionary's markers decides how much of a region may be holes.
     """
     layers = _layers(image, settings)
-    white = (
-        float(dictionary.patterns.mean()) * (dictionary.patterns.shape[-1] * dictionary.cell) ** 2
-    )
+    white_cells = float(dictionary.patterns.sum(axis=(1, 2)).mean())
+    white = white_cells * dictionary.cell**2
     regions: list[Region] = []
     rejected: Counter[str] = Counter()
     masks = []

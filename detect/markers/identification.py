@@ -65,21 +65,11 @@ _PLAIN_LARGEST_CELL_ERROR = 0.25
 
 
 class Identity(NamedTuple):
-    """A marker recognised.
-
-    Attributes
-    ----------
-    template : int
-        Index of the template.
-    distance : float
-        Mean absolute difference between cells and pattern, 0 to 1.
-    margin : float
-        Squared distance to the second best pattern less that to the best, in cells.
-    """
+    """A marker recognised."""
 
     template: int
-    distance: float
-    margin: float
+    distance: float  # mean absolute difference between cells and pattern, 0 to 1
+    margin: float  # squared distance to the second best pattern less that to the best, in cells
 
 
 def sampled_cells(picture: Picture, corners: FloatArray, templates: Templates) -> FloatArray | None:

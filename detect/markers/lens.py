@@ -30,17 +30,9 @@ _NOISE_ROWS = 64
 
 
 class Lens(NamedTuple):
-    """Where pixels are in an image without distortion.
+    """Where pixels are in an image without distortion."""
 
-    Attributes
-    ----------
-    grid : (H, W, 2) float64
-        Straight position of pixel (step_u * i, step_v * j) at [j, i].
-    step_u, step_v : float
-        Distances of the grid's pixels.
-    """
-
-    grid: FloatArray
+    grid: FloatArray  # (H, W, 2) straight position of pixel (step_u * i, step_v * j) at [j, i]
     step_u: float
     step_v: float
 

@@ -183,10 +183,7 @@ def _solved(
         sigma[WHITE] = sigma[BLACK] = light * max(abs(p[WHITE.start] - p[BLACK.start]), scale)
         prior = (scale / sigma) ** 2
         weighted = left.jacobian.T * left.weight
-        try:
-            inverse = _inverse(weighted @ left.jacobian + np.diag(prior))
-        except np.linalg.LinAlgError:
-            return None
+        inverse = _inverse(weighted @ left.jacobian + np.diag(prior))
         if step == steps or moved < _CLOSE_ENOUGH_PX:
             break
         change = inverse @ (weighted @ left.residual + prior * (expected - p))
@@ -202,7 +199,11 @@ def _solved(
 
 
 def _inverse(matrix: FloatArray) -> FloatArray:
-    return np.asarray(np.linalg.inv(matrix), np.float64)
+    """The inverse of a matrix; NaN if it is singular."""
+    try:
+        return np.asarray(np.linalg.inv(matrix), np.float64)
+    except np.linalg.LinAlgError:
+        return np.full_like(matrix, np.nan)
 
 
 def _homography_of(p: FloatArray) -> FloatArray:
@@ -271,7 +272,7 @@ def _samples(
     pad = 1.5 * reach + 2.0
     begin, end = np.maximum(0, (low - pad).astype(int)), np.minimum(last, (high + pad).astype(int))
     # Every n-th pixel is used, and far from the cells' ends every 10 n-th, as if at random.
-    area = signed_area(corners)
+    area = abs(signed_area(corners))
     side = math.sqrt(area)
     expected = area + reach * 4.0 * side
     share = 1.0 - (1.0 - min(1.0, 2.0 * near * len(lines) / side)) ** 2
