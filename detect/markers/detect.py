@@ -7,16 +7,20 @@ the whole marker, which makes the corners more exact and rejects false markers.
 
 from __future__ import annotations
 
+import math
 from collections import Counter
+from dataclasses import dataclass
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera
 from detect.markers import identification as identities
-from detect.markers.candidates import Mask, Region, candidate_layers, dark_masks, marker_regions
-from detect.markers.detections import ACCEPTED, SAME_MARKER, Candidate, MarkerDetections
+from detect.markers.candidates import Mask, Region, candidate_regions
+from detect.markers.dictionaries import Templates, templates_of
+from detect.markers.edges import NO_EDGE, RefinedQuadrangle, refine_quadrangle
 from detect.markers.identification import (
     Identity,
     likely_patterns,
@@ -35,45 +39,109 @@ from detect.markers.quadrangle import (
     rough_corners,
     signed_area,
 )
-from detect.markers.refinement import NO_EDGE, RefinedQuadrangle, refine_quadrangle
 from detect.markers.settings import MarkerSettings
-from detect.markers.templates import Templates, templates_of
+from landmarks import MarkerCorner, MarkerLandmark
 
 FloatArray = NDArray[np.float64]
 
+#: Fates of candidates, beside the causes of rejection.
+ACCEPTED = "accepted"
+SAME_MARKER = "a marker already found"
+
 #: How many rough quadrangles of the same are tried.
 _TRIES = 3
-#: How far edges may be from the rough ones: pixels of the layer, and in widths of the marker.
-_CAPTURE_LAYER_PX = 1.5
-_CAPTURE_PX = 0.7
-_CAPTURE_WIDTHS = 0.02
+#: How far edges may be from the rough ones: pixels of the layer, of the image, and in widths.
+_CAPTURE_LAYER_PX, _CAPTURE_PX, _CAPTURE_WIDTHS = 1.5, 0.7, 0.02
+#: Edges of cells that are blurred by more than this are not fitted.
+_HOPELESS_BLUR_CELLS = 0.75
+#: A first look may explain less than the full fit has to, by this much.
+_FIRST_LOOK_SLACK = 0.1
 #: Where edges and whole marker disagree by more than this (mean normalised squared difference; the
 #: edges' systematic error included), the marker is not what the fit takes it for: not flat, or
 #: bent by an uncalibrated lens. Its edges are then where they are seen.
-_MOST_DISAGREEMENT = 6.0
-_EDGE_SYSTEMATIC_PX = 0.02
-#: What is white within the border, or round the quiet zone, shines into edges that are softer than
-#: this part of the border: these are not used.
-_SHARP_BLURS = 0.14
+_MOST_DISAGREEMENT, _EDGE_SYSTEMATIC_PX = 6.0, 0.02
+#: Smaller markers are flat. What is white within the border, or round the quiet zone, shines into
+#: edges that are softer than this part of the border: these are not used.
+_LEAST_BENT_PX, _SHARP_BLURS = 40.0, 0.14
 #: Steps from or to grey levels beyond these are clipped, and seem to be where they are not.
 _UNCLIPPED = (3.0, 250.0)
-#: Smaller markers are flat.
-_LEAST_BENT_PX = 40.0
 #: Systematic error without optical blur, and the blur's variance (px^2) at which it is gone.
-_STAIRCASE_PX = 0.035
-_STAIRCASE_VARIANCE = 0.1
-#: A first look may explain less than the full fit has to, by this much.
-_FIRST_LOOK_SLACK = 0.1
+_STAIRCASE_PX, _STAIRCASE_VARIANCE = 0.035, 0.1
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A region that came as far as having corners, and what became of it."""
+
+    outline: FloatArray  # (4, 2) its rough corners, pixels of the image
+    fate: str  # "accepted" or why not
+    refined: RefinedQuadrangle | None = None  # its fitted edges, if it came so far
+
+
+@dataclass(frozen=True)
+class MarkerDetections:
+    """The markers found in one image, by ID and place, and the rejected candidates.
+
+    Attributes
+    ----------
+    dictionary : str
+        Name of the dictionary.
+    ids : (N,) int64
+        The markers' numbers.
+    corners : (N, 4, 2) float64
+        Top left, top right, bottom right, bottom left of each marker as printed; pixels (u, v) of
+        the image as it is.
+    covariance : (N, 4, 2, 2) float64
+        Of each corner, pixels squared.
+    quality : (N,) float64
+        1 less the mean absolute difference between the cells' whiteness and the pattern.
+    margin : (N,) float64
+        How much nearer the pattern is than the second best, in cells.
+    explained : (N,) float64
+        Share of the grey values' variance, noise aside, that the fit explains; NaN without
+        ``joint``.
+    candidates : tuple of Candidate
+        All regions that came as far as having corners.
+    rejected : Counter
+        How many regions and candidates were not taken, by cause.
+    masks : tuple of Mask
+        The dark pixels of phase 1, if they were to be kept.
+    """
+
+    dictionary: str
+    ids: NDArray[np.int64]
+    corners: FloatArray
+    covariance: FloatArray
+    quality: FloatArray
+    margin: FloatArray
+    explained: FloatArray
+    candidates: tuple[Candidate, ...]
+    rejected: Counter[str]
+    masks: tuple[Mask, ...]
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def landmarks(self) -> tuple[MarkerLandmark, ...]:
+        """The markers as rows of a file."""
+        rows = []
+        for k, number in enumerate(self.ids):
+            spreads = self.covariance[k].reshape(4, 4)[:, [0, 1, 3]]
+            a, b, c, d = (
+                MarkerCorner(*row) for row in np.hstack([self.corners[k], spreads]).tolist()
+            )
+            quality = float(self.quality[k])
+            rows.append(MarkerLandmark(self.dictionary, int(number), quality, (a, b, c, d)))
+        return tuple(rows)
 
 
 class _Marker(NamedTuple):
-    """A marker found: corners (4, 2) in the printed order, straight pixels; their covariances."""
+    """A marker found."""
 
     id: int
-    corners: FloatArray
-    covariance: FloatArray
-    distance: float
-    margin: float
+    corners: FloatArray  # (4, 2) in the printed order, straight pixels
+    covariance: FloatArray  # (4, 2, 2)
+    identity: Identity
     explained: float
     blur_px: float
 
@@ -118,31 +186,36 @@ def detect_markers(
     picture = picture_of(image, camera)
     lens = picture.lens
 
-    # Phases 1 and 2: dark regions that may be markers, and their rough corners.
-    quadrangles, rejected, masks = _quadrangles(picture, templates, settings)
+    # Phases 1 and 2: dark regions that may be markers.
+    regions, rejected, masks = candidate_regions(
+        picture.grey, picture.noise, templates.dictionary, settings
+    )
 
-    # Phase 3: the edges in the image itself, and which marker it is.
+    # Phase 3: their corners, the edges in the image itself, and which marker it is.
     markers: list[_Marker] = []
     candidates: list[Candidate] = []
-    tried, tries = np.empty((len(quadrangles), 4, 2)), 0
-    for region, rough in quadrangles:
-        if count_same(rough, _corners(markers)):
+    tried, tries = np.empty((len(regions), 4, 2)), 0
+    for region in regions:
+        rough = _rough_quadrangle(region, lens, settings)
+        if isinstance(rough, str):
+            rejected[rough] += 1
+            continue
+        if any(overlap(rough, marker.corners) for marker in markers):
             candidates.append(Candidate(lens.bend(rough), SAME_MARKER))
             continue
         if count_same(rough, tried[:tries]) >= _TRIES:
             continue
         tried[tries] = rough
         tries += 1
+        side = math.sqrt(signed_area(rough))
+        capture_px = _CAPTURE_LAYER_PX * region.scale + _CAPTURE_PX + _CAPTURE_WIDTHS * side
         refined = refine_quadrangle(
-            picture, rough, capture_px=_capture(region, rough), border=templates.border,
-            quick=settings.joint,
-        )  # fmt: skip
+            picture, rough, capture_px=capture_px, border=templates.border, quick=settings.joint
+        )
         found = NO_EDGE if refined is None else _identified(picture, refined, templates, settings)
         if isinstance(found, str):
             fate = found
             rejected[fate] += 1
-        elif any(overlap(found.corners, marker.corners) for marker in markers):
-            fate = SAME_MARKER
         else:
             fate = ACCEPTED
             markers.append(found)
@@ -157,40 +230,13 @@ def detect_markers(
         ids=np.array([m.id for m in markers], dtype=np.int64),
         corners=np.array(outlines).reshape(-1, 4, 2),
         covariance=np.array(spreads).reshape(-1, 4, 2, 2),
-        quality=np.array([max(0.0, 1.0 - m.distance) for m in markers]),
-        margin=np.array([m.margin for m in markers]),
+        quality=np.array([max(0.0, 1.0 - m.identity.distance) for m in markers]),
+        margin=np.array([m.identity.margin for m in markers]),
         explained=np.array([m.explained for m in markers]),
         candidates=tuple(candidates),
         rejected=+rejected,
         masks=tuple(masks) if keep_masks else (),
     )
-
-
-def _quadrangles(
-    picture: Picture, templates: Templates, settings: MarkerSettings
-) -> tuple[list[tuple[Region, FloatArray]], Counter[str], list[Mask]]:
-    """Regions with their rough corners; how many were rejected, by cause; all masks."""
-    found, masks = [], []
-    rejected: Counter[str] = Counter()
-    layers = candidate_layers(picture.grey, settings)
-    for layer in layers:
-        for mask in dark_masks(layer, picture.noise, settings):
-            masks.append(mask)
-            regions, causes = marker_regions(
-                mask, templates.dictionary, settings, last=layer is layers[-1]
-            )
-            rejected += causes
-            for region in regions:
-                corners = _rough_quadrangle(region, picture.lens, settings)
-                if isinstance(corners, str):
-                    rejected[corners] += 1
-                else:
-                    found.append((region, corners))
-    return found, rejected, masks
-
-
-def _corners(markers: list[_Marker]) -> FloatArray:
-    return np.array([marker.corners for marker in markers]).reshape(-1, 4, 2)
 
 
 def _rough_quadrangle(region: Region, lens: Lens, settings: MarkerSettings) -> FloatArray | str:
@@ -199,22 +245,16 @@ def _rough_quadrangle(region: Region, lens: Lens, settings: MarkerSettings) -> F
     corners = rough_corners(hull, settings.corners)
     if corners is None or not is_convex(corners):
         return NOT_FOUR_CORNERS
-    if signed_area(corners) < settings.least_square * abs(signed_area(hull)):
+    if signed_area(corners) < settings.least_square * cv2.contourArea(hull.astype(np.float32)):
         return NO_QUADRANGLE
     return corners
-
-
-def _capture(region: Region, rough: FloatArray) -> float:
-    """How far the edges of a region may be from the rough ones, pixels."""
-    side = float(np.sqrt(abs(signed_area(rough))))
-    return _CAPTURE_LAYER_PX * region.scale + _CAPTURE_PX + _CAPTURE_WIDTHS * side
 
 
 def _identified(
     picture: Picture, refined: RefinedQuadrangle, templates: Templates, settings: MarkerSettings
 ) -> _Marker | str:
     """The marker in a refined quadrangle, or the cause of there being none."""
-    contrast = refined.edges.light - refined.edges.dark
+    contrast = refined.light - refined.dark
     strongest = float(contrast.max())
     least = max(settings.least_contrast * picture.noise, settings.edge_balance * strongest)
     if strongest <= 0.0 or contrast.min() < least:
@@ -222,35 +262,27 @@ def _identified(
     cells = sampled_cells(picture, refined.corners, templates)
     if cells is None:
         return identities.OUTSIDE
-    if settings.joint:
-        return _fitted(picture, refined, cells, templates, settings)
-    found = nearest_pattern(cells, templates, settings)
-    if isinstance(found, str):
-        return found
-    return _marker(found, refined, templates, float(np.median(refined.edges.blur)), np.nan)
+    blur_px = float(np.median(refined.blur))
+    if not settings.joint:
+        identity = nearest_pattern(cells, templates, settings)
+        if isinstance(identity, str):
+            return identity
+        return _marker(identity, refined, templates, np.nan, blur_px)
 
-
-def _fitted(
-    picture: Picture,
-    refined: RefinedQuadrangle,
-    cells: FloatArray,
-    templates: Templates,
-    settings: MarkerSettings,
-) -> _Marker | str:
-    """The marker in a refined quadrangle by a fit of the whole of it."""
-    edges = refined.edges
-    levels = Levels(
-        float(np.median(edges.dark)), float(np.median(edges.light)), float(np.median(edges.blur))
-    )
-    side = np.sqrt(abs(signed_area(refined.corners)))
-    likely = likely_patterns(cells, templates, levels.blur_px / (templates.dictionary.cell * side))
-    if not len(likely):
+    # The whole marker, fitted to the likely patterns.
+    side = math.sqrt(signed_area(refined.corners))
+    blur_cells = blur_px / (templates.dictionary.cell * side)
+    if blur_cells > _HOPELESS_BLUR_CELLS:
+        return identities.TOO_SMALL
+    likely = likely_patterns(cells, templates, blur_cells)
+    if not likely:
         return identities.NO_PATTERN
+    levels = Levels(float(np.median(refined.dark)), float(np.median(refined.light)), blur_px)
     looks = [
-        (fit_marker(picture, refined.corners, templates, int(other), levels, FIRST_LOOK), other)
-        for other in likely
+        (fit_marker(picture, refined.corners, templates, template, levels, FIRST_LOOK), template)
+        for template in likely
     ]
-    possible = [(look, int(other)) for look, other in looks if look is not None]
+    possible = [(look, template) for look, template in looks if look is not None]
     if not possible:
         return identities.NOT_FITTED
     first, template = max(possible, key=lambda look: look[0].explained)
@@ -259,71 +291,54 @@ def _fitted(
     fit = fit_marker(picture, first.corners, templates, template, levels)
     if fit is None:
         return identities.NOT_FITTED
-    verified = verified_identity(fit, template, templates, settings)
-    if isinstance(verified, str):
-        return verified
+    identity = verified_identity(fit, template, templates, settings)
+    if isinstance(identity, str):
+        return identity
     best: RefinedQuadrangle | PatternFit = fit
     if side >= _LEAST_BENT_PX and fit.blur_px <= _SHARP_BLURS * templates.border * side:
+        capture_px = _CAPTURE_PX + 2.0 * fit.blur_px
         again = refine_quadrangle(
-            picture, fit.corners, capture_px=_CAPTURE_PX + 2.0 * fit.blur_px,
-            border=templates.border,
-        )  # fmt: skip
-        if again is not None and _trusted(again) and _disagreement(again, fit) > _MOST_DISAGREEMENT:
+            picture, fit.corners, capture_px=capture_px, border=templates.border
+        )
+        if again is not None and _contradicts(again, fit):
             best = again
-    return _marker(verified, best, templates, fit.blur_px, fit.explained)
+    return _marker(identity, best, templates, fit.explained, fit.blur_px)
 
 
-def _trusted(refined: RefinedQuadrangle) -> bool:
-    """Whether edges are seen over their whole length, and not clipped to white or black."""
-    low, high = _UNCLIPPED
-    edges = refined.edges
-    seen = edges.support.min() >= 1.0
-    return bool(seen and edges.light.max() < high and edges.dark.min() > low)
-
-
-def _disagreement(refined: RefinedQuadrangle, fit: PatternFit) -> float:
-    """Mean normalised squared difference of the corners by the edges and by the whole marker."""
+def _contradicts(refined: RefinedQuadrangle, fit: PatternFit) -> bool:
+    """Whether edges that are wholly seen and not clipped are not those of the fit."""
+    clipped = refined.dark.min() <= _UNCLIPPED[0] or refined.light.max() >= _UNCLIPPED[1]
+    if clipped or refined.support.min() < 1.0:
+        return False
     apart = fit.corners - refined.corners
     spread = refined.covariance + fit.covariance + _EDGE_SYSTEMATIC_PX**2 * np.eye(2)
     solved = np.linalg.solve(spread, apart[..., None])[..., 0]
-    return float(np.sum(apart * solved)) / 8.0
+    return float(np.mean(apart * solved)) > _MOST_DISAGREEMENT
 
 
 def _marker(
     identity: Identity,
     found: RefinedQuadrangle | PatternFit,
     templates: Templates,
-    blur_px: float,
     explained: float,
+    blur_px: float,
 ) -> _Marker:
     """A marker with its corners in the printed order."""
-    order = (np.arange(4) - int(templates.turns[identity.template])) % 4
-    return _Marker(
-        id=int(templates.dictionary.ids[templates.marker[identity.template]]),
-        corners=found.corners[order],
-        covariance=found.covariance[order],
-        distance=identity.distance,
-        margin=identity.margin,
-        explained=explained,
-        blur_px=blur_px,
-    )
+    number, turns = templates.turned_id(identity.template)
+    order = (np.arange(4) - turns) % 4
+    corners, covariance = found.corners[order], found.covariance[order]
+    return _Marker(number, corners, covariance, identity, explained, blur_px)
 
 
 def _image_covariance(
     marker: _Marker, pixels: FloatArray, lens: Lens, settings: MarkerSettings
 ) -> FloatArray:
     """(4, 2, 2) covariances of a marker's corners at their pixels in the image."""
-    systematic = np.hypot(settings.systematic_px, _staircase_px(marker.blur_px))
+    # A pixel's own square is taken for a Gaussian of its variance, 1/12 px^2; where there is little
+    # other blur, edges are staircases, and one along rows or columns up to 0.06 px beside where it
+    # seems to be.
+    optics = max(0.0, marker.blur_px**2 - 1.0 / 12.0)
+    staircase_px = _STAIRCASE_PX * max(0.0, 1.0 - optics / _STAIRCASE_VARIANCE)
     jacobian = np.array([lens.pixel_jacobian(pixel) for pixel in pixels])
     covariance = jacobian @ marker.covariance @ jacobian.transpose(0, 2, 1)
-    return np.asarray(covariance + systematic**2 * np.eye(2))
-
-
-def _staircase_px(blur_px: float) -> float:
-    """Systematic error of a corner in an image without blur, which shows edges as staircases.
-
-    A pixel's own square is taken for a Gaussian of its variance, 1/12 px^2; where there is little
-    else, a straight edge along rows or columns is up to 0.06 px beside where it seems to be.
-    """
-    optics = max(0.0, blur_px**2 - 1.0 / 12.0)
-    return _STAIRCASE_PX * max(0.0, 1.0 - optics / _STAIRCASE_VARIANCE)
+    return np.asarray(covariance + (settings.systematic_px**2 + staircase_px**2) * np.eye(2))

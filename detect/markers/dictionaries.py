@@ -1,4 +1,4 @@
-"""Dictionaries of square markers: the patterns of each set, and where their cells are.
+"""Dictionaries of square markers: the patterns of each set, where their cells are, and templates.
 
 - ``rawseeds``: RAWSEEDS deliverable D2.1 part 2. A black square of 24 units with a matrix of 6x6
   cells of 2 units, moved half a cell up and to the right, so that it lies on the right six columns
@@ -9,29 +9,40 @@
 - OpenCV's ArUco and AprilTag sets under their names in OpenCV without ``DICT_``, in small letters:
   ``4x4_50`` to ``7x7_1000``, ``aruco_original``, ``aruco_mip_36h12``, ``apriltag_16h5`` to
   ``apriltag_36h11``; border of one cell.
+
+Templates are the patterns made ready for comparison: turned four ways, blurred, and as geometry.
 """
 
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
+import itertools
+from dataclasses import dataclass, replace
+from statistics import NormalDist
 
+import cv2
 import numpy as np
 from cv2 import aruco
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from detect.errors import DetectError
+from detect.markers.settings import MarkerSettings
+
+FloatArray = NDArray[np.float64]
 
 #: ARToolKitPlus' simple code: a number of 9 bits is written four times, each time scrambled.
-SIMPLE_IDS = 512
+_SIMPLE_BITS, _SIMPLE_SIDE = 9, 6
 _SIMPLE_MASKS = (0x027, 0x14E, 0x109, 0x0DB)
-_SIMPLE_SIDE = 6
-
-RAWSEEDS = "rawseeds"
-ARTOOLKITPLUS_12 = "artoolkitplus12"
-ARTOOLKITPLUS_8 = "artoolkitplus8"
-
 _OPENCV_PREFIX = "DICT_"
+
+#: A random pattern is one of the dictionary's with a probability of 2 to the power of minus this:
+#: in strong dictionaries, and in weak ones.
+_STRONG_BITS, _WEAK_BITS = 24.0, 14.0
+#: Blurs for which templates are kept, in cells.
+_BLURS_CELLS = (0.2, 0.35, 0.5, 0.7, 1.0)
+#: Size of the cells and the margin of a specimen.
+_CELL_PX, _MARGIN_PX = 5, 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +67,7 @@ class MarkerDictionary:
     name: str
     ids: NDArray[np.int64]
     patterns: NDArray[np.bool_]
-    centres: NDArray[np.float64]
+    centres: FloatArray
     cell: float
 
     def __len__(self) -> int:
@@ -78,14 +89,12 @@ class MarkerDictionary:
                 f"{self.ids.min()} to {self.ids.max()}"
             )
         index = np.searchsorted(self.ids, wanted)
-        return MarkerDictionary(
-            self.name, self.ids[index], self.patterns[index], self.centres, self.cell
-        )
+        return replace(self, ids=self.ids[index], patterns=self.patterns[index])
 
 
 def dictionary_names() -> tuple[str, ...]:
     """Names that `marker_dictionary` accepts."""
-    return (RAWSEEDS, ARTOOLKITPLUS_12, ARTOOLKITPLUS_8, *sorted(_opencv_constants()))
+    return ("rawseeds", "artoolkitplus12", "artoolkitplus8", *sorted(_opencv_constants()))
 
 
 @functools.cache
@@ -97,61 +106,39 @@ def marker_dictionary(name: str) -> MarkerDictionary:
     name : str
         One of `dictionary_names`.
 
-    Returns
-    -------
-    MarkerDictionary
-
     Raises
     ------
     DetectError
         If there is none of that name.
     """
-    if name == RAWSEEDS:
-        patterns = np.zeros((SIMPLE_IDS, 7, 7), bool)
-        patterns[:, :6, 1:] = simple_patterns()
-        return _dictionary(name, patterns, cells=12, first=2.5)
-    if name == ARTOOLKITPLUS_12:
-        return _dictionary(name, _framed(simple_patterns()), cells=12, first=2.0)
-    if name == ARTOOLKITPLUS_8:
-        return _dictionary(name, _framed(simple_patterns()), cells=8, first=0.0)
-    constant = _opencv_constants().get(name)
-    if constant is None:
+    if name not in dictionary_names():
         raise DetectError(
             f"{name!r:.60}: no such dictionary of markers: expected one of "
             f"{', '.join(dictionary_names())}"
         )
-    patterns = _opencv_patterns(constant)
-    return _dictionary(name, patterns, cells=patterns.shape[-1], first=0.0)
+    # Widths of a marker in cells, and cells before the sampled grid.
+    if name == "rawseeds":
+        patterns, cells, first = np.pad(simple_patterns(), ((0, 0), (0, 1), (1, 0))), 12, 2.5
+    elif name == "artoolkitplus12":
+        patterns, cells, first = np.pad(simple_patterns(), ((0, 0), (1, 1), (1, 1))), 12, 2.0
+    elif name == "artoolkitplus8":
+        patterns, cells, first = np.pad(simple_patterns(), ((0, 0), (1, 1), (1, 1))), 8, 0.0
+    else:
+        known = aruco.getPredefinedDictionary(_opencv_constants()[name])
+        cells, first, numbers = known.markerSize + 2, 0.0, range(len(known.bytesList))
+        drawn = [aruco.generateImageMarker(known, number, cells) for number in numbers]
+        patterns = np.stack(drawn) > 127
+    centres = (first + 0.5 + np.arange(patterns.shape[-1])) / cells
+    return MarkerDictionary(name, np.arange(len(patterns)), patterns, centres, 1.0 / cells)
 
 
 def simple_patterns() -> NDArray[np.bool_]:
     """(512, 6, 6) cells of ARToolKitPlus' simple code by number, True for white."""
-    ids = np.arange(SIMPLE_IDS, dtype=np.int64)
-    code = np.zeros_like(ids)
-    for copy, mask in enumerate(_SIMPLE_MASKS):
-        code |= (ids ^ mask) << (9 * copy)
-    shifts = np.arange(_SIMPLE_SIDE**2 - 1, -1, -1)
-    bits = (code[:, None] >> shifts) & 1
-    return np.asarray(bits.reshape(-1, _SIMPLE_SIDE, _SIMPLE_SIDE).astype(bool))
-
-
-def _dictionary(
-    name: str, patterns: NDArray[np.bool_], *, cells: int, first: float
-) -> MarkerDictionary:
-    """A dictionary whose sampled grid begins `first` cells from the edge of a marker of `cells`."""
-    side = patterns.shape[-1]
-    return MarkerDictionary(
-        name=name,
-        ids=np.arange(len(patterns), dtype=np.int64),
-        patterns=patterns,
-        centres=(first + 0.5 + np.arange(side)) / cells,
-        cell=1.0 / cells,
-    )
-
-
-def _framed(patterns: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Patterns with one ring of the black border round them."""
-    return np.pad(patterns, ((0, 0), (1, 1), (1, 1)))
+    ids = np.arange(1 << _SIMPLE_BITS)
+    copies = [(ids ^ mask) << (_SIMPLE_BITS * k) for k, mask in enumerate(_SIMPLE_MASKS)]
+    code = np.bitwise_or.reduce(copies)
+    bits = (code[:, None] >> np.arange(_SIMPLE_SIDE**2)[::-1]) & 1
+    return np.asarray(bits.reshape(-1, _SIMPLE_SIDE, _SIMPLE_SIDE), bool)
 
 
 @functools.cache
@@ -160,13 +147,131 @@ def _opencv_constants() -> dict[str, int]:
     return {name.removeprefix(_OPENCV_PREFIX).lower(): getattr(aruco, name) for name in names}
 
 
-def _opencv_patterns(constant: int) -> NDArray[np.bool_]:
-    """Patterns of an OpenCV dictionary, with the border of one cell."""
-    dictionary = aruco.getPredefinedDictionary(constant)
-    side = dictionary.markerSize + 2
-    return np.stack(
-        [
-            aruco.generateImageMarker(dictionary, number, side, borderBits=1) > 127
-            for number in range(len(dictionary.bytesList))
-        ]
+@dataclass(frozen=True, eq=False)
+class Templates:
+    """Templates of the expected markers' cells, for each marker turned by 0, 90, 180, 270 deg."""
+
+    dictionary: MarkerDictionary
+    cells: NDArray[np.float32]  # (T, G * G) 1 for white; all markers, then all turned once ...
+    blurred: tuple[NDArray[np.float32], ...]  # for each blur, less their mean, of length 1
+    weakness: float  # how likely a pattern occurs by chance, from 0 (hardly ever) to 1
+    decoys: NDArray[np.float32]  # (D, G * G) content of other frames: nothing, a bar, or a half
+    plain: NDArray[np.bool_]  # (T,) which of the templates are similar to these
+    lines: FloatArray  # (L,) where cells end, and the square, in its widths from 0 to 1
+    grid: slice  # rows, and columns, of the grid among the cells between the lines
+    border: float  # least thickness of the black border in widths of the marker
+
+    def turned_id(self, template: int) -> tuple[int, int]:
+        """ID of a template's marker, and its quarter turns anti-clockwise."""
+        turns, marker = divmod(template, len(self.dictionary))
+        return int(self.dictionary.ids[marker]), turns
+
+    def blackness(self, template: int) -> FloatArray:
+        """(L - 1, L - 1) pattern of a template between the lines, 1 for black."""
+        side = self.dictionary.patterns.shape[-1]
+        result = np.ones((len(self.lines) - 1,) * 2)
+        result[self.grid, self.grid] = 1.0 - self.cells[template].reshape(side, side)
+        return result
+
+    def nearest_blur(self, blur_cells: float) -> NDArray[np.float32]:
+        """The blurred templates of the blur next to the given one."""
+        ratio = np.log(np.array(_BLURS_CELLS) / max(blur_cells, 1e-3))
+        return self.blurred[int(np.argmin(np.abs(ratio)))]
+
+
+@functools.lru_cache(maxsize=16)
+def templates_of(name: str, ids: tuple[int, ...]) -> Templates:
+    """Templates of a dictionary's markers.
+
+    Parameters
+    ----------
+    name : str
+        The dictionary.
+    ids : tuple of int
+        The markers expected; none for all.
+
+    Raises
+    ------
+    DetectError
+        If there is no such dictionary or marker.
+    """
+    dictionary = marker_dictionary(name)
+    if ids:
+        dictionary = dictionary.only(ids)
+    side = dictionary.patterns.shape[-1]
+    turned = [np.rot90(dictionary.patterns, turn, axes=(1, 2)) for turn in range(4)]
+    patterns = np.concatenate(turned).astype(np.float32)
+    begin = dictionary.centres[0] - 0.5 * dictionary.cell
+    edges = begin + dictionary.cell * np.arange(side + 1)
+    inner = edges[(edges > 1e-9) & (edges < 1.0 - 1e-9)]
+    lines = np.concatenate([[0.0], inner, [1.0]])
+    first = 0 if begin < 1e-9 else 1
+    # Outermost ring of the grid that is white in some marker.
+    varied = np.asarray(dictionary.patterns.any(axis=0))
+    used = np.asarray(varied.any(axis=0) | varied.any(axis=1))
+    ring = int(np.argmax(used | used[::-1]))
+    bits = int(varied.sum()) - np.log2(len(patterns))
+    decoys, plain = _decoys(varied, patterns)
+    return Templates(
+        dictionary=dictionary,
+        cells=patterns.reshape(len(patterns), -1),
+        blurred=tuple(_blurred(patterns, blur, float(first == 0)) for blur in _BLURS_CELLS),
+        weakness=float(np.clip((_STRONG_BITS - bits) / (_STRONG_BITS - _WEAK_BITS), 0.0, 1.0)),
+        decoys=decoys,
+        plain=plain,
+        lines=lines,
+        grid=slice(first, first + side),
+        border=float(edges[ring]),
     )
+
+
+def _blurred(
+    patterns: NDArray[np.float32], blur_cells: float, around: float
+) -> NDArray[np.float32]:
+    """Grey values in the middle of blurred cells, less their mean and of length 1."""
+    cdf = [NormalDist(0.0, blur_cells).cdf(end - 0.5) for end in range(-2, 4)]
+    shares = (np.diff(cdf) / (cdf[-1] - cdf[0])).astype(np.float32)
+    padded = np.pad(patterns, ((0, 0), (2, 2), (2, 2)), constant_values=around)
+    grey = sliding_window_view(padded, (5, 5), axis=(1, 2)) @ shares @ shares
+    flat = grey.reshape(len(grey), -1)
+    flat = flat - flat.mean(axis=1, keepdims=True)
+    length = np.linalg.norm(flat, axis=1, keepdims=True)
+    return np.asarray(flat / np.maximum(length, 1e-6), np.float32)
+
+
+def _decoys(
+    varied: NDArray[np.bool_], patterns: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Patterns of frames, bars, panes, and which of the markers' are within two cells of them.
+
+    Decoys that are as near a marker's pattern are left out: it could never be found.
+    """
+    rows, columns = np.flatnonzero(varied.any(axis=1)), np.flatnonzero(varied.any(axis=0))
+    j, i = np.indices((len(rows), len(columns)))
+    inner = [np.zeros(i.shape, bool)]
+    for place in (i, j):
+        for begin, end in itertools.combinations(range(place.max() + 2), 2):
+            inner.append((place >= begin) & (place < end))
+    for thick in range(1, max(2, len(columns) // 2)):
+        for shift in range(thick):
+            column, row = (i + shift) // thick % 2 == 0, (j + shift) // thick % 2 == 0
+            inner += [column, row, column ^ row, column | row, column & row]
+    decoys = np.zeros((2 * len(inner), *varied.shape), np.float32)
+    inside = np.s_[rows[0] : rows[0] + len(rows), columns[0] : columns[0] + len(columns)]
+    decoys[:, *inside] = inner + [~pattern for pattern in inner]
+    flat = np.unique(decoys.reshape(len(decoys), -1), axis=0)
+    known = patterns.reshape(len(patterns), -1)
+    apart = flat.sum(axis=1)[:, None] + known.sum(axis=1)[None] - 2.0 * flat @ known.T
+    near = apart < 2.0
+    return flat[~near.any(axis=1)], near.any(axis=0)
+
+
+def specimen_image(settings: MarkerSettings) -> NDArray[np.uint8]:
+    """A grey image of one of the expected markers on white, seen from the front."""
+    templates = templates_of(settings.dictionary, settings.ids)
+    widths = np.diff(templates.lines) / templates.dictionary.cell
+    pixels = np.maximum(1, np.rint(widths * _CELL_PX)).astype(np.intp)
+    black = np.repeat(np.repeat(templates.blackness(0), pixels, axis=0), pixels, axis=1)
+    grey = np.where(np.pad(black, _MARGIN_PX) > 0.5, 40.0, 200.0)
+    # Soft edges, as all images have them.
+    return np.asarray(np.rint(cv2.blur(grey, (3, 3))), np.uint8)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,11 +13,10 @@ from detect.drawing.strokes import (
     enlargement,
     with_legend,
 )
-from detect.markers.detections import ACCEPTED, SAME_MARKER, MarkerDetections
+from detect.markers.detect import ACCEPTED, SAME_MARKER, MarkerDetections
 
 FloatArray = NDArray[np.float64]
 
-_SUBPIXEL_BITS = 4
 _EDGE_COLOUR: Colour = (60, 220, 60)
 _TOP_LEFT_COLOUR: Colour = (0, 0, 255)
 _TEXT_COLOUR: Colour = (0, 230, 255)
@@ -80,27 +78,13 @@ def mark_marker(
     """
     times = enlargement(canvas)
     draw_curve(canvas, corners, _EDGE_COLOUR, closed=True)
+    angle = np.linspace(0.0, 2.0 * np.pi, 33)
+    circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     for place, spread in zip(corners, covariance):
-        _draw_ellipse(canvas, place, spread, _EDGE_COLOUR)
-    cv2.circle(
-        canvas, _fixed(corners[0]), 3 * times << _SUBPIXEL_BITS, _TOP_LEFT_COLOUR, times,
-        cv2.LINE_AA, _SUBPIXEL_BITS,
-    )  # fmt: skip
+        values, vectors = np.linalg.eigh(spread)
+        ellipse = place + _SIGMAS * (circle * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
+        draw_curve(canvas, ellipse, _EDGE_COLOUR, closed=True)
+    draw_curve(canvas, corners[0] + 3.0 * times * circle, _TOP_LEFT_COLOUR, closed=True)
     middle = corners.mean(axis=0)
     at = (round(float(middle[0])) - 8 * times, round(float(middle[1])) + 5 * times)
     draw_text(canvas, f"{number}", at, _TEXT_COLOUR, 0.45)
-
-
-def _fixed(place: FloatArray) -> tuple[int, int]:
-    at = np.rint(place * (1 << _SUBPIXEL_BITS)).astype(np.int32)
-    return int(at[0]), int(at[1])
-
-
-def _draw_ellipse(
-    canvas: NDArray[np.uint8], place: FloatArray, covariance: FloatArray, colour: Colour
-) -> None:
-    values, vectors = np.linalg.eigh(covariance)
-    angle = np.linspace(0.0, 2.0 * np.pi, 33)
-    circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    ellipse = place + _SIGMAS * (circle * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
-    draw_curve(canvas, ellipse, colour, closed=True)

@@ -1,8 +1,8 @@
-"""Fits a blurred step to the grey values along each of a marker's four edges.
+"""Edges and corners with sub-pixel precision: phase 3, first part.
 
-A straight step between two grey levels, which change along the edge, by robust least squares of all
-pixels near the expected place except near the corners. Everything happens at straight positions
-(see `detect.markers.lens`).
+A blurred step between two grey levels is fitted along each edge of a rough quadrangle, to all
+pixels near it except near the corners. The fitted edges meet in the corners, whose covariances
+follow from theirs. Everything happens at straight positions (see `detect.markers.lens`).
 """
 
 from __future__ import annotations
@@ -14,421 +14,374 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from detect.markers.homography import project, square_homography
-from detect.markers.lens import Picture, bent, middle_pixel, straightened
+from detect.markers.lens import Picture, bent, straightened
+from detect.markers.quadrangle import is_convex
 from detect.positive_definite import invert_positive, solve_positive
 
 FloatArray = NDArray[np.float64]
+
+#: Cause of rejection, as it is counted.
+NO_EDGE = "edge not found"
 
 #: Residuals beyond this many standard deviations lose weight.
 OUTLIER = 3.0
 #: Grey values are rounded: noise is never below this, grey levels.
 LEAST_NOISE = 0.3
-
 _MEDIAN_TO_SIGMA = 1.0 / 0.6745
-#: Of a step: offset and turn (px), dark and light grey level, the light's change along the edge,
-#: the blur's logarithm, the light's change across the edge, the dark's along it.
+
+#: Of each pass, if the edges are a start or the result: about how many pixels per edge are used (of
+#: more, whole columns or rows are left out), and steps that end the iteration, pixels.
+_QUICK_PASSES = ((100, 0.02), (250, 0.02))
+_PASSES = ((100, 0.02), (1500, 0.002), (1500, 0.002))
+#: Corners that a later pass moves less than this are where they are.
+_CLOSE_ENOUGH_PX = 0.05
+_FIRST_BLUR_PX = 0.9
+#: After the first pass an edge is searched within this many of its blurs, and this many pixels;
+#: with fewer rows of pixels on each side than the last number more would be unknown than there are.
+_REACH_BLURS, _REACH_PX, _LEAST_REACH_PX = 2.5, 0.8, 2.2
+#: Corners that move farther than this (in capture ranges) left their quadrangle.
+_LARGEST_MOVE = 2.5
+
+#: Of a step: offset and turn (px), dark and light grey level, the blur's logarithm, the light's
+#: change along and across the edge, the dark's along it.
 _PARAMETERS = 8
 _LEAST_PIXELS = 12
-_LEAST_BLUR = 0.25
-_LARGEST_BLUR = 8.0
-_WIDE_STEPS = 5
-_STEPS = 12
-#: Largest standard deviation of what a step leaves over, in its contrast.
-_LARGEST_REST = 0.6
-_ROOT_HALF = math.sqrt(0.5)
-_ROOT_2PI = math.sqrt(2.0 * math.pi)
+_LEAST_BLUR, _LARGEST_BLUR = 0.25, 8.0
+#: First all pixels weigh alike, then as their residuals suggest; steps of each round.
+_ROUNDS, _STEPS = 2, 8
+#: Standard deviations of the blur's logarithm; of the light's change along half an edge, and across
+#: it per pixel, both in contrasts.
+_BLUR_SIGMA, _ALONG_SIGMA, _ACROSS_SIGMA = 0.5, 0.3, 0.004
+#: Standard deviation of what a step leaves over, in its contrast: expected, and largest.
+_FIRST_REST, _LARGEST_REST = 0.2, 0.6
+#: Places across an edge, and turns of it (in reaches), at which a fit may begin.
+_SPLITS, _TURNS = 14, (0.0, -0.3, 0.3, -0.6, 0.6)
 _SEGMENTS = 8
-#: Number of places across an edge at which its search may begin.
-_SPLITS = 14
-#: Standard deviation of the light's change across an edge, in contrasts per pixel.
-_LIGHT_SLOPE = 0.004
-_SAMPLED_RESIDUALS = 400
 
 
-class EdgeFits(NamedTuple):
-    """The fitted steps of a quadrangle's four edges; each attribute is (4,) float64.
+class RefinedQuadrangle(NamedTuple):
+    """A quadrangle whose edges were fitted; edge k goes from corner k to corner k + 1."""
 
-    Attributes
-    ----------
-    offset, turn
-        From the given line outwards, in its middle, and the change from there to its end, pixels.
-    var_offset, covar, var_turn
-        Their variances and covariance, pixels squared.
-    dark, light
-        Grey levels, inside and outside.
-    blur
-        Standard deviation, the pixel's own included, pixels.
-    support
-        Share of the length where the step is there.
-    """
-
-    offset: FloatArray
-    turn: FloatArray
-    var_offset: FloatArray
-    covar: FloatArray
-    var_turn: FloatArray
-    dark: FloatArray
-    light: FloatArray
-    blur: FloatArray
-    support: FloatArray
+    corners: FloatArray  # (4, 2) straight pixels, clockwise as seen in the image
+    covariance: FloatArray  # (4, 2, 2) of each corner, from its two edges, pixels squared
+    dark: FloatArray  # (4,) grey level inside each edge
+    light: FloatArray  # (4,) grey level outside
+    blur: FloatArray  # (4,) standard deviation, the pixel's own included, pixels
+    support: FloatArray  # (4,) share of the length where the step is seen
 
 
-class EdgeSearch(NamedTuple):
-    """How edges are searched for.
+class _Search(NamedTuple):
+    """How edges are searched for."""
 
-    Attributes
-    ----------
-    capture : float
-        How far the edges may be from the rough ones, pixels.
-    border : float
-        Thickness of the black border, in widths of the marker.
-    blur_guess : float
-        Standard deviation of the blur, pixels.
-    most_pixels : int
-        About how many pixels are used per edge; of more, whole columns (rows) are left out.
-    close_enough : float
-        Steps smaller than this end the iteration, pixels.
-    """
-
-    capture: float
-    border: float
-    blur_guess: float
-    most_pixels: int
+    capture: float  # how far they may be from the rough ones, pixels
+    border: float  # thickness of the black border, in widths of the marker
+    blur: float  # expected standard deviation, pixels
+    pixels: int
     close_enough: float
 
 
-class _Band(NamedTuple):
-    """The surroundings of a line from p0 to p1, of which pixels within margin of an end are out."""
+class _Pixels(NamedTuple):
+    """Pixels near an edge."""
 
-    p0: FloatArray
-    p1: FloatArray
-    inwards: float
-    outwards: float
-    margin: float
-    stride: int
-
-
-class _EdgePixels(NamedTuple):
-    """Pixels near a line: where along (-1 to 1), how far out (px), grey value."""
-
-    along: FloatArray
-    across: FloatArray
+    along: FloatArray  # -1 to 1
+    across: FloatArray  # outwards, pixels
     grey: FloatArray
 
 
-class _Normal(NamedTuple):
-    """Normal equations of the step's parameters, with the residuals that they come from."""
+class _Step(NamedTuple):
+    """A fitted step: how far outwards the line given is to be moved at its ends, pixels."""
+
+    start: float
+    end: float
+    var_start: float
+    var_end: float
+    dark: float
+    light: float
+    blur: float
+    support: float
+
+
+class _Linearised(NamedTuple):
+    """Normal equations about some parameters, and sums over the pixels there."""
 
     matrix: FloatArray
     right: FloatArray
+    cost: float
+    weight: float
+    squares: float
     residual: FloatArray
 
 
-@njit(cache=True, error_model="numpy")
-def fit_edges(picture: Picture, corners: FloatArray, search: EdgeSearch, edges: EdgeFits) -> bool:
-    """Fit a blurred step to each of four edges.
+_NO_STEP = _Step(*(math.nan,) * 8)
 
-    Parameters
-    ----------
-    picture : Picture
-        The image.
-    corners : (4, 2) float64
-        Rough corners, clockwise as seen in the image, straight pixels.
-    search : EdgeSearch
-        How far and how closely.
-    edges : EdgeFits
-        Result.
 
-    Returns
-    -------
-    bool
-        Whether all four were fitted.
+def refine_quadrangle(
+    picture: Picture,
+    rough: FloatArray,
+    *,
+    capture_px: float,
+    border: float,
+    quick: bool = False,
+) -> RefinedQuadrangle | None:
+    """Fit the edges of a quadrangle (4, 2), clockwise at straight pixels, to the image.
+
+    Edges are within `capture_px` of the rough ones; the black border is `border` widths of the
+    marker thick. With `quick` they are good enough to begin the fit of the whole marker with. None
+    if an edge is not there, or the edges make no convex quadrangle near the rough one.
     """
-    guess = middle_pixel(picture.lens, corners)
-    thickness = _border_thickness(corners, search.border)
-    for k in range(4):
-        p0 = corners[k]
-        p1 = corners[(k + 1) % 4]
-        length = math.hypot(p1[0] - p0[0], p1[1] - p0[1])
-        reach = min(search.capture, max(1.2, thickness[k]))
-        inwards = min(reach, max(1.0, 0.85 * thickness[k]))
-        margin = min(max(1.0, 0.7 * reach), 0.2 * length)
-        stride = max(1, int(length * (inwards + reach) / search.most_pixels))
-        pixels = _pixels_along(picture, guess, _Band(p0, p1, inwards, reach, margin, stride))
-        if not _fit_step(pixels, reach, picture.noise, search, edges, k):
-            return False
-    return True
+    refined: RefinedQuadrangle | None = None
+    corners, reach, blur = rough, capture_px, _FIRST_BLUR_PX
+    for pixels, close_enough in _QUICK_PASSES if quick else _PASSES:
+        search = _Search(reach, border, blur, pixels, close_enough)
+        last, refined = refined, _fit_edges(picture, corners, search)
+        # What is not there is NaN.
+        moved_far = not np.abs(refined.corners - rough).max() <= _LARGEST_MOVE * capture_px
+        if moved_far or not is_convex(refined.corners):
+            return None
+        if last is not None and np.abs(refined.corners - corners).max() < _CLOSE_ENOUGH_PX:
+            break
+        corners = refined.corners
+        blur = min(max(float(np.median(refined.blur)), 0.3), 6.0)
+        reach = max(_REACH_BLURS * blur + _REACH_PX, _LEAST_REACH_PX)
+    return refined
 
 
 @njit(cache=True, error_model="numpy")
-def _border_thickness(corners: FloatArray, border: float) -> FloatArray:
-    """(4,) thickness of the black border in the middle of each edge, pixels."""
-    homography = square_homography(corners)
-    result = np.empty(4)
+def _fit_edges(picture: Picture, corners: FloatArray, search: _Search) -> RefinedQuadrangle:
+    """Fit the four edges; NaN if one of them is not there."""
+    found = RefinedQuadrangle(
+        np.full((4, 2), np.nan), np.zeros((4, 2, 2)),
+        np.empty(4), np.empty(4), np.empty(4), np.empty(4),
+    )  # fmt: skip
+    lines, variance = np.empty((4, 3)), np.empty((4, 2))
     for k in range(4):
-        mx = 0.5 if k % 2 == 0 else (1.0 - border if k == 1 else border)
-        my = 0.5 if k % 2 == 1 else (border if k == 0 else 1.0 - border)
-        x, y, _ = project(homography, mx, my)
-        p0 = corners[k]
-        p1 = corners[(k + 1) % 4]
-        length = math.hypot(p1[0] - p0[0], p1[1] - p0[1])
-        result[k] = abs((x - p0[0]) * (p1[1] - p0[1]) - (y - p0[1]) * (p1[0] - p0[0])) / length
+        p0, p1 = corners[k], corners[(k + 1) % 4]
+        outwards = np.array([p1[1] - p0[1], p0[0] - p1[0]]) / math.hypot(
+            p1[0] - p0[0], p1[1] - p0[1]
+        )
+        # The border is in proportion to the height over the edge.
+        across = p0 - 0.5 * (corners[(k + 2) % 4] + corners[(k + 3) % 4])
+        thickness = search.border * (across[0] * outwards[0] + across[1] * outwards[1])
+        reach = min(search.capture, max(1.2, thickness))
+        inwards = min(reach, max(1.0, 0.85 * thickness))
+        pixels = _pixels_along(picture, p0, p1, inwards, reach, search.pixels)
+        step = _fit_step(pixels, reach, max(picture.noise, LEAST_NOISE), search)
+        if math.isnan(step.start):
+            return found
+        found.dark[k], found.light[k] = step.dark, step.light
+        found.blur[k], found.support[k] = step.blur, step.support
+        variance[k] = step.var_start, step.var_end
+        a, b = p0 + step.start * outwards, p1 + step.end * outwards
+        # Unit normal and distance from the origin.
+        lines[k] = a[1] - b[1], b[0] - a[0], a[0] * b[1] - a[1] * b[0]
+        lines[k] /= math.hypot(lines[k, 0], lines[k, 1])
+    for k in range(4):
+        a, b = lines[k - 1], lines[k]
+        sine = a[0] * b[1] - a[1] * b[0]
+        found.corners[k, 0] = (a[1] * b[2] - a[2] * b[1]) / sine
+        found.corners[k, 1] = (a[2] * b[0] - a[0] * b[2]) / sine
+        # A line that moves takes the corner along the other line.
+        for line, spread in ((b, variance[k - 1, 1]), (a, variance[k, 0])):
+            along = np.array([-line[1], line[0]]) / sine
+            found.covariance[k] += spread * np.outer(along, along)
+    return found
+
+
+@njit(cache=True, error_model="numpy")
+def _fit_step(pixels: _Pixels, reach: float, noise: float, search: _Search) -> _Step:
+    """Robust least squares of a blurred step; NaN if there is none.
+
+    By the Levenberg-Marquardt method, from the best split of the grey values in two.
+    """
+    if len(pixels.grey) < _LEAST_PIXELS:
+        return _NO_STEP
+    offset, turn, dark, light = _best_split(pixels, reach)
+    if not light > dark + 0.3 * noise:
+        return _NO_STEP
+    expected = np.array([0.0, 0.0, dark, light, math.log(search.blur), 0.0, 0.0, 0.0])
+    p = expected.copy()
+    p[0], p[1] = offset, turn
+    change = np.empty(_PARAMETERS)
+    scale, outlier = _FIRST_REST * (light - dark), math.inf
+    sigma = np.full(_PARAMETERS, math.inf)
+    sigma[4] = _BLUR_SIGMA
+    for _ in range(_ROUNDS):
+        contrast = p[3] - p[2]
+        sigma[5], sigma[7] = _ALONG_SIGMA * contrast, _ALONG_SIGMA * contrast
+        sigma[6] = _ACROSS_SIGMA * contrast
+        prior = (scale / sigma) ** 2
+        here = _linearise(pixels, p, expected, prior, outlier)
+        damping = 1e-3
+        for _ in range(_STEPS):
+            damped = here.matrix + damping * np.diag(np.diag(here.matrix))
+            if not solve_positive(damped, here.right, change):
+                return _NO_STEP
+            trial = p + change
+            trial[4] = min(max(trial[4], math.log(_LEAST_BLUR)), math.log(_LARGEST_BLUR))
+            there = _linearise(pixels, trial, expected, prior, outlier)
+            if there.cost < here.cost:
+                p, here = trial, there
+                damping *= 0.1
+            else:
+                damping *= 10.0
+            if abs(change[0]) + abs(change[1]) < search.close_enough:
+                break
+        scale = robust_sigma(here.residual, noise)
+        outlier = OUTLIER * scale
+        if abs(p[0]) + abs(p[1]) > 2.0 * reach or not scale < _LARGEST_REST * (p[3] - p[2]):
+            return _NO_STEP
+    inverse = np.empty((_PARAMETERS, _PARAMETERS))
+    if not invert_positive(here.matrix, inverse):
+        return _NO_STEP
+    variance = max(here.squares / max(here.weight - _PARAMETERS, 1.0), noise * noise)
+    apart = variance * (inverse[0, 0] + inverse[1, 1])
+    shared = variance * 2.0 * inverse[0, 1]
+    return _Step(
+        p[0] - p[1], p[0] + p[1], apart - shared, apart + shared,
+        p[2], p[3], math.exp(p[4]), _support(pixels, p),
+    )  # fmt: skip
+
+
+@njit(cache=True, error_model="numpy")
+def _pixels_along(
+    picture: Picture, p0: FloatArray, p1: FloatArray, inwards: float, reach: float, enough: int
+) -> _Pixels:
+    """Pixels near the line from p0 to p1 but not near its ends; of more than about `enough`, whole
+    columns (rows) are left out.
+    """
+    height, width = picture.grey.shape
+    length = math.hypot(p1[0] - p0[0], p1[1] - p0[1])
+    tx, ty = (p1[0] - p0[0]) / length, (p1[1] - p0[1]) / length
+    stride = max(1, int(length * (inwards + reach) / enough))
+    margin = min(max(1.0, 0.7 * reach), 0.2 * length)
+    a0, b0 = bent(picture.lens, p0[0], p0[1])
+    a1, b1 = bent(picture.lens, p1[0], p1[1])
+    if not math.isfinite(a0 + b0 + a1 + b1):
+        return _Pixels(np.empty(0), np.empty(0), np.empty(0))
+    flat = abs(a1 - a0) >= abs(b1 - b0)
+    most_a, most_b = width, height
+    if not flat:
+        a0, b0, a1, b1, most_a, most_b = b0, a0, b1, a1, most_b, most_a
+    slope = (b1 - b0) / (a1 - a0)
+    # A rough width of the band along the other axis; the test below is exact.
+    pad = 1.5 * reach + 2.0
+    first, last = max(0, int(min(a0, a1) - pad)), min(most_a, int(max(a0, a1) + pad) + 2)
+    most = max(0, last - first) * (int(2.0 * pad) + 4)
+    along, across, grey = np.empty(most), np.empty(most), np.empty(most)
+    count = 0
+    for a in range(first, last, stride):
+        middle = b0 + slope * (a - a0)
+        for b in range(max(0, int(middle - pad)), min(most_b, int(middle + pad) + 2)):
+            u, v = (a, b) if flat else (b, a)
+            x, y, _, _, _, _ = straightened(picture.lens, float(u), float(v))
+            s = (x - p0[0]) * tx + (y - p0[1]) * ty
+            d = (x - p0[0]) * ty - (y - p0[1]) * tx
+            if margin <= s <= length - margin and -inwards <= d <= reach:
+                along[count] = 2.0 * s / length - 1.0
+                across[count] = d
+                grey[count] = picture.grey[v, u]
+                count += 1
+    return _Pixels(along[:count], across[:count], grey[:count])
+
+
+@njit(cache=True, error_model="numpy")
+def _best_split(pixels: _Pixels, reach: float) -> tuple[float, float, float, float]:
+    """Offset and turn of the line that splits the grey values best, and the means on both sides.
+
+    It explains most variance (Otsu's criterion), of those with the dark side inside.
+    """
+    best, result = 0.0, (0.0, 0.0, 0.0, 0.0)
+    for share in _TURNS:
+        n, total = np.zeros(_SPLITS), np.zeros(_SPLITS)
+        for k in range(len(pixels.grey)):
+            place = pixels.across[k] / reach - share * pixels.along[k]
+            b = min(max(int((place + 1.0) * 0.5 * _SPLITS), 0), _SPLITS - 1)
+            n[b] += 1.0
+            total[b] += pixels.grey[k]
+        n_in, total_in = 0.0, 0.0
+        for b in range(_SPLITS - 1):
+            n_in += n[b]
+            total_in += total[b]
+            n_out = n.sum() - n_in
+            if n_in < 3.0 or n_out < 3.0:
+                continue
+            dark, light = total_in / n_in, (total.sum() - total_in) / n_out
+            between = (light - dark) ** 2 * n_in * n_out
+            if light > dark and between > best:
+                best = between
+                offset = ((b + 1.0) * 2.0 / _SPLITS - 1.0) * reach
+                result = (offset, share * reach, dark, light)
     return result
 
 
 @njit(cache=True, error_model="numpy")
-def _pixels_along(picture: Picture, guess: tuple[float, float], band: _Band) -> _EdgePixels:
-    """The pixels of a band, but every `stride`-th of the image's columns or rows only."""
-    image, lens = picture.grey, picture.lens
-    p0, p1, inwards, outwards = band.p0, band.p1, band.inwards, band.outwards
-    height, width = image.shape
-    length = math.hypot(p1[0] - p0[0], p1[1] - p0[1])
-    most = int((length + 4.0) * (inwards + outwards + 2.0)) + 64
-    along, across, grey = np.empty(most), np.empty(most), np.empty(most)
-    tx, ty = (p1[0] - p0[0]) / length, (p1[1] - p0[1]) / length
-    u0, v0 = bent(lens, p0[0], p0[1], guess)
-    u1, v1 = bent(lens, p1[0], p1[1], guess)
-    if not (math.isfinite(u0 + v0) and math.isfinite(u1 + v1)):
-        return _EdgePixels(along[:0], across[:0], grey[:0])
-    flat = abs(u1 - u0) >= abs(v1 - v0)
-    # A rough width of the band along the other axis; the test below is exact.
-    pad = 1.5 * max(inwards, outwards) + 2.0
-    if flat:
-        begin, end = min(u0, u1), max(u0, u1)
-        slope = (v1 - v0) / (u1 - u0)
-        limit_a, limit_b = width, height
-    else:
-        begin, end = min(v0, v1), max(v0, v1)
-        slope = (u1 - u0) / (v1 - v0)
-        limit_a, limit_b = height, width
-    count = 0
-    half = 0.5 * length
-    for a in range(max(0, int(begin - pad)), min(limit_a, int(end + pad) + 2), band.stride):
-        middle = v0 + slope * (a - u0) if flat else u0 + slope * (a - v0)
-        for b in range(max(0, int(middle - pad)), min(limit_b, int(middle + pad) + 2)):
-            u, v = (a, b) if flat else (b, a)
-            x, y, _, _, _, _ = straightened(lens, float(u), float(v))
-            dx, dy = x - p0[0], y - p0[1]
-            s = dx * tx + dy * ty
-            d = dx * ty - dy * tx
-            if s < band.margin or s > length - band.margin or d < -inwards or d > outwards:
-                continue
-            if count == most:
-                return _EdgePixels(along, across, grey)
-            along[count] = (s - half) / half
-            across[count] = d
-            grey[count] = image[v, u]
-            count += 1
-    return _EdgePixels(along[:count], across[:count], grey[:count])
-
-
-@njit(cache=True, error_model="numpy")
-def _best_split(across: FloatArray, grey: FloatArray, reach: float) -> tuple[float, float, float]:
-    """How far out the grey values are best split in two, and the means on both sides.
-
-    The split that explains most variance (Otsu's criterion), of those with the dark side inside.
-    """
-    n = np.zeros(_SPLITS)
-    total = np.zeros(_SPLITS)
-    for k in range(len(grey)):
-        b = min(max(int((across[k] / reach + 1.0) * 0.5 * _SPLITS), 0), _SPLITS - 1)
-        n[b] += 1.0
-        total[b] += grey[k]
-    all_n = n.sum()
-    all_total = total.sum()
-    best, at, low, high = 0.0, 0.0, 0.0, 0.0
-    n_in, total_in = 0.0, 0.0
-    for b in range(_SPLITS - 1):
-        n_in += n[b]
-        total_in += total[b]
-        n_out = all_n - n_in
-        if n_in < 3.0 or n_out < 3.0:
-            continue
-        inside = total_in / n_in
-        outside = (all_total - total_in) / n_out
-        between = (outside - inside) ** 2 * n_in * n_out
-        if outside > inside and between > best:
-            best = between
-            at = ((b + 1.0) * 2.0 / _SPLITS - 1.0) * reach
-            low = inside
-            high = outside
-    return at, low, high
-
-
-@njit(cache=True, error_model="numpy")
-def _fit_step(
-    pixels: _EdgePixels, reach: float, noise: float, search: EdgeSearch, out: EdgeFits, k: int
-) -> bool:
-    """Robust least squares of a blurred step, which becomes edge k of the results.
-
-    The first steps of the iteration move a wide blur, which sees far, in place and levels only;
-    then the levels alone are adapted to the blur expected; then all is free.
-    """
-    count = len(pixels.grey)
-    if count < _LEAST_PIXELS:
-        return False
-    # Inside is darker, beyond what noise does.
-    split, low, high = _best_split(pixels.across, pixels.grey, reach)
-    if not high > low + 0.3 * noise:
-        return False
-    log_guess = math.log(search.blur_guess)
-    wide = max(0.6 * reach, search.blur_guess)
-    p = np.zeros(_PARAMETERS)
-    p[0], p[2], p[3], p[5] = split, low, high, math.log(wide)
-    least = max(noise, LEAST_NOISE)
-    normal = _Normal(np.empty((_PARAMETERS, _PARAMETERS)), np.empty(_PARAMETERS), np.empty(count))
-    change = np.empty(_PARAMETERS)
-    inverse = np.empty((_PARAMETERS, _PARAMETERS))
-    scale = -1.0
-    converged = False
-    free_steps = 0
-    for iteration in range(_WIDE_STEPS + _STEPS):
-        wide_now = iteration < _WIDE_STEPS and wide > 1.2 * search.blur_guess
-        if not wide_now:
-            free_steps += 1
-        if iteration == _WIDE_STEPS or (iteration == 0 and not wide_now):
-            p[5] = log_guess
-        outlier = OUTLIER * scale if free_steps > 2 else math.inf
-        weight_sum, rest = _linearise(pixels, p, outlier, normal)
-        scale = robust_sigma(normal.residual, _SAMPLED_RESIDUALS, least)
-        _add_priors(normal, p, scale, log_guess)
-        if wide_now or free_steps == 1:
-            # Place and levels only: the rest would follow what is not the edge. Then levels alone,
-            # with the narrow blur: those of the wide one are off.
-            for i in range(_PARAMETERS):
-                if not (i == 2 or i == 3 or (wide_now and i < 2)):
-                    normal.matrix[i, :] = 0.0
-                    normal.matrix[:, i] = 0.0
-                    normal.matrix[i, i] = 1.0
-                    normal.right[i] = 0.0
-        for i in range(2):
-            normal.matrix[i, i] += 1e-9 * (1.0 + normal.matrix[i, i])
-        if not solve_positive(normal.matrix, normal.right, change):
-            return False
-        largest = max(abs(change[0]), abs(change[1]))
-        change[:2] *= min(1.0, 0.6 * reach / largest) if largest > 0.0 else 1.0
-        change[5] = min(max(change[5], -0.7), 0.7)
-        p += change
-        p[5] = min(max(p[5], math.log(_LEAST_BLUR)), math.log(_LARGEST_BLUR))
-        if abs(p[0]) + abs(p[1]) > 2.0 * reach:
-            return False
-        if wide_now:
-            if iteration + 1 < _WIDE_STEPS and largest < 0.05:
-                # Close: go on with the blur free.
-                wide = search.blur_guess
-                p[5] = log_guess
-        elif largest < search.close_enough and free_steps > 2:
-            converged = True
-            break
-    if not converged and iteration + 1 < _WIDE_STEPS + _STEPS:
-        return False
-    if not invert_positive(normal.matrix, inverse):
-        return False
-    variance = max(rest / max(weight_sum - _PARAMETERS, 1.0), least * least)
-    out.offset[k], out.turn[k] = p[0], p[1]
-    out.var_offset[k] = variance * inverse[0, 0]
-    out.covar[k] = variance * inverse[0, 1]
-    out.var_turn[k] = variance * inverse[1, 1]
-    out.dark[k], out.light[k] = p[2], p[3]
-    out.blur[k] = math.exp(p[5])
-    out.support[k] = _support(pixels, p)
-    numbers = p.sum() + inverse[:2, :2].sum() + variance + scale
-    return bool(np.isfinite(numbers) and scale < _LARGEST_REST * (p[3] - p[2]))
-
-
-@njit(cache=True, error_model="numpy")
 def _linearise(
-    pixels: _EdgePixels, p: FloatArray, outlier: float, normal: _Normal
-) -> tuple[float, float]:
-    """Normal equations about p; returns the sums of the weights and of the weighted squares."""
-    along, across, grey = pixels.along, pixels.across, pixels.grey
-    matrix, right = normal.matrix, normal.right
+    pixels: _Pixels, p: FloatArray, expected: FloatArray, prior: FloatArray, outlier: float
+) -> _Linearised:
+    """Normal equations about p with the weights of prior knowledge, and the robust cost."""
+    matrix, right = np.diag(prior), prior * (expected - p)
+    residual = np.empty(len(pixels.grey))
     jacobian = np.empty(_PARAMETERS)
-    matrix[:] = 0.0
-    right[:] = 0.0
-    blur = math.exp(p[5])
-    weight_sum = 0.0
-    rest = 0.0
-    for n in range(len(grey)):
-        z = (across[n] - p[0] - p[1] * along[n]) / blur
-        share = 0.5 * (1.0 + math.erf(z * _ROOT_HALF))
-        density = math.exp(-0.5 * z * z) / _ROOT_2PI
-        out_px = z * blur
-        top = p[3] + p[4] * along[n] + p[6] * out_px
-        bottom = p[2] + p[7] * along[n]
-        step = top - bottom
-        r = grey[n] - (bottom + step * share)
-        normal.residual[n] = r
-        weight = (outlier / r) ** 2 if abs(r) > outlier else 1.0
+    blur = math.exp(p[4])
+    cost = np.sum(prior * (expected - p) ** 2)
+    weights, squares = 0.0, 0.0
+    for n in range(len(residual)):
+        along = pixels.along[n]
+        out = pixels.across[n] - p[0] - p[1] * along
+        z = out / blur
+        share = 0.5 * (1.0 + math.erf(z * math.sqrt(0.5)))
+        density = math.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi)
+        dark = p[2] + p[7] * along
+        step = p[3] + p[5] * along + p[6] * out - dark
+        r = pixels.grey[n] - dark - step * share
+        residual[n] = r
         slope = -step * density / blur - p[6] * share
         jacobian[0] = slope
-        jacobian[1] = slope * along[n]
+        jacobian[1] = slope * along
         jacobian[2] = 1.0 - share
         jacobian[3] = share
-        jacobian[4] = share * along[n]
-        jacobian[5] = -step * density * z
-        jacobian[6] = share * out_px
-        jacobian[7] = (1.0 - share) * along[n]
+        jacobian[4] = -step * density * z
+        jacobian[5] = share * along
+        jacobian[6] = share * out
+        jacobian[7] = (1.0 - share) * along
+        weight = 1.0
+        if abs(r) > outlier:
+            weight = (outlier / r) ** 2
+            cost += outlier**2 * (1.0 - math.log(weight))
+        else:
+            cost += r * r
         for i in range(_PARAMETERS):
-            right[i] += weight * jacobian[i] * r
-            for j in range(i, _PARAMETERS):
-                matrix[i, j] += weight * jacobian[i] * jacobian[j]
-        weight_sum += weight
-        rest += weight * r * r
-    for i in range(_PARAMETERS):
-        for j in range(i):
-            matrix[i, j] = matrix[j, i]
-    return weight_sum, rest
+            factor = weight * jacobian[i]
+            right[i] += factor * r
+            for j in range(i + 1):
+                matrix[i, j] += factor * jacobian[j]
+        weights += weight
+        squares += weight * r * r
+    return _Linearised(matrix, right, cost, weights, squares, residual)
 
 
 @njit(cache=True, error_model="numpy")
-def _add_priors(normal: _Normal, p: FloatArray, scale: float, log_guess: float) -> None:
-    """Weak priors: light changes little along an edge; the blur is about what was guessed."""
-    variance = scale * scale
-    contrast = max(abs(p[3] - p[2]), scale)
-    for i, sigma, expected in (
-        (4, 0.3 * contrast, 0.0),
-        (7, 0.3 * contrast, 0.0),
-        (6, _LIGHT_SLOPE * contrast, 0.0),
-        (5, 0.5, log_guess),
-    ):
-        prior = variance / (sigma * sigma)
-        normal.matrix[i, i] += prior
-        normal.right[i] -= prior * (p[i] - expected)
+def robust_sigma(residual: FloatArray, least: float) -> float:
+    """Standard deviation of residuals (N,) by the median of their magnitudes, at least `least`."""
+    return max(least, _MEDIAN_TO_SIGMA * float(np.median(np.abs(residual))))
 
 
 @njit(cache=True, error_model="numpy")
-def robust_sigma(residual: FloatArray, sampled: int, least: float) -> float:
-    """Standard deviation of residuals (N,) by the median of their magnitudes, at least `least`.
-
-    Of more residuals than about `sampled` every second, third, ... is used.
-    """
-    stride = max(1, len(residual) // sampled)
-    return max(least, _MEDIAN_TO_SIGMA * float(np.median(np.abs(residual[::stride]))))
-
-
-@njit(cache=True, error_model="numpy")
-def _support(pixels: _EdgePixels, p: FloatArray) -> float:
+def _support(pixels: _Pixels, p: FloatArray) -> float:
     """Share of the segments of an edge whose own step is at least half the fitted one."""
-    along, across, grey = pixels.along, pixels.across, pixels.grey
-    inside = np.zeros(_SEGMENTS)
-    outside = np.zeros(_SEGMENTS)
-    n_inside = np.zeros(_SEGMENTS)
-    n_outside = np.zeros(_SEGMENTS)
-    for k in range(len(grey)):
-        d = across[k] - p[0] - p[1] * along[k]
-        segment = min(int((along[k] + 1.0) * 0.5 * _SEGMENTS), _SEGMENTS - 1)
-        if d < -0.5:
-            inside[segment] += grey[k]
-            n_inside[segment] += 1.0
-        elif d > 0.5:
-            outside[segment] += grey[k]
-            n_outside[segment] += 1.0
+    total, n = np.zeros((_SEGMENTS, 2)), np.zeros((_SEGMENTS, 2))
+    for k in range(len(pixels.grey)):
+        along = pixels.along[k]
+        out = pixels.across[k] - p[0] - p[1] * along
+        if abs(out) > 0.5:
+            segment = min(int((along + 1.0) * 0.5 * _SEGMENTS), _SEGMENTS - 1)
+            side = int(out > 0.0)
+            total[segment, side] += pixels.grey[k]
+            n[segment, side] += 1.0
     there, known = 0.0, 0.0
     for k in range(_SEGMENTS):
-        if n_inside[k] > 0.0 and n_outside[k] > 0.0:
+        if n[k, 0] > 0.0 and n[k, 1] > 0.0:
             known += 1.0
-            if outside[k] / n_outside[k] - inside[k] / n_inside[k] > 0.5 * (p[3] - p[2]):
+            if total[k, 1] / n[k, 1] - total[k, 0] / n[k, 0] > 0.5 * (p[3] - p[2]):
                 there += 1.0
     return there / known if known > 0.0 else 0.0

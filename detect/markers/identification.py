@@ -8,18 +8,18 @@ away.
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
+import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
 
-from detect.markers.homography import project, square_homography
-from detect.markers.lens import Picture, bent, middle_pixel
+from detect.markers.dictionaries import Templates
+from detect.markers.lens import Picture
 from detect.markers.pattern_fit import PatternFit
+from detect.markers.quadrangle import square_homography
 from detect.markers.settings import MarkerSettings
-from detect.markers.templates import Templates
 
 FloatArray = NDArray[np.float64]
 
@@ -64,80 +64,33 @@ _PLAIN_LEAST_AGREEMENT = 0.95
 _PLAIN_LARGEST_CELL_ERROR = 0.25
 
 
-@dataclass(frozen=True)
-class Identity:
-    """A marker recognised.
-
-    Attributes
-    ----------
-    template : int
-        Index of the template.
-    distance : float
-        Mean absolute difference between cells and pattern, 0 to 1.
-    margin : float
-        Squared distance to the second best pattern less that to the best, in cells.
-    """
+class Identity(NamedTuple):
+    """A marker recognised."""
 
     template: int
-    distance: float
-    margin: float
+    distance: float  # mean absolute difference between cells and pattern, 0 to 1
+    margin: float  # squared distance to the second best pattern less that to the best, in cells
 
 
 def sampled_cells(picture: Picture, corners: FloatArray, templates: Templates) -> FloatArray | None:
-    """(G, G) grey values of the grid's cells; None if some are outside the image."""
-    dictionary = templates.dictionary
-    cells = np.empty((len(dictionary.centres),) * 2)
-    spread = _SPREAD_CELLS * dictionary.cell
-    return cells if _sample_cells(picture, corners, dictionary.centres, spread, cells) else None
-
-
-@njit(cache=True, error_model="numpy")
-def _sample_cells(
-    picture: Picture, corners: FloatArray, centres: FloatArray, spread: float, cells: FloatArray
-) -> bool:
-    """Mean of 3x3 grey values, `spread` apart, round the middle of each cell; False outside."""
-    image = picture.grey
-    height, width = image.shape
-    guess = middle_pixel(picture.lens, corners)
-    homography = square_homography(corners)
-    n = len(centres)
-    for j in range(n):
-        for i in range(n):
-            total = 0.0
-            for b in range(-1, 2):
-                for a in range(-1, 2):
-                    x, y, _ = project(homography, centres[i] + a * spread, centres[j] + b * spread)
-                    u, v = bent(picture.lens, x, y, guess)
-                    if not (0.0 <= u <= width - 1.0 and 0.0 <= v <= height - 1.0):
-                        return False
-                    iu = min(math.floor(u), width - 2)
-                    iv = min(math.floor(v), height - 2)
-                    fu, fv = u - iu, v - iv
-                    total += (1.0 - fv) * (
-                        (1.0 - fu) * image[iv, iu] + fu * image[iv, iu + 1]
-                    ) + fv * ((1.0 - fu) * image[iv + 1, iu] + fu * image[iv + 1, iu + 1])
-            cells[j, i] = total / 9.0
-    return True
+    """(G, G) grey values of the grid's cells, each the mean of 3x3; None if some are outside."""
+    centres, cell = templates.dictionary.centres, templates.dictionary.cell
+    along = (centres[:, None] + _SPREAD_CELLS * cell * np.array([-1.0, 0.0, 1.0])).ravel()
+    x, y = np.meshgrid(along, along)
+    straight = cv2.perspectiveTransform(np.stack([x, y], axis=-1), square_homography(corners))
+    u, v = picture.lens.bend(np.asarray(straight, np.float64).reshape(-1, 2)).T
+    height, width = picture.grey.shape
+    if not np.all((u >= 0.0) & (u <= width - 1.0) & (v >= 0.0) & (v <= height - 1.0)):
+        return None
+    side = len(centres)
+    grey = map_coordinates(picture.grey, [v, u], np.float64, order=1)
+    return np.asarray(grey.reshape(side, 3, side, 3).mean(axis=(1, 3)))
 
 
 def nearest_pattern(
     cells: FloatArray, templates: Templates, settings: MarkerSettings
 ) -> Identity | str:
-    """The nearest pattern as the report has it, or the cause of there being none.
-
-    Parameters
-    ----------
-    cells : (G, G) float64
-        Grey values.
-    templates : Templates
-        The patterns.
-    settings : MarkerSettings
-        ``largest_distance``, ``least_margin``.
-
-    Returns
-    -------
-    Identity or str
-    """
+    """The pattern nearest to grey values (G, G) as the report has it, or why there is none."""
     low, high = float(cells.min()), float(cells.max())
     if high <= low:
         return NO_PATTERN
@@ -150,54 +103,23 @@ def nearest_pattern(
     return Identity(best, distance, margin)
 
 
-def likely_patterns(
-    cells: FloatArray, templates: Templates, blur_cells: float
-) -> NDArray[np.int64]:
-    """Templates that cells may show, the best first; none if none is anything like them.
-
-    Parameters
-    ----------
-    cells : (G, G) float64
-        Grey values.
-    templates : Templates
-        The patterns.
-    blur_cells : float
-        Standard deviation of the blur, cells: neighbours shine into each other.
-    """
+def likely_patterns(cells: FloatArray, templates: Templates, blur_cells: float) -> list[int]:
+    """Templates that grey values (G, G) may show under a blur in cells, the best first."""
     flat = cells.ravel() - cells.mean()
     length = float(np.linalg.norm(flat))
     if length <= 0.0:
-        return np.empty(0, np.int64)
+        return []
     correlation = templates.nearest_blur(blur_cells) @ (flat / length).astype(np.float32)
-    count = min(_MOST_TRIED, len(correlation))
-    best = np.argpartition(-correlation, count - 1)[:count]
-    # Equal ones in the order of their numbers: the same on every machine.
-    best = best[np.lexsort((best, -correlation[best]))]
+    best = np.argsort(-correlation, kind="stable")[:_MOST_TRIED]
     close = _CLOSE_CORRELATION if blur_cells > _CLEAR_BLUR_CELLS else 0.25 * _CLOSE_CORRELATION
     least = max(_LEAST_CORRELATION, float(correlation[best[0]]) - close)
-    return np.asarray(best[correlation[best] >= least], dtype=np.int64)
+    return [int(template) for template in best if correlation[template] >= least]
 
 
 def verified_identity(
     fit: PatternFit, template: int, templates: Templates, settings: MarkerSettings
 ) -> Identity | str:
-    """The identity of a fitted marker by its cells, or the cause of its rejection.
-
-    Parameters
-    ----------
-    fit : PatternFit
-        The fit of the template.
-    template : int
-        Which was fitted.
-    templates : Templates
-        All patterns.
-    settings : MarkerSettings
-        ``least_explained``, ``largest_cell_error``, ``least_margin``, ``largest_distance``.
-
-    Returns
-    -------
-    Identity or str
-    """
+    """The identity of a fitted template by its cells, or the cause of its rejection."""
     weakness = templates.weakness
     if fit.blur_cells > _between(_LARGEST_BLUR_CELLS, weakness):
         return TOO_SMALL
@@ -240,10 +162,8 @@ def _nearest(whiteness: FloatArray, templates: Templates) -> tuple[int, float, f
     squared = templates.cells @ (1.0 - 2.0 * clipped).astype(np.float32)
     best = int(np.argmin(squared))
     distance = float(np.abs(clipped - templates.cells[best]).mean())
-    if len(squared) == 1:
-        return best, distance, float("inf")
-    others = np.delete(squared, best)
-    return best, distance, float(others.min() - squared[best])
+    others = np.delete(squared, best).min(initial=np.inf)
+    return best, distance, float(others - squared[best])
 
 
 def _log_odds(fit: PatternFit, template: int, templates: Templates) -> tuple[float, float]:
@@ -256,11 +176,6 @@ def _log_odds(fit: PatternFit, template: int, templates: Templates) -> tuple[flo
     sigma = np.hypot(mixing * fit.cell_sigma, _LEAST_CELL_SIGMA)
     gain = ((1.0 - 2.0 * fit.cells) / (2.0 * sigma**2)).astype(np.float32)
     cost = templates.cells @ gain
-    own = float(cost[template])
-    others = np.delete(cost, template)
-    decoys = templates.decoys @ gain
-    infinite = float("inf")
-    return (
-        float(others.min()) - own if len(others) else infinite,
-        float(decoys.min()) - own if len(decoys) else infinite,
-    )
+    others = np.delete(cost, template).min(initial=np.inf)
+    decoys = (templates.decoys @ gain).min(initial=np.inf)
+    return float(others - cost[template]), float(decoys - cost[template])

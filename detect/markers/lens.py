@@ -22,33 +22,26 @@ from detect.noise import estimate_noise
 FloatArray = NDArray[np.float64]
 
 #: Spacing for bilinear interpolation; the error is an eighth of its square times the curvature.
-_STEP_PX = 2
-_NEWTON_STEPS = 12
+_STEP_PX = 2.0
+_NEWTON_STEPS = 20
 _CLOSE_ENOUGH = 1e-7
 #: Rows of the image that its noise is estimated from.
 _NOISE_ROWS = 64
 
 
 class Lens(NamedTuple):
-    """Where pixels are in an image without distortion.
+    """Where pixels are in an image without distortion."""
 
-    Attributes
-    ----------
-    grid : (H, W, 2) float64
-        Straight position of pixel (step * i, step * j) at [j, i]; empty without distortion.
-    step : float
-        Distance of the grid's pixels.
-    """
-
-    grid: FloatArray
-    step: float
+    grid: FloatArray  # (H, W, 2) straight position of pixel (step_u * i, step_v * j) at [j, i]
+    step_u: float
+    step_v: float
 
     def straighten(self, pixels: FloatArray) -> FloatArray:
         """(N, 2) straight positions of (N, 2) pixels."""
         return np.asarray(_straighten_points(self, pixels))
 
     def bend(self, straight: FloatArray) -> FloatArray:
-        """(N, 2) pixels of (N, 2) straight positions near each other; NaN where there is none."""
+        """(N, 2) pixels of (N, 2) straight positions; NaN where there is none."""
         return np.asarray(_bend_points(self, straight))
 
     def pixel_jacobian(self, pixel: FloatArray) -> FloatArray:
@@ -58,23 +51,15 @@ class Lens(NamedTuple):
 
 
 class Picture(NamedTuple):
-    """An image, the lens that it was taken through, and the standard deviation of its noise.
-
-    Attributes
-    ----------
-    grey : (H, W) uint8
-        Grey values.
-    lens : Lens
-    noise : float
-        Grey levels.
-    """
+    """An image (H, W) uint8, the lens that it was taken through, its noise's standard deviation."""
 
     grey: NDArray[np.uint8]
     lens: Lens
     noise: float
 
 
-NO_LENS = Lens(np.empty((0, 0, 2)), 1.0)
+#: A grid of one cell, which is continued.
+NO_LENS = Lens(np.array([[[0.0, 0.0], [1.0, 0.0]], [[0.0, 1.0], [1.0, 1.0]]]), 1.0, 1.0)
 
 
 def picture_of(image: NDArray[np.uint8], camera: Camera | None) -> Picture:
@@ -85,18 +70,7 @@ def picture_of(image: NDArray[np.uint8], camera: Camera | None) -> Picture:
 
 
 def lens_of(camera: Camera | None, image: NDArray[np.uint8]) -> Lens:
-    """The lens that an image was taken through.
-
-    Parameters
-    ----------
-    camera : Camera or None
-        The calibration; without one, straight edges are straight in the image.
-    image : (H, W) uint8
-        The image.
-
-    Returns
-    -------
-    Lens
+    """The lens that an image (H, W) was taken through.
 
     Raises
     ------
@@ -115,23 +89,22 @@ def lens_of(camera: Camera | None, image: NDArray[np.uint8]) -> Lens:
 
 @functools.lru_cache(maxsize=8)
 def _cached_lens(camera: Camera) -> Lens:
-    if not (any(camera.coef[:2]) or any(camera.brown)):
+    undistorted = not (any(camera.coef[:2]) or any(camera.brown))
+    if undistorted or min(camera.width, camera.height) < 2:  # a row of pixels shows no marker
         return NO_LENS
-    if min(camera.width, camera.height) < 2:
-        return NO_LENS  # a row of pixels shows no marker
-    # The last cell may reach past the border, where the distortion need not be defined.
-    u = np.minimum(np.arange(0, camera.width - 1 + _STEP_PX, _STEP_PX), camera.width - 1.0)
-    v = np.minimum(np.arange(0, camera.height - 1 + _STEP_PX, _STEP_PX), camera.height - 1.0)
-    u_there, v_there = np.arange(len(u)) * _STEP_PX, np.arange(len(v)) * _STEP_PX
-    pixels = np.stack(np.meshgrid(u, v), axis=-1)
-    scale = np.array([camera.scale_x, camera.scale_y])
-    grid = camera.undistort(pixels) * scale + np.array([camera.offset_x, camera.offset_y])
+    u, step_u = _nodes(camera.width)
+    v, step_v = _nodes(camera.height)
+    normalised = camera.undistort(np.stack(np.meshgrid(u, v), axis=-1))
+    grid = normalised * [camera.scale_x, camera.scale_y] + [camera.offset_x, camera.offset_y]
     if not np.all(np.isfinite(grid)):
         raise FrameError("the calibration leaves pixels of the image without a direction")
-    # Continue the last cells to where they would have ended.
-    grid[:, -1] += (grid[:, -1] - grid[:, -2]) * ((u_there[-1] - u[-1]) / (u[-1] - u[-2]))
-    grid[-1] += (grid[-1] - grid[-2]) * ((v_there[-1] - v[-1]) / (v[-1] - v[-2]))
-    return Lens(np.ascontiguousarray(grid), float(_STEP_PX))
+    return Lens(grid, step_u, step_v)
+
+
+def _nodes(size: int) -> tuple[FloatArray, float]:
+    """Positions from the first to the last of `size` pixels, and their distance."""
+    count = math.ceil((size - 1) / _STEP_PX) + 1
+    return np.linspace(0.0, size - 1.0, count), (size - 1.0) / (count - 1)
 
 
 @njit(cache=True, error_model="numpy")
@@ -140,37 +113,30 @@ def straightened(lens: Lens, u: float, v: float) -> tuple[float, float, float, f
 
     Bilinear interpolation in the grid; beyond its border its outermost cells are continued.
     """
-    grid, step = lens.grid, lens.step
-    if grid.shape[0] == 0:
-        return u, v, 1.0, 0.0, 0.0, 1.0
-    fu = u / step
-    fv = v / step
+    grid = lens.grid
+    fu, fv = u / lens.step_u, v / lens.step_v
     i = min(max(math.floor(fu), 0), grid.shape[1] - 2)
     j = min(max(math.floor(fv), 0), grid.shape[0] - 2)
-    a = fu - i
-    b = fv - j
+    a, b = fu - i, fv - j
     x00, x01, x10, x11 = grid[j, i, 0], grid[j, i + 1, 0], grid[j + 1, i, 0], grid[j + 1, i + 1, 0]
     y00, y01, y10, y11 = grid[j, i, 1], grid[j, i + 1, 1], grid[j + 1, i, 1], grid[j + 1, i + 1, 1]
     x = (1.0 - b) * ((1.0 - a) * x00 + a * x01) + b * ((1.0 - a) * x10 + a * x11)
     y = (1.0 - b) * ((1.0 - a) * y00 + a * y01) + b * ((1.0 - a) * y10 + a * y11)
-    xu = ((1.0 - b) * (x01 - x00) + b * (x11 - x10)) / step
-    xv = ((1.0 - a) * (x10 - x00) + a * (x11 - x01)) / step
-    yu = ((1.0 - b) * (y01 - y00) + b * (y11 - y10)) / step
-    yv = ((1.0 - a) * (y10 - y00) + a * (y11 - y01)) / step
+    xu = ((1.0 - b) * (x01 - x00) + b * (x11 - x10)) / lens.step_u
+    xv = ((1.0 - a) * (x10 - x00) + a * (x11 - x01)) / lens.step_v
+    yu = ((1.0 - b) * (y01 - y00) + b * (y11 - y10)) / lens.step_u
+    yv = ((1.0 - a) * (y10 - y00) + a * (y11 - y01)) / lens.step_v
     return x, y, xu, xv, yu, yv
 
 
 @njit(cache=True, error_model="numpy")
-def bent(lens: Lens, x: float, y: float, guess: tuple[float, float]) -> tuple[float, float]:
-    """The pixel whose straight position is (x, y), from a pixel near it; NaN if none is found."""
-    if lens.grid.shape[0] == 0:
-        return x, y
-    u, v = guess
+def bent(lens: Lens, x: float, y: float) -> tuple[float, float]:
+    """The pixel whose straight position is (x, y), by Newton's method; NaN if none is found."""
+    u, v = x, y
     for _ in range(_NEWTON_STEPS):
         at_x, at_y, xu, xv, yu, yv = straightened(lens, u, v)
         determinant = xu * yv - xv * yu
-        dx = x - at_x
-        dy = y - at_y
+        dx, dy = x - at_x, y - at_y
         du = (yv * dx - xv * dy) / determinant
         dv = (xu * dy - yu * dx) / determinant
         u += du
@@ -178,13 +144,6 @@ def bent(lens: Lens, x: float, y: float, guess: tuple[float, float]) -> tuple[fl
         if abs(du) + abs(dv) < _CLOSE_ENOUGH:
             return u, v
     return math.nan, math.nan
-
-
-@njit(cache=True, error_model="numpy")
-def middle_pixel(lens: Lens, straight: FloatArray) -> tuple[float, float]:
-    """The pixel of the mean of (N, 2) straight positions."""
-    x, y = straight[:, 0].mean(), straight[:, 1].mean()
-    return bent(lens, x, y, (x, y))
 
 
 @njit(cache=True, error_model="numpy")
@@ -198,7 +157,6 @@ def _straighten_points(lens: Lens, pixels: FloatArray) -> FloatArray:
 @njit(cache=True, error_model="numpy")
 def _bend_points(lens: Lens, straight: FloatArray) -> FloatArray:
     result = np.empty_like(straight)
-    guess = middle_pixel(lens, straight)
     for k in range(len(straight)):
-        result[k, 0], result[k, 1] = bent(lens, straight[k, 0], straight[k, 1], guess)
+        result[k, 0], result[k, 1] = bent(lens, straight[k, 0], straight[k, 1])
     return result

@@ -9,62 +9,52 @@ itself then confirms or refutes the pattern.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from detect.markers.dictionaries import Templates
 from detect.markers.edges import LEAST_NOISE, OUTLIER, robust_sigma
-from detect.markers.homography import corners_by_homography, inverse_3x3, square_homography
 from detect.markers.lens import Picture
 from detect.markers.pattern_model import (
-    BLACK_AT,
-    BLUR_AT,
-    LIGHT_NUMBERS,
+    BLACK,
+    BLUR,
+    HOMOGRAPHY,
     PARAMETERS,
-    TONE_AT,
-    WHITE_AT,
+    TONE,
+    WHITE,
+    Linearised,
+    Model,
     Pattern,
-    blurred_blackness,
-    confine_blur,
-    corner_signs,
-    light_level,
-    place_on_marker,
+    Samples,
+    cell_sums,
+    linearise,
+    pattern_of,
 )
-from detect.markers.pattern_pixels import PixelBox, Samples, Seam, pixel_box, select_pixels
-from detect.markers.pattern_residuals import MarkerFrame, Residuals, cell_values, inflation_of
-from detect.markers.templates import Templates
-from detect.positive_definite import invert_positive, solve_positive
+from detect.markers.quadrangle import (
+    corners_by_homography,
+    corners_of,
+    signed_area,
+    square_homography,
+)
 
 FloatArray = NDArray[np.float64]
 
 #: Width of the seam round the marker that is fitted: blurs and pixels, at most a cell's size.
-_SEAM_BLURS = 2.5
-_SEAM_PX = 0.5
-_LEAST_SEAM_PX = 1.2
-#: How far a corner may move from where the edges meet, pixels or cells, the greater.
-_REACH_PX = 1.5
-_REACH_CELLS = 0.75
+_SEAM_BLURS, _SEAM_PX, _LEAST_SEAM_PX = 2.5, 0.5, 1.2
+#: How far a corner may move from where the edges meet, pixels or cells, the greater; in one step,
+#: part of that.
+_REACH_PX, _REACH_CELLS, _STEP_REACHES = 1.5, 0.75, 0.35
 
-#: Standard deviations of the light's slope and bend over half a marker, in contrasts.
-_SLOPE_SIGMA = 0.3
-_BEND_SIGMA = 0.15
-#: Standard deviation of the tone curve's bend, and its largest.
-_TONE_SIGMA, _LARGEST_TONE = 0.15, 0.6
-
-_SAMPLED_RESIDUALS = 700
-#: Clipped pixels do not count if the model is this near the limit, grey levels, or beyond.
-_CLIP_ZONE = 6.0
+#: Standard deviations of the light's slope and bend over half a marker, in contrasts, and of the
+#: tone curve's bend; its largest.
+_SLOPE_SIGMA, _BEND_SIGMA, _TONE_SIGMA, _LARGEST_TONE = 0.3, 0.15, 0.15, 0.6
+#: Variance of the blur along any direction, px^2: what a pixel does, and what is still an image.
+_LEAST_VARIANCE, _LARGEST_VARIANCE = 0.07, 60.0
 _CLOSE_ENOUGH_PX = 2e-3
 #: Pixels that are needed beyond one for each parameter.
 _SPARE_PIXELS = 12
-#: Whether there is one, its corners, their covariances, the cells' whiteness and its standard
-#: deviation, covariance uu, uv, vv of the blur (px^2), contrast, standard deviation of the
-#: residuals (grey levels), explained share.
-_Estimate: TypeAlias = tuple[
-    bool, FloatArray, FloatArray, tuple[FloatArray, FloatArray], FloatArray, float, float, float
-]
 
 
 class Effort(NamedTuple):
@@ -87,49 +77,17 @@ class Levels(NamedTuple):
 
 
 class PatternFit(NamedTuple):
-    """A marker fitted to the grey values.
+    """A marker fitted to the grey values."""
 
-    Attributes
-    ----------
-    corners : (4, 2) float64
-        Straight pixels, in the order of the corners given.
-    covariance : (4, 2, 2) float64
-        Of each corner, pixels squared.
-    cells, cell_sigma : (G * G,) float64
-        Whiteness of each cell of the grid, as the grey values have it, and its standard deviation
-        due to noise.
-    border : (B,) float64
-        Whiteness of the other cells of the square.
-    misfit : float
-        Standard deviation of what is left over beyond the image's noise, in contrasts.
-    explained : float
-        Explained share of the grey values' variance, noise aside.
-    blur_px : float
-        Mean standard deviation of the blur.
-    blur_cells : float
-        Standard deviation of the blur along the marker's axes, the greater, in cells.
-    """
-
-    corners: FloatArray
-    covariance: FloatArray
-    cells: FloatArray
-    cell_sigma: FloatArray
-    border: FloatArray
-    misfit: float
-    explained: float
-    blur_px: float
-    blur_cells: float
-
-
-class _Start(NamedTuple):
-    """Initial values of a fit, the pixels that it uses, and its limits."""
-
-    corners: FloatArray
-    levels: Levels
-    box: PixelBox
-    seam: Seam
-    steps: int
-    reach_px: float
+    corners: FloatArray  # (4, 2) straight pixels, in the order of the corners given
+    covariance: FloatArray  # (4, 2, 2) of each corner, pixels squared
+    cells: FloatArray  # (G * G,) whiteness of each cell of the grid by the grey values themselves
+    cell_sigma: FloatArray  # (G * G,) its standard deviation due to noise
+    border: FloatArray  # (B,) whiteness of the square's other cells
+    misfit: float  # standard deviation of what is left over beyond the noise, in contrasts
+    explained: float  # share of the grey values' variance, noise aside
+    blur_px: float  # mean standard deviation of the blur
+    blur_cells: float  # along the marker's axes, the greater, in cells
 
 
 def fit_marker(
@@ -140,326 +98,206 @@ def fit_marker(
     levels: Levels,
     effort: Effort = WHOLE_FIT,
 ) -> PatternFit | None:
-    """Fit a marker of a known pattern.
+    """Fit a marker of a known pattern by the Gauss-Newton method; None if there is none nearby.
 
-    Parameters
-    ----------
-    picture : Picture
-        The image.
-    corners : (4, 2) float64
-        Corners to begin with, straight pixels, clockwise as seen in the image.
-    templates : Templates
-        The dictionary.
-    template : int
-        Which of them.
-    levels : Levels
-        Grey levels and blur to begin with.
-    effort : Effort
-        How many pixels and steps.
-
-    Returns
-    -------
-    PatternFit or None
-        None if there is no fit near the given corners.
+    Corners (4, 2) to begin with are straight pixels, clockwise as seen in the image.
     """
-    cell_px = templates.dictionary.cell * _least_side(corners)
+    middles = 0.5 * (corners + np.roll(corners, -1, axis=0))
+    cell_px = templates.dictionary.cell * float(np.hypot(*(middles[:2] - middles[2:]).T).min())
+    pattern = pattern_of(templates.lines, templates.blackness(template))
     near = _SEAM_BLURS * levels.blur_px + _SEAM_PX
     reach = min(near, max(_LEAST_SEAM_PX, cell_px))
-    box = pixel_box(picture, corners, reach)
-    if box is None:
+    samples = _samples(picture, corners, pattern.lines, reach, near, effort.pixels)
+    if samples is None or len(samples.grey) < PARAMETERS + _SPARE_PIXELS:
         return None
-    black = templates.blackness(template)
-    pattern = Pattern(templates.lines, black, corner_signs(black))
+    noise = max(picture.noise, LEAST_NOISE)
     reach_px = max(_REACH_PX, _REACH_CELLS * cell_px)
-    seam = Seam(reach, near, effort.pixels)
-    start = _Start(corners, levels, box, seam, effort.steps, reach_px)
-    found, fitted, covariance, (values, sigma), blur, contrast, rest, explained = _fit_pattern(
-        picture, pattern, start
-    )
-    if not found:
+    centre = corners.mean(axis=0)
+    solution = _solved(samples, pattern, corners - centre, levels, noise, reach_px, effort.steps)
+    if solution is None:
         return None
-    grid = templates.grid
-    outside = np.ones(black.shape, dtype=bool)
-    outside[grid, grid] = False
-    excess = math.sqrt(max(0.0, rest**2 - max(picture.noise, LEAST_NOISE) ** 2))
+    p, model, left, inverse = solution
+
+    energy = left.weight * left.residual**2
+    variance = max(energy.sum() / max(left.weight.sum() - PARAMETERS, 1.0), noise**2)
+    homography = _homography_of(p)
+    by_homography = corners_by_homography(homography)
+    whole = by_homography @ inverse[HOMOGRAPHY, HOMOGRAPHY] @ by_homography.T
+    whole *= variance * _inflation(samples.pixel, left)
+    if not (np.all(np.isfinite(whole)) and np.all(np.diag(whole) > 0.0)):
+        return None
+    products, squares = cell_sums(samples, pattern, model, left.residual)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        cells = np.where(squares > 0.0, 1.0 - pattern.black + products / squares, 0.5)
+        sigma = np.sqrt(variance / squares)
+    outside = np.ones(cells.shape, dtype=bool)
+    outside[templates.grid, templates.grid] = False
+    contrast = max(float(p[WHITE.start] - p[BLACK.start]), 1e-3)
+    unexplained = float(np.mean(left.residual**2)) - picture.noise**2
+    total = max(float(np.var(samples.grey)), 1e-9)
     return PatternFit(
-        corners=fitted,
-        covariance=covariance,
-        cells=values[grid, grid].ravel(),
-        cell_sigma=sigma[grid, grid].ravel(),
-        border=values[outside],
-        misfit=excess / max(contrast, 1e-3),
-        explained=explained,
-        blur_px=math.sqrt(0.5 * (blur[0] + blur[2])),
-        blur_cells=_blur_along_axes(fitted, blur) / templates.dictionary.cell,
+        corners=corners_of(homography) + centre,
+        covariance=np.einsum("kikj->kij", whole.reshape(4, 2, 4, 2)),
+        cells=cells[templates.grid, templates.grid].ravel(),
+        cell_sigma=sigma[templates.grid, templates.grid].ravel(),
+        border=cells[outside],
+        misfit=math.sqrt(variance - noise**2) / contrast,
+        explained=1.0 - max(0.0, unexplained) / total,
+        blur_px=math.sqrt(0.5 * (model.blur[0] + model.blur[2])),
+        blur_cells=_blur_along_axes(homography, model.blur) / templates.dictionary.cell,
     )
 
 
-def _blur_along_axes(corners: FloatArray, covariance: FloatArray) -> float:
-    """Standard deviation of the blur in the marker's middle, along its axes, in its widths."""
-    h = square_homography(corners)
-    w = 0.5 * (h[2, 0] + h[2, 1]) + 1.0
-    middle = (0.5 * (h[:2, 0] + h[:2, 1]) + h[:2, 2]) / w
-    px_per_width = (h[:2, :2] - np.outer(middle, h[2, :2])) / w
-    widths_per_px = np.linalg.inv(px_per_width)
-    uu, uv, vv = covariance
-    blur = widths_per_px @ np.array([[uu, uv], [uv, vv]]) @ widths_per_px.T
-    return float(np.sqrt(np.diag(blur).max()))
-
-
-def _least_side(corners: FloatArray) -> float:
-    """Least distance of opposite edges' middles, pixels."""
-    middles = 0.5 * (corners + np.roll(corners, -1, axis=0))
-    return float(min(np.hypot(*(middles[0] - middles[2])), np.hypot(*(middles[1] - middles[3]))))
-
-
-@njit(cache=True, error_model="numpy")
-def _fit_pattern(picture: Picture, pattern: Pattern, start: _Start) -> _Estimate:
-    """Robust least squares of a pattern to grey values, by the Gauss-Newton method."""
-    samples = select_pixels(picture, start.corners, pattern.lines, start.box, start.seam)
-    count = len(samples.grey)
-    if count < PARAMETERS + _SPARE_PIXELS:
-        return _not_found()
-    centre = np.array([start.corners[:, 0].mean(), start.corners[:, 1].mean()])
-    at = start.corners - centre
-    size = 1.0
-    for k in range(4):
-        size = max(size, math.hypot(at[k, 0], at[k, 1]))
-    p = np.zeros(PARAMETERS)
-    p[WHITE_AT] = start.levels.white
-    p[BLACK_AT] = start.levels.black
-    p[BLUR_AT] = p[BLUR_AT + 2] = start.levels.blur_px**2
-    confine_blur(p)
-    blur_guess = p[BLUR_AT]
-    least = max(picture.noise, LEAST_NOISE)
-    left = Residuals(
-        np.empty(count),
-        np.ones(count),
-        np.zeros((count, PARAMETERS + 1)),
-        np.empty((7, len(pattern.lines))),
-    )
-    normal = np.empty((PARAMETERS, PARAMETERS))
-    right = np.empty(PARAMETERS)
-    change = np.empty(PARAMETERS)
-    squares = np.empty((PARAMETERS + 1, PARAMETERS + 1))
-    scale = -1.0
-    last_move = math.inf
-    frame = _frame_at(at, centre, size)
-    for iteration in range(start.steps + 1):
-        _linearise(samples, pattern, frame, p, scale, left)
-        _accumulate_squares(left.rows, squares)
-        normal[:] = squares[:PARAMETERS, :PARAMETERS]
-        right[:] = squares[:PARAMETERS, PARAMETERS]
-        scale = robust_sigma(left.residual, _SAMPLED_RESIDUALS, least)
-        _add_priors(normal, right, p, scale, blur_guess)
-        if iteration == start.steps or last_move < _CLOSE_ENOUGH_PX:
-            break
-        if not solve_positive(normal, right, change):
-            return _not_found()
-        move = corners_by_homography(frame.homography) @ change[:8]
-        last_move = np.abs(move).max()
-        limit = 0.35 * start.reach_px
-        shrink = min(1.0, limit / last_move) if last_move > 0.0 else 1.0
-        for k in range(4):
-            at[k, 0] += shrink * move[2 * k]
-            at[k, 1] += shrink * move[2 * k + 1]
-            off_x = at[k, 0] + centre[0] - start.corners[k, 0]
-            off_y = at[k, 1] + centre[1] - start.corners[k, 1]
-            if math.hypot(off_x, off_y) > start.reach_px:
-                return _not_found()
-        p[8:] += change[8:]
-        p[TONE_AT] = min(max(p[TONE_AT], -_LARGEST_TONE), _LARGEST_TONE)
-        largest_blur = blur_guess + (1.0 + 2.0 * blur_guess)
-        p[BLUR_AT] = min(p[BLUR_AT], largest_blur)
-        p[BLUR_AT + 2] = min(p[BLUR_AT + 2], largest_blur)
-        confine_blur(p)
-        frame = _frame_at(at, centre, size)
-    return _estimate(samples, pattern, frame, p, left, normal, at, picture.noise)
-
-
-@njit(cache=True, error_model="numpy")
-def _frame_at(at: FloatArray, centre: FloatArray, size: float) -> MarkerFrame:
-    homography = square_homography(at)
-    return MarkerFrame(homography, inverse_3x3(homography), centre[0], centre[1], size)
-
-
-@njit(cache=True, error_model="numpy")
-def _not_found() -> _Estimate:
-    none = np.empty((0, 0))
-    empty = np.empty((0, 0, 0))
-    return False, none, empty, (none, none), np.empty(0), math.nan, math.nan, math.nan
-
-
-@njit(cache=True, error_model="numpy")
-def _linearise(
+def _solved(
     samples: Samples,
     pattern: Pattern,
-    frame: MarkerFrame,
-    p: FloatArray,
-    scale: float,
-    left: Residuals,
-) -> None:
-    """Residuals, weights and weighted derivatives of all pixels; a scale below 0 weighs none."""
-    h = frame.homography
-    for k in range(len(samples.grey)):
-        x = samples.straight[k, 0] - frame.centre_x
-        y = samples.straight[k, 1] - frame.centre_y
-        at = place_on_marker(frame.inverse, x, y, p)
-        d, d_x, d_y, d_sx, d_sy, d_rho = blurred_blackness(at, pattern, left.profiles)
-        lx = x / frame.size
-        ly = y / frame.size
-        white = light_level(p, WHITE_AT, lx, ly)
-        dark = light_level(p, BLACK_AT, lx, ly)
-        light = 1.0 - d
-        toned = light + p[TONE_AT] * light * d
-        value = dark + (white - dark) * toned
-        grey = samples.grey[k]
-        g = left.rows[k]
-        # A clipped grey value says no more than that the light was at least (at most) that.
-        if (grey > 254.5 and value > 255.0 - _CLIP_ZONE) or (grey < 0.5 and value < _CLIP_ZONE):
-            left.residual[k] = 0.0
-            left.weight[k] = 1.0
-            g[:] = 0.0
-            continue
-        r = grey - value
-        weight = 1.0
-        if scale > 0.0 and abs(r) > OUTLIER * scale:
-            weight = (OUTLIER * scale / r) ** 2
-        left.residual[k] = r
-        left.weight[k] = weight
-        # d(value)/d(blackness), and from there on by the chain rule.
-        slope = -(white - dark) * (1.0 + p[TONE_AT] * (1.0 - 2.0 * light))
-        gu = slope * (d_x * at.x_u + d_y * at.y_u)
-        gv = slope * (d_x * at.x_v + d_y * at.y_v)
-        w = h[2, 0] * at.x + h[2, 1] * at.y + 1.0
-        # The pattern moves with the homography: against its own gradient.
-        g[0] = -gu * at.x / w
-        g[1] = -gu * at.y / w
-        g[2] = -gu / w
-        g[3] = -gv * at.x / w
-        g[4] = -gv * at.y / w
-        g[5] = -gv / w
-        moved = (gu * x + gv * y) / w
-        g[6] = moved * at.x
-        g[7] = moved * at.y
-        for first, share in ((WHITE_AT, toned), (BLACK_AT, 1.0 - toned)):
-            g[first] = share
-            g[first + 1] = share * lx
-            g[first + 2] = share * ly
-            g[first + 3] = share * lx * lx
-            g[first + 4] = share * lx * ly
-            g[first + 5] = share * ly * ly
-        # sigma_x^2, sigma_y^2 and their covariance are linear in the blur's.
-        sx, sy = at.sigma_x, at.sigma_y
-        fx = slope * (d_sx - d_rho * at.correlation / sx) / (2.0 * sx)
-        fy = slope * (d_sy - d_rho * at.correlation / sy) / (2.0 * sy)
-        fxy = slope * d_rho / (sx * sy)
-        g[BLUR_AT] = fx * at.x_u * at.x_u + fy * at.y_u * at.y_u + fxy * at.x_u * at.y_u
-        g[BLUR_AT + 1] = 2.0 * (fx * at.x_u * at.x_v + fy * at.y_u * at.y_v) + fxy * (
-            at.x_u * at.y_v + at.x_v * at.y_u
-        )
-        g[BLUR_AT + 2] = fx * at.x_v * at.x_v + fy * at.y_v * at.y_v + fxy * at.x_v * at.y_v
-        g[TONE_AT] = (white - dark) * light * d
-        g[PARAMETERS] = r
-        if weight != 1.0:
-            root = math.sqrt(weight)
-            for i in range(PARAMETERS + 1):
-                g[i] *= root
-
-
-@njit(cache=True, error_model="numpy")
-def _add_priors(
-    normal: FloatArray,
-    right: FloatArray,
-    p: FloatArray,
-    scale: float,
-    blur_guess: float,
-) -> None:
-    """Weak prior knowledge, in the same measure as the grey values.
-
-    Light changes little over a marker, the blur is round and about what was guessed, the tone
-    curve nearly straight.
-    """
-    variance = scale * scale
-    contrast = max(abs(p[WHITE_AT] - p[BLACK_AT]), scale)
-    for first in (WHITE_AT, BLACK_AT):
-        for i in range(first + 1, first + LIGHT_NUMBERS):
-            sigma = _SLOPE_SIGMA if i < first + 3 else _BEND_SIGMA
-            prior = variance / (sigma * contrast) ** 2
-            normal[i, i] += prior
-            right[i] -= prior * p[i]
-    for i in (BLUR_AT, BLUR_AT + 2):
-        prior = variance / (1.0 * blur_guess + 0.1) ** 2
-        normal[i, i] += prior
-        right[i] -= prior * (p[i] - blur_guess)
-    prior = variance / (0.5 * blur_guess + 0.05) ** 2
-    normal[BLUR_AT + 1, BLUR_AT + 1] += prior
-    right[BLUR_AT + 1] -= prior * p[BLUR_AT + 1]
-    prior = variance / _TONE_SIGMA**2
-    normal[TONE_AT, TONE_AT] += prior
-    right[TONE_AT] -= prior * p[TONE_AT]
-    for i in range(PARAMETERS):
-        normal[i, i] *= 1.0 + 1e-10
-
-
-@njit(cache=True, error_model="numpy")
-def _estimate(
-    samples: Samples,
-    pattern: Pattern,
-    frame: MarkerFrame,
-    p: FloatArray,
-    left: Residuals,
-    normal: FloatArray,
-    at: FloatArray,
+    corners: FloatArray,
+    levels: Levels,
     noise: float,
-) -> _Estimate:
-    """Corners, covariance and figures of a fit that has come to its end."""
-    inverse_normal = np.empty((PARAMETERS, PARAMETERS))
-    if not invert_positive(normal, inverse_normal):
-        return _not_found()
-    count = len(samples.grey)
-    rest, weight_sum, plain, mean, square = 0.0, 0.0, 0.0, 0.0, 0.0
-    for k in range(count):
-        rest += left.weight[k] * left.residual[k] ** 2
-        weight_sum += left.weight[k]
-        plain += left.residual[k] ** 2
-        mean += samples.grey[k]
-        square += samples.grey[k] ** 2
-    mean /= count
-    total = max(square - count * mean * mean, 1e-9)
-    least = max(noise, LEAST_NOISE)
-    variance = max(rest / max(weight_sum - PARAMETERS, 1.0), least * least)
-    by_homography = corners_by_homography(frame.homography)
-    whole = (
-        variance * inflation_of(samples.pixel, left)
-        * (by_homography @ inverse_normal[:8, :8].copy() @ by_homography.T)
-    )  # fmt: skip
-    corners = np.empty((4, 2))
-    covariance = np.empty((4, 2, 2))
-    for k in range(4):
-        corners[k, 0] = at[k, 0] + frame.centre_x
-        corners[k, 1] = at[k, 1] + frame.centre_y
-        covariance[k] = whole[2 * k : 2 * k + 2, 2 * k : 2 * k + 2]
-        if not (covariance[k, 0, 0] > 0.0 and covariance[k, 1, 1] > 0.0):
-            return _not_found()
-    if not (np.all(np.isfinite(whole)) and np.all(np.isfinite(corners))):
-        return _not_found()
-    cells = cell_values(samples, pattern, frame, p, left, variance)
-    explained = 1.0 - max(0.0, plain - count * noise * noise) / total
-    blur = p[BLUR_AT : BLUR_AT + 3].copy()
-    contrast = p[WHITE_AT] - p[BLACK_AT]
-    return True, corners, covariance, cells, blur, contrast, math.sqrt(variance), explained
+    reach_px: float,
+    steps: int,
+) -> tuple[FloatArray, Model, Linearised, FloatArray] | None:
+    """Parameters, model, residuals and inverse normal matrix of the best fit, if there is one.
+
+    Weak prior knowledge: light changes little over a marker, the blur is round and about what was
+    guessed, the tone curve nearly straight.
+    """
+    blur_guess = min(max(levels.blur_px**2, _LEAST_VARIANCE), _LARGEST_VARIANCE)
+    p = np.zeros(PARAMETERS)
+    p[BLUR] = blur_guess, 0.0, blur_guess
+    expected = p.copy()
+    p[HOMOGRAPHY] = square_homography(corners).flat[:8]
+    p[WHITE.start], p[BLACK.start] = levels.white, levels.black
+    sigma = np.full(PARAMETERS, np.inf)
+    sigma[BLUR] = blur_guess + 0.1, 0.5 * blur_guess + 0.05, blur_guess + 0.1
+    sigma[TONE] = _TONE_SIGMA
+    light = np.array([np.inf, _SLOPE_SIGMA, _SLOPE_SIGMA, _BEND_SIGMA, _BEND_SIGMA, _BEND_SIGMA])
+    outlier, moved = math.inf, math.inf
+    for step in range(steps + 1):
+        homography = _homography_of(p)
+        model = Model(_inverse(homography), homography[2, :2], p[WHITE], p[BLACK], p[BLUR],
+                      float(p[TONE]))  # fmt: skip
+        left = linearise(samples, pattern, model, outlier)
+        scale = robust_sigma(left.residual, noise)
+        outlier = OUTLIER * scale
+        sigma[WHITE] = sigma[BLACK] = light * max(abs(p[WHITE.start] - p[BLACK.start]), scale)
+        prior = (scale / sigma) ** 2
+        weighted = left.jacobian.T * left.weight
+        inverse = _inverse(weighted @ left.jacobian + np.diag(prior))
+        if step == steps or moved < _CLOSE_ENOUGH_PX:
+            break
+        change = inverse @ (weighted @ left.residual + prior * (expected - p))
+        moved = float(np.abs(corners_by_homography(homography) @ change[HOMOGRAPHY]).max())
+        change[HOMOGRAPHY] *= min(1.0, _STEP_REACHES * reach_px / max(moved, 1e-9))
+        p = p + change
+        off = corners_of(_homography_of(p)) - corners
+        if not np.hypot(*off.T).max() <= reach_px:
+            return None
+        p[TONE] = min(max(p[TONE], -_LARGEST_TONE), _LARGEST_TONE)
+        p[BLUR] = _confined(p[BLUR], min(1.0 + 3.0 * blur_guess, _LARGEST_VARIANCE))
+    return p, model, left, inverse
 
 
-@njit(cache=True, error_model="numpy")
-def _accumulate_squares(rows: FloatArray, squares: FloatArray) -> None:
-    """rows.T @ rows; a library's product would wake threads that cost more than they give."""
-    n = rows.shape[1]
-    squares[:] = 0.0
-    for k in range(rows.shape[0]):
-        row = rows[k]
-        for i in range(n):
-            factor = row[i]
-            into = squares[i]
-            for j in range(n):
-                into[j] += factor * row[j]
+def _inverse(matrix: FloatArray) -> FloatArray:
+    """The inverse of a matrix; NaN if it is singular."""
+    try:
+        return np.asarray(np.linalg.inv(matrix), np.float64)
+    except np.linalg.LinAlgError:
+        return np.full_like(matrix, np.nan)
+
+
+def _homography_of(p: FloatArray) -> FloatArray:
+    return np.append(p[HOMOGRAPHY], 1.0).reshape(3, 3)
+
+
+def _confined(blur: FloatArray, largest: float) -> FloatArray:
+    """A covariance uu, uv, vv with its variances along all directions within limits."""
+    values, vectors = np.linalg.eigh(blur[[0, 1, 1, 2]].reshape(2, 2))
+    confined = (vectors * np.clip(values, _LEAST_VARIANCE, largest)) @ vectors.T
+    return np.asarray(confined.flat[[0, 1, 3]])
+
+
+def _blur_along_axes(homography: FloatArray, blur: FloatArray) -> float:
+    """Standard deviation of the blur in the marker's middle, along its axes, in its widths."""
+    w = homography[2] @ [0.5, 0.5, 1.0]
+    middle = homography[:2] @ [0.5, 0.5, 1.0] / w
+    widths_per_px = np.linalg.inv((homography[:2, :2] - np.outer(middle, homography[2, :2])) / w)
+    covariance = widths_per_px @ blur[[0, 1, 1, 2]].reshape(2, 2) @ widths_per_px.T
+    return float(np.sqrt(np.diag(covariance).max()))
+
+
+def _inflation(pixel: NDArray[np.int64], left: Linearised) -> float:
+    """Factor of the covariance for residuals that are correlated between neighbouring pixels.
+
+    A pixel's residual that is correlated with its neighbours' by rho along a row (geometrically
+    falling off) counts as (1 - rho) / (1 + rho) of an independent one; rows and columns alike. Only
+    significant correlation is considered.
+    """
+    weighted = left.residual * np.sqrt(left.weight)
+    energy = float(np.mean(weighted**2))
+    if energy <= 0.0:
+        return 1.0
+    column, row = (pixel - pixel.min(axis=0)).T
+    image = np.full((row.max() + 1, column.max() + 1), np.nan)
+    image[row, column] = weighted
+    factor = 1.0
+    for products in (image[:, 1:] * image[:, :-1], image[1:] * image[:-1]):
+        known = products[np.isfinite(products)]
+        if len(known) > 20:
+            rho = float(known.mean()) / energy - 2.0 / math.sqrt(len(known))
+            rho = min(max(rho, 0.0), 0.8)
+            factor *= (1.0 + rho) / (1.0 - rho)
+    return factor
+
+
+def _samples(
+    picture: Picture,
+    corners: FloatArray,
+    lines: FloatArray,
+    reach: float,
+    near: float,
+    most: int,
+) -> Samples | None:
+    """Pixels of a marker and of a seam of `reach` pixels round it; None if it leaves the image.
+
+    Of too many, those within `near` pixels of the cells' ends (`lines`) go on as far as possible.
+    """
+    along = np.linspace(0.0, 1.0, 5)[:, None, None]
+    outline = (1.0 - along) * corners + along * np.roll(corners, -1, axis=0)
+    pixels = picture.lens.bend(outline.reshape(-1, 2))
+    low, high = pixels.min(axis=0), pixels.max(axis=0)
+    last = np.array(picture.grey.shape[::-1]) - 1
+    if not (np.all(low >= 0.0) and np.all(high <= last)):
+        return None
+    pad = 1.5 * reach + 2.0
+    begin, end = np.maximum(0, (low - pad).astype(int)), np.minimum(last, (high + pad).astype(int))
+    # Every n-th pixel is used, and far from the cells' ends every 10 n-th, as if at random.
+    area = abs(signed_area(corners))
+    side = math.sqrt(area)
+    expected = area + reach * 4.0 * side
+    share = 1.0 - (1.0 - min(1.0, 2.0 * near * len(lines) / side)) ** 2
+    every = math.ceil(expected * (share + 0.1) / most) if expected > most else 1
+    u, v = np.meshgrid(*(np.arange(a, b + 1) for a, b in zip(begin, end)))
+    hashed = (u * 73856093) ^ (v * 19349663)
+    some = hashed % every == 0
+    pixel, hashed = np.stack([u[some], v[some]], axis=-1), hashed[some]
+    straight = picture.lens.straighten(pixel.astype(np.float64))
+    inverse = _inverse(square_homography(corners))
+    projected = straight @ inverse[:, :2].T + inverse[:, 2]
+    q = projected[:, 2:]
+    place = projected[:, :2] / q
+    # Widths of the marker per pixel, along its axes.
+    widths = np.hypot(
+        inverse[:2, 0] - place * inverse[2, 0], inverse[:2, 1] - place * inverse[2, 1]
+    )
+    widths /= q
+    inside = np.abs(place - 0.5) <= np.minimum(0.5 + reach * widths, 1.5)
+    used = np.all(inside & (q > 0.0), axis=1)
+    if expected > most:
+        apart = np.abs(place[:, :, None] - lines).min(axis=-1)
+        used &= np.any(apart < near * widths, axis=1) | (hashed % (10 * every) == 0)
+    pixel, straight = pixel[used], straight[used]
+    centre = corners.mean(axis=0)
+    size = max(1.0, float(np.hypot(*(corners - centre).T).max()))
+    grey = picture.grey[pixel[:, 1], pixel[:, 0]].astype(np.float64)
+    return Samples(pixel, straight - centre, grey, size)

@@ -16,59 +16,58 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from detect.markers.homography import project
+from detect.markers.quadrangle import project
 
-#: Parameters: 8 of the homography, 6 of white and 6 of black (level, along x, along y, x^2, xy,
-#: y^2), 3 of the blur's covariance (uu, uv, vv; px^2), 1 of the tone curve.
+FloatArray = NDArray[np.float64]
+
+#: Columns of the Jacobian, for each part of a `Model`; the homography's last entry is 1.
 PARAMETERS = 24
-#: Where white, black, blur and tone curve begin among the parameters, and the numbers of a light.
-WHITE_AT, BLACK_AT, BLUR_AT, TONE_AT = 8, 14, 20, 23
-LIGHT_NUMBERS = 6
+HOMOGRAPHY, WHITE, BLACK = slice(0, 8), slice(8, 14), slice(14, 20)
+BLUR, TONE = slice(20, 23), 23
 
-_LEAST_VARIANCE = 0.07
-_LARGEST_VARIANCE = 60.0
+#: Clipped pixels do not count if the model is this near the limit, grey levels, or beyond.
+_CLIP_ZONE = 6.0
+#: Standard deviations beyond which the normal distribution is 0 or 1.
 _REACH = 3.6
 #: Twice the negative exponent beyond which a cell's corner adds nothing: exp(-6) and less.
 _FAR_FROM_CORNER = 12.0
-_ROOT_HALF = math.sqrt(0.5)
-_ROOT_2PI = math.sqrt(2.0 * math.pi)
-_LEAST_CORRELATION = 0.02
-_LARGEST_CORRELATION = 0.96
-#: Nodes and weights of Gauss and Legendre's quadrature over (0, 1).
-NODES = np.array([0.1127016653792583, 0.5, 0.8872983346207417])
-_WEIGHTS = np.array([0.2777777777777778, 0.4444444444444444, 0.2777777777777778])
+_LEAST_CORRELATION, _LARGEST_CORRELATION = 0.02, 0.96
+_ROOT_HALF, _ROOT_2PI = math.sqrt(0.5), math.sqrt(2.0 * math.pi)
+#: Gauss and Legendre's quadrature over (0, 1).
+NODES = (0.1127016653792583, 0.5, 0.8872983346207417)
+_WEIGHTS = (0.2777777777777778, 0.4444444444444444, 0.2777777777777778)
 
 
 class Pattern(NamedTuple):
-    """A pattern of black and white cells on the marker's unit square.
+    """A pattern of black and white cells on the marker's unit square."""
 
-    Attributes
-    ----------
-    lines : (L,) float64
-        Where cells end, in widths of the marker, from 0 to 1; along both axes.
-    black : (L - 1, L - 1) float64
-        1 where the pattern is black.
-    corner : (L, L) float64
-        Mixed differences of the pattern: the weights of the cells' corners.
-    """
+    lines: FloatArray  # (L,) where cells end along both axes, widths of the marker, from 0 to 1
+    black: FloatArray  # (L - 1, L - 1) 1 where the pattern is black
+    corner: FloatArray  # (L, L) mixed differences of the pattern: weights of the cells' corners
 
-    lines: NDArray[np.float64]
-    black: NDArray[np.float64]
-    corner: NDArray[np.float64]
+
+class Samples(NamedTuple):
+    """Pixels to which a marker is fitted, row by row."""
+
+    pixel: NDArray[np.int64]  # (N, 2) u, v
+    straight: FloatArray  # (N, 2) without distortion, from the marker's middle, pixels
+    grey: FloatArray  # (N,)
+    size: float  # distance of the farthest corner from the middle, pixels
+
+
+class Model(NamedTuple):
+    """How a marker is seen."""
+
+    inverse: FloatArray  # (3, 3) homography from straight positions to the unit square
+    denominator: FloatArray  # (2,) h20 and h21 of the homography from the unit square
+    white: FloatArray  # (6,) grey level: factors of 1, x, y, x^2, xy, y^2 in sizes
+    black: FloatArray  # (6,)
+    blur: FloatArray  # (3,) covariance uu, uv, vv, pixels squared
+    tone: float  # bend of the tone curve
 
 
 class MarkerPlace(NamedTuple):
-    """Where a pixel is on the marker, and how the blur lies there.
-
-    Attributes
-    ----------
-    x, y : float
-        In widths of the marker.
-    x_u, x_v, y_u, y_v : float
-        Their derivatives with respect to the pixel's straight position.
-    sigma_x, sigma_y, correlation : float
-        Of the blur, along the marker's axes.
-    """
+    """A pixel's place on the marker in widths, by its straight position, and the blur there."""
 
     x: float
     y: float
@@ -81,44 +80,53 @@ class MarkerPlace(NamedTuple):
     correlation: float
 
 
-def corner_signs(black: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(n + 1, n + 1) mixed differences of a pattern (n, n): what its corners weigh."""
-    return np.diff(np.diff(np.pad(black, 1), axis=0), axis=1)
+class Blackness(NamedTuple):
+    """The blurred pattern at a place, 1 for black, and its derivatives."""
+
+    value: float
+    by_x: float
+    by_y: float
+    by_sigma_x: float
+    by_sigma_y: float
+    by_correlation: float
+
+
+class Linearised(NamedTuple):
+    """A model at N pixels."""
+
+    residual: FloatArray  # (N,)
+    weight: FloatArray  # (N,) of robust least squares
+    jacobian: FloatArray  # (N, PARAMETERS)
+
+
+def pattern_of(lines: FloatArray, black: FloatArray) -> Pattern:
+    """A pattern with the weights of its corners."""
+    return Pattern(lines, black, np.diff(np.diff(np.pad(black, 1), axis=0), axis=1))
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def cell_profile(
-    x: float,
-    sigma: float,
-    lines: NDArray[np.float64],
-    z: NDArray[np.float64],
-    cdf: NDArray[np.float64],
-    pdf: NDArray[np.float64],
+def _cell_profile(
+    x: float, sigma: float, lines: FloatArray, z: FloatArray, cdf: FloatArray, pdf: FloatArray
 ) -> tuple[int, int]:
     """Normal distribution at the cells' ends; returns the cells from, to that have a share."""
     n = len(lines)
-    first = 0
-    last = n
+    first, last = 0, n - 1
     for k in range(n):
-        t = (lines[k] - x) / sigma
-        z[k] = t
-        if t <= -_REACH:
-            cdf[k] = 0.0
-            pdf[k] = 0.0
+        z[k] = (lines[k] - x) / sigma
+        if z[k] <= -_REACH:
+            cdf[k], pdf[k] = 0.0, 0.0
             first = k
-        elif t >= _REACH:
-            cdf[k] = 1.0
-            pdf[k] = 0.0
-            if last == n:
-                last = k
+        elif z[k] >= _REACH:
+            cdf[k], pdf[k] = 1.0, 0.0
+            last = min(last, k)
         else:
-            cdf[k] = 0.5 * (1.0 + math.erf(t * _ROOT_HALF))
-            pdf[k] = math.exp(-0.5 * t * t) / _ROOT_2PI
-    return first, min(last, n - 1)
+            cdf[k] = 0.5 * (1.0 + math.erf(z[k] * _ROOT_HALF))
+            pdf[k] = math.exp(-0.5 * z[k] * z[k]) / _ROOT_2PI
+    return first, last
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def corner_excess(h: float, k: float, sines: NDArray[np.float64], angle: float) -> float:
+def corner_excess(h: float, k: float, sines: tuple[float, float, float], angle: float) -> float:
     """Bivariate normal distribution at (h, k) less the product of its margins.
 
     Drezner and Wesolowsky, "On the computation of the bivariate normal integral", 1990. `sines`
@@ -132,93 +140,61 @@ def corner_excess(h: float, k: float, sines: NDArray[np.float64], angle: float) 
 
 
 @njit(cache=True, error_model="numpy")
-def blurred_blackness(
-    at: MarkerPlace, pattern: Pattern, profiles: NDArray[np.float64]
-) -> tuple[float, float, float, float, float, float]:
-    """Blurred pattern at a place, and its derivatives.
-
-    Parameters
-    ----------
-    at, pattern
-        The place and the pattern.
-    profiles : (7, L) float64
-        Working memory.
-
-    Returns
-    -------
-    blackness, by_x, by_y, by_sigma_x, by_sigma_y, by_correlation : float
-        1 is black, 0 white.
-    """
-    black = pattern.black
-    sx, sy, rho = at.sigma_x, at.sigma_y, at.correlation
-    zx, cx, px = profiles[0], profiles[1], profiles[2]
-    zy, cy, py = profiles[3], profiles[4], profiles[5]
-    x0, x1 = cell_profile(at.x, sx, pattern.lines, zx, cx, px)
-    y0, y1 = cell_profile(at.y, sy, pattern.lines, zy, cy, py)
-    value, by_x, by_y, by_sx, by_sy = 0.0, 0.0, 0.0, 0.0, 0.0
+def blurred_blackness(at: MarkerPlace, pattern: Pattern, work: FloatArray) -> Blackness:
+    """Blurred pattern at a place; `work` is memory of (6, L)."""
+    sx, sy = at.sigma_x, at.sigma_y
+    zx, cx, px, zy, cy, py = work[0], work[1], work[2], work[3], work[4], work[5]
+    x0, x1 = _cell_profile(at.x, sx, pattern.lines, zx, cx, px)
+    y0, y1 = _cell_profile(at.y, sy, pattern.lines, zy, cy, py)
+    value, by_x, by_y, by_sx, by_sy, by_rho = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for j in range(y0, y1):
-        wy = cy[j + 1] - cy[j]
-        wy_y = -(py[j + 1] - py[j]) / sy
-        wy_s = -(zy[j + 1] * py[j + 1] - zy[j] * py[j]) / sy
         row, row_x, row_s = 0.0, 0.0, 0.0
         for i in range(x0, x1):
-            if black[j, i] != 0.0:
+            if pattern.black[j, i] != 0.0:
                 row += cx[i + 1] - cx[i]
                 row_x -= px[i + 1] - px[i]
                 row_s -= zx[i + 1] * px[i + 1] - zx[i] * px[i]
-        value += row * wy
-        by_x += row_x * wy / sx
-        by_sx += row_s * wy / sx
-        by_y += row * wy_y
-        by_sy += row * wy_s
-    by_rho = 0.0
-    if abs(rho) > _LEAST_CORRELATION:
-        r = min(max(rho, -_LARGEST_CORRELATION), _LARGEST_CORRELATION)
+        share = cy[j + 1] - cy[j]
+        value += row * share
+        by_x += row_x * share / sx
+        by_sx += row_s * share / sx
+        by_y -= row * (py[j + 1] - py[j]) / sy
+        by_sy -= row * (zy[j + 1] * py[j + 1] - zy[j] * py[j]) / sy
+    if abs(at.correlation) > _LEAST_CORRELATION:
+        r = min(max(at.correlation, -_LARGEST_CORRELATION), _LARGEST_CORRELATION)
         root = math.sqrt(1.0 - r * r)
-        far = _FAR_FROM_CORNER * (1.0 + abs(r))
         angle = math.asin(r)
-        sines = profiles[6]
-        for i in range(3):
-            sines[i] = math.sin(angle * NODES[i])
+        sines = (
+            math.sin(angle * NODES[0]), math.sin(angle * NODES[1]), math.sin(angle * NODES[2])
+        )  # fmt: skip
         for j in range(y0, y1 + 1):
-            if py[j] == 0.0:
-                continue
             for i in range(x0, x1 + 1):
-                sign = pattern.corner[j, i]
-                if px[i] == 0.0 or sign == 0.0:
-                    continue
-                h, k = zx[i], zy[j]
-                if h * h + k * k > far:
+                h, k, sign = zx[i], zy[j], pattern.corner[j, i]
+                far = h * h + k * k > _FAR_FROM_CORNER * (1.0 + abs(r))
+                if sign == 0.0 or far or px[i] == 0.0 or py[j] == 0.0:
                     continue
                 value += sign * corner_excess(h, k, sines, angle)
                 # Of the bivariate distribution less the product of its margins.
-                by_h = (
-                    sign * px[i] * (0.5 * (1.0 + math.erf((k - r * h) / root * _ROOT_HALF)) - cy[j])
-                )
-                by_k = (
-                    sign * py[j] * (0.5 * (1.0 + math.erf((h - r * k) / root * _ROOT_HALF)) - cx[i])
-                )
+                beside_h, beside_k = (h - r * k) / root, (k - r * h) / root
+                by_h = sign * px[i] * (0.5 * (1.0 + math.erf(beside_k * _ROOT_HALF)) - cy[j])
+                by_k = sign * py[j] * (0.5 * (1.0 + math.erf(beside_h * _ROOT_HALF)) - cx[i])
                 by_x -= by_h / sx
                 by_y -= by_k / sy
                 by_sx -= by_h * h / sx
                 by_sy -= by_k * k / sy
-                by_rho += (
-                    sign * px[i] * math.exp(-0.5 * ((k - r * h) / root) ** 2) / (_ROOT_2PI * root)
-                )
-    return value, by_x, by_y, by_sx, by_sy, by_rho
+                by_rho += sign * px[i] * math.exp(-0.5 * beside_k**2) / (_ROOT_2PI * root)
+    return Blackness(value, by_x, by_y, by_sx, by_sy, by_rho)
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def place_on_marker(
-    inverse: NDArray[np.float64], x: float, y: float, p: NDArray[np.float64]
-) -> MarkerPlace:
-    """Where a straight position (x, y) is on the marker, by the inverse of its homography."""
+def _place_on_marker(model: Model, x: float, y: float) -> MarkerPlace:
+    inverse = model.inverse
     mx, my, q = project(inverse, x, y)
     ax = (inverse[0, 0] - mx * inverse[2, 0]) / q
     ay = (inverse[0, 1] - mx * inverse[2, 1]) / q
     bx = (inverse[1, 0] - my * inverse[2, 0]) / q
     by = (inverse[1, 1] - my * inverse[2, 1]) / q
-    uu, uv, vv = p[BLUR_AT], p[BLUR_AT + 1], p[BLUR_AT + 2]
+    uu, uv, vv = model.blur[0], model.blur[1], model.blur[2]
     sx = math.sqrt(ax * ax * uu + 2.0 * ax * ay * uv + ay * ay * vv)
     sy = math.sqrt(bx * bx * uu + 2.0 * bx * by * uv + by * by * vv)
     rho = (ax * bx * uu + (ax * by + ay * bx) * uv + ay * by * vv) / (sx * sy)
@@ -226,26 +202,86 @@ def place_on_marker(
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def light_level(p: NDArray[np.float64], first: int, x: float, y: float) -> float:
+def _light(c: FloatArray, x: float, y: float) -> float:
     """Grey level of white or black at a place."""
-    along_x = x * (p[first + 1] + x * p[first + 3] + y * p[first + 4])
-    along_y = y * (p[first + 2] + y * p[first + 5])
-    return float(p[first] + along_x + along_y)
+    return float(c[0] + x * (c[1] + x * c[3] + y * c[4]) + y * (c[2] + y * c[5]))
 
 
 @njit(cache=True, error_model="numpy")
-def confine_blur(p: NDArray[np.float64]) -> None:
-    """Keep the blur's covariance between what a pixel does and what is still an image."""
-    mean = 0.5 * (p[BLUR_AT] + p[BLUR_AT + 2])
-    half = 0.5 * (p[BLUR_AT] - p[BLUR_AT + 2])
-    spread = math.sqrt(half * half + p[BLUR_AT + 1] ** 2)
-    high = min(max(mean + spread, _LEAST_VARIANCE), _LARGEST_VARIANCE)
-    low = min(max(mean - spread, _LEAST_VARIANCE), _LARGEST_VARIANCE)
-    if spread > 0.0:
-        c, s = half / spread, p[BLUR_AT + 1] / spread
-    else:
-        c, s = 1.0, 0.0
-    new_mean, new_half = 0.5 * (high + low), 0.5 * (high - low)
-    p[BLUR_AT] = new_mean + new_half * c
-    p[BLUR_AT + 2] = new_mean - new_half * c
-    p[BLUR_AT + 1] = new_half * s
+def linearise(samples: Samples, pattern: Pattern, model: Model, outlier: float) -> Linearised:
+    """The model at all pixels; residuals beyond `outlier` lose weight."""
+    count = len(samples.grey)
+    left = Linearised(np.zeros(count), np.ones(count), np.zeros((count, PARAMETERS)))
+    work = np.empty((6, len(pattern.lines)))
+    for n in range(count):
+        x, y = samples.straight[n, 0], samples.straight[n, 1]
+        at = _place_on_marker(model, x, y)
+        d = blurred_blackness(at, pattern, work)
+        lx, ly = x / samples.size, y / samples.size
+        dark = _light(model.black, lx, ly)
+        contrast = _light(model.white, lx, ly) - dark
+        light = 1.0 - d.value
+        toned = light + model.tone * light * d.value
+        value = dark + contrast * toned
+        grey = samples.grey[n]
+        # A clipped grey value says no more than that the light was at least (at most) that.
+        if (grey > 254.5 and value > 255.0 - _CLIP_ZONE) or (grey < 0.5 and value < _CLIP_ZONE):
+            continue
+        r = grey - value
+        left.residual[n] = r
+        if abs(r) > outlier:
+            left.weight[n] = (outlier / r) ** 2
+        g = left.jacobian[n]
+        # d(value)/d(blackness), and from there on by the chain rule.
+        slope = -contrast * (1.0 + model.tone * (1.0 - 2.0 * light))
+        gu = slope * (d.by_x * at.x_u + d.by_y * at.y_u)
+        gv = slope * (d.by_x * at.x_v + d.by_y * at.y_v)
+        w = model.denominator[0] * at.x + model.denominator[1] * at.y + 1.0
+        # The pattern moves with the homography: against its own gradient.
+        g[0], g[1], g[2] = -gu * at.x / w, -gu * at.y / w, -gu / w
+        g[3], g[4], g[5] = -gv * at.x / w, -gv * at.y / w, -gv / w
+        moved = (gu * x + gv * y) / w
+        g[6], g[7] = moved * at.x, moved * at.y
+        for i, term in enumerate((1.0, lx, ly, lx * lx, lx * ly, ly * ly)):
+            g[WHITE.start + i] = toned * term
+            g[BLACK.start + i] = (1.0 - toned) * term
+        # sigma_x^2, sigma_y^2 and their covariance are linear in the blur's.
+        sx, sy = at.sigma_x, at.sigma_y
+        fx = slope * (d.by_sigma_x - d.by_correlation * at.correlation / sx) / (2.0 * sx)
+        fy = slope * (d.by_sigma_y - d.by_correlation * at.correlation / sy) / (2.0 * sy)
+        fxy = slope * d.by_correlation / (sx * sy)
+        blur = g[BLUR]
+        blur[0] = fx * at.x_u**2 + fy * at.y_u**2 + fxy * at.x_u * at.y_u
+        blur[1] = 2.0 * (fx * at.x_u * at.x_v + fy * at.y_u * at.y_v)
+        blur[1] += fxy * (at.x_u * at.y_v + at.x_v * at.y_u)
+        blur[2] = fx * at.x_v**2 + fy * at.y_v**2 + fxy * at.x_v * at.y_v
+        g[TONE] = contrast * light * d.value
+    return left
+
+
+@njit(cache=True, error_model="numpy")
+def cell_sums(
+    samples: Samples, pattern: Pattern, model: Model, residual: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """For each cell (L - 1, L - 1) the sums, over all pixels, of the grey levels that a change from
+    black to white would add, times residuals and squared.
+
+    These do not spare outliers: a cell that is not what it should be must show.
+    """
+    n = len(pattern.lines) - 1
+    products, squares = np.zeros((n, n)), np.zeros((n, n))
+    work = np.empty((6, n + 1))
+    for k in range(len(samples.grey)):
+        x, y = samples.straight[k, 0], samples.straight[k, 1]
+        at = _place_on_marker(model, x, y)
+        cx, cy = work[1], work[4]
+        x0, x1 = _cell_profile(at.x, at.sigma_x, pattern.lines, work[0], cx, work[2])
+        y0, y1 = _cell_profile(at.y, at.sigma_y, pattern.lines, work[3], cy, work[5])
+        lx, ly = x / samples.size, y / samples.size
+        contrast = _light(model.white, lx, ly) - _light(model.black, lx, ly)
+        for j in range(y0, y1):
+            for i in range(x0, x1):
+                share = contrast * (cy[j + 1] - cy[j]) * (cx[i + 1] - cx[i])
+                products[j, i] += share * residual[k]
+                squares[j, i] += share * share
+    return products, squares

@@ -15,11 +15,6 @@ _LEAST_WIDTH = Bounds("4 or more", 4.0, below=True)
 _AREA_FACTOR = Bounds("above 1", 1.0, above=True, below=True)
 
 
-def _expect(condition: bool, name: str, value: object, expected: str) -> None:
-    if not condition:
-        raise DetectError(f"{name} is {value}: expected {expected}")
-
-
 @dataclass(frozen=True)
 class MarkerSettings:
     """All settings of the marker detector. The defaults are the best known.
@@ -108,7 +103,8 @@ class MarkerSettings:
     systematic_px: float = 0.005
 
     def __post_init__(self) -> None:
-        _expect(bool(self.thresholds), "thresholds", self.thresholds, "at least one number")
+        if not self.thresholds:
+            raise DetectError("thresholds is (): expected at least one number")
         demand(
             self,
             DetectError,
@@ -119,11 +115,12 @@ class MarkerSettings:
             dark_noise=NOT_NEGATIVE,
             least_width_px=_LEAST_WIDTH,
             area_factor=_AREA_FACTOR,
-            least_holes=whole(0),
             most_holes=whole(0),
+            least_holes=whole(0, self.most_holes),
             least_solidity=SHARE,
-            least_white=NOT_NEGATIVE,
             most_white=NOT_NEGATIVE,
+            least_white=Bounds(f"0 to most_white ({self.most_white})", 0.0, self.most_white,
+                               below=True),
             least_square=SHARE,
             least_contrast=NOT_NEGATIVE,
             edge_balance=SHARE,
@@ -132,19 +129,7 @@ class MarkerSettings:
             least_explained=SHARE,
             largest_cell_error=SHARE,
             systematic_px=NOT_NEGATIVE,
-        )
-        _expect(
-            0 <= self.least_holes <= self.most_holes,
-            "least_holes",
-            self.least_holes,
-            f"0 to most_holes ({self.most_holes})",
-        )
-        _expect(
-            0.0 <= self.least_white < self.most_white,
-            "least_white",
-            self.least_white,
-            f"0 to most_white ({self.most_white:g})",
-        )
+        )  # fmt: skip
 
 
 DEFAULT = MarkerSettings()

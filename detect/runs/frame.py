@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from detect.circles import CircleDetections
     from detect.line_settings import LineSettings
     from detect.lines import LineDetections
-    from detect.markers.detections import MarkerDetections
+    from detect.markers.detect import MarkerDetections
     from detect.markers.settings import MarkerSettings
     from detect.settings import CircleSettings, Levelling
     from lut import DiscTable, VerticalTable

@@ -10,8 +10,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from detect.markers.homography import inverse_3x3, square_homography
-from detect.markers.templates import templates_of
+from detect.markers.dictionaries import templates_of
+from detect.markers.quadrangle import square_homography
 
 FloatArray = NDArray[np.float64]
 
@@ -124,7 +124,7 @@ def render(
         canvas[:] = np.repeat(np.repeat(background, samples, axis=0), samples, axis=1)
     for name, number, corners in markers:
         templates = templates_of(name, (number,))
-        inverse = inverse_3x3(square_homography(np.ascontiguousarray(corners)))
+        inverse = np.asarray(np.linalg.inv(square_homography(corners)), np.float64)
         quiet = quiet_cells * templates.dictionary.cell
         _paint(
             canvas, inverse, templates.lines, templates.blackness(0), quiet, dark, light, samples
