@@ -21,9 +21,10 @@ from numpy.typing import NDArray
 from camera import Camera
 from camera.distortion import inverse_table
 from camera.kernels import camera_numbers, lens_numbers
-from detect.discs.candidates import NO_VOTES, SIGNS, Centres, Votes, best_centres, chosen
+from detect.discs.candidates import NO_VOTES, SIGNS, best_centres
 from detect.discs.centre_rows import CentreRows, every_row, rows_to_look_at
 from detect.discs.fit import blur_ratio_of, fit_settings, working_space
+from detect.discs.hough import hough_candidates
 from detect.discs.positions import published_positions as pixel_positions
 from detect.discs.positions import refined_covariances
 from detect.discs.published import published_centres, strong_and_highest
@@ -31,7 +32,7 @@ from detect.discs.quality import Wanted, blocks_of, with_zeros
 from detect.discs.quality import quality_of_centres as quality_of_centres
 from detect.discs.rim_network import RimNetwork, rim_network
 from detect.discs.search import DiscSearch, search_discs
-from detect.discs.second_look import second_looks
+from detect.discs.second_look import SecondLooks, Sought, second_looks
 from detect.errors import FrameError
 from detect.noise import estimate_noise
 from detect.settings import CircleSettings
@@ -47,9 +48,8 @@ PUBLISHED_PIXEL_VARIANCE = 2.0
 _LEAST_NOISE = 1.0
 #: Rows of an image from which its noise is estimated.
 _NOISE_ROWS = 32
-#: Where the quality is low, a centre is a candidate if the grey value steps by this much, grey
-#: levels, in this share of the directions.
-_VOTE_STEP, _VOTES = 10, 0.65
+#: Least gradient of an edge that votes, and least step of a rim, grey levels (per pixel).
+_EDGE, _LEAST_STEP = 4.0, 8.0
 #: Discs of so little more than the least evidence are for the second look, where there is one.
 _DOUBTFUL = 0.5
 
@@ -119,14 +119,13 @@ def detect_circles(
         return _without_fit(image, camera, table, settings)
     noise = estimate_noise(image, _NOISE_ROWS)
     weakest = settings.noise_floor * max(noise, _LEAST_NOISE)
-    centres = candidates_of(image, table, settings, weakest)
-    # Those of votes alone are for a second look.
-    good = centres.score >= settings.threshold
+    rows = _looked_at(table, settings)
+    centres = best_centres(image, table, settings.threshold, settings.polarity, rows)
     kernel = _kernel_camera(camera)
     pixels, found_quality, floor_xy, covariance, evidence = search_discs(
         image,
         table.floor_xy,
-        chosen(centres, good),
+        centres,
         weakest,
         _first_search(settings),
         fit_settings(noise, kernel.blur_ratio),
@@ -134,15 +133,18 @@ def detect_circles(
         working_space(),
     )
     if _looks_twice(settings):
-        more = second_looks_at(image, camera, table, settings, centres, floor_xy, noise)
-        is_disc = more.evidence >= settings.evidence
-        pixels = np.concatenate([pixels, more.pixels[is_disc]])
+        more = second_looks_at(image, camera, table, settings, floor_xy, noise)
+        is_disc = more.log_odds >= 0.0
+        more_xy = more.floor_xy[is_disc]
+        pixels = np.concatenate([pixels, np.rint(camera.project_floor(more_xy)).astype(np.int64)])
         order = np.argsort(pixels[:, 1] * image.shape[1] + pixels[:, 0], kind="stable")
         pixels = pixels[order]
         found_quality = np.concatenate([found_quality, more.quality[is_disc]])[order]
-        floor_xy = np.concatenate([floor_xy, more.place[is_disc]])[order]
-        covariance = np.concatenate([covariance, more.covariance[is_disc]])[order]
-        evidence = np.concatenate([evidence, more.evidence[is_disc]])[order]
+        floor_xy = np.concatenate([floor_xy, more_xy])[order]
+        more_covariance = refined_covariance(camera, more_xy, more.covariance[is_disc], settings)
+        covariance = np.concatenate([covariance, more_covariance])[order]
+        more_evidence = settings.evidence + more.log_odds[is_disc]
+        evidence = np.concatenate([evidence, more_evidence])[order]
     if not settings.refine:
         floor_xy, covariance = published_positions(camera, pixels)
     return CircleDetections(
@@ -159,46 +161,11 @@ def _looks_twice(settings: CircleSettings) -> bool:
     return settings.polarity != "any" and settings.verify and settings.refine
 
 
-def candidates_of(
-    image: NDArray[np.uint8], table: DiscTable, settings: CircleSettings, weakest: float
-) -> Centres:
-    """Candidate centres: maxima of the quality and, for one polarity, of the votes.
-
-    Parameters
-    ----------
-    image, table, settings
-        As of `detect_circles`.
-    weakest : float
-        Least step of the grey value, grey levels.
-    """
-    votes = NO_VOTES
-    if _looks_twice(settings):
-        votes = Votes(_vote_step(weakest), math.ceil(_VOTES * table.samples))
-    rows = _looked_at(table, settings)
-    return best_centres(image, table, settings.threshold, settings.polarity, rows, votes)
-
-
-def _vote_step(weakest: float) -> int:
-    return min(max(math.ceil(weakest), _VOTE_STEP), 254)
-
-
-class SecondLooks(NamedTuple):
-    """Candidates of the second look."""
-
-    pixels: NDArray[np.int64]
-    quality: FloatArray
-    features: FloatArray
-    place: FloatArray
-    covariance: FloatArray
-    evidence: FloatArray
-
-
 def second_looks_at(
     image: NDArray[np.uint8],
     camera: Camera,
     table: DiscTable,
     settings: CircleSettings,
-    centres: Centres,
     found_xy: FloatArray,
     noise: float,
     network: RimNetwork | None = None,
@@ -208,41 +175,23 @@ def second_looks_at(
     Parameters
     ----------
     image, camera, table, settings
-        As of `detect_circles`.
-    centres : Centres
-        See `candidates_of`.
+        As of `detect_circles`; the polarity is stated.
     found_xy : (N, 2) float64
         Discs found already, metres.
     noise : float
         Of the image, grey levels.
     network : RimNetwork, optional
         Another than the trained one.
-
-    Returns
-    -------
-    SecondLooks
-        At most one in each place; covariances as `refined_covariance` has them.
     """
-    kernel = _kernel_camera(camera)
     weakest = settings.noise_floor * max(noise, _LEAST_NOISE)
-    index, features, place, covariance, evidence = second_looks(
-        image,
-        table.floor_xy,
-        centres,
-        np.ascontiguousarray(found_xy),
-        _disc_search(settings),
-        float(_vote_step(weakest)),
-        kernel.numbers,
-        network or rim_network(),
-    )
-    return SecondLooks(
-        centres.pixels[index],
-        centres.quality[index],
-        features,
-        place,
-        refined_covariance(camera, place, covariance, settings),
-        evidence,
-    )
+    sign = SIGNS[settings.polarity]
+    edge = max(_EDGE, 0.5 * weakest)
+    candidates = hough_candidates(image, camera, table, settings.radius_m, sign, edge)
+    sought = Sought(settings.radius_m, settings.separation_m, sign, max(weakest, _LEAST_STEP))
+    return second_looks(
+        image, candidates, np.ascontiguousarray(found_xy), sought,
+        _kernel_camera(camera).numbers, network or rim_network(),
+    )  # fmt: skip
 
 
 def _without_fit(

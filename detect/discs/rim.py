@@ -40,6 +40,12 @@ RADIUS_SIGMA = 0.06
 POINT_SIGMA_PX = 0.25
 #: Fewer points than this make no circle.
 LEAST_POINTS = 6
+#: A circle is placed by this number of points at least; steps of it, and how many deviations off
+#: the others a point may be.
+LEAST_TRUSTED = 8
+_PLACING_STEPS, _FAR_OFF = 4, 2.5
+#: Stretches of directions that are left out in turn.
+_STRETCHES = 8
 #: How far the starts of the circle are from the candidate, nominal radii; the first is at it.
 _START = 0.3
 _STARTS = 9
@@ -401,10 +407,75 @@ def follow_rim(
         hidden = chosen[k] == 0.0 and chosen[following] == 0.0 and not outside[k]
         runs += 1 if hidden and chosen[last] > 0.0 else 0
     scatter = math.sqrt(squares / best_count)
-    scale_2 = radius * radius * max(1.0, squares / best_count * 4.0)
+    best, (by_xx, by_xy, by_yy) = _placed(at_x, at_y, chosen, best)
+    area = radius * radius
     return Rim(
         best_count / DIRECTIONS, visible / DIRECTIONS, runs, scatter,
         math.sqrt(mean_2) / max(abs(mean), 1e-9), mean,
         x + radius * best.x, y + radius * best.y, radius * best.radius,
-        best.cov_xx * scale_2, best.cov_xy * scale_2, best.cov_yy * scale_2, radius_px,
+        area * (best.cov_xx + by_xx), area * (best.cov_xy + by_xy), area * (best.cov_yy + by_yy),
+        radius_px,
     )  # fmt: skip
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _placed(
+    x: NDArray[np.float64], y: NDArray[np.float64], chosen: NDArray[np.float64], circle: Circle
+) -> tuple[Circle, tuple[float, float, float]]:
+    """The circle by the inner points of each stretch, and the covariance of its centre.
+
+    Where a stretch ends, the edge of what hides the rest of the rim pulls at the rim's own. Points
+    far off the others by their median deviation are left out.
+    """
+    trusted = chosen.copy()
+    count = 0
+    for k in range(DIRECTIONS):
+        if chosen[(k - 1) % DIRECTIONS] == 0.0 or chosen[(k + 1) % DIRECTIONS] == 0.0:
+            trusted[k] = 0.0
+        count += trusted[k] > 0.0
+    if count < LEAST_TRUSTED:
+        trusted[:] = chosen
+    off = np.empty(DIRECTIONS)
+    for _ in range(_PLACING_STEPS):
+        circle = fit_circle(x, y, trusted, circle)
+        n = 0
+        for k in range(DIRECTIONS):
+            if trusted[k] > 0.0:
+                residual = math.hypot(x[k] - circle.x, y[k] - circle.y) - circle.radius
+                off[n] = abs(residual) * math.sqrt(trusted[k])
+                n += 1
+        limit = max(_FAR_OFF * 1.4826 * np.median(off[:n]), 1.0)
+        for k in range(DIRECTIONS):
+            if trusted[k] > 0.0 and n > LEAST_TRUSTED:
+                residual = math.hypot(x[k] - circle.x, y[k] - circle.y) - circle.radius
+                if abs(residual) * math.sqrt(trusted[k]) > limit:
+                    trusted[k] = 0.0
+                    n -= 1
+    return circle, _by_jackknife(x, y, trusted, circle)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _by_jackknife(
+    x: NDArray[np.float64], y: NDArray[np.float64], weight: NDArray[np.float64], circle: Circle
+) -> tuple[float, float, float]:
+    """Covariance (xx, xy, yy) of a centre by leaving out each stretch of directions in turn.
+
+    Neighbouring points err together where something touches the rim: what the centre owes to one
+    stretch says how far off all of them may be (B. Efron, The Jackknife, 1982).
+    """
+    without = np.empty((_STRETCHES, 2))
+    n = 0
+    each = DIRECTIONS // _STRETCHES
+    for k in range(_STRETCHES):
+        some = weight.copy()
+        some[each * k : each * (k + 1)] = 0.0
+        if np.sum(some) == np.sum(weight) or np.sum(some) == 0.0:
+            continue
+        other = fit_circle(x, y, some, fit_circle(x, y, some, circle))
+        without[n, 0], without[n, 1] = other.x, other.y
+        n += 1
+    if n < 2:
+        return 1.0, 0.0, 1.0
+    dx, dy = without[:n, 0] - np.mean(without[:n, 0]), without[:n, 1] - np.mean(without[:n, 1])
+    share = (n - 1.0) / n
+    return share * np.sum(dx * dx), share * np.sum(dx * dy), share * np.sum(dy * dy)

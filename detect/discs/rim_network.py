@@ -57,6 +57,9 @@ class RimNetwork(NamedTuple):
     out : (N, D + F) float32
         Of the dense units and F features of the rim.
     out_bias : (N,) float32
+    quick : (2 F + 1,) float64
+        Weights of the features, of their squares, and a constant: a rim below 0 is left out before
+        any network sees it.
     """
 
     around: _Weights
@@ -67,6 +70,7 @@ class RimNetwork(NamedTuple):
     dense_bias: _Weights
     out: _Weights
     out_bias: _Weights
+    quick: NDArray[np.float64]
 
 
 @cache
@@ -74,6 +78,16 @@ def rim_network() -> RimNetwork:
     """The trained network."""
     with np.load(WEIGHTS_FILE, allow_pickle=False) as weights:
         return RimNetwork(*(np.ascontiguousarray(weights[name]) for name in RimNetwork._fields))
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def worth_the_network(features: NDArray[np.float64], network: RimNetwork) -> bool:
+    """Whether the features of a rim alone leave it a chance to be a disc's."""
+    n = len(features)
+    odds = network.quick[2 * n]
+    for f in range(n):
+        odds += features[f] * (network.quick[f] + features[f] * network.quick[n + f])
+    return bool(odds >= 0.0)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

@@ -1,149 +1,212 @@
-"""A second look at what the quality, or the fit of a whole disc, speaks against.
+"""A second look for discs of stated polarity: candidates by edges, followed round their rims.
 
 Glare or a sun patch beside a disc raises the total variance of its outlines, a cable across it
-leaves much that the fit of a disc does not explain, and far away a disc has few pixels. A person
-sees the disc all the same. Here the candidates are those centres round which the grey value steps
-in most directions (`detect.discs.quality`). What the two outlines say about the disturbed
-directions is enough to drop most of the clutter among them; round the others the rim is followed,
-and a small network (`detect.discs.rim_network`) decides by the grey values about it and by the rim.
+leaves much that the fit of a whole disc does not explain, and far away a disc has few pixels. A
+person sees the disc all the same. Here the candidates are those of the Hough transform
+(`detect.discs.hough`). Round each the rim is followed (`detect.discs.rim`), and where enough of it
+lies on a circle of the right size, a small network (`detect.discs.rim_network`) decides by the grey
+values about it and by the rim.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from detect.discs.candidates import Centres, strong_and_alone, suppress_neighbours
-from detect.discs.patch import floor_steps
-from detect.discs.rim import Rim, follow_rim, profiles
-from detect.discs.rim_network import RimNetwork, network_inputs, network_log_odds
-from detect.discs.search import DiscSearch
+from camera.kernels import project_floor_point
+from detect.discs.candidates import suppress_neighbours
+from detect.discs.hough import HoughCandidates
+from detect.discs.rim import DIRECTIONS, FARTHEST, NEAREST, STEPS, Rim, follow_rim, profiles
+from detect.discs.rim_network import (
+    RimNetwork,
+    network_inputs,
+    network_log_odds,
+    worth_the_network,
+)
 
-_DIRECTIONS = 16
-_ANGLES = 2.0 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
+FloatArray = NDArray[np.float64]
+
+#: Where grey values count as of the disc and of the floor, nominal radii.
+_INSIDE, _OUTSIDE = (0.4, 0.75), (1.25, 1.6)
+_INNER, _OUTER = 0.6, 1.4
+#: Least share of the directions in which the disc differs from the floor, and of the rim.
+_LEAST_STEPS, _LEAST_RIM = 0.35, 0.35
+_ANGLES = 2.0 * np.pi * np.arange(16) / 16
 _COS, _SIN = np.cos(_ANGLES), np.sin(_ANGLES)
-#: A direction counts with this share of the median step.
-_LEAST_STEP = 0.4
-#: Weights of the outlines' directions, deviations inside and outside, and flatness towards the
-#: rim; and the least sum that is worth following the rim.
-_OUTLINE_WEIGHTS = (0.51, -4.74, -7.14, -3.68)
-_LEAST_OUTLINE = 0.3
-#: Share of the rim that is worth the network.
-_LEAST_RIM = 0.4
 #: Nearer to a disc already found than this share of the separation nothing is looked for.
 _WITHIN = 0.75
 #: A rim followed from its own middle may lose this share and is still the better one.
 _RIM_SLACK = 0.07
 #: Radius of a rim that fits best, relative to the nominal one.
 _RIM_RADIUS = 0.98
-#: Log-odds by the network that make a disc: its training sees discs and others as they were
-#: gathered, not as often as they occur.
-_TAKEN = -0.04
+#: Log-odds by the network that make a disc.
+_TAKEN = 0.0
 #: Features of the rim, in the order of the network's weights.
 FEATURES = ("rim", "runs", "scatter", "radius", "radius_2", "size", "score")
 
 
+class Sought(NamedTuple):
+    """Which discs are looked for."""
+
+    radius: float
+    """Nominal, metres."""
+    separation: float
+    """Least distance of two discs, metres."""
+    sign: float
+    """1 for light discs, -1 for dark ones."""
+    least_step: float
+    """Least step of the grey value at a rim, grey levels."""
+
+
+class SecondLooks(NamedTuple):
+    """Candidates that were followed to the end, at most one in each place.
+
+    Attributes
+    ----------
+    features : (N, len(FEATURES)) float64
+    floor_xy : (N, 2) float64
+        Metres.
+    covariance : (N, 2, 2) float64
+        Square metres.
+    quality : (N,) float64
+        Otsu's, of the disc and the floor round its rim.
+    log_odds : (N,) float64
+        That it is a disc; above 0 it is taken for one.
+    """
+
+    features: FloatArray
+    floor_xy: FloatArray
+    covariance: FloatArray
+    quality: FloatArray
+    log_odds: FloatArray
+
+
 @njit(cache=True, error_model="numpy", nogil=True)
-def outline_steps(
+def second_looks(
     image: NDArray[np.uint8],
-    floor_xy: NDArray[np.float32],
-    u0: int,
-    v0: int,
-    search: DiscSearch,
-    sign: float,
-    step: float,
-) -> tuple[float, float]:
-    """How much the outlines look like a disc's but for some directions, and the median step there.
+    candidates: HoughCandidates,
+    found_xy: FloatArray,
+    sought: Sought,
+    camera_numbers: FloatArray,
+    network: RimNetwork,
+) -> SecondLooks:
+    """Look a second time at candidates that are not at discs already found.
 
     Parameters
     ----------
     image : (H, W) uint8
-    floor_xy : (H, W, 2) float32
-        Floor position of each pixel, metres.
-    u0, v0 : int
-        Centre.
-    search : DiscSearch
-        Radii of the disc and the outlines.
-    sign : float
-        1 for a light disc, -1 for a dark one.
-    step : float
-        Directions with a larger step are compared, grey levels.
-
-    Returns
-    -------
-    weight, median_step : float
-        Minus infinity and 0 where too few directions step so, or some are outside the image.
+    candidates : HoughCandidates
+    found_xy : (M, 2) float64
+        Places of discs already found, metres.
+    sought : Sought
+    camera_numbers : (K,) float64
+        `camera.kernels.camera_numbers`.
+    network : RimNetwork
     """
-    height, width = image.shape
-    xu, yu, xv, yv = floor_steps(floor_xy, u0, v0)
-    area = xu * yv - xv * yu
-    inside = np.empty(_DIRECTIONS)
-    near_rim = np.empty(_DIRECTIONS)
-    outside = np.empty(_DIRECTIONS)
-    if not abs(area) > 0.0:
-        return -math.inf, 0.0
-    radius = search.radius
-    at = (search.inner, 0.5 * (search.inner + radius) + 0.05 * radius, search.outer)
-    for k in range(_DIRECTIONS):
-        du = (yv * _COS[k] - xv * _SIN[k]) / area
-        dv = (xu * _SIN[k] - yu * _COS[k]) / area
-        for m in range(3):
-            u = math.floor(u0 + at[m] * du + 0.5)
-            v = math.floor(v0 + at[m] * dv + 0.5)
-            if u < 0 or v < 0 or u >= width or v >= height:
-                return -math.inf, 0.0
-            value = sign * image[v, u]
-            if m == 0:
-                inside[k] = value
-            elif m == 1:
-                near_rim[k] = value
-            else:
-                outside[k] = value
-    difference = inside - outside
-    votes = difference > step
-    if np.sum(votes) < 5:
-        return -math.inf, 0.0
-    work = np.empty(_DIRECTIONS)
+    n = len(candidates.score)
+    features = np.empty((n, len(FEATURES)))
+    place = np.empty((n, 2))
+    covariance = np.empty((n, 2, 2))
+    quality = np.empty(n)
+    log_odds = np.empty(n)
     count = 0
-    for k in range(_DIRECTIONS):
-        if votes[k]:
-            work[count] = difference[k]
+    for i in range(n):
+        x, y = candidates.floor_xy[i, 0], candidates.floor_xy[i, 1]
+        if _near_any(found_xy, x, y, _WITHIN * sought.separation):
+            continue
+        contrast = _contrast(image, camera_numbers, candidates.floor_xy[i], sought)
+        if contrast == 0.0:
+            continue
+        rim = follow_rim(image, camera_numbers, x, y, sought.radius, sought.sign * contrast)
+        if rim.agreeing < _LEAST_RIM:
+            continue
+        _note_rim(rim, sought.radius, candidates.score[i], features[count])
+        if not worth_the_network(features[count], network):
+            continue
+        again = follow_rim(image, camera_numbers, rim.x, rim.y, sought.radius, rim.step)
+        if again.agreeing >= rim.agreeing - _RIM_SLACK:
+            rim = again
+        if _near_any(found_xy, rim.x, rim.y, sought.separation):
+            continue
+        if _near_any(place[:count], rim.x, rim.y, 0.1 * sought.radius):
+            continue
+        _note_rim(rim, sought.radius, candidates.score[i], features[count])
+        grey, scale = profiles(image, camera_numbers, rim.x, rim.y, sought.radius)
+        inputs, scales = network_inputs(grey, scale, sought.sign)
+        log_odds[count] = network_log_odds(inputs, scales, features[count], network) - _TAKEN
+        quality[count] = _quality(grey)
+        place[count, 0], place[count, 1] = rim.x, rim.y
+        covariance[count, 0, 0], covariance[count, 1, 1] = rim.cov_xx, rim.cov_yy
+        covariance[count, 0, 1] = covariance[count, 1, 0] = rim.cov_xy
+        count += 1
+    best = np.flatnonzero(suppress_neighbours(place[:count], log_odds[:count], sought.separation))
+    return SecondLooks(features[best], place[best], covariance[best], quality[best], log_odds[best])
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _near_any(places: FloatArray, x: float, y: float, distance: float) -> bool:
+    for k in range(len(places)):
+        if (places[k, 0] - x) ** 2 + (places[k, 1] - y) ** 2 < distance * distance:
+            return True
+    return False
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _between(grey: FloatArray, bounds: tuple[float, float]) -> FloatArray:
+    """Mean grey value of each direction between two distances, nominal radii."""
+    per_step = (FARTHEST - NEAREST) / (STEPS - 1)
+    first = round((bounds[0] - NEAREST) / per_step)
+    last = round((bounds[1] - NEAREST) / per_step)
+    mean = np.empty(DIRECTIONS)
+    for k in range(DIRECTIONS):
+        mean[k] = np.mean(grey[k, first : last + 1])
+    return mean
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _contrast(
+    image: NDArray[np.uint8], numbers: FloatArray, at: FloatArray, sought: Sought
+) -> float:
+    """Median step over those directions that step enough; 0 where these are too few."""
+    u0, v0 = project_floor_point(numbers, at[0], at[1])
+    ux, vx = project_floor_point(numbers, at[0] + sought.radius, at[1])
+    uy, vy = project_floor_point(numbers, at[0], at[1] + sought.radius)
+    height, width = image.shape
+    steps = np.empty(len(_COS))
+    count = 0
+    for k in range(len(_COS)):
+        du = _COS[k] * (ux - u0) + _SIN[k] * (uy - u0)
+        dv = _COS[k] * (vx - v0) + _SIN[k] * (vy - v0)
+        u1, v1 = math.floor(u0 + _INNER * du + 0.5), math.floor(v0 + _INNER * dv + 0.5)
+        u2, v2 = math.floor(u0 + _OUTER * du + 0.5), math.floor(v0 + _OUTER * dv + 0.5)
+        if min(u1, u2, v1, v2) < 0 or max(u1, u2) >= width or max(v1, v2) >= height:
+            continue
+        step = sought.sign * (float(image[v1, u1]) - float(image[v2, u2]))
+        if step > sought.least_step:
+            steps[count] = step
             count += 1
-    median = _median(work, count)
-    work[:] = inside
-    level = _median(work, _DIRECTIONS)
-    work[:] = np.abs(inside - level)
-    spread = _median(work, _DIRECTIONS)
-    work[:] = np.abs(near_rim - inside)
-    slope = _median(work, _DIRECTIONS)
-    weights = _OUTLINE_WEIGHTS
-    weight = (
-        weights[0] * np.sum(difference > _LEAST_STEP * median)
-        + weights[1] * min(spread / median, 1.2)
-        + weights[2] * min(_about_plane(outside, votes, _COS, _SIN) / median, 1.2)
-        + weights[3] * min(slope / median, 1.2)
-    )
-    return float(weight), median
+    return float(np.median(steps[:count])) if count >= _LEAST_STEPS * len(_COS) else 0.0
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _median(values: NDArray[np.float64], count: int) -> float:
-    """Median of the first few of some values, which are sorted."""
-    for i in range(1, count):
-        value = values[i]
-        k = i
-        while k > 0 and values[k - 1] > value:
-            values[k] = values[k - 1]
-            k -= 1
-        values[k] = value
-    return float(0.5 * (values[(count - 1) // 2] + values[count // 2]))
+def _quality(grey: FloatArray) -> float:
+    """Between-class over total variance of the grey values inside and outside."""
+    inside, outside = _between(grey, _INSIDE), _between(grey, _OUTSIDE)
+    seen = np.isfinite(inside) & np.isfinite(outside)
+    inside, outside = inside[seen], outside[seen]
+    if len(inside) == 0:
+        return 0.0
+    between = 0.25 * (np.mean(inside) - np.mean(outside)) ** 2
+    total = between + 0.5 * (np.var(inside) + np.var(outside))
+    return float(between / total) if total > 0.0 else 0.0
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _note_rim(rim: Rim, radius: float, score: float, out: NDArray[np.float64]) -> None:
+def _note_rim(rim: Rim, radius: float, score: float, out: FloatArray) -> None:
     """The features of the rim, each bounded, for a single one is never to decide."""
     off = abs(math.log(min(max(rim.radius / radius, 0.3), 3.0) / _RIM_RADIUS))
     out[0] = rim.agreeing
@@ -152,137 +215,4 @@ def _note_rim(rim: Rim, radius: float, score: float, out: NDArray[np.float64]) -
     out[3] = off
     out[4] = 10.0 * off * off
     out[5] = math.log(min(max(rim.radius_px, 3.0), 30.0) / 6.0)
-    out[6] = score
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def second_looks(
-    image: NDArray[np.uint8],
-    floor_xy: NDArray[np.float32],
-    centres: Centres,
-    found_xy: NDArray[np.float64],
-    search: DiscSearch,
-    step: float,
-    camera_numbers: NDArray[np.float64],
-    network: RimNetwork,
-) -> tuple[
-    NDArray[np.int64],
-    NDArray[np.float64],
-    NDArray[np.float64],
-    NDArray[np.float64],
-    NDArray[np.float64],
-]:
-    """Look a second time at candidates that are not at discs already found.
-
-    Parameters
-    ----------
-    image : (H, W) uint8
-    floor_xy : (H, W, 2) float32
-        Floor position of each pixel, metres.
-    centres : Centres
-        Candidates; the contrast's sign says which discs are looked for.
-    found_xy : (M, 2) float64
-        Places of discs already found, metres.
-    search : DiscSearch
-    step : float
-        Directions with a larger step are compared first, grey levels.
-    camera_numbers : (K,) float64
-        `camera.kernels.camera_numbers`.
-    network : RimNetwork
-
-    Returns
-    -------
-    index : (L,) int64
-        Which candidates were followed to the end: of those at one place the best.
-    features : (L, len(FEATURES)) float64
-    place : (L, 2) float64
-        Metres.
-    covariance : (L, 2, 2) float64
-        Of the place, square metres.
-    evidence : (L,) float64
-        Log-odds, on the scale of `DiscSearch.least_evidence`.
-    """
-    index = strong_and_alone(
-        centres.pixels, centres.score, centres.contrast, floor_xy, 0.0, 0.5 * search.separation
-    )
-    n = len(index)
-    features = np.empty((n, len(FEATURES)))
-    place = np.empty((n, 2))
-    covariance = np.empty((n, 2, 2))
-    evidence = np.empty(n)
-    count = 0
-    for i in index:
-        u, v = centres.pixels[i, 0], centres.pixels[i, 1]
-        x, y = np.float64(floor_xy[v, u, 0]), np.float64(floor_xy[v, u, 1])
-        if _near_any(found_xy, x, y, _WITHIN * search.separation):
-            continue
-        sign = 1.0 if centres.contrast[i] > 0.0 else -1.0
-        weight, median = outline_steps(image, floor_xy, u, v, search, sign, step)
-        if weight < _LEAST_OUTLINE:
-            continue
-        rim = follow_rim(image, camera_numbers, x, y, search.radius, sign * median)
-        if rim.agreeing < _LEAST_RIM:
-            continue
-        again = follow_rim(image, camera_numbers, rim.x, rim.y, search.radius, rim.step)
-        if again.agreeing >= rim.agreeing - _RIM_SLACK:
-            rim = again
-        if _near_any(found_xy, rim.x, rim.y, search.separation):
-            continue
-        _note_rim(rim, search.radius, centres.score[i], features[count])
-        grey, scale = profiles(image, camera_numbers, rim.x, rim.y, search.radius)
-        inputs, scales = network_inputs(grey, scale, sign)
-        log_odds = network_log_odds(inputs, scales, features[count], network)
-        index[count] = i
-        place[count, 0], place[count, 1] = rim.x, rim.y
-        covariance[count, 0, 0], covariance[count, 1, 1] = rim.cov_xx, rim.cov_yy
-        covariance[count, 0, 1] = covariance[count, 1, 0] = rim.cov_xy
-        evidence[count] = search.least_evidence + log_odds - _TAKEN
-        count += 1
-    best = np.flatnonzero(suppress_neighbours(place[:count], evidence[:count], search.separation))
-    return index[best], features[best], place[best], covariance[best], evidence[best]
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def _near_any(places: NDArray[np.float64], x: float, y: float, distance: float) -> bool:
-    for k in range(len(places)):
-        if (places[k, 0] - x) ** 2 + (places[k, 1] - y) ** 2 < distance * distance:
-            return True
-    return False
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def _about_plane(
-    level: NDArray[np.float64],
-    counted: NDArray[np.bool_],
-    cos: NDArray[np.float64],
-    sin: NDArray[np.float64],
-) -> float:
-    """Root mean square of some levels about a + b cos + c sin of their directions.
-
-    Solved by elimination: NumPy's own would have Numba look LAPACK up at the first call, which an
-    interrupt must not meet.
-    """
-    products = np.zeros((3, 3))
-    sums = np.zeros(3)
-    squares = 0.0
-    n = 0
-    for k in range(len(level)):
-        if counted[k]:
-            term = (1.0, cos[k], sin[k])
-            n += 1
-            squares += level[k] * level[k]
-            for i in range(3):
-                sums[i] += term[i] * level[k]
-                for j in range(3):
-                    products[i, j] += term[i] * term[j]
-    for i in range(3):
-        products[i, i] += 1e-6
-    explained = 0.0
-    for i in range(3):
-        explained += sums[i] * sums[i] / products[i, i]
-        for j in range(i + 1, 3):
-            share = products[j, i] / products[i, i]
-            sums[j] -= share * sums[i]
-            for k in range(i, 3):
-                products[j, k] -= share * products[i, k]
-    return math.sqrt(max(squares - explained, 0.0) / n)
+    out[6] = min(score, 12.0)

@@ -62,6 +62,34 @@ class Accuracy:
 
 
 @dataclass(frozen=True)
+class Disturbed:
+    """Discs partly hidden, stained, badly lit or blurred, and look-alikes, rendered: what is found.
+
+    Parameters
+    ----------
+    camera : Path
+        Calibration to render and detect through.
+    discs : int
+        Discs of each family and share.
+    shares : tuple of float
+        Of the rim that are disturbed.
+    polarity : str
+        Stated to the detector; the discs are light.
+    seed : int
+        Of scenes and noise.
+    picture : Path
+        Draw one disc of every family, and detect nothing.
+    """
+
+    camera: Path = Path("images/e/e.cam")
+    discs: int = 100
+    shares: tuple[float, ...] = (0.2, 0.3, 0.4)
+    polarity: Literal["light", "any"] = "light"
+    seed: int = 1
+    picture: Path | None = None
+
+
+@dataclass(frozen=True)
 class Photographs:
     """Detect the discs of every folder below DATA/dev and score them with DATA/evaluate.py.
 
@@ -142,6 +170,8 @@ class TrainRimNetwork:
         Folder with `rendered` and `dlr`.
     every : int
         Every n-th frame of the recorded run is used.
+    scenes : int
+        Rendered floors with disturbed discs.
     seed : int
         Of the disturbances and the networks.
     output : Path
@@ -152,6 +182,7 @@ class TrainRimNetwork:
 
     data: Positional[Path] = Path("../shared/data")
     every: int = 4
+    scenes: int = 600
     seed: int = 1
     output: Path = Path("build/rim_network.npz")
     force: bool = False
@@ -221,6 +252,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run a subcommand; returns the exit code."""
     command = tyro.cli(
         Annotated[Accuracy, subcommand("accuracy")]
+        | Annotated[Disturbed, subcommand("disturbed")]
         | Annotated[Photographs, subcommand("photographs")]
         | Annotated[Rendered, subcommand("rendered")]
         | Annotated[Buildings, subcommand("buildings")]
@@ -240,6 +272,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _carry_out(
     command: Accuracy
+    | Disturbed
     | Photographs
     | Rendered
     | Buildings
@@ -255,6 +288,8 @@ def _carry_out(
         return evaluate_markers(command)
     if isinstance(command, Accuracy):
         return _accuracy(command)
+    if isinstance(command, Disturbed):
+        return _disturbed(command)
     if isinstance(command, Photographs):
         return _photographs(command)
     if isinstance(command, Rendered):
@@ -288,7 +323,7 @@ def _carry_out(
 
 
 def _train_rim_network(command: TrainRimNetwork) -> int:
-    looks = gather(command.data, command.every, command.seed)
+    looks = gather(command.data, command.every, command.scenes, command.seed)
     print(f"{len(looks.is_disc)} looks, {looks.is_disc.sum()} at discs")
     for line in cross_validation(looks, command.seed):
         print(line)
@@ -327,6 +362,26 @@ def _accuracy(command: Accuracy) -> int:
                     f"  {result.normalised_error[chosen].mean():9.3f}"
                 )
         print(f"         both coordinates {result.rms_px:.4f} px rms, {result.failed} failed")
+    return 0
+
+
+def _disturbed(command: Disturbed) -> int:
+    import cv2
+
+    from tools.evaluation.disturbed import measure, picture_of, table_of
+
+    camera = read_camera(command.camera)
+    settings = CircleSettings(polarity=command.polarity, tilt_sigma_deg=0.0)
+    if command.picture is not None:
+        picture = picture_of(camera, settings.radius_m, command.shares[-1], command.seed)
+        _, png = cv2.imencode(".png", picture)
+        with write_whole(command.picture, overwrite=True) as stream:
+            stream.write(png.tobytes())
+        return 0
+    results = measure(
+        camera, settings, discs=command.discs, shares=command.shares, seed=command.seed
+    )
+    print(table_of(list(results)))
     return 0
 
 

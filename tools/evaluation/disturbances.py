@@ -1,160 +1,251 @@
-"""Discs of real images, disturbed as the floors of buildings disturb them, with known places."""
+"""What dirt, light and furniture do to the picture of a disc on the floor, and what resembles one.
+
+Everything happens on the floor round one disc, in units of its radius. A disturbance is a shape,
+whose size follows from the share of the rim that is to lie under it, and what it does to the grey
+values there. The same functions change real images (`disturbed`, `replaced`: for training) and the
+supersampled scenes of `tools.evaluation.disturbed`.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
 
-#: A disturbed disc is used if this share of its rim is not hidden, and as much still steps by so
-#: many grey levels.
-_LEAST_RIM = 0.62
-_LEAST_STEP = 8.0
+#: Signed distance into a shape of some size, radii, at places (s, t).
+Distance = Callable[[FloatArray, FloatArray, float], FloatArray]
+
 #: How far out an image is changed, radii.
-_REACH = 6.0
+REACH = 6.0
+#: Shares of the rim that are disturbed for training.
+_SHARES = (0.05, 0.45)
+_RIM = 2.0 * np.pi * np.arange(256) / 256
 
 
-class _Place:
-    """Grey values about a disc, and where they lie: `s` and `t` in radii, `s` in some direction."""
+@dataclass(frozen=True)
+class Surroundings:
+    """Grey values about a light disc.
 
-    def __init__(self, grey: FloatArray, offset: FloatArray, rng: np.random.Generator) -> None:
-        turn = rng.uniform(0.0, 2.0 * np.pi)
-        self.grey, self.rng = grey, rng
-        self.s = offset @ [np.cos(turn), np.sin(turn)]
-        self.t = offset @ [-np.sin(turn), np.cos(turn)]
-        self.radius = np.hypot(self.s, self.t)
-        pixels = max(np.sqrt((self.radius < 1.0).sum() / np.pi), 1.0)
-        self._softest = 0.3 / pixels
-        self.disc = float(np.median(grey[self.radius < 1.0]))
-        self.floor = float(np.median(grey[(self.radius > 1.2) & (self.radius < 1.7)]))
+    Attributes
+    ----------
+    grey : (H, W) float64
+    offset : (H, W, 2) float64
+        Floor position less the disc's centre, radii.
+    away : float
+        Direction from the camera to the disc on the floor, radians.
+    disc, floor : float
+        Grey values of the two.
+    pixel : float
+        Size of a pixel, radii: nothing is sharper.
+    """
 
-    def side(self, beyond: FloatArray, width: float = 0.05) -> FloatArray:
-        """1 where something is above 0, 0 where below; softly."""
-        shares = 1.0 / (1.0 + np.exp(-np.clip(beyond / max(width, self._softest), -30.0, 30.0)))
-        return np.asarray(shares)
+    grey: FloatArray
+    offset: FloatArray
+    away: float
+    disc: float
+    floor: float
+    pixel: float
 
-    def cover(self, share: FloatArray, grey: float) -> tuple[FloatArray, NDArray[np.bool_]]:
-        return self.grey * (1.0 - share) + share * grey, share > 0.5
+    @classmethod
+    def of(cls, grey: FloatArray, offset: FloatArray, away: float) -> Surroundings:
+        """Measure the grey values of disc and floor."""
+        radius = np.hypot(offset[..., 0], offset[..., 1])
+        return cls(
+            grey, offset, away,
+            disc=float(np.median(grey[radius < 0.9])),
+            floor=float(np.median(grey[(radius > 1.2) & (radius < 1.7)])),
+            pixel=1.0 / max(np.sqrt((radius < 1.0).sum() / np.pi), 1.0),
+        )  # fmt: skip
 
+    def turned(self, turn: float) -> tuple[FloatArray, FloatArray]:
+        """Coordinates (s, t) whose t axis has a direction `turn`."""
+        x, y = self.offset[..., 0], self.offset[..., 1]
+        return x * np.sin(turn) - y * np.cos(turn), x * np.cos(turn) + y * np.sin(turn)
 
-_Disturbed = tuple[FloatArray, NDArray[np.bool_]]
-
-
-def _sun_patch(p: _Place) -> _Disturbed:
-    lit = p.side(p.s - p.rng.uniform(0.3, 1.2)) * p.side(p.t + p.rng.uniform(0.3, 6.0))
-    return p.grey * (1.0 + lit * p.rng.uniform(0.5, 3.0)), p.radius < 0.0
-
-
-def _shadow(p: _Place) -> _Disturbed:
-    dark = p.side(p.s - p.rng.uniform(-0.3, 1.0), p.rng.uniform(0.05, 0.4))
-    return p.grey * (1.0 - dark * p.rng.uniform(0.3, 0.7)), p.radius < 0.0
-
-
-def _glare(p: _Place) -> _Disturbed:
-    width = p.rng.uniform(0.1, 0.8)
-    lit = p.side(p.s - p.rng.uniform(-0.2, 1.8), width)
-    lifted = p.rng.uniform(0.0, 0.5) * lit
-    grey = (p.grey + lit * p.rng.uniform(30.0, 180.0)) * (1.0 - lifted) + 255.0 * lifted
-    return grey, p.radius < 0.0
-
-
-def _cable(p: _Place) -> _Disturbed:
-    middle = p.rng.uniform(-0.8, 0.8) + p.rng.uniform(-0.2, 0.2) * p.t**2
-    share = p.side(p.rng.uniform(0.06, 0.2) - np.abs(p.s - middle), 0.03)
-    return p.cover(share, p.rng.uniform(0.0, 60.0))
+    def share(self, distance: FloatArray, width: float) -> FloatArray:
+        """1 inside a shape, 0 outside, over an edge of some width (radii)."""
+        scaled = distance / max(width, 0.3 * self.pixel)
+        return np.asarray(1.0 / (1.0 + np.exp(-np.clip(scaled, -30.0, 30.0))))
 
 
-def _stain(p: _Place) -> _Disturbed:
-    share = p.side(p.rng.uniform(0.2, 0.55) - np.hypot(p.s - p.rng.uniform(0.0, 1.1), p.t))
-    return p.cover(share, p.rng.uniform(0.2, 0.8) * p.disc)
+# --- Shapes ------------------------------------------------------------------------------------
 
 
-def _paper(p: _Place) -> _Disturbed:
-    near, half = p.rng.uniform(0.75, 1.1), p.rng.uniform(0.5, 2.0)
-    share = p.side(p.s - near) * p.side(near + p.rng.uniform(0.8, 2.5) - p.s)
-    share = share * p.side(half - np.abs(p.t - p.rng.uniform(-1.0, 1.0)))
-    return p.cover(share, p.disc + p.rng.uniform(-0.3, 0.6) * (p.disc - p.floor))
+def _half_plane(rng: np.random.Generator) -> Distance:
+    return lambda s, t, size: s - (1.0 - size)
 
 
-def _edge(p: _Place) -> _Disturbed:
-    return p.cover(p.side(p.s - p.rng.uniform(0.25, 0.95), 0.03), p.rng.uniform(0.0, 255.0))
+def _cables(rng: np.random.Generator) -> Distance:
+    middle, bend = rng.uniform(-0.6, 0.6), rng.uniform(-0.2, 0.2)
+
+    def distance(s: FloatArray, t: FloatArray, size: float) -> FloatArray:
+        across = s - middle - bend * t**2
+        # One cable is at most 0.2 radii thick; more of the rim is under several, to either side.
+        places = 0.3 * np.array([(k + 1) // 2 * (-1) ** k for k in range(math.ceil(size / 0.1))])
+        inside = [
+            min(size - 0.1 * k, 0.1) - np.abs(across - place) for k, place in enumerate(places)
+        ]
+        return np.asarray(np.max(inside, axis=0) if inside else np.full_like(across, -1.0))
+
+    return distance
 
 
-def _leg(p: _Place) -> _Disturbed:
-    share = p.side(p.rng.uniform(0.1, 0.3) - np.abs(p.s - p.rng.uniform(-0.9, 0.9)), 0.03)
-    return p.cover(share, float(p.rng.choice([30.0, 200.0])))
+def _band(rng: np.random.Generator) -> Distance:
+    middle = rng.uniform(-0.8, 0.8)
+    return lambda s, t, size: size - np.abs(s - middle)
 
 
-DISTURBANCES: dict[str, Callable[[_Place], _Disturbed]] = {
-    "sun patch": _sun_patch,
-    "shadow": _shadow,
-    "glare": _glare,
-    "cable": _cable,
-    "stain": _stain,
-    "paper": _paper,
-    "edge": _edge,
-    "leg": _leg,
+def _upright_band(rng: np.random.Generator) -> Distance:
+    middle, foot = rng.uniform(-0.9, 0.9), rng.uniform(-1.5, -0.8)
+    return lambda s, t, size: np.minimum(size - np.abs(s - middle), t - foot)
+
+
+def _sheet(rng: np.random.Generator) -> Distance:
+    half, depth = rng.uniform(1.2, 1.6), rng.uniform(2.0, 2.5)
+    middle = rng.uniform(-0.3, 0.3)
+    return lambda s, t, size: np.minimum(
+        np.minimum(s - (1.0 - size), 1.0 - size + depth - s), half - np.abs(t - middle)
+    )
+
+
+def _blot(rng: np.random.Generator) -> Distance:
+    middle = rng.uniform(0.7, 1.1)
+    return lambda s, t, size: size - np.hypot(s - middle, t)
+
+
+def _blots(rng: np.random.Generator) -> Distance:
+    angle, out = rng.uniform(0.0, 2.0 * np.pi, 9), rng.uniform(0.6, 1.1, 9)
+    weight = rng.uniform(0.5, 1.0, 9)
+
+    def distance(s: FloatArray, t: FloatArray, size: float) -> FloatArray:
+        reach = [
+            w * size - np.hypot(s - r * np.cos(a), t - r * np.sin(a))
+            for a, r, w in zip(angle, out, weight)
+        ]
+        return np.asarray(np.max(reach, axis=0))
+
+    return distance
+
+
+# --- What they do to the grey values -----------------------------------------------------------
+
+Paint = Callable[[Surroundings, FloatArray, np.random.Generator], FloatArray]
+
+
+def _cover(grey: Callable[[Surroundings, np.random.Generator], float]) -> Paint:
+    def paint(about: Surroundings, share: FloatArray, rng: np.random.Generator) -> FloatArray:
+        return np.asarray(about.grey * (1.0 - share) + share * grey(about, rng))
+
+    return paint
+
+
+def _light(least: float, most: float) -> Paint:
+    def paint(about: Surroundings, share: FloatArray, rng: np.random.Generator) -> FloatArray:
+        return np.asarray(about.grey * (1.0 + share * (rng.uniform(least, most) - 1.0)))
+
+    return paint
+
+
+def _glare(about: Surroundings, share: FloatArray, rng: np.random.Generator) -> FloatArray:
+    veil = rng.uniform(0.0, 0.5) * share
+    return np.asarray((about.grey + share * rng.uniform(30.0, 150.0)) * (1.0 - veil) + 255.0 * veil)
+
+
+@dataclass(frozen=True)
+class Disturbance:
+    """A shape, what it does, and how wide its edge is, radii (least and most)."""
+
+    shape: Callable[[np.random.Generator], Distance]
+    paint: Paint
+    width: tuple[float, float] = (0.02, 0.04)
+    upright: bool = False
+
+    def __call__(self, about: Surroundings, hidden: float, rng: np.random.Generator) -> FloatArray:
+        """Grey values with a share of the rim disturbed.
+
+        Raises
+        ------
+        ValueError
+            If this shape cannot have so much of the rim.
+        """
+        distance = self.shape(rng)
+        size = _size_for(distance, hidden)
+        turn = about.away if self.upright else rng.uniform(0.0, 2.0 * np.pi)
+        share = about.share(distance(*about.turned(turn), size), rng.uniform(*self.width))
+        return self.paint(about, share, rng)
+
+
+def _size_for(distance: Distance, hidden: float) -> float:
+    """The size at which a share of the rim lies under a shape, by bisection."""
+    low, high = 0.0, 3.0
+    for _ in range(20):
+        middle = 0.5 * (low + high)
+        if np.mean(distance(np.cos(_RIM), np.sin(_RIM), middle) > 0.0) < hidden:
+            low = middle
+        else:
+            high = middle
+    if high == 3.0:
+        raise ValueError(f"a share of {hidden} of the rim is more than this shape can cover")
+    return high
+
+
+DISTURBANCES: dict[str, Disturbance] = {
+    "cable": Disturbance(_cables, _cover(lambda p, rng: rng.uniform(0.0, 60.0))),
+    "tape": Disturbance(_band, _cover(lambda p, rng: float(rng.choice([30.0, 120.0, 220.0])))),
+    "leg": Disturbance(
+        _upright_band, _cover(lambda p, rng: float(rng.choice([30.0, 200.0]))), upright=True
+    ),
+    "table edge": Disturbance(_half_plane, _cover(lambda p, rng: rng.uniform(0.0, 255.0))),
+    "paper": Disturbance(
+        _sheet, _cover(lambda p, rng: p.disc + rng.uniform(-0.3, 0.6) * (p.disc - p.floor))
+    ),
+    "stain": Disturbance(_blot, _cover(lambda p, rng: rng.uniform(0.2, 0.8) * p.disc), (0.02, 0.2)),
+    "worn paint": Disturbance(_blots, _cover(lambda p, rng: p.floor), (0.02, 0.1)),
+    "shadow edge": Disturbance(_half_plane, _light(0.3, 0.7), (0.05, 0.4)),
+    "sun patch": Disturbance(_sheet, _light(1.5, 3.0), (0.02, 0.1)),
+    "glare": Disturbance(_half_plane, _glare, (0.1, 0.8)),
 }
 
 
-LOOK_ALIKES = ("square", "ring", "oval", "saucer", "plate")
+LOOK_ALIKES = ("square", "ring", "oval", "saucer", "plate", "light pool", "lid", "tile")
 
 
-def _look_alike(p: _Place, kind: str) -> FloatArray:
-    """The floor with something else of the disc's grey value in the disc's place."""
-    width, height = p.rng.uniform([0.75, 0.75], [1.25, 1.25])
-    share = {
-        "square": p.side(width - np.abs(p.s)) * p.side(height - np.abs(p.t)),
-        "ring": p.side(1.0 - p.radius) * p.side(p.radius - p.rng.uniform(0.3, 0.85)),
-        "oval": p.side(1.0 - np.hypot(p.s / (0.7 * width), p.t / (1.2 * height))),
-        "saucer": p.side(p.rng.uniform(0.45, 0.75) - p.radius),
-        "plate": p.side(p.rng.uniform(1.3, 1.7) - p.radius),
-    }[kind]
-    bare = np.where(p.radius < 1.15, p.floor, p.grey)
-    return np.asarray(bare * (1.0 - share) + share * p.disc)
+def look_alike(about: Surroundings, kind: str, rng: np.random.Generator) -> FloatArray:
+    """Grey values with one of `LOOK_ALIKES` in the disc's place."""
+    s, t = about.turned(rng.uniform(0.0, 2.0 * np.pi))
+    radius = np.hypot(s, t)
+    width, height = rng.uniform(0.75, 1.25, 2)
+    soft, grey = 0.05, about.disc
+    if kind == "square":
+        distance = np.minimum(width - np.abs(s), height - np.abs(t))
+    elif kind == "ring":
+        distance = np.minimum(1.0 - radius, radius - rng.uniform(0.3, 0.85))
+    elif kind == "oval":
+        distance = 1.0 - np.hypot(s / (0.7 * width), t / (1.2 * height))
+    elif kind == "saucer":
+        distance = rng.uniform(0.45, 0.75) - radius
+    elif kind == "plate":
+        distance = rng.uniform(1.3, 1.6) - radius
+    elif kind == "light pool":
+        distance, soft = 1.3 - radius, rng.uniform(0.15, 0.3)
+    elif kind == "lid":
+        distance = rng.uniform(2.0, 3.2) - radius
+        grey = about.floor * rng.uniform(0.4, 1.6)
+    elif kind == "tile":
+        distance = 1.5 - np.maximum(np.abs(s), np.abs(t))
+    else:
+        raise ValueError(f"{kind}: expected one of {', '.join(LOOK_ALIKES)}")
+    bare = np.where(radius < 1.15, about.floor, about.grey)
+    share = about.share(distance, soft)
+    return np.asarray(bare * (1.0 - share) + share * grey)
 
 
-def replaced(
-    image: NDArray[np.uint8],
-    floor_xy: NDArray[np.float32],
-    place: FloatArray,
-    radius: float,
-    kind: str,
-    rng: np.random.Generator,
-) -> NDArray[np.uint8]:
-    """An image with one of `LOOK_ALIKES` instead of a disc; parameters as of `disturbed`."""
-    window, p = _surroundings(image, floor_xy, place, radius, rng)
-    return _with(image, window, p, _look_alike(p, kind))
-
-
-_Window = tuple[slice, slice]
-
-
-def _surroundings(
-    image: NDArray[np.uint8],
-    floor_xy: NDArray[np.float32],
-    place: FloatArray,
-    radius: float,
-    rng: np.random.Generator,
-) -> tuple[_Window, _Place]:
-    offset = (floor_xy - place.astype(np.float32)) / np.float32(radius)
-    rows, columns = np.nonzero(np.hypot(offset[..., 0], offset[..., 1]) < _REACH)
-    window = slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1)
-    return window, _Place(image[window].astype(np.float64), offset[window].astype(np.float64), rng)
-
-
-def _with(
-    image: NDArray[np.uint8], window: _Window, p: _Place, grey: FloatArray
-) -> NDArray[np.uint8]:
-    """An image with other grey values about a disc, and noise where they are others."""
-    changed = np.abs(grey - p.grey) > 1.0
-    noisy = grey + changed * p.rng.normal(0.0, 0.8, grey.shape)
-    result = image.copy()
-    result[window] = np.clip(np.round(noisy), 0, 255).astype(np.uint8)
-    return result
+# --- Real images -------------------------------------------------------------------------------
 
 
 def disturbed(
@@ -164,8 +255,8 @@ def disturbed(
     radius: float,
     kind: str,
     rng: np.random.Generator,
-) -> NDArray[np.uint8] | None:
-    """An image with one light disc disturbed.
+) -> NDArray[np.uint8]:
+    """An image with one light disc disturbed, at a random share of its rim.
 
     Parameters
     ----------
@@ -179,22 +270,51 @@ def disturbed(
     kind : str
         Of `DISTURBANCES`.
     rng : numpy.random.Generator
-
-    Returns
-    -------
-    (H, W) uint8 or None
-        None where too little of the disc is left to be seen.
     """
-    window, p = _surroundings(image, floor_xy, place, radius, rng)
-    grey, hidden = DISTURBANCES[kind](p)
-    result = _with(image, window, p, grey)
-    seen = 0
-    angles = 2.0 * np.pi * np.arange(32) / 32
-    for angle in angles:
-        at = [
-            np.hypot(p.s - r * np.cos(angle), p.t - r * np.sin(angle)).argmin()
-            for r in (0.75, 1.0, 1.3)
-        ]
-        inside, _, outside = (float(result[window].flat[i]) for i in at)
-        seen += inside - outside > _LEAST_STEP and not hidden.flat[at[1]]
-    return result if seen >= _LEAST_RIM * len(angles) else None
+    window, about = _surroundings(image, floor_xy, place, radius)
+    grey = DISTURBANCES[kind](about, rng.uniform(*_SHARES), rng)
+    return _with(image, window, about.grey, grey, rng)
+
+
+def replaced(
+    image: NDArray[np.uint8],
+    floor_xy: NDArray[np.float32],
+    place: FloatArray,
+    radius: float,
+    kind: str,
+    rng: np.random.Generator,
+) -> NDArray[np.uint8]:
+    """An image with one of `LOOK_ALIKES` instead of a disc; parameters as of `disturbed`."""
+    window, about = _surroundings(image, floor_xy, place, radius)
+    return _with(image, window, about.grey, look_alike(about, kind, rng), rng)
+
+
+_Window = tuple[slice, slice]
+
+
+def _surroundings(
+    image: NDArray[np.uint8], floor_xy: NDArray[np.float32], place: FloatArray, radius: float
+) -> tuple[_Window, Surroundings]:
+    offset = (floor_xy - place.astype(np.float32)) / np.float32(radius)
+    rows, columns = np.nonzero(np.hypot(offset[..., 0], offset[..., 1]) < REACH)
+    window = slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1)
+    about = Surroundings.of(
+        image[window].astype(np.float64),
+        offset[window].astype(np.float64),
+        float(np.arctan2(place[1], place[0])),
+    )
+    return window, about
+
+
+def _with(
+    image: NDArray[np.uint8],
+    window: _Window,
+    before: FloatArray,
+    grey: FloatArray,
+    rng: np.random.Generator,
+) -> NDArray[np.uint8]:
+    """An image with other grey values in a window, and noise where they are others."""
+    noisy = grey + (np.abs(grey - before) > 1.0) * rng.normal(0.0, 0.8, grey.shape)
+    result = image.copy()
+    result[window] = np.clip(np.round(noisy), 0, 255).astype(np.uint8)
+    return result

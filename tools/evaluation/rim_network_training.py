@@ -12,6 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import minimize
+from scipy.special import expit
 
 from detect.discs.rim_network import DISTANCES, INPUTS, SCALES, RimNetwork
 from tools.evaluation.second_look_data import Looks
@@ -20,6 +22,8 @@ FloatArray = NDArray[np.floating]
 
 CHANNELS, UNITS, MEMBERS = 12, 16, 4
 _EPOCHS, _BATCH = 25, 256
+#: Share of the discs that the features of the rim alone may lose.
+_QUICKLY_LOST = 0.01
 _LONGEST_STEP, _RISING, _DECAY = 6e-3, 0.3, 0.02
 _MOMENTUM, _SQUARES = 0.9, 0.99
 #: A look is never taken for certain.
@@ -156,6 +160,37 @@ def _train_member(looks: Looks, used: NDArray[np.int64], seed: int) -> _Member:
     return member
 
 
+def quick_weights(looks: Looks, used: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """`RimNetwork.quick`: a logistic regression that keeps all but a few of the discs."""
+    chosen = looks.features[used]
+    mean, deviation = chosen.mean(axis=0), chosen.std(axis=0) + 1e-6
+    scaled = (chosen - mean) / deviation
+    design = np.concatenate([scaled, scaled**2, np.ones((len(chosen), 1))], axis=1)
+    target, weight = looks.is_disc[used], looks.weight[used]
+
+    def cost(weights: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+        odds = design @ weights
+        value = weight @ (np.logaddexp(0.0, odds) - target * odds) + 0.5 * weights @ weights
+        return float(value), design.T @ (weight * (expit(odds) - target)) + weights
+
+    linear, square, _ = np.split(
+        minimize(cost, np.zeros(design.shape[1]), jac=True).x, [len(mean), 2 * len(mean)]
+    )
+    # The same in the features as they are.
+    square = square / deviation**2
+    linear = linear / deviation - 2.0 * square * mean
+    odds = chosen @ linear + chosen**2 @ square
+    limit = np.quantile(odds[target], _QUICKLY_LOST)
+    return np.concatenate([linear, square, [-limit]])
+
+
+def worth_the_network(looks: Looks, quick: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """`detect.discs.rim_network.worth_the_network` of all looks."""
+    n = looks.features.shape[1]
+    odds = looks.features @ quick[:n] + looks.features**2 @ quick[n : 2 * n] + quick[-1]
+    return np.asarray(odds >= 0.0)
+
+
 def train(looks: Looks, used: NDArray[np.bool_], seed: int) -> RimNetwork:
     """Train networks on some of the looks.
 
@@ -171,6 +206,8 @@ def train(looks: Looks, used: NDArray[np.bool_], seed: int) -> RimNetwork:
     RimNetwork
         Its features are those of the looks as they are.
     """
+    quick = quick_weights(looks, used)
+    used = used & worth_the_network(looks, quick)
     index = np.flatnonzero(used)
     mean, deviation = looks.features[used].mean(axis=0), looks.features[used].std(axis=0) + 1e-6
     alike = looks._replace(features=(looks.features - mean) / deviation)
@@ -184,13 +221,15 @@ def train(looks: Looks, used: NDArray[np.bool_], seed: int) -> RimNetwork:
         again.reshape(MEMBERS, 3, CHANNELS, CHANNELS), again_bias, dense, dense_bias,
         np.c_[by_unit, by_feature].astype(np.float32),
         (out_bias[:, 0] - by_feature @ mean).astype(np.float32),
+        quick,
     )  # fmt: skip
 
 
 def log_odds(network: RimNetwork, batch: Batch) -> NDArray[np.float64]:
     """(N,) log-odds of looks by a network: `detect.discs.rim_network.network_log_odds` in NumPy."""
     members = []
-    for w in map(RimNetwork._make, zip(*network, strict=True)):
+    for layers in zip(*network[:-1], strict=True):
+        w = RimNetwork._make([*layers, network.quick])
         member = _Member(0, np.random.default_rng(0))
         member.weights = [
             w.around.reshape(-1, w.around.shape[-1]), w.around_bias,
@@ -210,7 +249,9 @@ def cross_validation(looks: Looks, seed: int) -> Iterable[str]:
             continue
         network = train(looks, buildings != left_out, seed)
         batch = batch_of(looks.grey[own, 0], looks.pixels_per_radius[own, 0], looks.features[own])
-        odds = log_odds(network, batch)
+        odds = np.where(
+            worth_the_network(looks, network.quick)[own], log_odds(network, batch), -np.inf
+        )
         discs, others = odds[looks.is_disc[own]], odds[~looks.is_disc[own]]
         text = ", ".join(
             f">= {t:g}: {(discs >= t).sum()}/{len(discs)} discs, {(others >= t).sum()} others"

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from camera import Camera, read_camera
 from camera.calibration.floor import with_pose
 from camera.kernels import camera_numbers
-from detect.circles import candidates_of, detect_circles, disc_shape, second_looks_at
+from detect.circles import detect_circles, disc_shape, second_looks_at
 from detect.discs.rim import DIRECTIONS, STEPS, profiles
 from detect.discs.rim_network import INPUTS, SCALES, RimNetwork
 from detect.discs.second_look import FEATURES
@@ -28,6 +28,7 @@ from detect.noise import estimate_noise
 from detect.settings import CircleSettings
 from lut import DiscTable, cached_disc_table
 from tools.evaluation.disturbances import DISTURBANCES, LOOK_ALIKES, disturbed, replaced
+from tools.evaluation.disturbed import BLURRED, Stage, render_scene
 
 FloatArray = NDArray[np.float64]
 
@@ -38,8 +39,14 @@ _FIRST = CircleSettings(polarity="any")
 _RADIUS = 0.1
 #: How much a row counts that is a disturbed disc, or no disc on a real image.
 _DISTURBED_WEIGHT, _REAL_WEIGHT = 0.2, 0.4
+#: How much less a disc counts that the first look finds.
+_FOUND_WEIGHT = 0.3
+#: Evidence of the first look from which on a disc of the real run is one.
+_CLEAR = 6.0
 #: How often discs of a frame are disturbed, and how many each time.
 _ROUNDS, _PER_ROUND = 6, 3
+#: How much a row counts of a rendered floor, how often floors change, and the disturbed shares.
+_SCENE_WEIGHT, _SCENES_PER_STAGE, _SHARES = 0.4, 50, (0.1, 0.5)
 #: Views of each rim, and how far all but the first are off its place (metres) and size (relative).
 _VIEWS, _OFF_PLACE, _OFF_SIZE = 5, 0.007, 0.06
 
@@ -50,11 +57,16 @@ def _network_by_rim() -> RimNetwork:
     out = np.zeros((1, 1 + len(FEATURES)), np.float32)
     out[0, 1 + FEATURES.index("rim")] = 1.0
     return RimNetwork._make(
-        [*(np.zeros(shape, np.float32) for shape in shapes), out, np.zeros(1, np.float32)]
+        [
+            *(np.zeros(shape, np.float32) for shape in shapes),
+            out,
+            np.zeros(1, np.float32),
+            np.zeros(2 * len(FEATURES) + 1),
+        ]
     )
 
 
-_NOWHERE = np.zeros((0, 4))
+_NOWHERE, _NO_PLACES = np.zeros((0, 4)), np.zeros((0, 2))
 
 
 class Looks(NamedTuple):
@@ -104,18 +116,17 @@ class _Gathering:
         """
         camera, table = view
         noise = estimate_noise(image, 32)
-        centres = candidates_of(image, table, _SETTINGS, 0.0)
         found = detect_circles(image, camera, table, _FIRST)
-        looks = second_looks_at(
-            image, camera, table, _SETTINGS, centres, found.floor_xy, noise, _BY_RIM
-        )
-        pixels = camera.project_floor(looks.place)
-        for features, place, uv in zip(looks.features, looks.place, pixels, strict=True):
+        looks = second_looks_at(image, camera, table, _SETTINGS, _NO_PLACES, noise, _BY_RIM)
+        pixels = camera.project_floor(looks.floor_xy)
+        for features, place, uv in zip(looks.features, looks.floor_xy, pixels, strict=True):
             if not np.isfinite(features).all():
                 continue
             near, far = _nearest(uv, discs), _nearest(uv, unsure)
             is_disc, is_other = near < 0.6, far < 0.6 if only else min(near, far) > 1.5
             counts = weight[0] if is_disc else weight[1]
+            if is_disc and (np.hypot(*(found.floor_xy - place).T) < _RADIUS).any():
+                counts *= _FOUND_WEIGHT
             if (is_disc or is_other) and counts > 0.0:
                 views = self._views(image, camera, place)
                 self.rows.append((features, *views, is_disc, counts, source))
@@ -161,10 +172,11 @@ def _images(camera: Camera, places: FloatArray, slack_px: float) -> FloatArray:
     return np.array(rows).reshape(-1, 4)
 
 
-def gather(data: Path, every: int, seed: int) -> Looks:
+def gather(data: Path, every: int, scenes: int, seed: int) -> Looks:
     """Look at all sources of a folder of data (see `docs/measured.md`); every n-th real frame."""
     rng = np.random.default_rng(seed)
     gathering = _Gathering(rng)
+    _add_scenes(gathering, read_camera(data / "dlr" / "e" / "e.cam"), scenes, rng)
     for folder in sorted((data / "rendered").glob("r*")):
         camera = read_camera(folder / f"{folder.name}.cam")
         view = camera, cached_disc_table(camera, disc_shape(_SETTINGS))
@@ -191,11 +203,30 @@ def gather(data: Path, every: int, seed: int) -> Looks:
         if number % every or not path.is_file():
             continue
         image = _read(path)
-        places = np.zeros((0, 4))
-        gathering.add(image, view, places, mapped, (0.0, _REAL_WEIGHT), "real")
+        found = detect_circles(image, *view, _FIRST)
+        clear = _images(camera, found.floor_xy[found.evidence > _CLEAR], 0.0)
+        gathering.add(image, view, clear, mapped, (_REAL_WEIGHT, _REAL_WEIGHT), "real")
         if number % (3 * every) == 0:
             _add_disturbed(gathering, image, view, rng, "real disturbed")
     return gathering.looks()
+
+
+def _add_scenes(
+    gathering: _Gathering, camera: Camera, scenes: int, rng: np.random.Generator
+) -> None:
+    """Look at rendered floors with discs or look-alikes (`tools.evaluation.disturbed`)."""
+    view = camera, cached_disc_table(camera, disc_shape(_SETTINGS))
+    kinds = [*DISTURBANCES, *DISTURBANCES, *BLURRED, *LOOK_ALIKES]
+    for number in range(scenes):
+        if number % _SCENES_PER_STAGE == 0:
+            stage = Stage(camera, _RADIUS, rng)
+        kind = str(rng.choice(kinds))
+        image, places = render_scene(stage, kind, rng.uniform(*_SHARES), rng)
+        at = _images(camera, np.array(places), 0.0)
+        is_disc = kind not in LOOK_ALIKES
+        discs, others = (at, _NOWHERE) if is_disc else (_NOWHERE, at)
+        weight = (_SCENE_WEIGHT, _SCENE_WEIGHT)
+        gathering.add(image, view, discs, others, weight, "scenes", only=not is_disc)
 
 
 def _add_disturbed(
@@ -212,16 +243,12 @@ def _add_disturbed(
         place = _images(view[0], at, 0.0)
         kind = str(rng.choice(list(DISTURBANCES)))
         changed = disturbed(image, view[1].floor_xy, at, _RADIUS, kind, rng)
-        if changed is not None:
-            gathering.add(changed, view, place, _NOWHERE, (_DISTURBED_WEIGHT, 0.0), source)
-        kind = str(rng.choice(LOOK_ALIKES))
-        bare = replaced(image, view[1].floor_xy, at, _RADIUS, kind, rng)
-        other: NDArray[np.uint8] | None = bare
+        gathering.add(changed, view, place, _NOWHERE, (_DISTURBED_WEIGHT, 0.0), source)
+        other = replaced(image, view[1].floor_xy, at, _RADIUS, str(rng.choice(LOOK_ALIKES)), rng)
         if rng.random() < 0.5:
             kind = str(rng.choice(list(DISTURBANCES)))
-            other = disturbed(bare, view[1].floor_xy, at, _RADIUS, kind, rng)
-        if other is not None:
-            gathering.add(other, view, _NOWHERE, place, (0.0, _DISTURBED_WEIGHT), source, only=True)
+            other = disturbed(other, view[1].floor_xy, at, _RADIUS, kind, rng)
+        gathering.add(other, view, _NOWHERE, place, (0.0, _DISTURBED_WEIGHT), source, only=True)
 
 
 def _mapped(run: Path) -> Iterator[tuple[str, FloatArray]]:

@@ -1,0 +1,344 @@
+"""Discs that are partly hidden, stained, badly lit or blurred, rendered with exact truth.
+
+A scene is a floor (carpet, tiles, parquet, lino) with some discs or look-alikes on it, computed on
+a grid finer than the pixels, seen through a calibrated camera: its optics blur, its pixels average,
+its noise and JPEG follow. Each family of disturbances is measured at several shares of the rim.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from camera import Camera
+from detect.circles import CircleDetections, detect_circles, disc_shape
+from detect.settings import CircleSettings
+from lut import cached_disc_table
+from tools.evaluation.disturbances import (
+    DISTURBANCES,
+    LOOK_ALIKES,
+    REACH,
+    Surroundings,
+    look_alike,
+)
+
+FloatArray = NDArray[np.float64]
+
+FLOORS = ("carpet", "tiles", "parquet", "lino")
+#: Families without a share of the rim, and what blurs the image: motion along u and optics, pixels.
+BLURRED = {
+    "motion blur 5 px": (5.0, 0.7),
+    "motion blur 10 px": (10.0, 0.7),
+    "motion blur 15 px": (15.0, 0.7),
+    "defocus 2 px": (0.0, 2.0),
+    "defocus 3 px": (0.0, 3.0),
+}
+BORDER = "cut by the border"
+_OPTICS = (0.0, 0.7)
+#: Cells per pixel along u and v, on which scenes are computed.
+_FINE = (3, 4)
+_DISTANCE_M = (0.8, 4.0)
+_APART_M = 1.2
+_PER_SCENE = 4
+_NOISE = 2.5
+_JPEG = 88
+#: A row this near a disc has found it, radii.
+_GATE = 0.6
+#: A rim outside the image may have this much more or less of a share than asked for.
+_SLACK = 0.05
+
+
+@dataclass
+class Tally:
+    """What became of the discs, or look-alikes, of one kind.
+
+    Attributes
+    ----------
+    shown, found : int
+    error_px : list of (2,) float64
+        Found less true place, in the image.
+    normalised : list of float
+        Squared error on the floor over the stated covariance, per degree of freedom.
+    elsewhere : int
+        Rows at no disc.
+    """
+
+    shown: int = 0
+    found: int = 0
+    error_px: list[FloatArray] = field(default_factory=list)
+    normalised: list[float] = field(default_factory=list)
+    elsewhere: int = 0
+
+    @property
+    def recall(self) -> float:
+        """Share of those shown that were found."""
+        return self.found / max(self.shown, 1)
+
+    @property
+    def rms_px(self) -> float:
+        """Root mean square of the errors of either coordinate, pixels."""
+        return float(np.sqrt(np.mean(np.square(self.error_px)))) if self.error_px else np.nan
+
+    @property
+    def normalised_error(self) -> float:
+        """Mean normalised error squared per degree of freedom."""
+        return float(np.mean(self.normalised)) if self.normalised else np.nan
+
+
+class Stage:
+    """A camera over its floors, on the fine grid."""
+
+    def __init__(self, camera: Camera, radius_m: float, rng: np.random.Generator) -> None:
+        self.camera, self.radius_m = camera, radius_m
+        across, down = _FINE
+        u = (np.arange(camera.width * across) + 0.5) / across - 0.5
+        v = (np.arange(camera.height * down) + 0.5) / down - 0.5
+        self.floor_xy = camera.floor_from_pixel(np.stack(np.meshgrid(u, v), axis=-1))
+        self.floors = {kind: _texture(kind, self.floor_xy, rng) for kind in FLOORS}
+
+    def outline(self, place: FloatArray, radii: float = 1.0) -> FloatArray:
+        """(64, 2) pixels of a circle about a place."""
+        angle = 2.0 * np.pi * np.arange(64) / 64
+        circle = radii * self.radius_m * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+        return self.camera.project_floor(place + circle)
+
+    def seen_share(self, place: FloatArray, radii: float = 1.0) -> float:
+        """How much of a circle is in the image."""
+        u, v = self.outline(place, radii).T
+        inside = (u > -0.5) & (u < self.camera.width - 0.5)
+        return float(np.mean(inside & (v > -0.5) & (v < self.camera.height - 0.5)))
+
+    def window(self, place: FloatArray) -> tuple[slice, slice]:
+        """The cells within reach of a disturbance."""
+        outline = self.outline(place, REACH)
+        outline = outline[np.isfinite(outline).all(axis=-1)]
+        across, down = _FINE
+        low = np.maximum(np.floor(outline.min(axis=0)), 0.0).astype(int)
+        high = np.ceil(outline.max(axis=0)).astype(int) + 1
+        return slice(low[1] * down, high[1] * down), slice(low[0] * across, high[0] * across)
+
+    def exposed(
+        self, grey: FloatArray, blur: tuple[float, float], rng: np.random.Generator
+    ) -> NDArray[np.uint8]:
+        """An image of a fine scene, with motion and optics that blur by so many pixels."""
+        across, down = _FINE
+        motion, optics = blur
+        fine: NDArray[Any] = grey.astype(np.float32)
+        along_v = optics * self.camera.scale_y / self.camera.scale_x
+        fine = cv2.GaussianBlur(fine, (0, 0), optics * across, sigmaY=max(along_v * down, 0.3))
+        if motion > 0.0:
+            fine = cv2.blur(fine, (round(motion * across), 1))
+        size = self.camera.width, self.camera.height
+        pixels = cv2.resize(fine, size, interpolation=cv2.INTER_AREA)
+        noisy = np.clip(np.rint(pixels + rng.normal(0.0, _NOISE, pixels.shape)), 0, 255)
+        _, jpeg = cv2.imencode(".jpg", noisy.astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, _JPEG])
+        return np.asarray(cv2.imdecode(jpeg, cv2.IMREAD_GRAYSCALE), np.uint8)
+
+
+def _texture(kind: str, floor_xy: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Grey values of a floor."""
+    x, y = np.nan_to_num(floor_xy[..., 0]), np.nan_to_num(floor_xy[..., 1])
+    mottled = np.zeros_like(x)
+    for wave in 2.0 * np.pi / np.array([0.9, 0.5, 0.31]):
+        turn, phase = rng.uniform(0.0, 2.0 * np.pi, 2)
+        mottled += np.sin(wave * (x * np.cos(turn) + y * np.sin(turn)) + phase)
+    if kind == "carpet":
+        cells = (np.floor(x / 0.006) * 73856093).astype(int) ^ (
+            np.floor(y / 0.006) * 19349663
+        ).astype(int)
+        return np.asarray(70.0 + 3.0 * mottled + 30.0 * rng.uniform(-1.0, 1.0, 4096)[cells % 4096])
+    if kind == "tiles":
+        column, row = np.floor(x / 0.3).astype(int), np.floor(y / 0.3).astype(int)
+        shade = rng.uniform(-8.0, 8.0, 97)[(column * 31 + row * 17) % 97]
+        joint = (np.mod(x, 0.3) < 0.006) | (np.mod(y, 0.3) < 0.006)
+        return np.asarray(np.where(joint, 55.0, 100.0 + shade + mottled))
+    if kind == "parquet":
+        strip = np.floor(x / 0.07).astype(int)
+        board = np.floor(y / 0.5 + 0.37 * strip).astype(int)
+        shade = rng.uniform(-18.0, 18.0, 101)[(strip * 13 + board * 29) % 101]
+        return np.asarray(85.0 + shade + 4.0 * np.sin(2.0 * np.pi * x / 0.011) + mottled)
+    return np.asarray(60.0 + 5.0 * mottled)
+
+
+def _places(stage: Stage, outside: float, rng: np.random.Generator) -> list[FloatArray]:
+    """Places of discs apart from each other, with a share of the rim outside the image."""
+    places: list[FloatArray] = []
+    width, height = stage.camera.width, stage.camera.height
+    for _ in range(4000):
+        pixel = rng.uniform([-40.0, 0.0], [width + 40.0, height + 40.0])
+        ahead = stage.camera.floor_from_pixel(pixel)
+        distance = rng.uniform(*_DISTANCE_M)
+        place = ahead * distance / np.hypot(*ahead)
+        if not np.isfinite(place).all():
+            continue
+        if outside > 0.0:
+            fits = abs(1.0 - stage.seen_share(place) - outside) < _SLACK
+            fits = fits and stage.seen_share(place, 0.0) == 1.0
+        else:
+            fits = stage.seen_share(place, 1.6) == 1.0
+        if fits and all(np.hypot(*(place - other)) > _APART_M for other in places):
+            places.append(place)
+            if len(places) == _PER_SCENE:
+                break
+    return places
+
+
+def render_scene(
+    stage: Stage, kind: str, share: float, rng: np.random.Generator
+) -> tuple[NDArray[np.uint8], list[FloatArray]]:
+    """An image of a floor with discs of one family of disturbances, or look-alikes.
+
+    Parameters
+    ----------
+    stage : Stage
+    kind : str
+        Of `DISTURBANCES`, `BLURRED`, `LOOK_ALIKES`, or `BORDER`.
+    share : float
+        Of the rim that is disturbed, 0 to 1.
+    rng : numpy.random.Generator
+
+    Returns
+    -------
+    image : (H, W) uint8
+    places : list of (2,) float64
+        Of the discs or look-alikes, metres.
+    """
+    grey = stage.floors[str(rng.choice(FLOORS))].copy()
+    places = _places(stage, share if kind == BORDER else 0.0, rng)
+    for place in places:
+        window = stage.window(place)
+        offset = (stage.floor_xy[window] - place) / stage.radius_m
+        light = rng.uniform(170.0, 235.0)
+        grey[window] = np.where(np.hypot(*np.moveaxis(offset, -1, 0)) < 1.0, light, grey[window])
+        away = place - stage.camera.centre[:2]
+        about = Surroundings.of(grey[window], offset, float(np.arctan2(away[1], away[0])))
+        if kind in LOOK_ALIKES:
+            grey[window] = look_alike(about, kind, rng)
+        elif kind in DISTURBANCES and share > 0.0:
+            grey[window] = np.clip(DISTURBANCES[kind](about, share, rng), 0.0, 255.0)
+    return stage.exposed(grey, BLURRED.get(kind, _OPTICS), rng), places
+
+
+def measure(
+    camera: Camera,
+    settings: CircleSettings,
+    *,
+    discs: int,
+    shares: Sequence[float],
+    seed: int,
+) -> Iterator[tuple[str, float, Tally]]:
+    """Detect the discs of scenes of every family and share, and the look-alikes.
+
+    Parameters
+    ----------
+    camera : Camera
+    settings : CircleSettings
+        Of the detector.
+    discs : int
+        Of each family and share.
+    shares : sequence of float
+        Of the rim that are disturbed.
+    seed : int
+
+    Yields
+    ------
+    kind, share, tally : str, float, Tally
+        The share is 0 where there is none.
+    """
+    stage = Stage(camera, settings.radius_m, np.random.default_rng(seed))
+    table = cached_disc_table(camera, disc_shape(settings))
+    cases = [(kind, share) for kind in (*DISTURBANCES, BORDER) for share in shares]
+    cases += [(kind, 0.0) for kind in (*BLURRED, *LOOK_ALIKES)]
+    for number, (kind, share) in enumerate(cases):
+        rng = np.random.default_rng([seed, number])
+        tally = Tally()
+        while tally.shown < discs:
+            image, places = render_scene(stage, kind, share, rng)
+            found = detect_circles(image, camera, table, settings)
+            _count(tally, camera, found, places, settings.radius_m)
+        yield kind, share, tally
+
+
+def _count(
+    tally: Tally, camera: Camera, found: CircleDetections, places: list[FloatArray], radius: float
+) -> None:
+    taken = np.zeros(len(found), np.bool_)
+    for place in places:
+        tally.shown += 1
+        off = found.floor_xy - place
+        distance = np.hypot(off[:, 0], off[:, 1])
+        taken |= distance < REACH * radius
+        if not (distance < _GATE * radius).any():
+            continue
+        nearest = int(np.argmin(distance))
+        tally.found += 1
+        tally.error_px.append(
+            camera.project_floor(found.floor_xy[nearest]) - camera.project_floor(place)
+        )
+        error, covariance = off[nearest], found.covariance[nearest]
+        tally.normalised.append(float(error @ np.linalg.solve(covariance, error)) / 2.0)
+    tally.elsewhere += int((~taken).sum())
+
+
+def table_of(results: Sequence[tuple[str, float, Tally]]) -> str:
+    """Two tables in Markdown: what is found of disturbed discs, and what look-alikes give."""
+    shares = sorted({share for _, share, _ in results if share > 0.0})
+    head = "".join(f" {100 * share:.0f} % |" for share in shares)
+    lines = [f"| family |{head}", "|---|" + "---|" * len(shares)]
+    by_kind: dict[str, dict[float, Tally]] = {}
+    for kind, share, tally in results:
+        by_kind.setdefault(kind, {})[share] = tally
+    for kind in (*DISTURBANCES, BORDER):
+        cells = "".join(f" {_cell(by_kind[kind][share])} |" for share in shares)
+        lines.append(f"| {kind} |{cells}")
+    lines += ["", "| family | found, error, normalised |", "|---|---|"]
+    lines += [f"| {kind} | {_cell(by_kind[kind][0.0])} |" for kind in BLURRED]
+    lines += ["", "| look-alike | rows for each |", "|---|---|"]
+    lines += [f"| {kind} | {_digits(by_kind[kind][0.0].recall, 3)} |" for kind in LOOK_ALIKES]
+    elsewhere = sum(tally.elsewhere for _, _, tally in results)
+    scenes = sum(tally.shown for _, _, tally in results) / _PER_SCENE
+    lines += ["", f"Rows elsewhere: {elsewhere} in some {scenes:.0f} images."]
+    return "\n".join(lines)
+
+
+def _cell(tally: Tally) -> str:
+    rms, normalised = _digits(tally.rms_px, 2), f"{tally.normalised_error:.2f}"
+    return f"{_digits(tally.recall, 3)}, {rms} px, {normalised}"
+
+
+def _digits(value: float, digits: int) -> str:
+    return f"{value:.{digits}f}".removeprefix("0") if value < 1.0 else f"{value:.{digits}f}"
+
+
+def picture_of(camera: Camera, radius_m: float, share: float, seed: int) -> NDArray[np.uint8]:
+    """One disc of every family and one of every look-alike, side by side with their names."""
+    stage = Stage(camera, radius_m, np.random.default_rng(seed))
+    panels = []
+    for number, kind in enumerate((*DISTURBANCES, BORDER, *BLURRED, *LOOK_ALIKES)):
+        rng = np.random.default_rng([seed, number])
+        image, places = render_scene(stage, kind, share, rng)
+        place = min(places, key=lambda at: abs(float(np.hypot(*at)) - 1.8))
+        panels.append(_panel(image, stage.outline(place, 2.5), kind))
+    blank = np.full_like(panels[0], 255)
+    columns = 6
+    panels += [blank] * (-len(panels) % columns)
+    rows = [np.hstack(panels[k : k + columns]) for k in range(0, len(panels), columns)]
+    return np.vstack(rows)
+
+
+def _panel(image: NDArray[np.uint8], outline: FloatArray, name: str) -> NDArray[np.uint8]:
+    middle = outline.mean(axis=0)
+    half = float(np.ptp(outline[:, 0])) / 2.0
+    rows = np.linspace(middle[1] - half / 2.0, middle[1] + half / 2.0, 160)
+    columns = np.linspace(middle[0] - half, middle[0] + half, 160)
+    u, v = np.meshgrid(columns.astype(np.float32), rows.astype(np.float32))
+    crop = cv2.remap(image, u, v, cv2.INTER_NEAREST, borderValue=255)
+    panel = np.full((190, 168), 255, np.uint8)
+    panel[26:186, 4:164] = crop
+    cv2.putText(panel, name, (4, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.42, 0, 1, cv2.LINE_AA)
+    return panel
