@@ -21,20 +21,18 @@ from numpy.typing import NDArray
 from camera import Camera
 from camera.distortion import inverse_table
 from camera.kernels import camera_numbers, lens_numbers
-from detect.discs.candidates import NO_VOTES, SIGNS, Centres, Votes, best_centres, chosen
-from detect.discs.centre_rows import CentreRows, every_row, rows_to_look_at
-from detect.discs.fit import blur_ratio_of, fit_settings, working_space
+from detect.discs.candidates import alone_published, local_maxima
+from detect.discs.fit import blur_ratio_of, fit_settings
 from detect.discs.positions import published_positions as pixel_positions
 from detect.discs.positions import refined_covariances
-from detect.discs.published import published_centres, strong_and_highest
-from detect.discs.quality import Wanted, blocks_of, with_zeros
+from detect.discs.quality import Centres, Limits, centres_of, chosen
 from detect.discs.quality import quality_of_centres as quality_of_centres
 from detect.discs.rim_network import RimNetwork, rim_network
-from detect.discs.search import DiscSearch, search_discs
-from detect.discs.second_look import second_looks
+from detect.discs.search import DiscSearch, Scene, search_discs
+from detect.discs.second_look import SecondLooks, second_looks
 from detect.errors import FrameError
 from detect.noise import estimate_noise
-from detect.settings import CircleSettings
+from detect.settings import CircleSettings, Polarity
 from lut import DiscShape, DiscTable
 
 FloatArray = NDArray[np.float64]
@@ -45,8 +43,11 @@ PUBLISHED_PIXEL_VARIANCE = 2.0
 
 #: For the noise floor an image's noise is never less than this: one grey level, its resolution.
 _LEAST_NOISE = 1.0
+_SIGNS: dict[Polarity, int] = {"any": 0, "light": 1, "dark": -1}
 #: Rows of an image from which its noise is estimated.
 _NOISE_ROWS = 32
+#: Of the least quality, every second direction of what is fitted must have this share.
+_HALF_QUALITY = 0.8
 #: Where the quality is low, a centre is a candidate if the grey value steps by this much, grey
 #: levels, in this share of the directions.
 _VOTE_STEP, _VOTES = 10, 0.65
@@ -123,23 +124,23 @@ def detect_circles(
     # Those of votes alone are for a second look.
     good = centres.score >= settings.threshold
     kernel = _kernel_camera(camera)
-    pixels, found_quality, floor_xy, covariance, evidence = search_discs(
-        image,
-        table.floor_xy,
-        chosen(centres, good),
-        weakest,
-        _first_search(settings),
-        fit_settings(noise, kernel.blur_ratio),
-        (kernel.numbers, kernel.centre),
-        working_space(),
-    )
+    scene = Scene(
+        image, table.floor_xy, _first_search(settings), fit_settings(noise, kernel.blur_ratio),
+        kernel.numbers,
+    )  # fmt: skip
+    first = chosen(centres, good)
+    found = search_discs(scene, first, weakest)
+    pixels, found_quality = first.pixels[found.centre], first.quality[found.centre]
+    floor_xy, evidence = found.floor_xy, found.evidence
+    covariance = refined_covariance(camera, floor_xy, found.covariance, settings)
     if _looks_twice(settings):
         more = second_looks_at(image, camera, table, settings, centres, floor_xy, noise)
         is_disc = more.evidence >= settings.evidence
-        pixels = np.concatenate([pixels, more.pixels[is_disc]])
+        pixels = np.concatenate([pixels, centres.pixels[more.centre[is_disc]]])
         order = np.argsort(pixels[:, 1] * image.shape[1] + pixels[:, 0], kind="stable")
         pixels = pixels[order]
-        found_quality = np.concatenate([found_quality, more.quality[is_disc]])[order]
+        found_quality = np.concatenate([found_quality, centres.quality[more.centre[is_disc]]])
+        found_quality = found_quality[order]
         floor_xy = np.concatenate([floor_xy, more.place[is_disc]])[order]
         covariance = np.concatenate([covariance, more.covariance[is_disc]])[order]
         evidence = np.concatenate([evidence, more.evidence[is_disc]])[order]
@@ -162,7 +163,7 @@ def _looks_twice(settings: CircleSettings) -> bool:
 def candidates_of(
     image: NDArray[np.uint8], table: DiscTable, settings: CircleSettings, weakest: float
 ) -> Centres:
-    """Candidate centres: maxima of the quality and, for one polarity, of the votes.
+    """Candidate centres: those of a good quality and, for one polarity, with votes enough.
 
     Parameters
     ----------
@@ -171,26 +172,17 @@ def candidates_of(
     weakest : float
         Least step of the grey value, grey levels.
     """
-    votes = NO_VOTES
+    limits = Limits(
+        settings.threshold, _HALF_QUALITY * settings.threshold, sign=_SIGNS[settings.polarity]
+    )
     if _looks_twice(settings):
-        votes = Votes(_vote_step(weakest), math.ceil(_VOTES * table.samples))
-    rows = _looked_at(table, settings)
-    return best_centres(image, table, settings.threshold, settings.polarity, rows, votes)
+        votes = math.ceil(_VOTES * settings.samples)
+        limits = limits._replace(step=_vote_step(weakest), votes=votes)
+    return centres_of(image, table, limits)
 
 
 def _vote_step(weakest: float) -> int:
     return min(max(math.ceil(weakest), _VOTE_STEP), 254)
-
-
-class SecondLooks(NamedTuple):
-    """Candidates of the second look."""
-
-    pixels: NDArray[np.int64]
-    quality: FloatArray
-    features: FloatArray
-    place: FloatArray
-    covariance: FloatArray
-    evidence: FloatArray
 
 
 def second_looks_at(
@@ -225,24 +217,12 @@ def second_looks_at(
     """
     kernel = _kernel_camera(camera)
     weakest = settings.noise_floor * max(noise, _LEAST_NOISE)
-    index, features, place, covariance, evidence = second_looks(
-        image,
-        table.floor_xy,
-        centres,
-        np.ascontiguousarray(found_xy),
-        _disc_search(settings),
-        float(_vote_step(weakest)),
-        kernel.numbers,
-        network or rim_network(),
-    )
-    return SecondLooks(
-        centres.pixels[index],
-        centres.quality[index],
-        features,
-        place,
-        refined_covariance(camera, place, covariance, settings),
-        evidence,
-    )
+    fits = fit_settings(noise, kernel.blur_ratio)
+    scene = Scene(image, table.floor_xy, _disc_search(settings), fits, kernel.numbers)
+    step = float(_vote_step(weakest))
+    looks = second_looks(scene, centres, found_xy, step, network or rim_network())
+    covariance = refined_covariance(camera, looks.place, looks.covariance, settings)
+    return looks._replace(covariance=covariance)
 
 
 def _without_fit(
@@ -253,28 +233,25 @@ def _without_fit(
     if settings.noise_floor > 0.0:
         noise = estimate_noise(image, _NOISE_ROWS)
         weakest = max(weakest, settings.noise_floor * max(noise, _LEAST_NOISE))
+    limits = Limits(
+        settings.threshold,
+        max(2.0 * settings.threshold - 1.0, 0.0),
+        weakest,
+        _SIGNS[settings.polarity],
+    )
+    pixels, quality, _, _ = centres_of(image, table, limits)
     if settings.stride == 0.0:
-        pixels, quality, contrast, _ = best_centres(
-            image, table, settings.threshold, settings.polarity
-        )
-        keep = strong_and_highest(
-            pixels, quality, contrast, table.floor_xy, 0.0, weakest, settings.separation_m
-        )
+        qualities = np.zeros(image.shape)
+        qualities[pixels[:, 1], pixels[:, 0]] = quality
+        keep = local_maxima(qualities, settings.threshold)[pixels[:, 1], pixels[:, 0]]
         pixels, quality = pixels[keep], quality[keep]
-    else:
-        wanted = Wanted(settings.threshold, weakest, SIGNS[settings.polarity], *NO_VOTES)
-        every = every_row(table).blocks
-        pixels, quality = published_centres(
-            with_zeros(image, table), blocks_of(table), every, wanted, table.floor_xy,
-            settings.separation_m,
-        )  # fmt: skip
+    above = quality > settings.threshold
+    pixels, quality = pixels[above], quality[above]
+    seen_xy = table.floor_xy[pixels[:, 1], pixels[:, 0]]
+    keep = alone_published(seen_xy, quality, settings.separation_m)
+    pixels, quality = pixels[keep], quality[keep]
     floor_xy, covariance = published_positions(camera, pixels)
     return CircleDetections(pixels, floor_xy, covariance, quality, np.full(len(pixels), np.nan))
-
-
-@lru_cache(maxsize=4)
-def _looked_at(table: DiscTable, settings: CircleSettings) -> CentreRows:
-    return rows_to_look_at(table, settings)
 
 
 @lru_cache(maxsize=4)
@@ -304,6 +281,10 @@ def _first_search(settings: CircleSettings) -> DiscSearch:
 def disc_shape(settings: CircleSettings) -> DiscShape:
     """What the table needs to know of the settings."""
     inner, outer = settings.inner_radius_m, settings.outer_radius_m
+    stride_m, rows_m = settings.stride * (outer - inner), 0.0
+    if settings.verify and settings.refine:
+        rows_m = settings.rows_apart * min(settings.radius_m - inner, outer - settings.radius_m)
+        stride_m = max(stride_m, rows_m)
     return DiscShape(
         inner_radius_m=inner,
         outer_radius_m=outer,
@@ -312,7 +293,8 @@ def disc_shape(settings: CircleSettings) -> DiscShape:
         far_limit_m_per_px=settings.far_limit_m_per_px,
         least_pairs=settings.least_pairs,
         apart_px=settings.apart_px,
-        stride_m=settings.stride * (outer - inner),
+        stride_m=stride_m,
+        rows_m=rows_m,
     )
 
 

@@ -134,7 +134,9 @@ def solve_step(
     the damping, come in only then.
     """
     damped, factor, values = work.damped, work.factor, work.values
-    damped[BY_BLUR:, :] = work.best[BY_BLUR:, :]
+    for i in range(BY_BLUR, ROWS):
+        for j in range(ROWS):
+            damped[i, j] = work.best[i, j]
     for parameter, off, sigma in (
         (BY_BLUR, best.log_blur - math.log(settings.blur_px), settings.blur_sigma),
         (BY_RADIUS, best.radius - 1.0, settings.radius_sigma),
@@ -223,7 +225,9 @@ def descend(
             done = cost - now <= 1e-3 * variance_now
             cost, variance, best = now, variance_now, disc
             contrast = factor[GREY, SHARE] * factor[SHARE, SHARE]
-            work.best[:] = products
+            for i in range(ROWS):
+                for j in range(ROWS):
+                    work.best[i, j] = products[i, j]
             damping = max(0.2 * damping, 1e-7)
             if not abs(contrast) > 1e-6:
                 break

@@ -63,8 +63,8 @@ def residuals(
         leaves there.
     """
     design, residual, without = patch.design, patch.residual, patch.row
-    residual[:n] = design[GREY, :n]
-    without[:n] = design[GREY, :n]
+    for i in range(n):
+        residual[i] = without[i] = design[GREY, i]
     for row in range(UNKNOWNS):
         value = F32(values[row])
         for i in range(n):
@@ -165,7 +165,7 @@ def outline_statistics(
     """
     _find_sectors(patch, n, disc)
     c = F32(contrast)
-    sums[:] = 0.0
+    sums.fill(0.0)
     for i in range(n):
         w, e = patch.design[SHARE, i], patch.residual[i]
         r = c * patch.design[BY_RADIUS, i]

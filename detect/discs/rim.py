@@ -302,7 +302,9 @@ def best_circle(
     best_chosen : (DIRECTIONS,) float64
         Result: the weights of the points on the circle, 0 of the others.
     """
-    points = np.sum(weight > 0.0)
+    points = 0
+    for k in range(DIRECTIONS):
+        points += weight[k] > 0.0
     chosen = np.zeros(DIRECTIONS)
     best = Circle(0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
     best_count = 0
@@ -321,7 +323,8 @@ def best_circle(
         if count > best_count:
             best_count = count
             best = circle
-            best_chosen[:] = chosen
+            for k in range(DIRECTIONS):
+                best_chosen[k] = chosen[k]
             # What has more points than this shares most of them: it is the same circle.
             if count >= _CERTAINLY_BEST * points:
                 break
@@ -408,3 +411,17 @@ def follow_rim(
         x + radius * best.x, y + radius * best.y, radius * best.radius,
         best.cov_xx * scale_2, best.cov_xy * scale_2, best.cov_yy * scale_2, radius_px,
     )  # fmt: skip
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def median(values: NDArray[np.float64]) -> float:
+    """Median of some values, which are sorted. (NumPy's takes much longer to compile.)"""
+    count = len(values)
+    for i in range(1, count):
+        value = values[i]
+        k = i
+        while k > 0 and values[k - 1] > value:
+            values[k] = values[k - 1]
+            k -= 1
+        values[k] = value
+    return float(0.5 * (values[(count - 1) // 2] + values[count // 2]))

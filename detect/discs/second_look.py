@@ -11,16 +11,20 @@ and a small network (`detect.discs.rim_network`) decides by the grey values abou
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from detect.discs.candidates import Centres, strong_and_alone, suppress_neighbours
+from detect.discs.candidates import strong_and_alone, suppress_neighbours
 from detect.discs.patch import floor_steps
-from detect.discs.rim import Rim, follow_rim, profiles
+from detect.discs.quality import Centres, chosen
+from detect.discs.rim import Rim, follow_rim, median, profiles
 from detect.discs.rim_network import RimNetwork, network_inputs, network_log_odds
-from detect.discs.search import DiscSearch
+from detect.discs.search import DiscSearch, Scene
+
+FloatArray = NDArray[np.float64]
 
 _DIRECTIONS = 16
 _ANGLES = 2.0 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
@@ -106,40 +110,17 @@ def outline_steps(
     votes = difference > step
     if np.sum(votes) < 5:
         return -math.inf, 0.0
-    work = np.empty(_DIRECTIONS)
-    count = 0
-    for k in range(_DIRECTIONS):
-        if votes[k]:
-            work[count] = difference[k]
-            count += 1
-    median = _median(work, count)
-    work[:] = inside
-    level = _median(work, _DIRECTIONS)
-    work[:] = np.abs(inside - level)
-    spread = _median(work, _DIRECTIONS)
-    work[:] = np.abs(near_rim - inside)
-    slope = _median(work, _DIRECTIONS)
+    usual = median(difference[votes])
+    spread = median(np.abs(inside - median(inside.copy())))
+    slope = median(np.abs(near_rim - inside))
     weights = _OUTLINE_WEIGHTS
     weight = (
-        weights[0] * np.sum(difference > _LEAST_STEP * median)
-        + weights[1] * min(spread / median, 1.2)
-        + weights[2] * min(_about_plane(outside, votes, _COS, _SIN) / median, 1.2)
-        + weights[3] * min(slope / median, 1.2)
+        weights[0] * np.sum(difference > _LEAST_STEP * usual)
+        + weights[1] * min(spread / usual, 1.2)
+        + weights[2] * min(_about_plane(outside, votes, _COS, _SIN) / usual, 1.2)
+        + weights[3] * min(slope / usual, 1.2)
     )
-    return float(weight), median
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def _median(values: NDArray[np.float64], count: int) -> float:
-    """Median of the first few of some values, which are sorted."""
-    for i in range(1, count):
-        value = values[i]
-        k = i
-        while k > 0 and values[k - 1] > value:
-            values[k] = values[k - 1]
-            k -= 1
-        values[k] = value
-    return float(0.5 * (values[(count - 1) // 2] + values[count // 2]))
+    return float(weight), usual
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -155,69 +136,72 @@ def _note_rim(rim: Rim, radius: float, score: float, out: NDArray[np.float64]) -
     out[6] = score
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+class SecondLooks(NamedTuple):
+    """Candidates that were followed to the end: of those at one place the best.
+
+    Attributes
+    ----------
+    centre : (L,) int64
+        Their indices.
+    features : (L, len(FEATURES)) float64
+        Of their rims.
+    place, covariance : (L, 2), (L, 2, 2) float64
+        Metres, square metres.
+    evidence : (L,) float64
+        Log-odds, on the scale of `DiscSearch.least_evidence`.
+    """
+
+    centre: NDArray[np.int64]
+    features: FloatArray
+    place: FloatArray
+    covariance: FloatArray
+    evidence: FloatArray
+
+
 def second_looks(
-    image: NDArray[np.uint8],
-    floor_xy: NDArray[np.float32],
-    centres: Centres,
-    found_xy: NDArray[np.float64],
-    search: DiscSearch,
-    step: float,
-    camera_numbers: NDArray[np.float64],
-    network: RimNetwork,
-) -> tuple[
-    NDArray[np.int64],
-    NDArray[np.float64],
-    NDArray[np.float64],
-    NDArray[np.float64],
-    NDArray[np.float64],
-]:
+    scene: Scene, centres: Centres, found_xy: FloatArray, step: float, network: RimNetwork
+) -> SecondLooks:
     """Look a second time at candidates that are not at discs already found.
 
     Parameters
     ----------
-    image : (H, W) uint8
-    floor_xy : (H, W, 2) float32
-        Floor position of each pixel, metres.
+    scene : Scene
     centres : Centres
         Candidates; the contrast's sign says which discs are looked for.
     found_xy : (M, 2) float64
         Places of discs already found, metres.
-    search : DiscSearch
     step : float
         Directions with a larger step are compared first, grey levels.
-    camera_numbers : (K,) float64
-        `camera.kernels.camera_numbers`.
     network : RimNetwork
-
-    Returns
-    -------
-    index : (L,) int64
-        Which candidates were followed to the end: of those at one place the best.
-    features : (L, len(FEATURES)) float64
-    place : (L, 2) float64
-        Metres.
-    covariance : (L, 2, 2) float64
-        Of the place, square metres.
-    evidence : (L,) float64
-        Log-odds, on the scale of `DiscSearch.least_evidence`.
     """
-    index = strong_and_alone(
-        centres.pixels, centres.score, centres.contrast, floor_xy, 0.0, 0.5 * search.separation
+    separation = scene.search.separation
+    index = strong_and_alone(centres, centres.score, scene.floor_xy, 0.0, 0.5 * separation)
+    looks = _look_at_all(
+        scene, chosen(centres, index), np.ascontiguousarray(found_xy), step, network
     )
-    n = len(index)
-    features = np.empty((n, len(FEATURES)))
-    place = np.empty((n, 2))
-    covariance = np.empty((n, 2, 2))
-    evidence = np.empty(n)
+    best = np.flatnonzero(suppress_neighbours(looks.place, looks.evidence, separation))
+    return SecondLooks(
+        index[looks.centre[best]], looks.features[best], looks.place[best], looks.covariance[best],
+        looks.evidence[best],
+    )  # fmt: skip
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _look_at_all(
+    scene: Scene, centres: Centres, found_xy: FloatArray, step: float, network: RimNetwork
+) -> SecondLooks:
+    image, camera_numbers, search = scene.image, scene.camera_numbers, scene.search
+    n = len(centres.score)
+    index, features = np.empty(n, np.int64), np.empty((n, len(FEATURES)))
+    place, covariance, evidence = np.empty((n, 2)), np.empty((n, 2, 2)), np.empty(n)
     count = 0
-    for i in index:
+    for i in range(n):
         u, v = centres.pixels[i, 0], centres.pixels[i, 1]
-        x, y = np.float64(floor_xy[v, u, 0]), np.float64(floor_xy[v, u, 1])
+        x, y = np.float64(scene.floor_xy[v, u, 0]), np.float64(scene.floor_xy[v, u, 1])
         if _near_any(found_xy, x, y, _WITHIN * search.separation):
             continue
         sign = 1.0 if centres.contrast[i] > 0.0 else -1.0
-        weight, median = outline_steps(image, floor_xy, u, v, search, sign, step)
+        weight, median = outline_steps(image, scene.floor_xy, u, v, search, sign, step)
         if weight < _LEAST_OUTLINE:
             continue
         rim = follow_rim(image, camera_numbers, x, y, search.radius, sign * median)
@@ -238,12 +222,13 @@ def second_looks(
         covariance[count, 0, 1] = covariance[count, 1, 0] = rim.cov_xy
         evidence[count] = search.least_evidence + log_odds - _TAKEN
         count += 1
-    best = np.flatnonzero(suppress_neighbours(place[:count], evidence[:count], search.separation))
-    return index[best], features[best], place[best], covariance[best], evidence[best]
+    return SecondLooks(
+        index[:count], features[:count], place[:count], covariance[:count], evidence[:count]
+    )
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _near_any(places: NDArray[np.float64], x: float, y: float, distance: float) -> bool:
+def _near_any(places: FloatArray, x: float, y: float, distance: float) -> bool:
     for k in range(len(places)):
         if (places[k, 0] - x) ** 2 + (places[k, 1] - y) ** 2 < distance * distance:
             return True
