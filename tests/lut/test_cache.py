@@ -326,7 +326,7 @@ def test_concurrent_writers_all_get_right_tables(
     tmp_path: Path, camera: Camera, project_root: Path
 ) -> None:
     built = build_disc_table(camera, SHAPE)
-    right = hashlib.sha256(built.copies.tobytes() + built.floor_xy.tobytes()).hexdigest()
+    right = hashlib.sha256(built.samples.tobytes() + built.floor_xy.tobytes()).hexdigest()
     write_camera(camera, tmp_path / "e.cam")
     processes = [
         subprocess.Popen(
