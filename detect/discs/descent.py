@@ -18,6 +18,17 @@ import numpy as np
 from numba import njit
 
 from detect.discs.evidence_kernels import LEAST_EXPLAINED, evidence_of
+from detect.discs.least_squares import (
+    BACKGROUND,
+    SECTORS,
+    UNKNOWNS,
+    background_products,
+    blur_width,
+    disc_products,
+    factor_rows,
+    left_over,
+    solution,
+)
 from detect.discs.model import (
     BY_BLUR,
     BY_RADIUS,
@@ -32,17 +43,7 @@ from detect.discs.model import (
     chord_shares,
     edge_shares,
 )
-from detect.discs.normal_equations import (
-    BACKGROUND,
-    UNKNOWNS,
-    background_products,
-    disc_products,
-    factor_rows,
-    left_over,
-    solution,
-)
 from detect.discs.patch import CHORDS_ALONG_V, EDGE, PATCH, FitSettings, Gathered
-from detect.discs.residuals import SECTORS, blur_width
 
 #: Limits of what a fit may come to; the blur in pixels, the radius in nominal ones.
 LEAST_BLUR, MOST_BLUR = 0.1, 8.0

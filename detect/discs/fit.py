@@ -2,7 +2,7 @@
 
 Around each candidate a blurred disc on an unevenly lit background is fitted: pixels are gathered
 (`detect.discs.patch`), the descent goes to the least squares (`detect.discs.descent`), and the
-residuals say how far the fit can be trusted (`detect.discs.residuals`). It gives the position
+residuals say how far the fit can be trusted (`detect.discs.least_squares`). It gives the position
 with its covariance, and the evidence that there is a disc at all.
 """
 
@@ -29,11 +29,19 @@ from detect.discs.descent import (
     moved,
     solve_step,
 )
-from detect.discs.evidence_kernels import evidence_of_all
+from detect.discs.evidence_kernels import evidence_of
+from detect.discs.least_squares import (
+    BACKGROUND,
+    UNKNOWNS,
+    blur_width,
+    correlated_area,
+    factor_rows,
+    outline_statistics,
+    residuals,
+    solution,
+)
 from detect.discs.model import BY_BLUR, BY_X, BY_Y, SHARE, Disc
-from detect.discs.normal_equations import BACKGROUND, UNKNOWNS, factor_rows, solution
 from detect.discs.patch import EDGE, FULL, LOOK, Candidate, Effort, FitSettings, Gathered, gather
-from detect.discs.residuals import blur_width, correlated_area, outline_statistics, residuals
 
 FloatArray = NDArray[np.float64]
 
@@ -374,15 +382,10 @@ def disc_evidence(fits: DiscFits, radius_m: float, blur_px: float = 1.0) -> Floa
     -------
     (N,) float64
     """
-    return np.asarray(
-        evidence_of_all(
-            fits.fitted,
-            fits.explained,
-            fits.radius_m / radius_m,
-            fits.outline_deviation,
-            fits.sectors_good,
-            fits.middle_step,
-            fits.relative_blur,
-            blur_px,
-        )
-    )
+    evidence = np.full(len(fits.fitted), -np.inf)
+    for k in np.flatnonzero(fits.fitted):
+        evidence[k] = evidence_of(
+            fits.explained[k], fits.radius_m[k] / radius_m, fits.outline_deviation[k],
+            fits.sectors_good[k], fits.middle_step[k], fits.relative_blur[k], blur_px,
+        )  # fmt: skip
+    return evidence
