@@ -21,21 +21,19 @@ from numpy.typing import NDArray
 from camera import Camera
 from camera.distortion import inverse_table
 from camera.kernels import camera_numbers, lens_numbers
-from detect.discs.candidates import NO_VOTES, SIGNS, best_centres
-from detect.discs.centre_rows import CentreRows, every_row, rows_to_look_at
-from detect.discs.fit import blur_ratio_of, fit_settings, working_space
+from detect.discs.candidates import alone_published, local_maxima
+from detect.discs.fit import blur_ratio_of, fit_settings
 from detect.discs.hough import hough_candidates
 from detect.discs.positions import published_positions as pixel_positions
 from detect.discs.positions import refined_covariances
-from detect.discs.published import published_centres, strong_and_highest
-from detect.discs.quality import Wanted, blocks_of, with_zeros
+from detect.discs.quality import Limits, centres_of
 from detect.discs.quality import quality_of_centres as quality_of_centres
 from detect.discs.rim_network import RimNetwork, rim_network
-from detect.discs.search import DiscSearch, search_discs
+from detect.discs.search import DiscSearch, Scene, search_discs
 from detect.discs.second_look import SecondLooks, Sought, second_looks
 from detect.errors import FrameError
 from detect.noise import estimate_noise
-from detect.settings import CircleSettings
+from detect.settings import CircleSettings, Polarity
 from lut import DiscShape, DiscTable
 
 FloatArray = NDArray[np.float64]
@@ -46,10 +44,13 @@ PUBLISHED_PIXEL_VARIANCE = 2.0
 
 #: For the noise floor an image's noise is never less than this: one grey level, its resolution.
 _LEAST_NOISE = 1.0
+_SIGNS: dict[Polarity, int] = {"any": 0, "light": 1, "dark": -1}
 #: Rows of an image from which its noise is estimated.
 _NOISE_ROWS = 32
 #: Least gradient of an edge that votes, and least step of a rim, grey levels (per pixel).
 _EDGE, _LEAST_STEP = 4.0, 8.0
+#: Of the least quality, every second direction of what is fitted must have this share.
+_HALF_QUALITY = 0.8
 #: Discs of so little more than the least evidence are for the second look, where there is one.
 _DOUBTFUL = 0.5
 
@@ -119,19 +120,17 @@ def detect_circles(
         return _without_fit(image, camera, table, settings)
     noise = estimate_noise(image, _NOISE_ROWS)
     weakest = settings.noise_floor * max(noise, _LEAST_NOISE)
-    rows = _looked_at(table, settings)
-    centres = best_centres(image, table, settings.threshold, settings.polarity, rows)
+    least, sign = settings.threshold, _SIGNS[settings.polarity]
+    centres = centres_of(image, table, Limits(least, _HALF_QUALITY * least, sign=sign))
     kernel = _kernel_camera(camera)
-    pixels, found_quality, floor_xy, covariance, evidence = search_discs(
-        image,
-        table.floor_xy,
-        centres,
-        weakest,
-        _first_search(settings),
-        fit_settings(noise, kernel.blur_ratio),
-        (kernel.numbers, kernel.centre),
-        working_space(),
-    )
+    scene = Scene(
+        image, table.floor_xy, _first_search(settings), fit_settings(noise, kernel.blur_ratio),
+        kernel.numbers,
+    )  # fmt: skip
+    found = search_discs(scene, centres, weakest)
+    pixels, found_quality = centres.pixels[found.centre], centres.quality[found.centre]
+    floor_xy, evidence = found.floor_xy, found.evidence
+    covariance = refined_covariance(camera, floor_xy, found.covariance, settings)
     if _looks_twice(settings):
         more = second_looks_at(image, camera, table, settings, floor_xy, noise)
         is_disc = more.log_odds >= 0.0
@@ -157,7 +156,7 @@ def detect_circles(
 
 
 def _looks_twice(settings: CircleSettings) -> bool:
-    """Whether the grey value may vote: of two signs, chance would vote for either."""
+    """Whether there is a second look: of two signs, chance would speak for either."""
     return settings.polarity != "any" and settings.verify and settings.refine
 
 
@@ -184,7 +183,7 @@ def second_looks_at(
         Another than the trained one.
     """
     weakest = settings.noise_floor * max(noise, _LEAST_NOISE)
-    sign = SIGNS[settings.polarity]
+    sign = float(_SIGNS[settings.polarity])
     edge = max(_EDGE, 0.5 * weakest)
     candidates = hough_candidates(image, camera, table, settings.radius_m, sign, edge)
     sought = Sought(settings.radius_m, settings.separation_m, sign, max(weakest, _LEAST_STEP))
@@ -202,28 +201,25 @@ def _without_fit(
     if settings.noise_floor > 0.0:
         noise = estimate_noise(image, _NOISE_ROWS)
         weakest = max(weakest, settings.noise_floor * max(noise, _LEAST_NOISE))
+    limits = Limits(
+        settings.threshold,
+        max(2.0 * settings.threshold - 1.0, 0.0),
+        weakest,
+        _SIGNS[settings.polarity],
+    )
+    pixels, quality, _ = centres_of(image, table, limits)
     if settings.stride == 0.0:
-        pixels, quality, contrast, _ = best_centres(
-            image, table, settings.threshold, settings.polarity
-        )
-        keep = strong_and_highest(
-            pixels, quality, contrast, table.floor_xy, 0.0, weakest, settings.separation_m
-        )
+        qualities = np.zeros(image.shape)
+        qualities[pixels[:, 1], pixels[:, 0]] = quality
+        keep = local_maxima(qualities, settings.threshold)[pixels[:, 1], pixels[:, 0]]
         pixels, quality = pixels[keep], quality[keep]
-    else:
-        wanted = Wanted(settings.threshold, weakest, SIGNS[settings.polarity], *NO_VOTES)
-        every = every_row(table).blocks
-        pixels, quality = published_centres(
-            with_zeros(image, table), blocks_of(table), every, wanted, table.floor_xy,
-            settings.separation_m,
-        )  # fmt: skip
+    above = quality > settings.threshold
+    pixels, quality = pixels[above], quality[above]
+    seen_xy = table.floor_xy[pixels[:, 1], pixels[:, 0]]
+    keep = alone_published(seen_xy, quality, settings.separation_m)
+    pixels, quality = pixels[keep], quality[keep]
     floor_xy, covariance = published_positions(camera, pixels)
     return CircleDetections(pixels, floor_xy, covariance, quality, np.full(len(pixels), np.nan))
-
-
-@lru_cache(maxsize=4)
-def _looked_at(table: DiscTable, settings: CircleSettings) -> CentreRows:
-    return rows_to_look_at(table, settings)
 
 
 @lru_cache(maxsize=4)
@@ -253,6 +249,10 @@ def _first_search(settings: CircleSettings) -> DiscSearch:
 def disc_shape(settings: CircleSettings) -> DiscShape:
     """What the table needs to know of the settings."""
     inner, outer = settings.inner_radius_m, settings.outer_radius_m
+    stride_m, rows_m = settings.stride * (outer - inner), 0.0
+    if settings.verify and settings.refine:
+        rows_m = settings.rows_apart * min(settings.radius_m - inner, outer - settings.radius_m)
+        stride_m = max(stride_m, rows_m)
     return DiscShape(
         inner_radius_m=inner,
         outer_radius_m=outer,
@@ -261,7 +261,8 @@ def disc_shape(settings: CircleSettings) -> DiscShape:
         far_limit_m_per_px=settings.far_limit_m_per_px,
         least_pairs=settings.least_pairs,
         apart_px=settings.apart_px,
-        stride_m=settings.stride * (outer - inner),
+        stride_m=stride_m,
+        rows_m=rows_m,
     )
 
 

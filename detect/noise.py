@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
-
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
-
-from detect.noise_kernels import median_response
 
 #: With fewer pixels than this that are neither black nor saturated, all count for the noise.
 _LEAST_COUNTABLE = 100
+#: Grey values that count lie between these.
+_DARK, _LIGHT = 2, 253
+#: The mask's absolute coefficients add up to 16, so no response is larger.
+_MOST_RESPONSE = 16 * 255
 
 
 def estimate_noise(image: NDArray[np.uint8], most_rows: int | None = None) -> float:
@@ -35,17 +36,39 @@ def estimate_noise(image: NDArray[np.uint8], most_rows: int | None = None) -> fl
     height, width = image.shape
     if min(height, width) < 3:
         return 0.0
-    rows = _rows(height, most_rows)
-    response = np.empty(len(rows) * (width - 2), np.int16)
+    rows = np.arange(1, height - 1)
+    if most_rows is not None and most_rows < len(rows):
+        rows = rows[np.arange(most_rows) * (len(rows) - 1) // (most_rows - 1)]
     # The mask's coefficients have a sum of squares of 36; 0.6745 makes a median a deviation.
-    return median_response(image, rows, _LEAST_COUNTABLE, response) / 0.6745 / 6.0
+    return _median_response(image, rows) / 0.6745 / 6.0
 
 
-@lru_cache(maxsize=8)
-def _rows(height: int, most_rows: int | None) -> NDArray[np.intp]:
-    """The rows to use."""
-    if most_rows is None:
-        rows = np.arange(1, height - 1)
-    else:
-        rows = np.unique(np.linspace(1, height - 2, most_rows).astype(np.intp))
-    return rows
+@njit(cache=True, error_model="numpy", nogil=True)
+def _median_response(image: NDArray[np.uint8], rows: NDArray[np.int64]) -> float:
+    """Median of the absolute responses in some rows, by their histogram."""
+    width = image.shape[1]
+    bend = np.empty(width, np.int32)
+    counted = np.zeros(_MOST_RESPONSE + 1, np.int64)
+    others = np.zeros(_MOST_RESPONSE + 1, np.int64)
+    for v in rows:
+        above, here, below = image[v - 1], image[v], image[v + 1]
+        for u in range(width):
+            bend[u] = np.int32(above[u]) + np.int32(below[u]) - 2 * np.int32(here[u])
+        for u in range(1, width - 1):
+            response = abs(bend[u - 1] - 2 * bend[u] + bend[u + 1])
+            if _DARK < here[u] < _LIGHT:
+                counted[response] += 1
+            else:
+                others[response] += 1
+    count = np.sum(counted)
+    if count < _LEAST_COUNTABLE:
+        counted += others
+        count = np.sum(counted)
+    # The two in the middle, or twice the one.
+    seen, total = 0, 0.0
+    for response in range(len(counted)):
+        for rank in ((count - 1) // 2, count // 2):
+            if seen <= rank < seen + counted[response]:
+                total += 0.5 * response
+        seen += counted[response]
+    return total

@@ -71,8 +71,9 @@ def invert_positive(matrix: NDArray[np.float64], inverse: NDArray[np.float64]) -
     unit = np.zeros(n)
     column = np.empty(n)
     for j in range(n):
-        unit[:] = 0.0
+        unit.fill(0.0)
         unit[j] = 1.0
         _substitute(lower, unit, column)
-        inverse[:, j] = column
+        for i in range(n):
+            inverse[i, j] = column[i]
     return bool(np.all(np.isfinite(inverse)))

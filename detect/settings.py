@@ -58,7 +58,8 @@ class CircleSettings:
     rows_apart : float
         If detections are fitted (`verify` and `refine`), rows of centres are skipped, as long as
         each row of a disc is at most this share of the distance between the disc's edge and the
-        nearer outline from an evaluated row; 0: every row is evaluated.
+        nearer outline from an evaluated row, and centres along a row, up to half of that; 0: every
+        centre is evaluated.
     least_contrast : float
         Without a fit: the mean grey values of the outlines differ by more than this.
     noise_floor : float

@@ -2,12 +2,12 @@
 
 from lut.cache import TABLE_VERSION, cache_folder, cached_disc_table, cached_vertical_table
 from lut.errors import TableError
-from lut.floor import floor_positions
 from lut.outlines import (
     MIN_SHARE_INSIDE,
     DiscShape,
     DiscTable,
     build_disc_table,
+    floor_positions,
     ring,
 )
 from lut.verticals import VerticalTable, build_vertical_table

@@ -12,29 +12,28 @@ be written to is no error: the next run just computes again.
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 import io
 import logging
 import os
 import stat
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from dataclasses import astuple, fields
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
 from camera import Camera
-from lut.floor import floor_positions
 from lut.outlines import DiscShape, DiscTable, build_disc_table
 from lut.table_checks import check_disc_table, check_vertical_table
 from lut.verticals import VerticalTable, build_vertical_table
 from storage import write_whole
 
 #: Incremented with every change of the tables' content or computation.
-TABLE_VERSION = 12
+TABLE_VERSION = 13
 
-Made = TypeVar("Made")
+Table = TypeVar("Table", DiscTable, VerticalTable)
 
 _log = logging.getLogger("redetect")
 
@@ -75,24 +74,12 @@ def cached_disc_table(camera: Camera, shape: DiscShape, folder: Path | None = No
     TableError
         As `lut.build_disc_table`.
     """
-    folder = cache_folder() if folder is None else folder
-    path = folder / f"discs-{_key(camera, shape)}.table"
-    table: DiscTable | None = None
-    if (fields := _read(path)) is not None:
-        # Outside of the checks that follow: an error here is not the file's.
-        floor_xy = floor_positions(camera).astype(np.float32)
-
-        def complete() -> DiscTable:
-            table = DiscTable(**fields, floor_xy=floor_xy)
-            check_disc_table(table, camera, shape)
-            return table
-
-        table = _sound(path, complete)
+    path = (folder or cache_folder()) / f"discs-{_key(camera, shape)}.table"
+    table = _read(path, DiscTable, lambda table: check_disc_table(table, camera, shape))
     if table is None:
         _log.info("computing the table of discs, once for this calibration")
         table = build_disc_table(camera, shape)
-        # The largest part of a table, and computed as soon as it would be read.
-        _keep(path, table, without=("floor_xy",))
+        _keep(path, table)
     return table
 
 
@@ -111,16 +98,8 @@ def cached_vertical_table(camera: Camera, folder: Path | None = None) -> Vertica
     VerticalTable
         Equal to that of `lut.build_vertical_table`.
     """
-    path = (cache_folder() if folder is None else folder) / f"verticals-{_key(camera)}.table"
-    table: VerticalTable | None = None
-    if (fields := _read(path)) is not None:
-
-        def complete() -> VerticalTable:
-            table = VerticalTable(**fields)
-            check_vertical_table(table, camera)
-            return table
-
-        table = _sound(path, complete)
+    path = (folder or cache_folder()) / f"verticals-{_key(camera)}.table"
+    table = _read(path, VerticalTable, lambda table: check_vertical_table(table, camera))
     if table is None:
         _log.info("computing the table of verticals, once for this calibration")
         table = build_vertical_table(camera)
@@ -129,37 +108,30 @@ def cached_vertical_table(camera: Camera, folder: Path | None = None) -> Vertica
 
 
 def _key(camera: Camera, shape: DiscShape | None = None) -> str:
-    values = () if shape is None else dataclasses.astuple(shape)
+    values = () if shape is None else astuple(shape)
     numbers = [float(value).hex() for value in values]
     parts = [str(TABLE_VERSION), camera.content_hash, *numbers]
     return hashlib.sha256(" ".join(parts).encode()).hexdigest()[:32]
 
 
-def _read(path: Path) -> dict[str, Any] | None:
-    """The fields that a file holds; None if there is no file or it must not be used."""
+def _read(path: Path, kind: type[Table], check: Callable[[Table], None]) -> Table | None:
+    """The table that a file holds; None if there is no file, or one that must not be used."""
     content = _own_content(path)
     if content is None:
         return None
     digest, payload = content[:_DIGEST_BYTES], content[_DIGEST_BYTES:]
-
-    def fields() -> dict[str, Any]:
+    try:
         if _digest(path, payload) != digest:
             raise ValueError("damaged")
         with np.load(io.BytesIO(payload), allow_pickle=False) as arrays:
-            found = {name: arrays[name] for name in arrays.files}
+            found: dict[str, Any] = {name: arrays[name] for name in arrays.files}
         # Numbers were stored as arrays without dimensions.
-        return {name: a if a.ndim else a.item() for name, a in found.items()}
-
-    return _sound(path, fields)
-
-
-def _sound(path: Path, make: Callable[[], Made]) -> Made | None:
-    """What `make` returns for a file's content; None, with a warning, if the content is invalid."""
-    try:
-        return make()
+        table = kind(**{name: a if a.ndim else a.item() for name, a in found.items()})
+        check(table)
     except Exception:  # a damaged or forged archive can raise anything
         _log.info("%s: is damaged: it is computed again", path)
         return None
+    return table
 
 
 def _own_content(path: Path) -> bytes | None:
@@ -206,12 +178,10 @@ def _digest(path: Path, payload: bytes) -> bytes:
     return digest.digest()
 
 
-def _keep(path: Path, table: DiscTable | VerticalTable, without: Sequence[str] = ()) -> None:
+def _keep(path: Path, table: DiscTable | VerticalTable) -> None:
     buffer = io.BytesIO()
-    names = [field.name for field in dataclasses.fields(table) if field.name not in without]
-    fields = {name: getattr(table, name) for name in names}
     # NumPy before 2.1 would take `allow_pickle` for an array; these are numbers all.
-    np.savez(buffer, **fields)
+    np.savez(buffer, **{field.name: getattr(table, field.name) for field in fields(table)})
     payload = buffer.getvalue()
     try:
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)

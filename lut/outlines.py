@@ -1,44 +1,29 @@
-"""Table of the outlines' pixels around every possible centre of a disc.
+"""Table of the outlines' pixels around the centres of discs that are tested.
 
 A disc on the floor centred where pixel (u, v) meets it has an inner outline (inside the disc's
 edge) and an outer one (outside). Where their equally spaced samples fall in the image depends on
-the calibration alone, so it is computed ahead of time, for every pixel (DLR Spatial Cognition data
-set report, circle detection).
+the calibration alone, so it is computed ahead of time (DLR Spatial Cognition data set report,
+circle detection).
 
-From one pixel to the next along a row, a sample nearly always moves by one pixel as well: its
-offset from the centre stays the same for some 50 pixels. So the table does not store an offset for
-each centre and sample but a list of *copies*: up to 64 bytes of the image each, as far apart as the
-centres are. Placed one after the other, they align the grey values of one sample for consecutive
-centres. Excess bytes of a copy are overwritten by the next.
-
-Samples outside the image do not count: the table takes them from behind the image's last pixel,
-where a detector has zeros. A centre is usable if at least half of each outline's samples are
-inside, it keeps its distance from the border, and the floor there moves by no more than a given
-length per image row.
+A centre is usable if enough of each outline's samples are inside the image, it keeps its distance
+from the border, and the floor there moves by no more than a given length per image row. Where discs
+are large, neighbouring centres see nearly the same: then only some rows, and some centres in each,
+are tested.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera
-from camera.kernels import camera_numbers
 from lut.errors import TableError
-from lut.floor import floor_positions
-from lut.kernels import (
-    ADVANCE_BITS,
-    LANES,
-    Scan,
-    blocks_of_row,
-    copies_of_block,
-    row_samples,
-    usable_centres,
-)
 from storage.bounds import ABOVE_0, LIMIT, NOT_NEGATIVE, demand, whole
+
+FloatArray = NDArray[np.float64]
 
 #: Part of an outline's samples that must lie inside the image.
 MIN_SHARE_INSIDE = 0.5
@@ -66,8 +51,12 @@ class DiscShape:
         How far the samples of a pair that fall on the same pixel are moved, one inwards and one
         outwards: the length on the floor of this many pixels down the image.
     stride_m : float
-        After a usable centre, those nearer than this along the row are left out, metres: counted
-        in pixels as long as one down the image, rounded up; 0: none.
+        Centres along a row are left out as long as none is farther than half of this from one that
+        is tested, metres. If samples are counted in pairs, those are left out that are nearer than
+        this to a usable one, in pixels as long as one down the image, rounded up. 0: none is.
+    rows_m : float
+        Rows are left out as long as no centre in them is farther than this from a row that is
+        tested, metres on the floor across the row; 0: none is left out.
     """
 
     inner_radius_m: float = 0.06
@@ -78,6 +67,7 @@ class DiscShape:
     least_pairs: int = 0
     apart_px: float = 0.0
     stride_m: float = 0.0
+    rows_m: float = 0.0
 
     def __post_init__(self) -> None:
         demand(
@@ -91,6 +81,7 @@ class DiscShape:
             least_pairs=whole(0, self.samples),
             apart_px=NOT_NEGATIVE,
             stride_m=NOT_NEGATIVE,
+            rows_m=NOT_NEGATIVE,
         )
         if not self.inner_radius_m < self.outer_radius_m:
             raise TableError(
@@ -101,106 +92,52 @@ class DiscShape:
 
 @dataclass(frozen=True, eq=False)
 class DiscTable:
-    """Usable centres, and how the grey values of their outlines are gathered.
-
-    Hashed and compared by identity.
-
-    Centres are processed in *blocks*: up to 256 centres of a row, all of them or every n-th one.
-    For each block ``2 R`` rows of 256 grey values are gathered, a column for each centre: R =
-    `samples` rounded up to a multiple of 4 for the inner outline, then R for the outer one; rows
-    that are no samples are 0.
-
-    Copies fill these rows one after the other. Each is one number, ``source * 512 + advance``: of
-    64 pixels of the image every n-th one is copied, from the pixel with index `source` in scan
-    order on, and the next copy goes `advance` bytes further.
+    """The centres that are tested, and the pixels of their outlines; compared by identity.
 
     Attributes
     ----------
-    samples : int
-        Samples on each of the two outlines.
-    copies : (N,) uint32, or uint64 for images of more than 8 Mpixel
-        See above. `source` is H * W or less: behind the image's last pixel there are 64 zeros.
-    block_copies : (B + 1,) int64
-        Block b has the copies ``block_copies[b] : block_copies[b + 1]``, a multiple of 4: those
-        that fill up copy zeros and go no further. Blocks are in scan order.
-    block_row, block_column, block_stride : (B,) int32
-        First centre of each block, and pixels from one to the next, at most 8.
-    block_votes : (B + 1,) int64
-        The centres of block b are the columns ``block_votes[b] : block_votes[b + 1]`` of `votes`.
-    votes : (2, M) uint8
-        Samples of the inner and of the outer outline inside the image, for the centres of all
-        blocks, of which each has a multiple of 32; 0 for those that are not usable.
+    samples : (N, K, 2) uint32
+        Index in scan order of the pixel of the inner and of the outer sample in each direction,
+        every second direction first; H * W outside the image, or where it does not count.
+    row, column : (N,) int32
+        Pixel of each centre, in scan order.
     floor_xy : (H, W, 2) float32
         Floor position (robot X, Y in metres) that each pixel sees; NaN above the horizon.
     """
 
-    samples: int
-    copies: NDArray[np.uint32] | NDArray[np.uint64]
-    block_copies: NDArray[np.int64]
-    block_row: NDArray[np.int32]
-    block_column: NDArray[np.int32]
-    block_stride: NDArray[np.int32]
-    block_votes: NDArray[np.int64]
-    votes: NDArray[np.uint8]
+    samples: NDArray[np.uint32]
+    row: NDArray[np.int32]
+    column: NDArray[np.int32]
     floor_xy: NDArray[np.float32]
 
     @cached_property
-    def first_source(self) -> int:
-        """The first pixel, in scan order, that is copied for any block; H * W without blocks.
-
-        In the rows above, the camera sees no floor, or none that is near enough.
-        """
-        height, width = self.floor_xy.shape[:2]
-        return int(self.copies.min(initial=height * width << ADVANCE_BITS)) >> ADVANCE_BITS
+    def whole(self) -> NDArray[np.bool_]:
+        """(N,) whether all samples of a centre count."""
+        return np.asarray(np.all(self.samples < self.floor_xy[..., 0].size, axis=(1, 2)))
 
     @cached_property
     def usable(self) -> NDArray[np.bool_]:
-        """(H, W) the usable centres."""
-        return np.asarray(self.votes_inner > 0)
-
-    @cached_property
-    def votes_inner(self) -> NDArray[np.uint8]:
-        """(H, W) samples of the inner outline inside the image, for usable centres."""
-        return self._votes(0)
-
-    @cached_property
-    def votes_outer(self) -> NDArray[np.uint8]:
-        """(H, W) samples of the outer outline inside the image, for usable centres."""
-        return self._votes(1)
-
-    @cached_property
-    def centres(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Rows and columns of the centres of `votes`; what fills blocks up may be off the image."""
-        widths = np.diff(self.block_votes)
-        place = np.arange(self.votes.shape[1]) - np.repeat(self.block_votes[:-1], widths)
-        first, stride = np.repeat(self.block_column, widths), np.repeat(self.block_stride, widths)
-        return np.repeat(self.block_row, widths).astype(np.int64), first + place * stride
-
-    @cached_property
-    def block_whole(self) -> NDArray[np.bool_]:
-        """(B,) whether all samples of all usable centres of a block vote."""
-        lacking = (self.votes[0] > 0) & np.any(self.votes < self.samples, axis=0)
-        some = np.zeros(len(self.block_row), np.bool_)
-        some[np.repeat(np.arange(len(some)), np.diff(self.block_votes))[lacking]] = True
-        return ~some
-
-    def _votes(self, outline: int) -> NDArray[np.uint8]:
-        height, width = self.floor_xy.shape[:2]
-        map_of_votes = np.zeros((height, width), np.uint8)
-        rows, columns = self.centres
-        inside = columns < width
-        map_of_votes[rows[inside], columns[inside]] = self.votes[outline, inside]
-        return map_of_votes
+        """(H, W) the centres that are tested."""
+        usable = np.zeros(self.floor_xy.shape[:2], np.bool_)
+        usable[self.row, self.column] = True
+        return usable
 
 
-def ring(radius_m: float, samples: int) -> NDArray[np.float64]:
+def ring(radius_m: float, samples: int) -> FloatArray:
     """(samples, 2) equally spaced points on a circle about the origin, metres."""
     angle = 2.0 * np.pi * np.arange(samples) / samples
     return radius_m * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
 
+@lru_cache(maxsize=2)
+def floor_positions(camera: Camera) -> FloatArray:
+    """(H, W, 2) floor position (robot X, Y, metres) that each pixel sees; NaN above the horizon."""
+    v, u = np.mgrid[0 : camera.height, 0 : camera.width]
+    return camera.floor_from_pixel(np.stack([u, v], axis=-1))
+
+
 def build_disc_table(camera: Camera, shape: DiscShape) -> DiscTable:
-    """Compute the outlines' pixels around every usable centre.
+    """Compute the outlines' pixels around the centres that are tested.
 
     Parameters
     ----------
@@ -212,7 +149,7 @@ def build_disc_table(camera: Camera, shape: DiscShape) -> DiscTable:
     Returns
     -------
     DiscTable
-        A camera that sees no usable floor (looking up, say) gets a table without usable centres.
+        A camera that sees no usable floor (looking up, say) gets a table without centres.
 
     Raises
     ------
@@ -224,83 +161,133 @@ def build_disc_table(camera: Camera, shape: DiscShape) -> DiscTable:
             f"the camera is {camera.centre[2]:g} m above the floor: expected more than 0"
         )
     floor_xy = floor_positions(camera)
-    numbers = camera_numbers(camera)
-    size = _size_down(floor_xy)
-    if shape.least_pairs:
-        # The data set's own detector turns by the transpose of a rotation that its file gives in
-        # few digits; by the inverse some samples would fall on other pixels.
-        numbers[10:19] = camera.rotation.T.ravel()
-        size = _exact_size_down(camera)
-    scan = Scan(
-        enough=shape.least_pairs or MIN_SHARE_INSIDE * shape.samples,
-        stride=shape.stride_m,
-        pairs=shape.least_pairs > 0,
-        apart_px=shape.apart_px,
-    )
-    inner = ring(shape.inner_radius_m, shape.samples)
-    outer = ring(shape.outer_radius_m, shape.samples)
-    pixels = camera.height * camera.width
-    candidate = _within_limits(size, shape)
-    places: list[tuple[int, int, int]] = []
-    copies: list[NDArray[np.uint64]] = []
-    votes: list[NDArray[np.uint8]] = []
-    for row in np.flatnonzero(candidate.any(axis=1)).tolist():
-        nearest = row_samples(
-            numbers, floor_xy[row], inner, outer, size[row], (camera.height, camera.width), scan
-        )
-        inside = np.count_nonzero((nearest >= 0.0).reshape(2, shape.samples, -1), axis=1)
-        usable = usable_centres(candidate[row], inside, size[row], scan)
-        for block in blocks_of_row(usable, scan.stride > 0.0):
-            column, stride, number = block.tolist()
-            places.append((row, column, stride))
-            copies.append(copies_of_block(nearest, usable, block, pixels))
-            centres = column + stride * np.arange(number)
-            filled = np.zeros((2, -(-number // LANES) * LANES), np.uint8)
-            filled[:, :number] = np.where(usable[centres], inside[:, centres], 0)
-            votes.append(filled)
-    fits = (pixels + 1) << ADVANCE_BITS <= np.iinfo(np.uint32).max + 1
-    every_copy = np.concatenate([np.empty(0, np.uint64), *copies])
-    numbers_of = np.array(places, np.int32).reshape(-1, 3).T.copy()
+    down = _size_down(camera, floor_xy, shape)
+    candidate = _within_limits(down, shape)
+    step = _columns_apart(floor_xy, down, shape)
+    enough = shape.least_pairs or MIN_SHARE_INSIDE * shape.samples
+    nothing = np.zeros((0, shape.samples, 2), np.uint32)
+    samples, rows, columns = [nothing], [np.zeros(0, np.int32)], [np.zeros(0, np.int32)]
+    for row in _rows_tested(floor_xy, candidate, shape.rows_m):
+        across = np.flatnonzero(candidate[row])
+        pixels = _sample_pixels(camera, floor_xy[row, across], down[row, across], shape)
+        inside = np.count_nonzero(pixels < camera.height * camera.width, axis=1).min(axis=1)
+        usable = np.flatnonzero(inside >= enough)
+        kept = usable[_strided(across[usable], step[row, across[usable]])]
+        samples.append(pixels[kept])
+        columns.append(across[kept].astype(np.int32))
+        rows.append(np.full(len(kept), row, np.int32))
     return DiscTable(
-        samples=shape.samples,
-        copies=every_copy.astype(np.uint32) if fits else every_copy,
-        block_copies=_bounds([len(of_block) for of_block in copies]),
-        block_row=numbers_of[0],
-        block_column=numbers_of[1],
-        block_stride=numbers_of[2],
-        block_votes=_bounds([of_block.shape[1] for of_block in votes]),
-        votes=np.concatenate([np.zeros((2, 0), np.uint8), *votes], axis=1),
+        samples=np.concatenate(samples),
+        row=np.concatenate(rows),
+        column=np.concatenate(columns),
         floor_xy=floor_xy.astype(np.float32),
     )
 
 
-def _bounds(lengths: list[int]) -> NDArray[np.int64]:
-    """Where each of some consecutive pieces begins, and where the last one ends."""
-    return np.cumsum([0, *lengths], dtype=np.int64)
+def _sample_pixels(
+    camera: Camera, centre_xy: FloatArray, down: FloatArray, shape: DiscShape
+) -> NDArray[np.uint32]:
+    """`DiscTable.samples` of some centres, (N, 2) on the floor, with (N,) the size of a pixel."""
+    outside = camera.height * camera.width
+    radii = np.array([shape.inner_radius_m, shape.outer_radius_m])
+    unit = np.concatenate([ring(1.0, shape.samples)[0::2], ring(1.0, shape.samples)[1::2]])
+    samples_xy = centre_xy[:, None, None] + radii[:, None] * unit[:, None]
+    if not shape.least_pairs:
+        return _nearest_pixels(camera, camera.project_floor(samples_xy), -0.5)
+    # The data set's own detector turns by the transpose of a rotation that its file gives in few
+    # digits; by the inverse some samples would fall on other pixels.
+    pixels = _nearest_pixels(camera, _seen_published(camera, samples_xy), 0.0)
+    centre, pair = np.nonzero((pixels[..., 0] == pixels[..., 1]) & (pixels[..., 0] < outside))
+    moved = radii + shape.apart_px * down[centre, None] * [-1.0, 1.0]
+    moved_xy = centre_xy[centre, None] + moved[..., None] * unit[pair, None]
+    pixels[centre, pair] = _nearest_pixels(camera, _seen_published(camera, moved_xy), 0.0)
+    lacking = np.any(pixels == outside, axis=2, keepdims=True)
+    return np.where(lacking, np.uint32(outside), pixels)
 
 
-def _size_down(floor_xy: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(H, W) how far the floor moves per image row, metres, by differences of whole pixels."""
-    # Central differences over the neighbouring rows; one-sided at the image's first and last.
-    if len(floor_xy) == 1:
-        return np.full(floor_xy.shape[:2], np.nan)
-    per_row = np.gradient(floor_xy, axis=0)
-    return np.hypot(per_row[..., 0], per_row[..., 1])
+def _seen_published(camera: Camera, floor_xy: FloatArray) -> FloatArray:
+    """(..., 2) pixels of (..., 2) floor points, turned by the transpose of the rotation."""
+    points = np.concatenate([floor_xy, np.zeros_like(floor_xy[..., :1])], axis=-1)
+    return camera.project((points - camera.centre) @ camera.rotation)
 
 
-def _exact_size_down(camera: Camera) -> NDArray[np.float64]:
-    """(H, W) how far the floor moves per image row, metres: its derivative."""
-    v, u = np.mgrid[0 : camera.height, 0 : camera.width]
-    per_row = camera.floor_jacobian_published(np.stack([u, v], axis=-1))[..., 1]
-    return np.hypot(per_row[..., 0], per_row[..., 1])
+def _nearest_pixels(camera: Camera, seen: FloatArray, least: float) -> NDArray[np.uint32]:
+    """Index of the pixel nearest to places in the image; H * W outside, or before `least`."""
+    with np.errstate(invalid="ignore"):
+        nearest = np.floor(seen + 0.5)
+        inside = np.all((seen >= least) & (nearest < [camera.width, camera.height]), axis=-1)
+        index = nearest[..., 1] * camera.width + nearest[..., 0]
+    return np.where(inside, index, camera.height * camera.width).astype(np.uint32)
 
 
-def _within_limits(size: NDArray[np.float64], shape: DiscShape) -> NDArray[np.bool_]:
+def _size_down(camera: Camera, floor_xy: FloatArray, shape: DiscShape) -> FloatArray:
+    """(H, W) how far the floor moves per image row, metres."""
+    if shape.least_pairs:
+        v, u = np.mgrid[0 : camera.height, 0 : camera.width]
+        by_row = camera.floor_jacobian_published(np.stack([u, v], axis=-1))[..., 1]
+        return np.hypot(by_row[..., 0], by_row[..., 1])
+    by_row = _gradient(floor_xy, 0)
+    return np.hypot(by_row[..., 0], by_row[..., 1])
+
+
+def _gradient(floor_xy: FloatArray, axis: int) -> FloatArray:
+    """Central differences along an axis of the image; one-sided at the border."""
+    if floor_xy.shape[axis] == 1:
+        return np.full(floor_xy.shape, np.nan)
+    return np.asarray(np.gradient(floor_xy, axis=axis))
+
+
+def _within_limits(down: FloatArray, shape: DiscShape) -> NDArray[np.bool_]:
     """Pixels far enough from the border and near enough on the floor."""
-    height, width = size.shape
+    height, width = down.shape
     u, v = np.arange(width), np.arange(height)
     border = shape.border_px
     inside_u = (u >= border) & (u <= width - border)
     inside_v = (v >= border) & (v <= height - border)
-    near = size <= shape.far_limit_m_per_px
+    near = down <= shape.far_limit_m_per_px
     return np.asarray(near & inside_v[:, None] & inside_u[None, :])
+
+
+def _columns_apart(floor_xy: FloatArray, down: FloatArray, shape: DiscShape) -> NDArray[np.int64]:
+    """(H, W) pixels along the row from each centre to the next one that is tested."""
+    if shape.least_pairs:
+        step = np.ceil(shape.stride_m / down)
+    else:
+        by_column = _gradient(floor_xy, 1)
+        size = np.hypot(by_column[..., 0], by_column[..., 1])
+        step = 1.0 + 2.0 * np.floor(0.5 * shape.stride_m / size)
+    return np.where(step > 1.0, step, 1.0).astype(np.int64)
+
+
+def _strided(columns: NDArray[np.int64], step: NDArray[np.int64]) -> list[int]:
+    """Which of some columns keep the distance that the one before them asks for."""
+    kept, following = [], 0
+    for k, (column, apart) in enumerate(zip(columns.tolist(), step.tolist())):
+        if column >= following:
+            kept.append(k)
+            following = column + apart
+    return kept
+
+
+def _rows_tested(floor_xy: FloatArray, candidate: NDArray[np.bool_], apart_m: float) -> list[int]:
+    """Rows with candidates, so close that no candidate between them is far from one of them.
+
+    How far a row is from its neighbour, as it sees the floor, is the area of a pixel there over its
+    length along the row; the pixel that is smallest so decides.
+    """
+    if apart_m == 0.0:
+        return np.flatnonzero(candidate.any(axis=1)).tolist()
+    by_u, by_v = _gradient(floor_xy, 1), _gradient(floor_xy, 0)
+    area = np.abs(by_u[..., 0] * by_v[..., 1] - by_u[..., 1] * by_v[..., 0])
+    across = area / np.hypot(by_u[..., 0], by_u[..., 1])
+    largest = np.where(candidate & np.isfinite(across), across, 0.0).max(axis=1)
+    # Between two rows tested, the middle one is half as far from either.
+    rows = [0]
+    while rows[-1] < len(largest) - 1:
+        row, apart = rows[-1], 1
+        while row + apart + 1 < len(largest) and (
+            (apart + 1) * largest[row + 1 : row + apart + 2].max() <= 2.0 * apart_m
+        ):
+            apart += 1
+        rows.append(row + apart)
+    return [row for row in rows if candidate[row].any()]

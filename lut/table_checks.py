@@ -8,11 +8,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from camera import Camera
 from lut.errors import TableError
-from lut.kernels import ADVANCE_BITS, AT_ONCE, GROUP, LANES, LARGEST_STRIDE, PITCH
 from lut.outlines import DiscShape, DiscTable
 from lut.verticals import VerticalTable
 
@@ -34,51 +32,20 @@ def check_disc_table(table: DiscTable, camera: Camera, shape: DiscShape) -> None
         If a type, shape or index is impossible; the message names it.
     """
     height, width = camera.height, camera.width
-    pixels = height * width
-    fits = (pixels + 1) << ADVANCE_BITS <= np.iinfo(np.uint32).max + 1
-    _demand(type(table.samples) is int and table.samples == shape.samples, "samples")
     for name, dtype, dimensions in (
-        ("copies", np.uint32 if fits else np.uint64, 1),
-        ("block_copies", np.int64, 1),
-        ("block_row", np.int32, 1),
-        ("block_column", np.int32, 1),
-        ("block_stride", np.int32, 1),
-        ("block_votes", np.int64, 1),
-        ("votes", np.uint8, 2),
+        ("samples", np.uint32, 3),
+        ("row", np.int32, 1),
+        ("column", np.int32, 1),
         ("floor_xy", np.float32, 3),
     ):
         _demand_array(getattr(table, name), name, dtype, dimensions)
-    blocks = len(table.block_row)
+    centres = len(table.row)
     _demand(table.floor_xy.shape == (height, width, 2), "floor_xy")
-    _demand(len(table.block_column) == blocks == len(table.block_stride), "block_row")
-    limits = {"row": (0, height), "column": (0, width), "stride": (1, LARGEST_STRIDE + 1)}
-    for name, (least, end) in limits.items():
-        values = getattr(table, f"block_{name}")
-        _demand(bool(np.all((values >= least) & (values < end))), f"block_{name}")
-
-    _demand(len(table.block_votes) == blocks + 1 and table.votes.shape[0] == 2, "block_votes")
-    _demand_bounds(table.block_votes, table.votes.shape[1], "block_votes")
-    widths = np.diff(table.block_votes)
-    _demand(bool(np.all((widths % LANES == 0) & (widths <= PITCH))), "block_votes")
-    _demand(bool(np.all(table.votes <= table.samples)), "votes")
-    # A block may reach past the image's border, but nothing votes there.
-    _demand(not table.votes[:, table.centres[1] >= width].any(), "votes")
-
-    _demand(len(table.block_copies) == blocks + 1, "block_copies")
-    _demand_bounds(table.block_copies, len(table.copies), "block_copies")
-    _demand(bool(np.all(np.diff(table.block_copies) % AT_ONCE == 0)), "block_copies")
-    if not blocks:
-        return
-    _demand(int(table.copies.max()) >> ADVANCE_BITS <= pixels, "copies")
-    advance = (table.copies & ((1 << ADVANCE_BITS) - 1)).astype(np.int64)
-    filled = np.add.reduceat(advance, table.block_copies[:-1])
-    padded = -(-table.samples // GROUP) * GROUP
-    _demand(bool(np.all(filled == 2 * padded * PITCH)), "copies")
-
-
-def _demand_bounds(bounds: NDArray[np.int64], end: int, name: str) -> None:
-    """Refuse bounds of consecutive pieces, none of which may be empty, that are no such bounds."""
-    _demand(bool(bounds[0] == 0 and bounds[-1] == end and np.all(np.diff(bounds) > 0)), name)
+    _demand(table.samples.shape == (centres, shape.samples, 2), "samples")
+    _demand(table.samples.max(initial=0) <= height * width, "samples")
+    _demand(len(table.column) == centres, "column")
+    _demand(bool(np.all((table.row >= 0) & (table.row < height))), "row")
+    _demand(bool(np.all((table.column >= 0) & (table.column < width))), "column")
 
 
 def check_vertical_table(table: VerticalTable, camera: Camera) -> None:
@@ -134,6 +101,6 @@ def _demand_array(array: object, name: str, dtype: type[np.generic], dimensions:
     _demand(right, name)
 
 
-def _demand(condition: bool, name: str) -> None:
+def _demand(condition: bool | np.bool_, name: str) -> None:
     if not condition:
         raise TableError(f"the table's {name} cannot be: expected one for this calibration")

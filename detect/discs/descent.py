@@ -18,6 +18,17 @@ import numpy as np
 from numba import njit
 
 from detect.discs.evidence_kernels import LEAST_EXPLAINED, evidence_of
+from detect.discs.least_squares import (
+    BACKGROUND,
+    SECTORS,
+    UNKNOWNS,
+    background_products,
+    blur_width,
+    disc_products,
+    factor_rows,
+    left_over,
+    solution,
+)
 from detect.discs.model import (
     BY_BLUR,
     BY_RADIUS,
@@ -32,17 +43,7 @@ from detect.discs.model import (
     chord_shares,
     edge_shares,
 )
-from detect.discs.normal_equations import (
-    BACKGROUND,
-    UNKNOWNS,
-    background_products,
-    disc_products,
-    factor_rows,
-    left_over,
-    solution,
-)
 from detect.discs.patch import CHORDS_ALONG_V, EDGE, PATCH, FitSettings, Gathered
-from detect.discs.residuals import SECTORS, blur_width
 
 #: Limits of what a fit may come to; the blur in pixels, the radius in nominal ones.
 LEAST_BLUR, MOST_BLUR = 0.1, 8.0
@@ -134,7 +135,9 @@ def solve_step(
     the damping, come in only then.
     """
     damped, factor, values = work.damped, work.factor, work.values
-    damped[BY_BLUR:, :] = work.best[BY_BLUR:, :]
+    for i in range(BY_BLUR, ROWS):
+        for j in range(ROWS):
+            damped[i, j] = work.best[i, j]
     for parameter, off, sigma in (
         (BY_BLUR, best.log_blur - math.log(settings.blur_px), settings.blur_sigma),
         (BY_RADIUS, best.radius - 1.0, settings.radius_sigma),
@@ -223,7 +226,9 @@ def descend(
             done = cost - now <= 1e-3 * variance_now
             cost, variance, best = now, variance_now, disc
             contrast = factor[GREY, SHARE] * factor[SHARE, SHARE]
-            work.best[:] = products
+            for i in range(ROWS):
+                for j in range(ROWS):
+                    work.best[i, j] = products[i, j]
             damping = max(0.2 * damping, 1e-7)
             if not abs(contrast) > 1e-6:
                 break

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from detect.discs.rim import Rim
 
@@ -116,25 +114,3 @@ def evidence_with_rim(
 def _log_odds(share: float) -> float:
     bounded = min(max(share, 0.003), 0.997)
     return math.log(bounded / (1.0 - bounded))
-
-
-@njit(cache=True, error_model="numpy")
-def evidence_of_all(
-    fitted: NDArray[np.bool_],
-    explained: NDArray[np.float64],
-    relative_radius: NDArray[np.float64],
-    outline_deviation: NDArray[np.float64],
-    sectors_good: NDArray[np.float64],
-    middle_step: NDArray[np.float64],
-    relative_blur: NDArray[np.float64],
-    optics_px: float,
-) -> NDArray[np.float64]:
-    """`evidence_of` N fits; minus infinity where `fitted` is false."""
-    score = np.full(len(fitted), -np.inf)
-    for k in range(len(fitted)):
-        if fitted[k]:
-            score[k] = evidence_of(
-                explained[k], relative_radius[k], outline_deviation[k], sectors_good[k],
-                middle_step[k], relative_blur[k], optics_px,
-            )  # fmt: skip
-    return score

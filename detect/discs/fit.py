@@ -2,7 +2,7 @@
 
 Around each candidate a blurred disc on an unevenly lit background is fitted: pixels are gathered
 (`detect.discs.patch`), the descent goes to the least squares (`detect.discs.descent`), and the
-residuals say how far the fit can be trusted (`detect.discs.residuals`). It gives the position
+residuals say how far the fit can be trusted (`detect.discs.least_squares`). It gives the position
 with its covariance, and the evidence that there is a disc at all.
 """
 
@@ -29,11 +29,19 @@ from detect.discs.descent import (
     moved,
     solve_step,
 )
-from detect.discs.evidence_kernels import evidence_of_all
+from detect.discs.evidence_kernels import evidence_of
+from detect.discs.least_squares import (
+    BACKGROUND,
+    UNKNOWNS,
+    blur_width,
+    correlated_area,
+    factor_rows,
+    outline_statistics,
+    residuals,
+    solution,
+)
 from detect.discs.model import BY_BLUR, BY_X, BY_Y, SHARE, Disc
-from detect.discs.normal_equations import BACKGROUND, UNKNOWNS, factor_rows, solution
-from detect.discs.patch import EDGE, Candidate, FitSettings, Gathered, gather
-from detect.discs.residuals import blur_width, correlated_area, outline_statistics, residuals
+from detect.discs.patch import EDGE, FULL, LOOK, Candidate, Effort, FitSettings, Gathered, gather
 
 FloatArray = NDArray[np.float64]
 
@@ -49,8 +57,6 @@ _BLUR_SIGMA = 0.7
 _BLUR_PX = 0.6
 #: Grey values are rounded: noise is never below this.
 _LEAST_NOISE = 0.3
-#: Most evaluations of the model.
-_MOST_EVALUATIONS, _LOOK_EVALUATIONS = 15, 3
 #: A flat disc's blur may grow from the one its pixels were gathered for by this factor, and pixels.
 _MOST_GROWTH, _MOST_GROWTH_PX = 1.5, 1.0
 
@@ -71,14 +77,14 @@ SECTORS_GOOD, OUTLINE_DEVIATION, MIDDLE_STEP = "sectors_good", "outline_deviatio
 RELATIVE_BLUR, BLUR_BOUND = "relative_blur", "blur_bound"
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@njit(cache=True, error_model="numpy", nogil=True)
 def fit_disc(
     image: NDArray[np.uint8],
     floor_xy: NDArray[np.float32],
     candidate: Candidate,
     settings: FitSettings,
     start: Disc,
-    look: bool,
+    effort: Effort,
     hope: Hope,
     work: Any,
     result: Any,
@@ -94,8 +100,7 @@ def fit_disc(
     settings : FitSettings
     start : Disc
         Where to start.
-    look : bool
-        Take about 160 pixels and few steps: covariance and outline are left out.
+    effort : Effort
     hope : Hope
         When to give up.
     work : WORK
@@ -110,15 +115,14 @@ def fit_disc(
     """
     patch, radius = work.patch, candidate.radius
     _clear(result)
-    gathered = gather(image, floor_xy, candidate, settings, look, patch)
+    gathered = gather(image, floor_xy, candidate, settings, effort.look, patch)
     most_blur = MOST_BLUR
     if gathered.shape != EDGE:
         most_blur = min(_MOST_GROWTH * candidate.blur + _MOST_GROWTH_PX, MOST_BLUR)
     result.blur_bound = most_blur
     if gathered.fitted - UNKNOWNS < 4:
         return False
-    evaluations = _LOOK_EVALUATIONS if look else _MOST_EVALUATIONS
-    descent = descend(gathered, start, settings, most_blur, evaluations, hope, work)
+    descent = descend(gathered, start, settings, most_blur, effort.evaluations, hope, work)
     if not descent.arrived or not _solve_last_step(descent, settings, most_blur, work):
         return False
     # The last step is taken as the linear model has it, and so are its residuals.
@@ -134,7 +138,7 @@ def fit_disc(
     result.relative_blur = blur_width(patch, gathered.n, disc, blur) / disc.radius
     result.sectors_good = 1.0
     result.middle_step = 1.0
-    if not look:
+    if not effort.look:
         variance = max(residual / (gathered.fitted - UNKNOWNS), settings.noise**2)
         _judge(gathered, disc, radius, variance, work, result)
     return True
@@ -192,7 +196,7 @@ def fit_all(
     radius: float,
     blur_guess: FloatArray,
     settings: FitSettings,
-    look: bool,
+    effort: Effort,
 ) -> tuple[Any, NDArray[np.bool_]]:
     """(N,) results of `fit_disc` from each pixel, and whether there is one."""
     n = len(pixels)
@@ -203,7 +207,7 @@ def fit_all(
         candidate = Candidate(pixels[i, 0], pixels[i, 1], radius, blur_guess[i])
         start = Disc(0.0, 0.0, 1.0, math.log(blur_guess[i]))
         fitted[i] = fit_disc(
-            image, floor_xy, candidate, settings, start, look, PATIENT, work[0], results[i]
+            image, floor_xy, candidate, settings, start, effort, PATIENT, work[0], results[i]
         )
     return results, fitted
 
@@ -290,7 +294,7 @@ def fit_discs(
         blur_guess = np.full(len(pixels), _BLUR_PX)
     results, fitted = fit_all(
         image, floor_xy, np.ascontiguousarray(pixels), radius_m, blur_guess,
-        fit_settings(noise, blur_ratio), first_look,
+        fit_settings(noise, blur_ratio), LOOK if first_look else FULL,
     )  # fmt: skip
     centres, covariance = fitted_positions(results)
     return DiscFits(
@@ -378,15 +382,10 @@ def disc_evidence(fits: DiscFits, radius_m: float, blur_px: float = 1.0) -> Floa
     -------
     (N,) float64
     """
-    return np.asarray(
-        evidence_of_all(
-            fits.fitted,
-            fits.explained,
-            fits.radius_m / radius_m,
-            fits.outline_deviation,
-            fits.sectors_good,
-            fits.middle_step,
-            fits.relative_blur,
-            blur_px,
-        )
-    )
+    evidence = np.full(len(fits.fitted), -np.inf)
+    for k in np.flatnonzero(fits.fitted):
+        evidence[k] = evidence_of(
+            fits.explained[k], fits.radius_m[k] / radius_m, fits.outline_deviation[k],
+            fits.sectors_good[k], fits.middle_step[k], fits.relative_blur[k], blur_px,
+        )  # fmt: skip
+    return evidence

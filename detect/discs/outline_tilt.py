@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from camera import Camera
 from camera.kernels import camera_numbers
-from detect.discs.rim import DIRECTIONS, profiles, rim_points
+from detect.discs.rim import DIRECTIONS, median, profiles, rim_points
 from detect.positive_definite import invert_positive
 from detect.verticals.tilt import level_matrix
 
@@ -47,6 +47,9 @@ _STEP_RAD = 1e-4
 _ITERATIONS = 7
 #: Degrees of freedom of Student's density of discs' tilts.
 _FREEDOM = 4.0
+
+
+FloatArray = NDArray[np.float64]
 
 
 class OutlineTilt(NamedTuple):
@@ -160,11 +163,11 @@ def fit_outline(
             row[k, 3] = (lengths[3] - lengths[4]) / (2.0 * _STEP_RAD) * px_per_m[k]
         if iteration > 1:
             # The first steps go from a level floor to the tilted one, with all points.
-            sigma = max(0.1, 1.48 * np.median(np.abs(residual[weight > 0.0])))
+            sigma = max(0.1, 1.48 * median(np.abs(residual[weight > 0.0])))
             for k in range(count):
                 if weight[k] > 0.0:
                     weight[k] = 1.0 / (1.0 + (residual[k] / (2.0 * sigma)) ** 2) ** 2
-        normal[:, :] = 0.0
+        normal.fill(0.0)
         right = np.zeros(4)
         for k in range(count):
             for i in range(4):
@@ -185,63 +188,43 @@ def fit_outline(
         squares += weight[k] * residual[k] ** 2
         weights += weight[k]
     variance = max(squares / weights, POINT_SIGMA_PX**2) * TOGETHER
-    found = bool(on >= LEAST_DIRECTIONS and np.abs(unknowns[2:]).max() < 0.3)
+    found = bool(on >= LEAST_DIRECTIONS and max(abs(unknowns[2]), abs(unknowns[3])) < 0.3)
     return found, unknowns[2:], variance * inverse[2:, 2:]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def mean_of_tilts(
-    tilt: NDArray[np.float64], covariance: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def mean_of_tilts(tilt: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Mean of discs' tilts by Student's density, and its covariance.
 
     Parameters
     ----------
-    tilt : (N, 2) float64
-        Pitch and roll (rad).
-    covariance : (N, 2, 2) float64
-        Of them (rad^2).
+    tilt, covariance : (N, 2), (N, 2, 2) float64
+        Pitch and roll (rad), and their covariance (rad^2).
 
     Returns
     -------
-    mean : (2,) float64
-    covariance : (2, 2) float64
+    mean, covariance : (2,), (2, 2) float64
     """
-    mean = np.array([np.median(tilt[:, 0]), np.median(tilt[:, 1])])
-    information = np.zeros((len(tilt), 2, 2))
-    for k in range(len(tilt)):
-        invert_positive(covariance[k], information[k])
-    of_mean = np.zeros((2, 2))
+    mean = np.median(tilt, axis=0)
+    information = np.linalg.inv(covariance)
     for _ in range(_ITERATIONS):
-        total = np.zeros((2, 2))
-        right = np.zeros(2)
-        for k in range(len(tilt)):
-            off = tilt[k] - mean
-            squared = 0.0
-            for i in range(2):
-                for j in range(2):
-                    squared += off[i] * information[k, i, j] * off[j]
-            weight = (_FREEDOM + 2.0) / (_FREEDOM + squared)
-            total += weight * information[k]
-            for i in range(2):
-                for j in range(2):
-                    right[i] += weight * information[k, i, j] * tilt[k, j]
-        invert_positive(total, of_mean)
-        for i in range(2):
-            mean[i] = of_mean[i, 0] * right[0] + of_mean[i, 1] * right[1]
+        off = tilt - mean
+        squared = np.einsum("ni,nij,nj->n", off, information, off)
+        weighed = ((_FREEDOM + 2.0) / (_FREEDOM + squared))[:, None, None] * information
+        of_mean = np.linalg.inv(weighed.sum(axis=0))
+        mean = of_mean @ np.einsum("nij,nj->i", weighed, tilt)
     return mean, of_mean
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _tilt_of_outlines(
+def _tilts_of_discs(
     image: NDArray[np.uint8],
-    numbers: NDArray[np.float64],
-    centre: NDArray[np.float64],
-    floor_xy: NDArray[np.float64],
+    numbers: FloatArray,
+    centre: FloatArray,
+    floor_xy: FloatArray,
     radius: float,
     height_ratio: float,
-) -> tuple[int, NDArray[np.float64], NDArray[np.float64]]:
-    """How many discs, their mean tilt and its covariance."""
+) -> tuple[FloatArray, FloatArray]:
+    """Tilts of the discs that show one, and their covariances."""
     tilts, covariances = np.empty((len(floor_xy), 2)), np.empty((len(floor_xy), 2, 2))
     used = 0
     point_xy = np.empty((DIRECTIONS, 2))
@@ -256,29 +239,26 @@ def _tilt_of_outlines(
         distance, _ = rim_points(grey, scale, contrast)
         if np.count_nonzero(~np.isnan(distance)) < LEAST_DIRECTIONS:
             continue
-        point_xy[:, 0] = radius * distance * _COS
-        point_xy[:, 1] = radius * distance * _SIN
+        for m in range(DIRECTIONS):
+            point_xy[m, 0] = radius * distance[m] * _COS[m]
+            point_xy[m, 1] = radius * distance[m] * _SIN[m]
         # What a higher camera sees is larger than the calibrated floor has it.
-        seen_radius = radius / height_ratio
-        found, tilt, covariance = fit_outline(point_xy, scale / radius, centre, x, y, seen_radius)
+        found, tilt, covariance = fit_outline(
+            point_xy, scale / radius, centre, x, y, radius / height_ratio
+        )
         if found:
-            tilts[used] = tilt
-            covariances[used] = covariance
             for i in range(2):
-                covariances[used, i, i] += DISC_SIGMA_RAD**2
+                tilts[used, i] = tilt[i]
+                for j in range(2):
+                    covariances[used, i, j] = covariance[i, j]
             used += 1
-    if used == 0:
-        return 0, np.zeros(2), np.zeros((2, 2))
-    mean, covariance = mean_of_tilts(tilts[:used], covariances[:used])
-    for i in range(2):
-        covariance[i, i] += FLOOR_SIGMA_RAD**2
-    return used, mean, covariance
+    return tilts[:used], covariances[:used]
 
 
 def tilt_of_outlines(
     image: NDArray[np.uint8],
     camera: Camera,
-    floor_xy: NDArray[np.float64],
+    floor_xy: FloatArray,
     radius_m: float,
     raised_m: float = 0.0,
 ) -> OutlineTilt | None:
@@ -302,16 +282,13 @@ def tilt_of_outlines(
     OutlineTilt or None
         None where no disc's rim is in view.
     """
-    discs, mean, covariance = _tilt_of_outlines(
-        image,
-        camera_numbers(camera),
-        np.array(camera.centre),
-        floor_xy,
-        radius_m,
-        1.0 + raised_m / float(camera.centre[2]),
+    height_ratio = 1.0 + raised_m / float(camera.centre[2])
+    tilts, covariances = _tilts_of_discs(
+        image, camera_numbers(camera), np.array(camera.centre), floor_xy, radius_m, height_ratio
     )
-    if discs == 0:
+    if not len(tilts):
         return None
+    mean, covariance = mean_of_tilts(tilts, covariances + DISC_SIGMA_RAD**2 * np.eye(2))
+    (cpp, cpr), (_, crr) = (covariance + FLOOR_SIGMA_RAD**2 * np.eye(2)).tolist()
     pitch, roll = mean.tolist()
-    (cpp, cpr), (_, crr) = covariance.tolist()
-    return OutlineTilt(pitch, roll, cpp, cpr, crr, discs)
+    return OutlineTilt(pitch, roll, cpp, cpr, crr, len(tilts))

@@ -102,6 +102,18 @@ class FitSettings(NamedTuple):
     """Blur along v over blur along u, in pixels: 0.5 in single fields of interlaced frames."""
 
 
+class Effort(NamedTuple):
+    """How much a fit may cost: a tuple, for Numba compiles anew for each literal bool."""
+
+    look: bool
+    """Take about 160 pixels, rather than all that matter; leave out covariance and outline."""
+    evaluations: int
+    """Of the model, at most."""
+
+
+LOOK, FULL = Effort(True, 3), Effort(False, 15)
+
+
 class Candidate(NamedTuple):
     """Where a disc may be."""
 

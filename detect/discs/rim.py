@@ -308,7 +308,9 @@ def best_circle(
     best_chosen : (DIRECTIONS,) float64
         Result: the weights of the points on the circle, 0 of the others.
     """
-    points = np.sum(weight > 0.0)
+    points = 0
+    for k in range(DIRECTIONS):
+        points += weight[k] > 0.0
     chosen = np.zeros(DIRECTIONS)
     best = Circle(0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
     best_count = 0
@@ -327,7 +329,8 @@ def best_circle(
         if count > best_count:
             best_count = count
             best = circle
-            best_chosen[:] = chosen
+            for k in range(DIRECTIONS):
+                best_chosen[k] = chosen[k]
             # What has more points than this shares most of them: it is the same circle.
             if count >= _CERTAINLY_BEST * points:
                 break
@@ -444,7 +447,7 @@ def _placed(
                 residual = math.hypot(x[k] - circle.x, y[k] - circle.y) - circle.radius
                 off[n] = abs(residual) * math.sqrt(trusted[k])
                 n += 1
-        limit = max(_FAR_OFF * 1.4826 * np.median(off[:n]), 1.0)
+        limit = max(_FAR_OFF * 1.4826 * median(off[:n]), 1.0)
         for k in range(DIRECTIONS):
             if trusted[k] > 0.0 and n > LEAST_TRUSTED:
                 residual = math.hypot(x[k] - circle.x, y[k] - circle.y) - circle.radius
@@ -479,3 +482,17 @@ def _by_jackknife(
     dx, dy = without[:n, 0] - np.mean(without[:n, 0]), without[:n, 1] - np.mean(without[:n, 1])
     share = (n - 1.0) / n
     return share * np.sum(dx * dx), share * np.sum(dx * dy), share * np.sum(dy * dy)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def median(values: NDArray[np.float64]) -> float:
+    """Median of some values, which are sorted. (NumPy's takes much longer to compile.)"""
+    count = len(values)
+    for i in range(1, count):
+        value = values[i]
+        k = i
+        while k > 0 and values[k - 1] > value:
+            values[k] = values[k - 1]
+            k -= 1
+        values[k] = value
+    return float(0.5 * (values[(count - 1) // 2] + values[count // 2]))

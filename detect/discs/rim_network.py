@@ -153,7 +153,8 @@ def _convolve(
     result = np.empty((directions, len(bias)), np.float32)
     for k in range(directions):
         row = result[k]
-        row[:] = bias
+        for c in range(len(bias)):
+            row[c] = bias[c]
         for tap in range(3):
             seen = values[(k + tap - 1) % directions]
             for i in range(inputs):
@@ -185,7 +186,8 @@ def network_log_odds(
     units = network.dense_bias.shape[1]
     total = 0.0
     pooled = np.empty(3 * channels + len(scales), np.float32)
-    pooled[3 * channels :] = scales
+    for i in range(len(scales)):
+        pooled[3 * channels + i] = scales[i]
     for n in range(members):
         around = _convolve(inputs, network.around[n], network.around_bias[n])
         again = _convolve(around, network.again[n], network.again_bias[n])

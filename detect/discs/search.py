@@ -10,8 +10,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from detect.discs import fit
-from detect.discs.candidates import Centres, middles, strong_and_alone, suppress_neighbours
-from detect.discs.descent import PATIENT, Hope
+from detect.discs.candidates import middles, strong_and_alone, suppress_neighbours
+from detect.discs.descent import Hope
 from detect.discs.evidence_kernels import (
     CLEAR_EVIDENCE,
     LEAST_MIDDLE_STEP,
@@ -21,11 +21,11 @@ from detect.discs.evidence_kernels import (
     evidence_of,
     evidence_with_rim,
 )
-from detect.discs.fit import RESULT, fit_disc
+from detect.discs.fit import RESULT, X, Y, fit_disc, fitted_positions, working_space
 from detect.discs.model import Disc
-from detect.discs.patch import Candidate, FitSettings, floor_steps
-from detect.discs.positions import refined_covariances
-from detect.discs.rim import follow_rim
+from detect.discs.patch import FULL, LOOK, Candidate, FitSettings, floor_steps
+from detect.discs.quality import Centres
+from detect.discs.rim import Rim, follow_rim
 
 #: Candidates whose first look is this much below the required evidence are not fitted in full; more
 #: is allowed where the quality is high, for what hides part of a disc hardly lowers that.
@@ -96,124 +96,92 @@ class Scene(NamedTuple):
     camera_numbers: NDArray[np.float64]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def search_discs(
-    image: NDArray[np.uint8],
-    floor_xy: NDArray[np.float32],
-    centres: Centres,
-    weakest: float,
-    search: DiscSearch,
-    settings: FitSettings,
-    camera: tuple[NDArray[np.float64], NDArray[np.float64]],
-    work: NDArray[Any],
-) -> tuple[
-    NDArray[np.int64],
-    NDArray[np.float64],
-    NDArray[np.float64],
-    NDArray[np.float64],
-    NDArray[np.float64],
-]:
+class FoundDiscs(NamedTuple):
+    """Discs that were found.
+
+    Attributes
+    ----------
+    centre : (M,) int64
+        Indices of the candidates.
+    floor_xy, covariance : (M, 2), (M, 2, 2) float64
+        Fitted places and their covariances by the fits alone, metres, square metres.
+    evidence : (M,) float64
+    """
+
+    centre: NDArray[np.int64]
+    floor_xy: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    evidence: NDArray[np.float64]
+
+
+def search_discs(scene: Scene, centres: Centres, weakest: float) -> FoundDiscs:
     """Fit discs at the best centres, weigh the evidence, and keep the best of those that are one.
 
     Parameters
     ----------
-    image : (H, W) uint8
-    floor_xy : (H, W, 2) float32
-        Floor position of each pixel, metres.
+    scene : Scene
     centres : Centres
     weakest : float
         Least contrast, grey levels.
-    search : DiscSearch
-    settings : FitSettings
-    camera : (K,) float64, (3,) float64
-        `camera_numbers` and `centre` of `detect.discs.positions.refined_covariances`.
-    work : (1,) WORK
-        See `detect.discs.fit.working_space`.
-
-    Returns
-    -------
-    own_pixels, own_quality : (M, 2) int64, (M,) float64
-        Those of the best centres that are discs, in their order.
-    found_xy : (M, 2) float64
-        Their fitted places, metres.
-    covariance : (M, 2, 2) float64
-        Square metres.
-    evidence : (M,) float64
     """
-    pixels, quality, contrast = centres.pixels, centres.quality, centres.contrast
-    camera_numbers, centre = camera
+    search = scene.search
     # Each disc has several best centres: of those in the middle of it one is enough.
     near = 0.5 * search.separation
-    keep = strong_and_alone(pixels, quality, contrast, floor_xy, weakest, near)
-    starts = middles(pixels, quality, contrast, floor_xy, weakest, near, keep)
-    scene = Scene(image, floor_xy, search, settings, camera_numbers)
-    results, evidence, found = _fit_all(scene, starts, quality[keep], contrast[keep], work[0])
+    keep = strong_and_alone(centres, scene.floor_xy, weakest, near)
+    starts = middles(centres, keep, scene.floor_xy, weakest, near)
+    quality, contrast, work = centres.quality[keep], centres.contrast[keep], working_space()[0]
+    order = np.argsort(-quality, kind="stable")
+    looks, promise = _look_at_all(scene, starts, quality, contrast, order, work)
+    order = np.flatnonzero(promise > -np.inf)
+    looked_xy = np.column_stack([looks[X], looks[Y]])
+    order = _apart(order, looked_xy, promise, _SAME_DISC * search.separation)
+    results, evidence, score = _fit_all(scene, starts, quality, contrast, looks, order, work)
+    found = np.flatnonzero(score > -np.inf)
+    places = np.column_stack([results[X], results[Y]])
+    if not search.refine:
+        places = scene.floor_xy[starts[:, 1], starts[:, 0]].astype(np.float64)
+    found = _apart(found, places, score, search.separation)
     if search.verify:
-        found = _of_likely_sign(results, evidence, found, search.least_evidence)
-    own_pixels = np.empty((len(found), 2), np.int64)
-    own_quality = np.empty(len(found))
-    found_xy = np.empty((len(found), 2))
-    covariance = np.empty((len(found), 2, 2))
-    log_odds = np.empty(len(found))
-    for k in range(len(found)):
-        result = results[found[k]]
-        i = keep[found[k]]
-        own_pixels[k, 0] = pixels[i, 0]
-        own_pixels[k, 1] = pixels[i, 1]
-        own_quality[k] = quality[i]
-        found_xy[k, 0] = result[fit.X]
-        found_xy[k, 1] = result[fit.Y]
-        covariance[k, 0, 0] = result[fit.COV_XX]
-        covariance[k, 0, 1] = covariance[k, 1, 0] = result[fit.COV_XY]
-        covariance[k, 1, 1] = result[fit.COV_YY]
-        log_odds[k] = evidence[found[k]]
-    covariance = refined_covariances(
-        camera_numbers, centre, found_xy, covariance, search.pixel_variance, search.tilt_variance
-    )
-    return own_pixels, own_quality, found_xy, covariance, log_odds
+        found = found[_likely_sign(contrast[found] > 0.0, evidence[found], search.least_evidence)]
+    return FoundDiscs(keep[found], *fitted_positions(results[found]), evidence[found])
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def _of_likely_sign(
-    results: NDArray[Any],
-    evidence: NDArray[np.float64],
-    found: NDArray[np.int64],
-    least_evidence: float,
+def _apart(
+    index: NDArray[np.int64], place: NDArray[np.float64], score: NDArray[np.float64], near: float
 ) -> NDArray[np.int64]:
+    """Those of some discs that have no better one nearby; all of them if nothing is near."""
+    if near > 0.0:
+        index = index[suppress_neighbours(place[index], score[index], near)]
+    return index
+
+
+def _likely_sign(
+    light: NDArray[np.bool_], evidence: NDArray[np.float64], least_evidence: float
+) -> NDArray[np.bool_]:
     """Which discs are not both doubtful and the only dark ones among light ones, or vice versa.
 
     Discs of one place are mostly alike. With m of n clear discs of a sign, the odds of that sign
     are (m + 1) : (n - m + 1) by Laplace's rule of succession; where they speak against a doubtful
     disc, they are weighed with its evidence. Few clear discs say too little.
     """
-    light = dark = 0
-    for i in found:
-        if evidence[i] >= least_evidence + CLEAR_EVIDENCE:
-            if results[i][fit.CONTRAST] > 0.0:
-                light += 1
-            else:
-                dark += 1
-    if light + dark < _LEAST_CLEAR:
-        return found
-    log_odds = math.log((light + 1.0) / (dark + 1.0))
-    likely = np.ones(len(found), np.bool_)
-    for k in range(len(found)):
-        i = found[k]
-        sign = 1.0 if results[i][fit.CONTRAST] > 0.0 else -1.0
-        likely[k] = evidence[i] + min(sign * log_odds, 0.0) >= least_evidence
-    return found[likely]
+    clear = evidence >= least_evidence + CLEAR_EVIDENCE
+    if np.count_nonzero(clear) < _LEAST_CLEAR:
+        return np.ones(len(light), np.bool_)
+    odds = (np.count_nonzero(light & clear) + 1) / (np.count_nonzero(~light & clear) + 1)
+    log_odds = np.where(light, 1.0, -1.0) * math.log(odds)
+    return np.asarray(evidence + np.minimum(log_odds, 0.0) >= least_evidence)
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _evidence(result: Any, radius: float, optics_px: float) -> float:
+def _evidence(result: Any, search: DiscSearch) -> float:
     return evidence_of(
         result[fit.EXPLAINED],
-        result[fit.RADIUS] / radius,
+        result[fit.RADIUS] / search.radius,
         result[fit.OUTLINE_DEVIATION],
         result[fit.SECTORS_GOOD],
         result[fit.MIDDLE_STEP],
         result[fit.RELATIVE_BLUR],
-        optics_px,
+        search.optics_px,
     )
 
 
@@ -224,38 +192,24 @@ def _slack(quality: float) -> float:
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _shows_rim(
-    image: NDArray[np.uint8],
-    camera_numbers: NDArray[np.float64],
-    search: DiscSearch,
-    result: Any,
-) -> bool:
-    """Whether enough of a rim is in view round a poor first look to be worth a fit."""
-    rim = follow_rim(
-        image, camera_numbers, result[fit.X], result[fit.Y], search.radius, result[fit.CONTRAST]
-    )
-    return bool(rim.agreeing >= LEAST_RIM or rim.radius_px < LEAST_RIM_PX)
+def _rim_of(scene: Scene, result: Any) -> Rim:
+    return follow_rim(
+        scene.image, scene.camera_numbers, result[fit.X], result[fit.Y], scene.search.radius,
+        result[fit.CONTRAST],
+    )  # fmt: skip
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _with_rim(
-    image: NDArray[np.uint8],
-    camera_numbers: NDArray[np.float64],
-    search: DiscSearch,
-    quality: float,
-    log_odds: float,
-    result: Any,
-) -> float:
+def _with_rim(scene: Scene, quality: float, log_odds: float, result: Any) -> float:
     """The evidence of a doubtful fit with its rim, which also places a partly hidden disc."""
+    search = scene.search
     relative = result[fit.RADIUS] / search.radius
     possible = (
         RADIUS_RANGE[0] < relative < RADIUS_RANGE[1] and result[fit.MIDDLE_STEP] > LEAST_MIDDLE_STEP
     )
     if not possible:
         return log_odds
-    rim = follow_rim(
-        image, camera_numbers, result[fit.X], result[fit.Y], search.radius, result[fit.CONTRAST]
-    )
+    rim = _rim_of(scene, result)
     if rim.radius_px < LEAST_RIM_PX:
         return log_odds
     together = evidence_with_rim(
@@ -394,23 +348,12 @@ def _near_clear(clear: NDArray[np.float64], count: int, x: float, y: float, near
     return False
 
 
-@njit(cache=True, error_model="numpy")
-def _fit(
-    scene: Scene, candidate: Candidate, start: Disc, look: bool, quality: float, work: Any,
-    result: Any,
-) -> tuple[bool, float]:  # fmt: skip
-    """Fit a disc, or look: whether that came to a result, and the evidence.
-
-    The one call of `fit_disc` here: machine code of it twice takes twice as long to compile.
-    """
-    search = scene.search
-    hope = PATIENT
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _hope(search: DiscSearch, quality: float) -> Hope:
+    """When a fit is given up."""
     if search.verify:
-        hope = Hope(_LEAST_SHARE, search.least_evidence - _slack(quality), search.optics_px)
-    fitted = fit_disc(
-        scene.image, scene.floor_xy, candidate, scene.settings, start, look, hope, work, result
-    )
-    return fitted, _evidence(result, search.radius, search.optics_px) if fitted else -math.inf
+        return Hope(_LEAST_SHARE, search.least_evidence - _slack(quality), search.optics_px)
+    return Hope(-math.inf, -math.inf, search.optics_px)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -421,15 +364,17 @@ def _promising(scene: Scene, quality: float, log_odds: float, result: Any) -> bo
         return True
     if log_odds < search.least_evidence - _slack(quality):
         return False
-    return _shows_rim(scene.image, scene.camera_numbers, search, result)
+    # Whether enough of a rim is in view round a poor first look to be worth a fit.
+    rim = _rim_of(scene, result)
+    return bool(rim.agreeing >= LEAST_RIM or rim.radius_px < LEAST_RIM_PX)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _look_at_all(
     scene: Scene, pixels: NDArray[np.int64], quality: NDArray[np.float64],
-    contrast: NDArray[np.float32], work: Any,
+    contrast: NDArray[np.float32], order: NDArray[np.int64], work: Any,
 ) -> tuple[Any, NDArray[np.float64]]:  # fmt: skip
-    """Look at the candidates, the best first: (N,) RESULT, and what they promise.
+    """Look at the candidates in some order: (N,) RESULT, and what they promise.
 
     What lies within a disc that showed clearly is left out. The promise is the evidence;
     minus infinity for what is not worth a fit.
@@ -440,7 +385,7 @@ def _look_at_all(
     clear = np.empty((len(pixels), 2))
     clear_count = 0
     blur = _first_blur(scene)
-    for i in np.argsort(-quality, kind="mergesort"):
+    for i in order:
         u, v = pixels[i, 0], pixels[i, 1]
         x, y = float(floor_xy[v, u, 0]), float(floor_xy[v, u, 1])
         if _near_clear(clear, clear_count, x, y, _WITHIN * search.separation):
@@ -451,7 +396,11 @@ def _look_at_all(
             continue
         candidate = Candidate(u, v, search.radius, blur)
         start = Disc(0.0, 0.0, 1.0, math.log(blur))
-        fitted, log_odds = _fit(scene, candidate, start, True, quality[i], work, looks[i])
+        fitted = fit_disc(
+            scene.image, scene.floor_xy, candidate, scene.settings, start, LOOK,
+            _hope(search, quality[i]), work, looks[i],
+        )  # fmt: skip
+        log_odds = _evidence(looks[i], search) if fitted else -math.inf
         if not search.verify:
             if fitted:
                 promise[i] = max(log_odds, _NO_EVIDENCE)
@@ -487,11 +436,13 @@ def _fit_after_look(
             log_blur,
         )
         candidate = Candidate(u, v, search.radius, blur)
-        fitted, log_odds = _fit(scene, candidate, start, False, quality, work, result)
+        fitted = fit_disc(
+            scene.image, scene.floor_xy, candidate, scene.settings, start, FULL,
+            _hope(search, quality), work, result,
+        )  # fmt: skip
+        log_odds = _evidence(result, search) if fitted else -math.inf
         if search.verify and fitted and log_odds < search.least_evidence + CLEAR_EVIDENCE:
-            log_odds = _with_rim(
-                scene.image, scene.camera_numbers, search, quality, log_odds, result
-            )
+            log_odds = _with_rim(scene, quality, log_odds, result)
         enough = fitted and (not search.verify or log_odds >= search.least_evidence)
         if not (enough and result[fit.BLUR] > _AT_BOUND * result[fit.BLUR_BOUND]):
             break
@@ -505,40 +456,20 @@ def _fit_after_look(
 @njit(cache=True, error_model="numpy", nogil=True)
 def _fit_all(
     scene: Scene, pixels: NDArray[np.int64], quality: NDArray[np.float64],
-    contrast: NDArray[np.float32], work: Any,
-) -> tuple[Any, NDArray[np.float64], NDArray[np.int64]]:  # fmt: skip
-    """Look at all, then fit what the looks left: the results, the evidence, the discs."""
-    n = len(pixels)
+    contrast: NDArray[np.float32], looks: Any, order: NDArray[np.int64], work: Any,
+) -> tuple[Any, NDArray[np.float64], NDArray[np.float64]]:  # fmt: skip
+    """Fit what the looks left: (N,) RESULT, the evidence, and a score for those that are discs."""
     search = scene.search
-    looks, promise = _look_at_all(scene, pixels, quality, contrast, work)
-    order = np.flatnonzero(promise > -np.inf)
-    place = np.zeros((n, 2))
-    place[:, 0], place[:, 1] = looks[fit.X], looks[fit.Y]
-    order = _apart(order, place, promise, _SAME_DISC * search.separation)
-    results = np.zeros(n, RESULT)
-    evidence = np.full(n, -np.inf)
-    score = np.full(n, -np.inf)
+    results = np.zeros(len(pixels), RESULT)
+    evidence, score = np.full(len(pixels), -np.inf), np.full(len(pixels), -np.inf)
     for i in order:
         result = results[i]
         enough, log_odds = _fit_after_look(scene, pixels[i], quality[i], looks[i], work, result)
         evidence[i] = log_odds
         candidate = scene.floor_xy[pixels[i, 1], pixels[i, 0]]
-        place[i, 0] = result[fit.X] if search.refine else candidate[0]
-        place[i, 1] = result[fit.Y] if search.refine else candidate[1]
         # A fit that wandered off, or turned the disc's contrast round, is about something else.
         off = math.hypot(result[fit.X] - candidate[0], result[fit.Y] - candidate[1])
         same_sign = result[fit.CONTRAST] * contrast[i] > 0.0
         if enough and off < search.radius and same_sign:
             score[i] = log_odds if log_odds > -math.inf else _NO_EVIDENCE + quality[i]
-    found = np.flatnonzero(score > -np.inf)
-    return results, evidence, _apart(found, place, score, search.separation)
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def _apart(
-    index: NDArray[np.int64], place: NDArray[np.float64], score: NDArray[np.float64], near: float
-) -> NDArray[np.int64]:
-    """Those of some discs that have no better one nearby; all of them if nothing is near."""
-    if near > 0.0:
-        return index[suppress_neighbours(place[index], score[index], near)]
-    return index
+    return results, evidence, score

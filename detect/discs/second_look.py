@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from camera.kernels import project_floor_point
 from detect.discs.candidates import suppress_neighbours
 from detect.discs.hough import HoughCandidates
-from detect.discs.rim import DIRECTIONS, FARTHEST, NEAREST, STEPS, Rim, follow_rim, profiles
+from detect.discs.rim import DIRECTIONS, FARTHEST, NEAREST, STEPS, Rim, follow_rim, median, profiles
 from detect.discs.rim_network import (
     RimNetwork,
     network_inputs,
@@ -85,7 +85,6 @@ class SecondLooks(NamedTuple):
     log_odds: FloatArray
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
 def second_looks(
     image: NDArray[np.uint8],
     candidates: HoughCandidates,
@@ -107,6 +106,20 @@ def second_looks(
         `camera.kernels.camera_numbers`.
     network : RimNetwork
     """
+    looks = _look_at_all(image, candidates, found_xy, sought, camera_numbers, network)
+    best = suppress_neighbours(looks.floor_xy, looks.log_odds, sought.separation)
+    return SecondLooks(*(values[best] for values in looks))
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _look_at_all(
+    image: NDArray[np.uint8],
+    candidates: HoughCandidates,
+    found_xy: FloatArray,
+    sought: Sought,
+    camera_numbers: FloatArray,
+    network: RimNetwork,
+) -> SecondLooks:
     n = len(candidates.score)
     features = np.empty((n, len(FEATURES)))
     place = np.empty((n, 2))
@@ -189,7 +202,7 @@ def _contrast(
         if step > sought.least_step:
             steps[count] = step
             count += 1
-    return float(np.median(steps[:count])) if count >= _LEAST_STEPS * len(_COS) else 0.0
+    return median(steps[:count]) if count >= _LEAST_STEPS * len(_COS) else 0.0
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

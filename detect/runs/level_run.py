@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 import numpy as np
 
 from camera import Camera
-from detect.discs.levelling import level_discs
+from detect.levelling import level_discs
 from detect.run_tilt import frame_tilts, tilt_of_run
 from detect.runs.outputs import RUN_TILT
 from detect.runs.rows import RunSummary, disc_numbers, landmark_rows
@@ -59,13 +59,9 @@ def _levelled(circles: str, tilt: FrameTilt, camera: Camera) -> str:
         return head
     words = [row.split() for row in rows]
     numbers = np.array([word[1:7] for word in words], np.float64)
-    floor_xy, covariance, down = level_discs(
-        np.ascontiguousarray(numbers[:, :2]),
-        np.ascontiguousarray(numbers[:, [3, 4, 4, 5]]).reshape(-1, 2, 2),
-        np.array(camera.centre),
-        (tilt.pitch, tilt.roll, tilt.cpp, tilt.cpr, tilt.crr),
-    )
-    level = disc_numbers(floor_xy[down], numbers[down, 2], covariance[down])
+    covariance = numbers[:, [3, 4, 4, 5]].reshape(-1, 2, 2)
+    floor_xy, level_covariance, down = level_discs(camera, numbers[:, :2], covariance, tilt)
+    level = disc_numbers(floor_xy[down], numbers[down, 2], level_covariance[down])
     ids = [tuple(map(int, words[k][7:])) for k in np.flatnonzero(down)]
     return head + landmark_rows("LANDMARK_C", level, ids)
 

@@ -18,13 +18,11 @@ from numba import typeof
 
 from camera import Camera, parse_camera
 from detect.circles import CircleDetections, refined_covariance
-from detect.discs.levelling import level_discs
 from detect.discs.positions import refined_covariances
 from detect.levelling import level_covariances, level_positions, levelled
 from detect.settings import CircleSettings
 from landmarks import FrameTilt
-from lut import DiscShape, cached_disc_table, cached_vertical_table, floor_positions
-from lut.kernels import fill_floor_positions
+from lut import DiscShape, cached_disc_table, cached_vertical_table
 from tests.conftest import PUBLISHED_CAM
 
 FLOOR_XY = np.array([[0.0, -1.0], [1.1, -2.0]])
@@ -67,7 +65,7 @@ def test_cameras_that_are_read_and_handed_over_are_of_one_kind() -> None:
     assert read.centre[2] > 0.0  # kept by the camera, and handed over with it
     assert read.rotation.shape == (3, 3)
     handed_over = pickle.loads(pickle.dumps(read))
-    kernels = (level_discs, refined_covariances, fill_floor_positions)
+    kernels = (refined_covariances,)
     pixels, two = np.array([[400, 200], [300, 150]]), np.ones(2)
     discs = CircleDetections(pixels, FLOOR_XY, COVARIANCE, two, two)
     tilt = FrameTilt("e.0000", 0.01, 0.02, 1e-6, 0.0, 1e-6, 9)
@@ -77,6 +75,5 @@ def test_cameras_that_are_read_and_handed_over_are_of_one_kind() -> None:
         level_covariances(camera, FLOOR_XY, COVARIANCE, 0.01, 0.02, np.eye(2))
         levelled(discs, camera, tilt)
         refined_covariance(camera, FLOOR_XY, COVARIANCE, CircleSettings())
-        floor_positions(camera)
         compiled.append([set(kernel.signatures) for kernel in kernels])
     assert compiled[0] == compiled[1]

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-import errno
 import hashlib
 import io
 import logging
-import os
 import pickle
 import subprocess
 import sys
@@ -137,25 +135,6 @@ def test_every_camera_has_a_table_of_its_own(
     cached_disc_table(camera, SHAPE, tmp_path)
     assert_same(cached_disc_table(other, SHAPE, tmp_path), build_disc_table(other, SHAPE))
     assert computed == [SHAPE, SHAPE]
-
-
-def test_what_is_no_fault_of_the_file_is_not_called_damage(
-    tmp_path: Path,
-    camera: Camera,
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
-) -> None:
-    """A kernel that cannot be kept, say: the disk is full."""
-    cached_disc_table(camera, SHAPE, tmp_path)
-
-    def full(_: Camera) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "kernel.nbc")
-
-    monkeypatch.setattr(lut.cache, "floor_positions", full)
-    caplog.clear()
-    with caplog.at_level(logging.INFO, logger="redetect"), pytest.raises(OSError, match="kernel"):
-        cached_disc_table(camera, SHAPE, tmp_path)
-    assert caplog.messages == []
 
 
 def test_another_version_of_the_tables_does_not_read_old_ones(
@@ -331,7 +310,7 @@ while not (folder / "go").exists():
 digests = set()
 for _ in range(rounds):
     table = cached_disc_table(camera, shape, folder / "cache")
-    digests.add(hashlib.sha256(table.copies.tobytes() + table.floor_xy.tobytes()).hexdigest())
+    digests.add(hashlib.sha256(table.samples.tobytes() + table.floor_xy.tobytes()).hexdigest())
     # Half of the time somebody clears the cache or damages it.
     for path in (folder / "cache").glob("*.table"):
         if sys.argv[4] == "0":
@@ -347,7 +326,7 @@ def test_concurrent_writers_all_get_right_tables(
     tmp_path: Path, camera: Camera, project_root: Path
 ) -> None:
     built = build_disc_table(camera, SHAPE)
-    right = hashlib.sha256(built.copies.tobytes() + built.floor_xy.tobytes()).hexdigest()
+    right = hashlib.sha256(built.samples.tobytes() + built.floor_xy.tobytes()).hexdigest()
     write_camera(camera, tmp_path / "e.cam")
     processes = [
         subprocess.Popen(

@@ -29,7 +29,7 @@ class Said(logging.Handler):
 
 def tables_are_right(camera: Camera, folder: Path) -> None:
     discs, verticals = cached_disc_table(camera, SHAPE, folder), build_vertical_table(camera)
-    np.testing.assert_array_equal(discs.copies, build_disc_table(camera, SHAPE).copies)
+    np.testing.assert_array_equal(discs.samples, build_disc_table(camera, SHAPE).samples)
     found = cached_vertical_table(camera, folder)
     for field in dataclasses.fields(verticals):
         np.testing.assert_array_equal(getattr(found, field.name), getattr(verticals, field.name))

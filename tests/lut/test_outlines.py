@@ -24,7 +24,6 @@ from lut import (
     floor_positions,
     ring,
 )
-from lut.kernels import ADVANCE_BITS, AT_ONCE, COPIED, GROUP, LANES, LARGEST_STRIDE, PITCH
 from tests.camera.strategies import cameras
 
 IntArray = NDArray[np.int64]
@@ -68,89 +67,19 @@ def plain_outlines(camera: Camera, shape: DiscShape) -> Outlines:
     return Outlines(nearest[..., 0], nearest[..., 1], inside, usable, doubtful)
 
 
-def decoded(table: DiscTable) -> tuple[IntArray, IntArray]:
-    """What the table's copies gather, if carried out byte by byte.
-
-    Returns
-    -------
-    (B, 2 R, 256) int64
-        For each block, row and centre the index of the pixel that is copied there; H W for zeros.
-    (H, W, 2 samples) int64
-        The same around every pixel, for samples only; -1 where nothing is gathered.
-    """
-    height, width = table.usable.shape
-    padded = -(-table.samples // GROUP) * GROUP
-    blocks = len(table.block_row)
-    gathered = np.full((blocks, 2 * padded * PITCH + COPIED), -1)
-    for b in range(blocks):
-        place = 0
-        taken = np.arange(0, COPIED, table.block_stride[b])
-        for copy in table.copies[table.block_copies[b] : table.block_copies[b + 1]].tolist():
-            source, advance = copy >> ADVANCE_BITS, copy % (1 << ADVANCE_BITS)
-            gathered[b, place : place + len(taken)] = source + taken
-            place += advance
-        assert place == 2 * padded * PITCH
-    # From behind the image come zeros, 64 of them.
-    assert gathered.max(initial=0) < height * width + COPIED
-    values = np.minimum(gathered[:, : 2 * padded * PITCH], height * width)
-    values = values.reshape(blocks, 2, padded, PITCH)
-    around = np.full((height, width, 2 * table.samples), -1)
-    samples = values[:, :, : table.samples].reshape(blocks, 2 * table.samples, PITCH)
-    for b in range(blocks):
-        columns = table.block_column[b] + table.block_stride[b] * np.arange(PITCH)
-        inside = columns < width
-        voting = slice(*table.block_votes[b : b + 2])
-        inside[: table.votes[0, voting].size] &= table.votes[0, voting] > 0
-        inside[table.votes[0, voting].size :] = False
-        around[table.block_row[b], columns[inside]] = samples[b].T[inside]
-    return values.reshape(blocks, 2 * padded, PITCH), around
-
-
-def places_of(widths: IntArray) -> IntArray:
-    """0, 1, ... for each of some widths."""
-    return np.arange(widths.sum()) - np.repeat(np.cumsum(widths) - widths, widths)
-
-
 def assert_table_is(table: DiscTable, plain: Outlines) -> None:
-    """Bit for bit, for all usable centres; and safe everywhere."""
+    """Bit for bit, for all usable centres."""
     height, width = plain.usable.shape
-    usable = plain.usable
-    assert table.usable.dtype == np.bool_
-    assert np.array_equal(table.usable, usable)
-    gathered, around = decoded(table)
-    expected = np.where(plain.inside, plain.row * width + plain.column, height * width)
-    assert np.array_equal(around[usable], expected[usable])
-
-    for votes, outline in (
-        (table.votes_inner, plain.inside[..., : table.samples]),
-        (table.votes_outer, plain.inside[..., table.samples :]),
-    ):
-        assert votes.dtype == np.uint8
-        assert np.array_equal(votes, np.where(usable, outline.sum(axis=-1), 0))
-
-    # Rows that are no samples are zeros, where there are centres: they add nothing to any sum.
-    padded = gathered.shape[1] // 2
-    widths = np.diff(table.block_votes)
-    voting = np.zeros((len(widths), PITCH), bool)
-    voting[np.repeat(np.arange(len(widths)), widths), places_of(widths)] = table.votes[0] > 0
-    for first in (table.samples, padded + table.samples):
-        empty = gathered[:, first : first + padded - table.samples]
-        assert np.all((empty == height * width) | ~voting[:, None])
-
-    # Each row's blocks begin at a usable centre, and end at one; none has centres of another.
-    first = table.votes[0, table.block_votes[:-1]]
-    assert np.all(first > 0)
-    assert np.count_nonzero(table.votes[0]) == np.count_nonzero(usable)
-    order = table.block_row * width + table.block_column
-    assert np.all(np.diff(order) > 0)
-
-    # What a detector takes for granted.
-    assert table.block_copies[0] == 0
-    assert table.block_copies[-1] == len(table.copies)
-    counts = np.diff(table.block_copies)
-    assert np.all((counts > 0) & (counts % AT_ONCE == 0))
-    assert np.all((widths > 0) & (widths % LANES == 0) & (widths <= PITCH))
-    assert np.all((table.block_stride > 0) & (table.block_stride <= LARGEST_STRIDE))
+    assert np.array_equal(table.usable, plain.usable)
+    v, u = np.nonzero(plain.usable)
+    assert np.array_equal(table.row, v)
+    assert np.array_equal(table.column, u)
+    expected = np.where(plain.inside, plain.row * width + plain.column, height * width)[v, u]
+    samples = expected.shape[1] // 2
+    order = np.concatenate([np.arange(0, samples, 2), np.arange(1, samples, 2)])
+    pairs = np.stack([expected[:, :samples], expected[:, samples:]], axis=-1)
+    assert np.array_equal(table.samples, pairs[:, order])
+    assert np.array_equal(table.whole, plain.inside[v, u].all(axis=1))
 
 
 # -- the published calibration --------------------------------------------------------------------
@@ -189,7 +118,7 @@ def test_a_table_with_browns_terms_is_what_a_plain_computation_says(
     camera = dataclasses.replace(small, **lens)
     table = build_disc_table(camera, DiscShape())
     assert_table_is(table, plain_outlines(camera, DiscShape()))
-    assert not np.array_equal(table.copies, build_disc_table(small, DiscShape()).copies)
+    assert not np.array_equal(table.usable, build_disc_table(small, DiscShape()).usable)
     seen = camera.floor_from_pixel([[0, 71], [191, 71], [96, 50]])
     found = floor_positions(camera)[[71, 71, 50], [0, 191, 96]]
     np.testing.assert_allclose(found, seen, rtol=1e-12)
@@ -223,17 +152,6 @@ def test_the_floor_positions_are_the_camera_s(
         assert floor_xy[v, u] == pytest.approx(published_camera.floor_from_pixel([u, v]), rel=1e-12)
     assert np.isnan(floor_xy[0, 384]).all()
     assert np.array_equal(published_table.floor_xy, floor_xy.astype(np.float32), equal_nan=True)
-
-
-def test_the_table_is_small(published_table: DiscTable) -> None:
-    # What makes a detector fast: many grey values with each copy, and a table that stays in the
-    # processor's cache.
-    centres = published_table.usable.sum() * 2 * published_table.samples
-    assert centres / len(published_table.copies) > 30
-    assert published_table.copies.dtype == np.uint32
-    fields = [getattr(published_table, field.name) for field in dataclasses.fields(DiscTable)]
-    arrays = [value for value in fields if isinstance(value, np.ndarray)]
-    assert sum(array.nbytes for array in arrays) - published_table.floor_xy.nbytes < 800_000
 
 
 @pytest.mark.parametrize(
@@ -358,8 +276,8 @@ def test_a_camera_that_looks_up_gets_an_empty_table(published_camera: Camera) ->
     )
     table = build_disc_table(up, DiscShape())
     assert not table.usable.any()
-    assert len(table.copies) == len(table.block_row) == len(table.block_column) == 0
-    assert table.block_copies.tolist() == [0]
+    assert table.samples.shape == (0, 16, 2)
+    assert len(table.row) == len(table.column) == 0
     assert np.isnan(table.floor_xy).all()
 
 

@@ -113,7 +113,7 @@ def plain_maxima(quality: FloatArray, threshold: float) -> list[tuple[int, int]]
 def plain_best_centres(
     image: NDArray[np.uint8], outlines: PlainOutlines, threshold: float, polarity: Polarity = "any"
 ) -> tuple[NDArray[np.int64], FloatArray, NDArray[np.float32]]:
-    """What `detect.discs.candidates.best_centres` is to find."""
+    """The plain maxima, of one polarity."""
     quality, contrast = plain_quality(image, outlines)
     if polarity != "any":
         quality[contrast * (1.0 if polarity == "light" else -1.0) <= 0.0] = 0.0

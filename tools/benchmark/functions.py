@@ -9,9 +9,7 @@ import numpy as np
 
 from camera import Camera
 from detect.circles import detect_circles, disc_shape
-from detect.discs.candidates import best_centres
-from detect.discs.centre_rows import rows_to_look_at
-from detect.discs.quality import quality_of_centres
+from detect.discs.quality import Limits, centres_of, quality_of_centres
 from detect.levelling import levelled
 from detect.line_settings import DEFAULT as LINES_DEFAULT
 from detect.lines import detect_lines
@@ -21,14 +19,12 @@ from detect.settings import PUBLISHED, REPORT, CircleSettings
 from detect.verticals.response import line_response
 from lut import cached_disc_table, cached_vertical_table
 from tools.benchmark.material import Picture, decode
-from tools.benchmark.plain_gather import gather_table, plain_quality_of_centres
 
 #: What everything else is compared with.
 DECODING = "decoding"
 
 #: What ratios of one's own parts and of peers are taken between, for the report.
 KERNEL = "quality map (report)"
-PLAIN_GATHER = "plain gather (report)"
 RESPONSE = "response (dense)"
 CIRCLES = "circles (default)"
 LINES = "lines (default)"
@@ -71,19 +67,18 @@ def circle_detectors(camera: Camera, *, parts: bool = True) -> list[Measured]:
     report = cached_disc_table(camera, disc_shape(REPORT))
     settings = CircleSettings()
     default = cached_disc_table(camera, disc_shape(settings))
-    rows = rows_to_look_at(default, settings)
     pieces = [
         Measured(KERNEL, "circles", lambda p: quality_of_centres(p.grey, report)),
         Measured("quality map (default)", "circles", lambda p: quality_of_centres(p.grey, default)),
         Measured(
-            "best centres (report)",
+            "good centres (report)",
             "circles",
-            lambda p: best_centres(p.grey, report, REPORT.threshold, REPORT.polarity),
+            lambda p: centres_of(p.grey, report, Limits(REPORT.threshold)),
         ),
         Measured(
-            "best centres (default)",
+            "good centres (default)",
             "circles",
-            lambda p: best_centres(p.grey, default, settings.threshold, settings.polarity, rows),
+            lambda p: centres_of(p.grey, default, Limits(settings.threshold)),
         ),
         Measured("noise estimate", "circles", lambda p: estimate_noise(p.grey)),
     ]
@@ -119,13 +114,6 @@ def both_detectors(camera: Camera) -> Measured:
         return lines, circles if tilt is None else levelled(circles, camera, tilt)
 
     return Measured(ALL, "all", detect)
-
-
-def plain_gather(camera: Camera) -> Measured:
-    """The quality map of the preset `report` by one gather per sample."""
-    shape = disc_shape(REPORT)
-    table = gather_table(camera, shape, cached_disc_table(camera, shape))
-    return Measured(PLAIN_GATHER, "peer", lambda p: plain_quality_of_centres(p.grey, table))
 
 
 def peers_of_other_libraries() -> tuple[list[Measured], list[str]]:

@@ -37,7 +37,6 @@ from tools.benchmark.timing import measure_in_turn
 
 #: Peers, and what does their work here.
 _COMPARED = (
-    (f.PLAIN_GATHER, f.KERNEL),
     ("cv2.HoughCircles", f.CIRCLES),
     ("cv2.SimpleBlobDetector", f.CIRCLES),
     ("skimage hough_circle", f.CIRCLES),
@@ -135,7 +134,6 @@ def benchmark(settings: Settings, on_stage: Callable[[str], None] | None = None)
         *f.circle_detectors(run.camera),
         *f.line_detectors(run.camera),
         f.both_detectors(run.camera),
-        f.plain_gather(run.camera),
         *peers,
     ]
     kinds = []

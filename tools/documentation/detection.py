@@ -28,9 +28,11 @@ def draw_discs(figure: Any, run: Path, frame: int) -> None:
     table = cached_disc_table(camera, disc_shape(settings))
     from detect.discs.quality import quality_of_centres
 
-    quality, _ = quality_of_centres(image, table)
+    without_fit = CircleSettings(verify=False, refine=False)
+    every = cached_disc_table(camera, disc_shape(without_fit))
+    quality, _ = quality_of_centres(image, every)
     found = detect_circles(image, camera, table, settings)
-    loose = detect_circles(image, camera, table, CircleSettings(verify=False, refine=False))
+    loose = detect_circles(image, camera, every, without_fit)
     panels = figure.subplots(3, 1)
     titles = (
         "quality of the outlines round every pixel: between-class over total variance",
@@ -78,7 +80,7 @@ def draw_verticals(figure: Any, run: Path, frame: int) -> None:
 def draw_tables(figure: Any, run: Path) -> None:
     """What is known of every pixel before the first image."""
     camera, image = _frame(run, 0)
-    table = cached_disc_table(camera, disc_shape(CircleSettings()))
+    table = cached_disc_table(camera, disc_shape(CircleSettings(rows_apart=0.0)))
     verticals = cached_vertical_table(camera)
     panels = figure.subplots(2, 1)
     _image(panels[0], image, "the two outlines (radius 0.06 and 0.14 m) about some pixels")

@@ -7,7 +7,7 @@ fit), and fitted. Errors are held against the covariance that the fit predicts.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,7 +82,7 @@ def measure_accuracy(
     -------
     Accuracy
     """
-    table = cached_disc_table(camera, disc_shape(settings))
+    table = cached_disc_table(camera, disc_shape(replace(settings, rows_apart=0.0)))
     rng = np.random.default_rng(seed)
     rows, columns = np.nonzero(table.usable)
     distance, error, normalised = [], [], []

@@ -12,9 +12,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from camera import Camera, parse_camera
-from detect.circles import CircleDetections, detect_circles, disc_shape, quality_of_centres
-from detect.discs.candidates import best_centres, local_maxima
-from detect.discs.centre_rows import centre_rows
+from detect.circles import CircleDetections, detect_circles, disc_shape
 from detect.settings import CircleSettings
 from lut import DiscTable, build_disc_table
 from tests.camera.strategies import cameras
@@ -35,70 +33,54 @@ def detect(image: NDArray[np.uint8], circles: CircleSettings) -> CircleDetection
     return detect_circles(image, CAMERA, table_of(CAMERA, circles), circles)
 
 
-def rows_looked_at(table: DiscTable, apart_m: float) -> list[int]:
-    rows: list[int] = np.unique(table.block_row[centre_rows(table, apart_m).blocks]).tolist()
+def rows_tested(camera: Camera, apart_m: float) -> list[int]:
+    shape = replace(disc_shape(EVERY_ROW), rows_m=apart_m)
+    rows: list[int] = np.unique(build_disc_table(camera, shape).row).tolist()
     return rows
 
 
-def test_every_row_is_looked_at_unless_asked_otherwise() -> None:
-    table = table_of(CAMERA)
-    every = centre_rows(table, 0.0)
-    assert np.array_equal(every.blocks, np.arange(len(table.block_row)))
-    assert np.all(np.diff(every.rank) == 1)
+def test_every_row_is_tested_unless_asked_otherwise() -> None:
+    table = table_of(CAMERA, EVERY_ROW)
+    assert np.all(np.diff(rows_tested(CAMERA, 0.0)) == 1)
+    assert np.count_nonzero(table.usable) == len(table.row)
+    assert np.all(np.diff(table.column[table.row == 200]) == 1)
 
 
 def test_more_rows_are_left_out_where_discs_are_nearer() -> None:
-    table = table_of(CAMERA)
-    rows = np.array(rows_looked_at(table, 0.03))
+    rows = np.array(rows_tested(CAMERA, 0.03))
     apart = np.diff(rows)
     assert apart[0] == 1
     assert apart[-2] >= 5
     # Each distance between rows comes before the larger ones, but for where the image ends.
     assert np.all(np.diff(apart[:-1]) >= 0)
-    assert len(rows) < 0.6 * len(rows_looked_at(table, 0.0))
+    assert len(rows) < 0.6 * len(rows_tested(CAMERA, 0.0))
 
 
 @given(cameras(), st.floats(0.001, 0.2))
 @settings(max_examples=10, deadline=None)
-def test_no_usable_centre_is_too_far_from_the_rows_looked_at(
-    camera: Camera, apart_m: float
-) -> None:
-    table = build_disc_table(camera, disc_shape(DEFAULT))
-    looked_at = centre_rows(table, apart_m)
-    some = np.zeros(camera.height, bool)
-    some[np.flatnonzero(np.diff(looked_at.rank, prepend=0))] = True
-    assert looked_at.blocks.tolist() == np.flatnonzero(some[table.block_row]).tolist()
-    # From a centre in a row left out, the nearest row looked at is less than `apart_m` away, or
-    # half of two neighbouring rows.
-    rows = np.flatnonzero(some)
-    left_out = np.unique(table.block_row[~some[table.block_row]])
-    floor = table.floor_xy.astype(np.float64)
-    for v in left_out.tolist():
-        off = int(np.abs(rows - v).min())
-        columns = np.flatnonzero(table.usable[v])[::16]
+def test_no_usable_centre_is_too_far_from_those_tested(camera: Camera, apart_m: float) -> None:
+    shape = replace(disc_shape(EVERY_ROW), rows_m=apart_m, stride_m=apart_m)
+    some = build_disc_table(camera, shape)
+    every = build_disc_table(camera, disc_shape(EVERY_ROW))
+    rows = np.unique(some.row)
+    floor = every.floor_xy.astype(np.float64)
+    for v in np.unique(every.row).tolist():
+        columns = np.flatnonzero(every.usable[v])[::16]
         columns = columns[(columns > 0) & (columns < camera.width - 1)]
         by_u = 0.5 * (floor[v, columns + 1] - floor[v, columns - 1])
-        by_v = 0.5 * (floor[v + 1, columns] - floor[v - 1, columns])
+        by_v = floor[min(v + 1, camera.height - 1), columns] - floor[max(v - 1, 0), columns]
+        by_v /= min(v + 1, camera.height - 1) - max(v - 1, 0)
         length = np.linalg.norm(by_u, axis=1)
-        # How far the next row's line of sight is from this one, where they meet the floor.
-        apart = np.abs(by_u[:, 0] * by_v[:, 1] - by_u[:, 1] * by_v[:, 0]) / length
-        assert np.all(off * apart <= 1.1 * apart_m)
-
-
-def test_best_centres_are_the_maxima_among_the_rows_looked_at() -> None:
-    table = table_of(CAMERA)
-    looked_at = centre_rows(table, 0.03)
-    rng = np.random.default_rng(3)
-    coarse = rng.integers(0, 256, (CAMERA.height // 8, CAMERA.width // 16), dtype=np.uint8)
-    image = np.kron(coarse, np.ones((8, 16), np.uint8))
-    found = best_centres(image, table, 0.4, "any", looked_at)
-    rows = np.flatnonzero(np.diff(looked_at.rank, prepend=0))
-    quality, contrast = quality_of_centres(image, table)
-    columns, rank = local_maxima(quality[rows], 0.4)
-    assert len(columns) > 100
-    np.testing.assert_array_equal(found[0], np.column_stack([columns, rows[rank]]))
-    np.testing.assert_array_equal(found[1], quality[rows[rank], columns])
-    np.testing.assert_array_equal(found[2], contrast[rows[rank], columns])
+        if v in rows:
+            # The next tested centre is at most half a stride away, or the next pixel.
+            tested = np.flatnonzero(some.usable[v])
+            between = (columns >= tested[0]) & (columns <= tested[-1])
+            off = np.abs(columns[:, None] - tested).min(axis=1)
+            assert np.all((off * length)[between] <= 0.6 * apart_m + length[between])
+        elif rows[0] < v < rows[-1]:
+            # How far the next row's line of sight is from this one, where they meet the floor.
+            across = np.abs(by_u[:, 0] * by_v[:, 1] - by_u[:, 1] * by_v[:, 0]) / length
+            assert np.all(np.abs(rows - v).min() * across <= 1.1 * apart_m)
 
 
 @pytest.mark.parametrize("y", np.linspace(-1.25, -0.95, 13).tolist())

@@ -11,6 +11,7 @@ from detect.circles import disc_shape, refined_covariance, tilt_jacobian
 from detect.discs.candidates import middles, strong_and_alone
 from detect.discs.fit import disc_evidence, fit_discs, fit_settings
 from detect.discs.patch import EDGE, Candidate, view_of
+from detect.discs.quality import Centres
 from detect.discs.search import nearest_pixel
 from detect.settings import CircleSettings
 from lut import DiscTable, build_disc_table
@@ -120,10 +121,11 @@ def test_larger_discs_than_a_patch_are_fitted(published_camera: Camera, table: D
 def test_strongest_alone_in_scan_order(table: DiscTable) -> None:
     pixels = np.array([[300, 200], [304, 200], [500, 200], [600, 200]])
     quality = np.array([0.7, 0.9, 0.8, 0.95])
-    contrast = np.array([30.0, -30.0, 30.0, 5.0])
-    keep = strong_and_alone(pixels, quality, contrast, table.floor_xy, 10.0, 0.07)
+    contrast = np.array([30.0, -30.0, 30.0, 5.0], np.float32)
+    centres = Centres(pixels, quality, contrast)
+    keep = strong_and_alone(centres, table.floor_xy, 10.0, 0.07)
     np.testing.assert_array_equal(keep, [1, 2])
-    keep = strong_and_alone(pixels, quality, contrast, table.floor_xy, 10.0, 0.0)
+    keep = strong_and_alone(centres, table.floor_xy, 10.0, 0.0)
     np.testing.assert_array_equal(keep, [0, 1, 2])
 
 
@@ -154,12 +156,12 @@ def test_the_middle_of_a_discs_best_centres(table: DiscTable) -> None:
     """Weighed by what speaks for each; neither weak ones nor those of the other sign count."""
     pixels = np.array([[298, 200], [304, 200], [306, 200], [301, 201], [500, 200]])
     quality = np.array([1.0, 0.5, 0.9, 0.9, 0.8])
-    contrast = np.array([30.0, 60.0, -40.0, 5.0, 30.0])
-    keep = np.array([0, 4])
-    found = middles(pixels, quality, contrast, table.floor_xy, 10.0, 0.07, keep)
-    # (30 * 298 + 0.25 * 60 * 304) / 45
+    contrast = np.array([30.0, 240.0, -40.0, 5.0, 30.0], np.float32)
+    centres, keep = Centres(pixels, quality, contrast), np.array([0, 4])
+    found = middles(centres, keep, table.floor_xy, 10.0, 0.07)
+    # (30 * 298 + 0.5^4 * 240 * 304) / 45
     np.testing.assert_array_equal(found, [[300, 200], [500, 200]])
-    alone = middles(pixels, quality, contrast, table.floor_xy, 10.0, 0.0, keep)
+    alone = middles(centres, keep, table.floor_xy, 10.0, 0.0)
     np.testing.assert_array_equal(alone, pixels[keep])
 
 

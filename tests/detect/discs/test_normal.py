@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.discs import normal_equations as normal
+from detect.discs import least_squares as normal
 from detect.discs.model import ROWS
 from detect.discs.patch import PATCH
 

@@ -4,33 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 from fractions import Fraction
-from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
-from numba import njit
 from numpy.typing import NDArray
 
 from camera import Camera, parse_camera
 from detect.discs.candidates import suppress_neighbours
-from detect.discs.gathering import gather
-from detect.discs.quality import (
-    Wanted,
-    blocks_of,
-    compare,
-    compare_whole,
-    find_centres,
-    memory_for,
-    quality_of_centres,
-    sum_and_gather,
-    vote,
-    with_zeros,
-)
+from detect.discs.quality import Limits, centres_of, quality_of_centres
 from lut import DiscShape, build_disc_table, ring
-from lut.kernels import ADVANCE_BITS, COPIED, GROUP, LARGEST_STRIDE, PITCH
 from tests.conftest import PUBLISHED_CAM
 
 # The first example of a property waits for the compiler: hence no deadlines.
@@ -110,8 +95,7 @@ KINDS = ["random", "binary", "saturated", "nearly constant", "blocks"]
 @pytest.mark.parametrize("kind", KINDS)
 def test_quality_and_contrast_are_exact_to_the_last_bit(kind: str) -> None:
     assert TABLE.usable.sum() > 500
-    voting = TABLE.votes.sum(axis=0)
-    assert np.any((voting > 0) & (voting < 14))  # outlines do reach outside the image
+    assert not TABLE.whole.all()  # outlines do reach outside the image
     image = random_image(1, kind)
     quality, contrast = quality_of_centres(image, TABLE)
     exact, exact_contrast = exact_quality(image, CAMERA, SHAPE, TABLE.usable)
@@ -205,108 +189,19 @@ def test_an_empty_table_finds_nothing() -> None:
     assert not contrast.any()
 
 
-# -- step by step ---------------------------------------------------------------------------------
+# -- limits ---------------------------------------------------------------------------------------
 
 
-@njit(error_model="numpy")
-def _gathered(
-    pixels: GreyImage, copies: NDArray[Any], gathered: GreyImage, stride: int, first: int,
-    count: int, to: int,
-) -> int:  # fmt: skip
-    return gather(pixels, copies, gathered, stride, first, count, to)
-
-
-@pytest.mark.parametrize("stride", range(1, LARGEST_STRIDE + 1))
-@pytest.mark.parametrize("bits", [32, 64])
-def test_copies_are_carried_out_one_after_the_other(bits: int, stride: int) -> None:
-    rng = np.random.default_rng(bits)
-    pixels = rng.integers(0, 256, 1000, dtype=np.uint8)
-    source, advance = rng.integers(0, 1000 - COPIED, 40), rng.integers(0, 64 // stride, 40)
-    copies = ((source << ADVANCE_BITS) | advance).astype(f"uint{bits}")
-    expected, gathered = np.full(4000, 7, np.uint8), np.full(4000, 7, np.uint8)
-    place = 13
-    for s, a in zip(source[4:32].tolist(), advance[4:32].tolist()):
-        expected[place : place + a] = pixels[s : s + COPIED : stride][:a]
-        place += a
-    assert _gathered(pixels, copies, gathered, stride, 4, 28, 13) == place
-    assert np.array_equal(gathered[:place], expected[:place])
-    # What is in excess stays within 64 bytes.
-    assert np.all(gathered[place + COPIED :] == 7)
-
-
-def outlines_of(samples: int, seed: int) -> NDArray[np.int64]:
-    """(2, samples, 256) grey values of all sorts, random votes being none and so zeros."""
-    rng = np.random.default_rng(seed)
-    level = rng.integers(0, 256, (2, 1, PITCH))
-    scatter = rng.choice([0.0, 0.7, 5.0, 30.0, 100.0], PITCH)
-    x = np.clip(np.rint(level + rng.normal(0.0, 1.0, (2, samples, PITCH)) * scatter), 0, 255)
-    x[:, :, :2] = [0.0, 255.0]
-    x[0, :, 2], x[1, :, 2] = 255.0, 0.0
-    return np.asarray(x, np.int64)
-
-
-@pytest.mark.parametrize("samples", [3, 16, 40, 128])
-@pytest.mark.parametrize("threshold", [1e-6, 0.4, 0.6, 1.0])
-@pytest.mark.parametrize("contrast", [0.0, 5.0])
-@pytest.mark.parametrize("all_vote", [True, False])
-def test_what_may_matter_is_noted_and_hardly_anything_else(
-    samples: int, threshold: float, contrast: float, all_vote: bool
-) -> None:
-    rng = np.random.default_rng(samples)
-    votes = rng.integers((samples + 1) // 2, samples + 1, (2, PITCH))
-    votes[:, ::3] = samples
-    votes[:, rng.random(PITCH) < 0.2] = 0
-    if all_vote:
-        votes[:] = samples
-    x = outlines_of(samples, samples) * (np.arange(samples)[:, None] < votes[:, None])
-    memory = memory_for(samples)
-    padded = -(-samples // GROUP) * GROUP
-    rows = np.zeros((2, padded, PITCH), np.uint8)
-    rows[:, :samples] = x
-    memory.gathered[5 : 5 + rows.size] = rows.ravel()
-    nothing = np.zeros(COPIED, np.uint8)
-    sum_and_gather(memory, 5, samples, PITCH, nothing, blocks_of(TABLE), -1, 0)
-    assert np.array_equal([memory.inner, memory.outer], x.sum(axis=1))
-    assert np.array_equal(memory.products, (x * (255 - x)).sum(axis=(0, 1)))
-    wanted = Wanted(threshold, contrast, 0.0, 0, 0)
-    if np.all(votes == samples):
-        compare_whole(memory, samples, PITCH, wanted)
-    else:
-        compare(memory, votes.astype(np.uint8).ravel(), 0, PITCH, wanted)
-    noted = memory.matters > 0
-    n, total = votes.sum(axis=0), x.sum(axis=(0, 1))
-    spread = n * (x**2).sum(axis=(0, 1)) - total**2
-    difference = votes[1] * x[0].sum(axis=0) - votes[0] * x[1].sum(axis=0)
-    pairs = votes[0] * votes[1]
-    good = (difference**2 >= threshold * pairs * spread) & (spread > 0) & (pairs > 0)
-    assert np.all(noted[good & (abs(difference) > contrast * pairs)])
-    assert not np.any(noted[difference**2 < threshold * (1.0 - 1e-5) * pairs * spread])
-    assert not np.any(noted[abs(difference) < contrast * (1.0 - 1e-5) * pairs])
-    assert not np.any(noted[(spread == 0) | (pairs == 0)])
-    assert 0 < np.count_nonzero(noted) < PITCH
-
-
-@pytest.mark.parametrize("sign", [-1.0, 0.0, 1.0])
-def test_votes_are_counted(sign: float) -> None:
-    samples, wide = 13, 96
-    rng = np.random.default_rng(5)
-    memory = memory_for(samples)
-    grey = np.zeros((2, -(-samples // GROUP) * GROUP, PITCH), np.uint8)
-    grey[:, :samples] = rng.integers(0, 256, (2, samples, PITCH))
-    grey[1, rng.random(grey[1].shape) < 0.2] = 0
-    memory.gathered[: grey.size] = grey.ravel()
-    memory.matters[:] = 0
-    lacking = rng.random(wide) < 0.5
-    memory.lacking[:wide] = lacking
-    vote(memory, 0, samples, wide, Wanted(0.5, 0.0, sign, 10, 6))
-    inner, outer = grey[:, :samples, :wide].astype(int)
-    light = (inner - outer + lacking > 10) & ((outer > 0) | ~lacking)
-    dark = outer - inner > 10
-    counts = light.sum(axis=0) * (sign >= 0.0), dark.sum(axis=0) * (sign <= 0.0)
-    np.testing.assert_array_equal(memory.light[:wide], counts[0])
-    np.testing.assert_array_equal(memory.dark[:wide], counts[1])
-    np.testing.assert_array_equal(memory.matters[:wide] > 0, np.maximum(*counts) >= 6)
-    assert 0 < np.count_nonzero(memory.matters[:wide]) < wide
+@pytest.mark.parametrize("samples", [7, 9, 16])
+@pytest.mark.parametrize("threshold", [0.5, 0.6, 0.8])
+def test_half_of_the_samples_rules_out_nothing_that_counts(samples: int, threshold: float) -> None:
+    table = build_disc_table(CAMERA, dataclasses.replace(SHAPE, samples=samples))
+    for seed, kind in enumerate(KINDS):
+        image = random_image(seed, kind)
+        every = centres_of(image, table, Limits(threshold))
+        some = centres_of(image, table, Limits(threshold, 2.0 * threshold - 1.0))
+        for left, right in zip(every, some):
+            np.testing.assert_array_equal(left, right, strict=True)
 
 
 @pytest.mark.parametrize("stride", [0.05, 0.3, 1.0, 2.5])
@@ -315,15 +210,13 @@ def test_centres_at_strides_are_found_as_on_the_map(stride: float) -> None:
     assert np.all(TABLE.usable[some.usable])
     image = random_image(1, "blocks")
     quality, contrast = quality_of_centres(image, TABLE)
-    wanted = Wanted(0.3, 20.0, 0.0, 0, 0)
-    every = np.arange(len(some.block_row))
-    found = find_centres(with_zeros(image, some), blocks_of(some), every, wanted)
+    found = centres_of(image, some, Limits(0.3, contrast=20.0))
     expected = some.usable & (quality >= 0.3) & (abs(contrast) > 20.0)
     rows, columns = np.nonzero(expected)
     assert len(rows) > 5
-    assert list(zip(found["v"], found["u"])) == list(zip(rows, columns))
-    np.testing.assert_array_equal(found["quality"], quality[expected])
-    np.testing.assert_array_equal(found["contrast"], contrast[expected])
+    np.testing.assert_array_equal(found.pixels, np.column_stack([columns, rows]))
+    np.testing.assert_array_equal(found.quality, quality[expected])
+    np.testing.assert_array_equal(found.contrast, contrast[expected])
 
 
 # -- suppression ----------------------------------------------------------------------------------

@@ -9,8 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from detect.discs.descent import WORK
+from detect.discs.least_squares import blur_width, correlated_area, outline_statistics, residuals
 from detect.discs.model import BY_RADIUS, PLANE_X, PLANE_Y, SHARE, Blur, Disc
-from detect.discs.residuals import blur_width, correlated_area, outline_statistics, residuals
 from tests.reference.discs import Pixels as ReferencePixels
 from tests.reference.discs import background_of, edge_share, outline_of
 

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from camera import Camera
 from detect.circles import CircleDetections, detect_circles, disc_shape
-from detect.discs import fit
-from detect.discs.search import _of_likely_sign
+from detect.discs.search import _likely_sign
 from detect.settings import CircleSettings
 from lut import DiscTable, build_disc_table
 from tests.detect.painted_floor import FLOOR, LIGHT, PaintedFloor
@@ -100,11 +99,10 @@ def test_a_pool_of_light_is_no_disc(published_camera: Camera, table: DiscTable) 
 def test_a_doubtful_disc_of_the_other_sign_among_many_clear_ones_is_dropped(
     clear: int, kept: bool
 ) -> None:
-    results = np.zeros(clear + 2, fit.RESULT)
-    results[fit.CONTRAST] = -80.0
-    results[fit.CONTRAST][-2:] = 40.0
+    light = np.zeros(clear + 2, np.bool_)
+    light[-2:] = True
     evidence = np.full(clear + 2, 12.0)
     evidence[-1] = 2.5
-    found = _of_likely_sign(results, evidence, np.arange(clear + 2), 1.1)
-    assert clear in found
-    assert (clear + 1 in found) == kept
+    likely = _likely_sign(light, evidence, 1.1)
+    assert likely[clear]
+    assert likely[clear + 1] == kept

@@ -12,7 +12,7 @@ from camera import write_camera
 from detect.run import open_run
 from tools.benchmark.cli import main
 from tools.benchmark.errors import BenchmarkError
-from tools.benchmark.functions import ALL, CIRCLES, DECODING, KERNEL, LINES, PLAIN_GATHER, RESPONSE
+from tools.benchmark.functions import ALL, CIRCLES, DECODING, KERNEL, LINES, RESPONSE
 from tools.benchmark.material import repeated_run
 from tools.benchmark.runs import commands, measure_runs, perform
 
@@ -82,7 +82,7 @@ def test_the_command_measures_everything(
     for kind in document["kinds"]:
         names = [function["name"] for function in kind["functions"]]
         assert len(set(names)) == len(names)
-        assert {DECODING, KERNEL, CIRCLES, RESPONSE, LINES, ALL, PLAIN_GATHER} <= set(names)
+        assert {DECODING, KERNEL, CIRCLES, RESPONSE, LINES, ALL} <= set(names)
         assert {"cv2.HoughCircles", "cv2.SimpleBlobDetector", "skimage hough_circle"} <= set(names)
         assert all(function["ms"]["median"] > 0.0 for function in kind["functions"])
         for compared in kind["comparisons"]:

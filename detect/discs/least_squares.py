@@ -1,6 +1,11 @@
-"""Residuals of a fitted disc: are they correlated, is the outline even?
+"""Least squares of the disc fit: normal equations of a patch, and what the residuals say.
 
-`residuals` are the grey values less the fitted model's. Where the model does not fit they are
+The unknowns of one Gauss-Newton step are in the order of the design matrix's rows: the five terms
+of the background, the contrast, and the contrast times the steps of log blur, radius, x and y. The
+grey value comes last. So one Cholesky factor of all sums of products gives, row by row, what is
+left of the grey values' squares without a disc, with the disc where it is, and after the step.
+
+Residuals are the grey values less the fitted model's. Where the model does not fit they are
 correlated, and neighbours say less than their number: `correlated_area`. `outline_statistics`
 asks each of 16 sectors of the disc alone how large its step is and where its edge lies.
 """
@@ -15,7 +20,10 @@ from numba import njit
 from numpy.typing import NDArray
 
 from detect.discs.model import (
+    BY_BLUR,
     BY_RADIUS,
+    BY_X,
+    BY_Y,
     F32,
     FASTMATH,
     GREY,
@@ -23,11 +31,14 @@ from detect.discs.model import (
     PIXEL_VARIANCE,
     PLANE_X,
     PLANE_Y,
+    ROWS,
     SHARE,
     Blur,
     Disc,
 )
-from detect.discs.normal_equations import BACKGROUND, UNKNOWNS
+
+#: Terms of the background, and unknowns of a step.
+BACKGROUND, UNKNOWNS = 5, 10
 
 SECTORS = 16
 #: Pixels without which the middle of a disc, this part of its radius, says nothing.
@@ -39,6 +50,84 @@ _LEAST_PIXELS, _LEAST_SPREAD = 3.0, 0.15
 _GOOD_STEP = 0.4
 # Where the sectors of a quadrant meet.
 _TAN_1, _TAN_3 = F32(math.tan(math.pi / 8.0)), F32(math.tan(3.0 * math.pi / 8.0))
+
+FloatArray = NDArray[np.float64]
+
+
+@njit(cache=True, error_model="numpy", forceinline=True, fastmath=FASTMATH)
+def background_products(patch: Any, n: int, products: FloatArray) -> None:
+    """Sums of products of the background's terms with each other and the grey values."""
+    design = patch.design
+    for i in range(BACKGROUND + 1):
+        a = GREY if i == BACKGROUND else i
+        for b in range(i + 1):
+            c = GREY if b == BACKGROUND else b
+            total = F32(0.0)
+            for k in range(n):
+                total += design[a, k] * design[c, k]
+            products[a, c] = total
+
+
+@njit(cache=True, error_model="numpy", forceinline=True, fastmath=FASTMATH)
+def disc_products(patch: Any, n: int, products: FloatArray) -> None:
+    """Sums of products of the disc's rows with all rows."""
+    design = patch.design
+    for row in range(ROWS):
+        w = blur = radius = x = y = F32(0.0)
+        for k in range(n):
+            other = design[row, k]
+            w += other * design[SHARE, k]
+            blur += other * design[BY_BLUR, k]
+            radius += other * design[BY_RADIUS, k]
+            x += other * design[BY_X, k]
+            y += other * design[BY_Y, k]
+        for column, total in enumerate((w, blur, radius, x, y)):
+            # Only what is below the diagonal is used.
+            products[max(row, SHARE + column), min(row, SHARE + column)] = total
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def factor_rows(products: FloatArray, begin: int, end: int, factor: FloatArray) -> bool:
+    """Rows `begin` to `end` of the Cholesky factor, and the row of the grey values as far.
+
+    The diagonal is stored inverted. Returns False where the products are not positive definite.
+    """
+    for i in range(begin, end):
+        for j in range(i):
+            s = products[i, j]
+            for k in range(j):
+                s -= factor[i, k] * factor[j, k]
+            factor[i, j] = s * factor[j, j]
+        s = products[i, i]
+        for k in range(i):
+            s -= factor[i, k] * factor[i, k]
+        if not s > 1e-7 * products[i, i]:
+            return False
+        factor[i, i] = 1.0 / math.sqrt(s)
+        s = products[GREY, i]
+        for k in range(i):
+            s -= factor[GREY, k] * factor[i, k]
+        factor[GREY, i] = s * factor[i, i]
+    return True
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def left_over(products: FloatArray, factor: FloatArray, unknowns: int) -> float:
+    """The sum of the squared residuals with the first unknowns, however many."""
+    left = products[GREY, GREY]
+    for k in range(unknowns):
+        left -= factor[GREY, k] * factor[GREY, k]
+    return max(float(left), 0.0)
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def solution(factor: FloatArray, begin: int, end: int, values: FloatArray) -> None:
+    """Unknowns `begin` to `end` of the least-squares solution with the first `end` unknowns."""
+    for i in range(end - 1, begin - 1, -1):
+        s = factor[GREY, i]
+        for k in range(i + 1, end):
+            s -= factor[k, i] * values[k]
+        values[i] = s * factor[i, i]
 
 
 @njit(cache=True, error_model="numpy", forceinline=True, fastmath=FASTMATH)
@@ -52,7 +141,7 @@ def residuals(
     patch, n
         The patch, and its pixels.
     values : (10,) float64
-        The unknowns of `detect.discs.normal_equations`.
+        The unknowns.
     bare : (5,) float64
         The terms of the background where there is no disc.
 
@@ -63,8 +152,8 @@ def residuals(
         leaves there.
     """
     design, residual, without = patch.design, patch.residual, patch.row
-    residual[:n] = design[GREY, :n]
-    without[:n] = design[GREY, :n]
+    for i in range(n):
+        residual[i] = without[i] = design[GREY, i]
     for row in range(UNKNOWNS):
         value = F32(values[row])
         for i in range(n):
@@ -165,7 +254,7 @@ def outline_statistics(
     """
     _find_sectors(patch, n, disc)
     c = F32(contrast)
-    sums[:] = 0.0
+    sums.fill(0.0)
     for i in range(n):
         w, e = patch.design[SHARE, i], patch.residual[i]
         r = c * patch.design[BY_RADIUS, i]
