@@ -55,6 +55,8 @@ _MOST_UNEVEN = 0.14
 _BY_FIT = 0.5
 #: From this share of the rim on, the fit of the whole disc gives the place better.
 _WHOLE_RIM = 0.9
+#: A fit that explains less of the variance than this may place the disc worse than half of its rim.
+_WELL_EXPLAINED, _HALF_RIM = 0.97, 0.5
 
 
 #: Candidates of a lower quality than this are kept only if the grey value steps in this share
@@ -224,13 +226,31 @@ def _with_rim(scene: Scene, quality: float, log_odds: float, result: Any) -> flo
     if by_rim < search.least_evidence and log_odds >= search.least_evidence:
         return by_fit
     if rim.agreeing < _WHOLE_RIM:
-        result[fit.X], result[fit.Y] = rim.x, rim.y
-        result[fit.COV_XX], result[fit.COV_XY], result[fit.COV_YY] = (
-            rim.cov_xx,
-            rim.cov_xy,
-            rim.cov_yy,
-        )
+        _place_by_rim(result, rim)
     return by_rim
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _place_by_rim(result: Any, rim: Rim) -> None:
+    result[fit.X], result[fit.Y] = rim.x, rim.y
+    result[fit.COV_XX], result[fit.COV_XY] = rim.cov_xx, rim.cov_xy
+    result[fit.COV_YY] = rim.cov_yy
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _place_by_the_surer(scene: Scene, result: Any) -> None:
+    """Place a disc that the fit explains in part by its rim, if that states the smaller covariance.
+
+    A shadow's edge, a sun patch or a sheet of paper pull at the fit of a whole disc, and much less
+    at the points of the rim beside them.
+    """
+    if result[fit.EXPLAINED] >= _WELL_EXPLAINED:
+        return
+    rim = _rim_of(scene, result)
+    by_fit = result[fit.COV_XX] + result[fit.COV_YY]
+    enough = rim.agreeing >= _HALF_RIM and rim.radius_px >= LEAST_RIM_PX
+    if enough and rim.cov_xx + rim.cov_yy < by_fit:
+        _place_by_rim(result, rim)
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
@@ -445,6 +465,8 @@ def _fit_after_look(
             log_odds = _with_rim(scene, quality, log_odds, result)
         enough = fitted and (not search.verify or log_odds >= search.least_evidence)
         if not (enough and result[fit.BLUR] > _AT_BOUND * result[fit.BLUR_BOUND]):
+            if enough and search.verify:
+                _place_by_the_surer(scene, result)
             break
         # Too blurred for its patch: once more, in a wider one.
         blur = result[fit.BLUR_BOUND]

@@ -44,7 +44,7 @@ _RIM_SLACK = 0.07
 #: Radius of a rim that fits best, relative to the nominal one.
 _RIM_RADIUS = 0.98
 #: Log-odds by the network that make a disc.
-_TAKEN = 0.0
+_TAKEN = 0.6
 #: Features of the rim, in the order of the network's weights.
 FEATURES = ("rim", "runs", "scatter", "radius", "radius_2", "size", "score")
 
@@ -156,8 +156,9 @@ def _look_at_all(
         covariance[count, 0, 0], covariance[count, 1, 1] = rim.cov_xx, rim.cov_yy
         covariance[count, 0, 1] = covariance[count, 1, 0] = rim.cov_xy
         count += 1
-    best = np.flatnonzero(suppress_neighbours(place[:count], log_odds[:count], sought.separation))
-    return SecondLooks(features[best], place[best], covariance[best], quality[best], log_odds[best])
+    return SecondLooks(
+        features[:count], place[:count], covariance[:count], quality[:count], log_odds[:count]
+    )
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

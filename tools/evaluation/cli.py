@@ -181,8 +181,8 @@ class TrainRimNetwork:
     """
 
     data: Positional[Path] = Path("../shared/data")
-    every: int = 4
-    scenes: int = 600
+    every: int = 8
+    scenes: int = 500
     seed: int = 1
     output: Path = Path("build/rim_network.npz")
     force: bool = False

@@ -21,7 +21,7 @@ from tools.evaluation.second_look_data import Looks
 FloatArray = NDArray[np.floating]
 
 CHANNELS, UNITS, MEMBERS = 12, 16, 4
-_EPOCHS, _BATCH = 25, 256
+_EPOCHS, _BATCH = 60, 256
 #: Share of the discs that the features of the rim alone may lose.
 _QUICKLY_LOST = 0.01
 _LONGEST_STEP, _RISING, _DECAY = 6e-3, 0.3, 0.02

@@ -37,6 +37,8 @@ _SETTINGS = CircleSettings(polarity="light")
 _FIRST = CircleSettings(polarity="any")
 #: Of a disc, metres.
 _RADIUS = 0.1
+#: How much a row counts of a rendered building.
+_BUILDING_WEIGHT = 3.0
 #: How much a row counts that is a disturbed disc, or no disc on a real image.
 _DISTURBED_WEIGHT, _REAL_WEIGHT = 0.2, 0.4
 #: How much less a disc counts that the first look finds.
@@ -193,7 +195,9 @@ def gather(data: Path, every: int, scenes: int, seed: int) -> Looks:
             ]
             sure = np.array([a for mandatory, a in at if mandatory]).reshape(-1, 4)
             unsure = np.array([a for mandatory, a in at if not mandatory]).reshape(-1, 4)
-            gathering.add(image, view, sure, unsure, (1.0, 1.0), folder.name)
+            gathering.add(
+                image, view, sure, unsure, (_BUILDING_WEIGHT, _BUILDING_WEIGHT), folder.name
+            )
             _add_disturbed(gathering, image, view, rng, f"{folder.name} disturbed")
     run = data / "dlr"
     camera = read_camera(run / "e" / "e.cam")
