@@ -44,8 +44,9 @@ LEAST_POINTS = 6
 #: the others a point may be.
 LEAST_TRUSTED = 8
 _PLACING_STEPS, _FAR_OFF = 4, 2.5
-#: Stretches of directions that are left out in turn.
-_STRETCHES = 8
+#: Stretches of directions that are left out in turn; their spread is the covariance, with this
+#: share of what independent points of `POINT_SIGMA_PX` would state.
+_STRETCHES, _INDEPENDENT_SHARE = 8, 0.35
 #: How far the starts of the circle are from the candidate, nominal radii; the first is at it.
 _START = 0.3
 _STARTS = 9
@@ -411,13 +412,13 @@ def follow_rim(
         runs += 1 if hidden and chosen[last] > 0.0 else 0
     scatter = math.sqrt(squares / best_count)
     best, (by_xx, by_xy, by_yy) = _placed(at_x, at_y, chosen, best)
-    area = radius * radius
+    area, share = radius * radius, _INDEPENDENT_SHARE
     return Rim(
         best_count / DIRECTIONS, visible / DIRECTIONS, runs, scatter,
         math.sqrt(mean_2) / max(abs(mean), 1e-9), mean,
         x + radius * best.x, y + radius * best.y, radius * best.radius,
-        area * (best.cov_xx + by_xx), area * (best.cov_xy + by_xy), area * (best.cov_yy + by_yy),
-        radius_px,
+        area * (share * best.cov_xx + by_xx), area * (share * best.cov_xy + by_xy),
+        area * (share * best.cov_yy + by_yy), radius_px,
     )  # fmt: skip
 
 
