@@ -72,6 +72,8 @@ class Map(RunFlags):
         `huber`, `cauchy` or `geman-mcclure` lets far-off rows pull less.
     loss_scale : float
         Standard deviations from which on they do.
+    start : three floats
+        Pose at the start in the map (m, m, rad).
     output : Path
         Folder for map.csv, path.csv, table.json and pictures; by default `slam` in the run folder.
     interactive : bool
@@ -84,6 +86,7 @@ class Map(RunFlags):
     solver: Literal["separable", "gtsam"] = "separable"
     loss: Literal["none", "huber", "cauchy", "geman-mcclure"] = "none"
     loss_scale: float = 3.0
+    start: tuple[float, float, float] = (0.0, 0.0, 0.0)
     output: Annotated[MaybePath, arg(aliases=["-o"])] = None
     interactive: bool = False
 
@@ -157,6 +160,8 @@ class Ekf(FilterFlags):
         filter gains no spurious information about its heading from landmarks that it has placed
         itself; or at the `latest`, as the textbook filter does, which is inconsistent at large
         heading errors.
+    start : three floats
+        Pose at the start in the map (m, m, rad).
     reference_map : Path
         A map.csv to measure the distance of the landmarks from.
     output : Path
@@ -165,6 +170,7 @@ class Ekf(FilterFlags):
     """
 
     jacobians: Literal["first", "latest"] = "first"
+    start: tuple[float, float, float] = (0.0, 0.0, 0.0)
     reference_map: MaybePath = None
 
 
@@ -268,6 +274,9 @@ class Export(RunFlags):
     solution : Path
         Folder that `slam map` wrote: its poses and landmarks are the estimates in the graph; by
         default odometry's and first sight's.
+    times : Path
+        For --to tum, times of the frames, rows `prefix seconds`; by default a .times file beside
+        the run that has them all; where there is none, t counts the steps.
     axes : str
         `robotics`: X forward, Y left, as the other tools expect; `dataset`: X left, Y backward.
     output : Path
@@ -277,6 +286,7 @@ class Export(RunFlags):
     output: Annotated[Path, arg(aliases=["-o"])]
     to: Literal["g2o", "tum", "csv"] = "g2o"
     solution: MaybePath = None
+    times: MaybePath = None
     axes: Literal["robotics", "dataset"] = "robotics"
 
 

@@ -13,7 +13,8 @@ floor can be detected.
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -44,6 +45,7 @@ from detect.sources.poses import (
     FARTHEST,
     PoseStream,
     TimedPose,
+    carried,
     heading_rad,
 )
 from storage.messages import one_line
@@ -64,6 +66,8 @@ _STATIC = ("/tf_static", "tf2_msgs/msg/TFMessage")
 
 # x, y and the rotation about z, in the 6x6 covariances of ROS.
 _PLANAR = np.ix_([0, 1, 5], [0, 1, 5])
+# A pose's covariance has not grown where that is less definite than this, against its own.
+_INDEFINITE = 1e-9
 
 Matrix = NDArray[np.float64]
 
@@ -134,18 +138,21 @@ class Bag(Source):
                 return None
             found = chosen_topic(reader, self.path, (_ODOMETRY,), topic, "odometry", "--odometry")
         name = f"{self.path}: {one_line(found, LONGEST_NAME)}"
-        return PoseStream(name, self.path, lambda: _odometry_poses(self.path, found, name))
+        return PoseStream(name, self.path, lambda: _summed(_odometry_poses(self.path, found, name)))
 
 
-def _odometry_poses(path: Path, topic: str, name: str) -> Generator[TimedPose, None, None]:
+def _odometry_poses(path: Path, topic: str, name: str) -> Iterator[tuple[TimedPose, Matrix]]:
+    """Poses of a topic, each with the (3, 3) covariance of its twist, in the robot's frame."""
     with opened_bag(path) as reader:
         for _, recorded_s, message in messages(reader, path, topic):
             with understood(name):
                 pose = message.pose.pose
                 q, p = pose.orientation, pose.position
-                covariance = np.array(message.pose.covariance, dtype=np.float64)
-                planar = covariance.reshape(6, 6)[_PLANAR]
-                numbers = [p.x, p.y, q.x, q.y, q.z, q.w, *planar.ravel()]
+                planar, twist = (
+                    np.array(part.covariance, dtype=np.float64).reshape(6, 6)[_PLANAR]
+                    for part in (message.pose, message.twist)
+                )
+                numbers = [p.x, p.y, q.x, q.y, q.z, q.w, *planar.ravel(), *twist.ravel()]
                 values = np.array(numbers, dtype=np.float64)
                 time_s = stamp_s(message, recorded_s)
             if not np.abs(values).max() <= FARTHEST or not np.any(values[2:6] ** 2 > 0.0):
@@ -154,7 +161,32 @@ def _odometry_poses(path: Path, topic: str, name: str) -> Generator[TimedPose, N
                     f"finite covariance, no number above {FARTHEST:g}"
                 )
             theta = heading_rad(q.x, q.y, q.z, q.w)
-            yield TimedPose(time_s, float(p.x), float(p.y), theta, planar)
+            yield TimedPose(time_s, float(p.x), float(p.y), theta, planar), twist
+
+
+def _summed(poses: Iterator[tuple[TimedPose, Matrix]]) -> Generator[TimedPose, None, None]:
+    """Poses with the sum of what each movement adds to the covariance since the first.
+
+    That is what the pose's own has grown by or, where it has not grown as by a movement (a driver
+    that publishes the same all the time), the twist's over the time, independent of that before.
+    """
+    before: TimedPose | None = None
+    total = np.zeros((3, 3))
+    for pose, twist in poses:
+        if before is not None:
+            assert before.covariance is not None
+            assert pose.covariance is not None
+            grown = pose.covariance - carried(before.covariance, before, pose)
+            scale = float(np.abs(pose.covariance).max())
+            if not np.any(grown) or np.linalg.eigvalsh(grown)[0] < -_INDEFINITE * scale:
+                cos, sin = np.cos(pose.theta), np.sin(pose.theta)
+                by_rate = (pose.time_s - before.time_s) * np.array(
+                    [[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]]
+                )
+                grown = by_rate @ twist @ by_rate.T
+            total = carried(total, before, pose) + grown
+        yield replace(pose, covariance=total)
+        before = pose
 
 
 def _recorded_calibration(path: Path, image_topic: str, base: str, posed: bool) -> Camera | None:

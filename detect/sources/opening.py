@@ -5,6 +5,7 @@ Readers of sources other than folders are imported on demand.
 
 from __future__ import annotations
 
+import math
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -138,7 +139,7 @@ def _source(name: Path, options: SourceOptions) -> Source:
 def _frames(source: Source, options: SourceOptions) -> tuple[Frames, Path | None]:
     """The frames of a source along the odometry that was named, and the file of that."""
     from detect.sources.odometry import FramesAlongPoses, FramesAlongRows
-    from detect.sources.poses import PoseStream, tum_poses
+    from detect.sources.poses import PoseStream, tick_poses, tum_poses
 
     named = options.odometry
     poses: PoseStream | None
@@ -149,6 +150,13 @@ def _frames(source: Source, options: SourceOptions) -> tuple[Frames, Path | None
     elif named.endswith(".tum"):
         path, axes = Path(named), options.odometry_axes
         poses = PoseStream(named, path, lambda: tum_poses(path, axes))
+    elif named.endswith(".ticks"):
+        wheels = options.wheel_base_m, options.metres_per_tick
+        if not all(0.0 < number < math.inf for number in wheels):
+            raise DetectError(
+                f"{named}: ticks of wheels: expected --wheel-base-m and --metres-per-tick above 0"
+            )
+        poses = PoseStream(named, Path(named), lambda: tick_poses(Path(named), *wheels))
     elif named and named != "none":
         return FramesAlongRows(source, Path(named)), Path(named)
     else:

@@ -20,10 +20,15 @@ class SourceOptions:
     ----------
     odometry : str
         Where the steps come from, if not from the source itself: a TUM trajectory (.tum; rows t x y
-        z qx qy qz qw), a file of STEP rows, a nav_msgs/Odometry topic of the bag (/odom), or none.
+        z qx qy qz qw), counters of two wheels (.ticks; rows t left right), a file of STEP rows, a
+        nav_msgs/Odometry topic of the bag (/odom), or none.
     odometry_axes : str
         Axes of the robot in a TUM trajectory: robotics (X forward, Y left) or dataset (X left, Y
         backward).
+    wheel_base_m : float
+        Distance of the two wheels whose ticks are counted.
+    metres_per_tick : float
+        Way of a wheel from one tick to the next.
     times : str
         File of the images' times, rows `prefix seconds`; by default <folder>.times among the
         images.
@@ -41,6 +46,8 @@ class SourceOptions:
 
     odometry: str = ""
     odometry_axes: Axes = "robotics"
+    wheel_base_m: float = 0.0
+    metres_per_tick: float = 0.0
     times: str = ""
     image_topic: str = ""
     base_frame: str = ""

@@ -2,8 +2,9 @@
 
 A pose (x, y, theta) has the robot's X forward and Y left, as in ROS; a STEP its X left and Y
 backward, in the robot's frame before it. Turning by the same angle is the same in both. Poses may
-come from TUM trajectories, rows ``t x y z qx qy qz qw``: seconds, metres, unit quaternions. The
-robot moves on the floor: of its attitude the heading is taken, of its position x and y.
+come from TUM trajectories, rows ``t x y z qx qy qz qw``: seconds, metres, unit quaternions; or from
+the counters of two wheels, rows ``t left right``. The robot moves on the floor: of its attitude the
+heading is taken, of its position x and y.
 """
 
 from __future__ import annotations
@@ -31,8 +32,9 @@ LARGEST_GAP_S = 1.0
 #: Takes (forward, left, turn) to (left, backward, turn).
 DATASET_FROM_ROBOTICS: FloatArray = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
-# A covariance of a step that is less definite than this, against that of the pose, is none.
-_INDEFINITE = 1e-9
+# A covariance of a step is none where its smallest eigenvalue is below this share of its largest,
+# or lost in the rounding of the pose's own.
+_INDEFINITE, _ROUNDING = 1e-8, 1e-12
 # How far the length of a trajectory's quaternions may be from 1.
 _UNIT = 1e-2
 # Times are written with six digits: the last image may seem to be later than the last pose.
@@ -65,9 +67,8 @@ def step_between(prefix: str, before: TimedPose, after: TimedPose) -> Step:
     """The STEP row of a robot's movement from one pose to another.
 
     The covariances of poses are assumed to grow with the path: that of the later pose is that
-    of the earlier, carried along, plus that of the movement, independent of it. Where they have
-    not (a driver that publishes the same covariance all the time), that of the movement is unknown:
-    zero.
+    of the earlier, carried along, plus that of the movement, independent of it. Where that is
+    missing or singular, the covariance of the step is not stated: zero.
     """
     cos, sin = np.cos(before.theta), np.sin(before.theta)
     moved = np.array([after.x - before.x, after.y - before.y])
@@ -76,15 +77,23 @@ def step_between(prefix: str, before: TimedPose, after: TimedPose) -> Step:
     pose = DATASET_FROM_ROBOTICS @ np.array([*(robot_from_fixed[:2, :2] @ moved), turn])
     c = np.zeros((3, 3))
     if before.covariance is not None and after.covariance is not None:
-        carried = np.eye(3)
-        carried[:2, 2] = (-moved[1], moved[0])  # effect of an error of theta on the position
-        grown = after.covariance - carried @ before.covariance @ carried.T
+        grown = after.covariance - carried(before.covariance, before, after)
+        smallest, _, largest = np.linalg.eigvalsh(grown)
         scale = float(np.abs(after.covariance).max())
-        if float(np.linalg.eigvalsh(grown).min()) >= -_INDEFINITE * scale:
+        if smallest > max(_INDEFINITE * largest, _ROUNDING * scale):
             to_dataset = DATASET_FROM_ROBOTICS @ robot_from_fixed
             c = to_dataset @ grown @ to_dataset.T
     entries = (c[0, 0], c[0, 1], c[1, 1], c[0, 2], c[1, 2], c[2, 2])
     return Step(prefix, *map(float, (*pose, *entries)))
+
+
+def carried(
+    covariance: FloatArray, before: TimedPose, after: TimedPose, share: float = 1.0
+) -> FloatArray:
+    """A pose's covariance after a share of an exact movement to another one."""
+    carry = np.eye(3)  # an error of theta moves the positions after it
+    carry[:2, 2] = share * (before.y - after.y), share * (after.x - before.x)
+    return np.asarray(carry @ covariance @ carry.T)
 
 
 def pose_between(before: TimedPose, after: TimedPose, time_s: float) -> TimedPose:
@@ -92,7 +101,8 @@ def pose_between(before: TimedPose, after: TimedPose, time_s: float) -> TimedPos
     share = (time_s - before.time_s) / (after.time_s - before.time_s)
     covariance = None
     if before.covariance is not None and after.covariance is not None:
-        covariance = (1.0 - share) * before.covariance + share * after.covariance
+        grown = after.covariance - carried(before.covariance, before, after)
+        covariance = carried(before.covariance, before, after, share) + share * grown
     return TimedPose(
         time_s,
         before.x + share * (after.x - before.x),
@@ -136,16 +146,8 @@ class PosesOverTime:
 
 def tum_poses(path: Path, axes: Axes = "robotics") -> Generator[TimedPose, None, None]:
     """The poses of a TUM trajectory; `axes` are the robot's, as in `SourceOptions`."""
-    for number, words in text_rows(path, "TUM trajectory"):
-        place = f"{path}:{number}"
-        try:
-            time_s, x, y, _, *quaternion = values = [float(word) for word in words]
-        except ValueError:
-            values = []
-        if len(values) != 8 or not all(map(math.isfinite, values)):
-            raise DetectError(
-                f"{place}: {' '.join(words)[:60]!r}: expected 8 numbers: t x y z qx qy qz qw"
-            )
+    for place, row in _number_rows(path, "TUM trajectory", "t x y z qx qy qz qw"):
+        time_s, x, y, _, *quaternion = row
         if max(abs(x), abs(y)) > FARTHEST:
             raise DetectError(f"{place}: expected x and y of at most {FARTHEST:g} m")
         if abs(math.hypot(*quaternion) - 1.0) > _UNIT:
@@ -154,6 +156,41 @@ def tum_poses(path: Path, axes: Axes = "robotics") -> Generator[TimedPose, None,
         # Only the robot's own axes differ; the fixed frame is the trajectory's.
         turned = 0.5 * math.pi if axes == "dataset" else 0.0
         yield TimedPose(time_s, x, y, theta - turned)
+
+
+def tick_poses(
+    path: Path, wheel_base_m: float, metres_per_tick: float
+) -> Generator[TimedPose, None, None]:
+    """The poses of a robot with two driven wheels by its counters; arcs from row to row."""
+    x = y = theta = 0.0
+    last: tuple[float, float] | None = None
+    for place, (time_s, left, right) in _number_rows(path, "file of wheel ticks", "t left right"):
+        if last is not None:
+            ways = metres_per_tick * (left - last[0]), metres_per_tick * (right - last[1])
+            way, half_turn = 0.5 * sum(ways), 0.5 * (ways[1] - ways[0]) / wheel_base_m
+            if not max(abs(way), abs(half_turn)) <= FARTHEST:
+                raise DetectError(f"{place}: expected a way and a turn of at most {FARTHEST:g}")
+            chord = way * float(np.sinc(half_turn / math.pi))
+            x += chord * math.cos(theta + half_turn)
+            y += chord * math.sin(theta + half_turn)
+            theta += 2.0 * half_turn
+        last = (left, right)
+        yield TimedPose(time_s, x, y, theta)
+
+
+def _number_rows(path: Path, what: str, columns: str) -> Iterator[tuple[str, list[float]]]:
+    """The place and the finite numbers of each row of a file of some columns."""
+    count = len(columns.split())
+    for number, words in text_rows(path, what):
+        try:
+            values = [float(word) for word in words]
+        except ValueError:
+            values = []
+        if len(values) != count or not all(map(math.isfinite, values)):
+            raise DetectError(
+                f"{path}:{number}: {' '.join(words)[:60]!r}: expected {count} numbers: {columns}"
+            )
+        yield f"{path}:{number}", values
 
 
 def heading_rad(qx: float, qy: float, qz: float, qw: float) -> float:

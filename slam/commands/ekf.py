@@ -22,6 +22,7 @@ from slam.filters.ekf_slam import EkfSlam, run_ekf
 from slam.filters.report import map_distance, path_distance, summary, table
 from slam.mapping.covariance_file import covariance_file, write_joint_covariance
 from slam.options import Ekf
+from storage.bounds import FINITE, demand
 
 MAP_NAME, JSON_NAME = "map.csv", "ekf.json"
 
@@ -33,10 +34,11 @@ def perform(command: Ekf) -> int:
         *(PATH_NAME, MAP_NAME, covariance_file(Path(MAP_NAME)).name, JSON_NAME, MAP_PICTURE),
         *([ERROR_PICTURE] if command.reference else []),
     )
+    demand(command, SlamError, start=FINITE)
     associator = Associator(command.association, command.gate_probability)
     recording, camera_xy = read_run_of(command)
     demand_free(output, names, overwrite=command.force)
-    ekf = EkfSlam(camera_xy=camera_xy, jacobians=command.jacobians)
+    ekf = EkfSlam(command.start, camera_xy=camera_xy, jacobians=command.jacobians)
     run, time_line = timed(lambda: run_ekf(recording, ekf, associator))
     landmark_map = ekf.landmark_map()
     if not len(landmark_map.discs) and not len(landmark_map.lines):

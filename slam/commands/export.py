@@ -18,7 +18,7 @@ from landmarks.map_file import (
     write_path,
 )
 from slam.commands.run_camera import camera_of_run
-from slam.commands.run_rows import recording_of
+from slam.commands.run_rows import print_assumed, recording_of
 from slam.errors import SlamError
 from slam.formats.axes import MEANING, Axes, covariance_from_dataset, from_dataset
 from slam.formats.g2o import write_g2o
@@ -32,7 +32,7 @@ from slam.formats.tables import (
     write_odometry,
 )
 from slam.formats.text import text_rows
-from slam.formats.tum import read_tum, write_tum
+from slam.formats.tum import read_times, read_tum, write_tum
 from slam.options import Export, Import
 from slam.recording import demand_landmarks, landmark_file
 from storage import OutputExistsError
@@ -61,7 +61,8 @@ def _export_g2o(command: Export) -> int:
     else:
         demand_landmarks(file)
     frames = list(read_frames(file))
-    graph = graph_of_frames(frames, str(file), command.solution)
+    graph = graph_of_frames(frames, str(file), command.solution, command.odometry_noise)
+    print_assumed(graph.unstated_steps, len(graph.steps), command.odometry_noise)
     total = sum(isinstance(row, CircleLandmark) for frame in frames for row in frame.landmarks)
     write_g2o(
         command.output,
@@ -87,10 +88,31 @@ def _export_tum(command: Export) -> int:
     else:
         source = command.run
         path = poses_of_run(recording_of(command), None)
-    comments = [_made_by(source), "t counts the steps"]
-    write_tum(command.output, path, axes=command.axes, comments=comments, overwrite=command.force)
-    print(f"{command.output}: {len(path.poses)} poses")
+    times = _times_of(command, path)
+    write_tum(
+        command.output,
+        path,
+        times=times,
+        axes=command.axes,
+        comments=[_made_by(source), "t counts the steps" if times is None else "t in seconds"],
+        overwrite=command.force,
+    )
+    count = len(path.poses) if times is None else len(path.poses) - 1
+    print(f"{command.output}: {count} poses")
     return 0
+
+
+def _times_of(command: Export, path: Path2D) -> dict[str, float] | None:
+    """Times of a path's poses: of the file named, or the first beside the run that has them all."""
+    folder = command.run if command.run.is_dir() else command.run.parent
+    for file in [command.times] if command.times else sorted(folder.glob("*.times")):
+        times = read_times(file)
+        missing = [name for name in path.prefixes[1:] if name not in times]
+        if not missing:
+            return {name: times[name] for name in path.prefixes[1:]}
+        if command.times:
+            raise SlamError(f"{file}: no time of {missing[0]}: expected those of all frames")
+    return None
 
 
 def _export_tables(command: Export) -> int:

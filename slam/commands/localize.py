@@ -22,6 +22,7 @@ from slam.filters.localizer import Localizer, MapErrors, run_localizer
 from slam.filters.report import path_distance, summary, table
 from slam.mapping.covariance_file import covariance_file, read_joint_covariance
 from slam.options import Localize
+from storage.bounds import FINITE, NOT_NEGATIVE, demand
 
 JSON_NAME = "localize.json"
 
@@ -31,14 +32,7 @@ def perform(command: Localize) -> int:
     output = command.output or default_output(command.run, "localize")
     names = (PATH_NAME, JSON_NAME, MAP_PICTURE, *([ERROR_PICTURE] if command.reference else []))
     associator = Associator(command.association, command.gate_probability)
-    if (
-        not np.all(np.isfinite([*command.start, *command.start_sigma]))
-        or min(command.start_sigma) < 0.0
-    ):
-        raise SlamError(
-            f"start {command.start}, sigma {command.start_sigma}: expected finite numbers, "
-            "standard deviations not below 0"
-        )
+    demand(command, SlamError, start=FINITE, start_sigma=NOT_NEGATIVE)
     landmark_map = read_map(command.map)
     map_errors = _map_errors(command)
     considered = map_errors == "considered"

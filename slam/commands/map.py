@@ -24,6 +24,7 @@ from slam.options import Map
 from slam.pictures import draw_map
 from slam.recording import Recording
 from storage import OutputExistsError, write_whole
+from storage.bounds import FINITE, demand
 
 MAP_NAME, PATH_NAME, TABLE_NAME, PICTURE_NAME = "map.csv", "path.csv", "table.json", "map.png"
 
@@ -54,7 +55,14 @@ def perform(command: Map) -> int:
     if command.calibrate or command.tilt_deg or len(recording.lines):
         camera = camera_of_run(command.run, command.camera)
     begin = time.perf_counter()
-    mapped = map_run(recording, camera, weighting, solver=command.solver, name=str(command.run))
+    mapped = map_run(
+        recording,
+        camera,
+        weighting,
+        start=command.start,
+        solver=command.solver,
+        name=str(command.run),
+    )
     seconds = time.perf_counter() - begin
 
     output.mkdir(parents=True, exist_ok=True)
@@ -85,6 +93,7 @@ def perform(command: Map) -> int:
 
 
 def _check(command: Map) -> None:
+    demand(command, SlamError, start=FINITE)
     if not (math.isfinite(command.loss_scale) and command.loss_scale > 0.0):
         raise SlamError(f"--loss-scale {command.loss_scale:g}: expected above 0")
     if not (0.0 <= command.tilt_deg < 45.0):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 
+from slam.models.odometry_noise import OdometryNoise
 from slam.options import RunFlags
 from slam.recording import Recording, read_recording
 
@@ -17,10 +18,15 @@ def recording_of(flags: RunFlags) -> Recording:
         stem=flags.stem,
         noise=flags.odometry_noise,
     )
-    if recording.unstated_steps:
+    print_assumed(recording.unstated_steps, len(recording), flags.odometry_noise)
+    return recording
+
+
+def print_assumed(unstated: int, total: int, noise: OdometryNoise) -> None:
+    """Print the noise that was assumed of the steps that state none, if there are any."""
+    if unstated:
         print(
-            f"{recording.unstated_steps} of {len(recording)} steps state no covariance: taken for "
-            f"{flags.odometry_noise.sentence()} (--odometry-noise)",
+            f"{unstated} of {total} steps state no covariance: taken for {noise.sentence()} "
+            "(--odometry-noise)",
             file=sys.stderr,
         )
-    return recording

@@ -63,6 +63,8 @@ class RunGraph:
         Measurements of discs, all with an identifier.
     quality : (n,) float64
         Of those rows; NaN where it is unknown.
+    unstated_steps : int
+        Steps whose covariance is an assumed one.
     """
 
     prefixes: tuple[str, ...]
@@ -73,6 +75,7 @@ class RunGraph:
     step_covariance: FloatArray
     circles: CircleRows
     quality: FloatArray
+    unstated_steps: int = 0
 
 
 def first_disc_vertex(last_pose_vertex: int) -> int:

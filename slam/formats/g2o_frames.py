@@ -22,7 +22,8 @@ from slam.formats.g2o import RunGraph
 from slam.formats.tables import identified_discs
 from slam.models.measurement import disc_in_map
 from slam.models.motion import chain_steps
-from slam.recording import CircleRows, Recording, recording_of_frames
+from slam.models.odometry_noise import OdometryNoise
+from slam.recording import ASSUMED, CircleRows, Recording, recording_of_frames
 
 FloatArray = NDArray[np.float64]
 
@@ -30,7 +31,12 @@ FloatArray = NDArray[np.float64]
 _LEAST_STEP_COVARIANCE = 0.5e-12
 
 
-def graph_of_frames(frames: Sequence[Frame], name: str, solution: Path | None = None) -> RunGraph:
+def graph_of_frames(
+    frames: Sequence[Frame],
+    name: str,
+    solution: Path | None = None,
+    noise: OdometryNoise = ASSUMED,
+) -> RunGraph:
     """A run's steps and identified discs with estimates of poses and discs.
 
     Parameters
@@ -42,6 +48,8 @@ def graph_of_frames(frames: Sequence[Frame], name: str, solution: Path | None = 
     solution : Path, optional
         Folder with path.csv and map.csv; by default poses are odometry's, and each disc lies where
         it was first seen.
+    noise : OdometryNoise
+        Of the steps that state no covariance.
 
     Returns
     -------
@@ -52,7 +60,7 @@ def graph_of_frames(frames: Sequence[Frame], name: str, solution: Path | None = 
     SlamError
         If a covariance is not positive definite, or the solution is not of this run.
     """
-    recording = recording_of_frames(frames, name)
+    recording = recording_of_frames(frames, name, noise)
     if len(recording.lines):
         raise SlamError(
             f"{name}: bearings of verticals have no edge in g2o: expected discs only, or --to csv"
@@ -88,6 +96,7 @@ def graph_of_frames(frames: Sequence[Frame], name: str, solution: Path | None = 
         step_covariance=recording.step_covariance,
         circles=rows,
         quality=quality,
+        unstated_steps=recording.unstated_steps,
     )
 
 

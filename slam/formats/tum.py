@@ -1,13 +1,13 @@
 """Paths as TUM trajectories: a row ``t x y z qx qy qz qw`` for each pose.
 
-Comments begin with ``#``. A path on the floor has z, qx and qy 0. A run has no times: t is the
-number of the step, 0 for the start.
+Comments begin with ``#``. A path on the floor has z, qx and qy 0. Of a run without times t is the
+number of the step, 0 for the start. Files of times have rows ``name t``.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,7 @@ def write_tum(
     path: str | os.PathLike[str],
     poses: Path2D,
     *,
+    times: Mapping[str, float] | None = None,
     axes: Axes = "robotics",
     comments: Sequence[str] = (),
     overwrite: bool = False,
@@ -42,6 +43,9 @@ def write_tum(
         The file.
     poses : Path2D
         The path, in the data set's axes. Its covariance has no place in the format.
+    times : mapping of str to float, optional
+        Times of the poses (s), by their names; the others, like the start, are left out. By default
+        t is the number of the step.
     axes : str
         The axes to write it in.
     comments : sequence of str
@@ -59,10 +63,42 @@ def write_tum(
         f"{AXES_COMMENT} {axes} ({MEANING[axes]})",
         f"# {' '.join(_COLUMNS)}",
     ]
-    for number, (x, y, theta) in enumerate((from_dataset(poses.poses, axes) + 0.0).tolist()):
-        half = 0.5 * theta
-        rows.append(f"{number} {x!r} {y!r} 0 0 0 {np.sin(half).item()!r} {np.cos(half).item()!r}")
+    numbers = (from_dataset(poses.poses, axes) + 0.0).tolist()
+    for number, (name, (x, y, theta)) in enumerate(zip(poses.prefixes, numbers)):
+        half, t = 0.5 * theta, str(number)
+        if times is not None:
+            if name not in times:
+                continue
+            t = f"{times[name]:.6f}"
+        rows.append(f"{t} {x!r} {y!r} 0 0 0 {np.sin(half).item()!r} {np.cos(half).item()!r}")
     write_text(path, rows, overwrite=overwrite)
+
+
+def read_times(path: str | os.PathLike[str]) -> dict[str, float]:
+    """Read a file of times.
+
+    Parameters
+    ----------
+    path : path
+        Rows ``name seconds`` between blanks or commas.
+
+    Returns
+    -------
+    dict of str to float
+
+    Raises
+    ------
+    SlamError
+        If the file cannot be read or has other rows.
+    """
+    times = {}
+    for line, text in text_rows(path):
+        words = text.partition("#")[0].replace(",", " ").split()
+        if words:
+            if len(words) != 2:
+                raise SlamError(f"{path}:{line}: {len(words)} words: expected a name and seconds")
+            times[words[0]] = finite(path, line, "t", words[1])
+    return times
 
 
 def read_tum(path: str | os.PathLike[str], *, axes: Axes = "robotics") -> Path2D:

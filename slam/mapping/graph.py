@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from camera import Camera
 from slam.models.measurement import disc_in_map
@@ -187,19 +187,21 @@ def with_lines(graph: Graph, rows: LineRows, line_ids: IntArray) -> Graph:
     )
 
 
-def first_sight(graph: Graph) -> Estimate:
+def first_sight(graph: Graph, start: ArrayLike = (0.0, 0.0, 0.0)) -> Estimate:
     """Poses as odometry chains them, discs where they were first seen, no lines.
 
     Parameters
     ----------
     graph : Graph
         Its lines are not placed: `line_xy` is NaN.
+    start : (3,) array_like
+        The first pose.
 
     Returns
     -------
     Estimate
     """
-    poses = chain_steps(graph.steps)
+    poses = chain_steps(graph.steps, start)
     _, first = np.unique(graph.disc_index, return_index=True)
     return Estimate(
         poses=poses,

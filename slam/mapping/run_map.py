@@ -107,6 +107,7 @@ def map_run(
     camera: Camera | None = None,
     weighting: Weighting | None = None,
     *,
+    start: tuple[float, float, float] = (0.0, 0.0, 0.0),
     solver: Solver = "separable",
     name: str = "run",
 ) -> MappedRun:
@@ -124,6 +125,8 @@ def map_run(
         unknown.
     weighting : Weighting, optional
         Loss and unknowns; plain least squares by default.
+    start : (3,)
+        The first pose (m, m, rad).
     solver : "separable" or "gtsam"
         The solver that does the final optimisation.
     name : str
@@ -142,7 +145,7 @@ def map_run(
     wanted = weighting or Weighting()
     _check_usable(recording, camera, wanted, name)
     graph = graph_of_recording(recording, camera)
-    start = first_sight(graph)
+    begin = first_sight(graph, start)
     plain = Weighting()
     descend = _descent(solver)
     trail: list[Solution] = []
@@ -153,7 +156,7 @@ def map_run(
 
     more = len(recording.lines) > 0
     only_start = more or wanted != plain or solver != "separable"
-    estimate = keep(solve(graph, start, plain, tolerance=_COARSE if only_start else 1e-10))
+    estimate = keep(solve(graph, begin, plain, tolerance=_COARSE if only_start else 1e-10))
     placed = InitialLines(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0, np.int64))
     if more:
         placed = place_lines(estimate.poses, recording.lines, graph.camera_xy)
@@ -175,7 +178,7 @@ def map_run(
     covariance = marginals(graph, estimate, wanted)
     return MappedRun(
         graph=graph,
-        start=start,
+        start=begin,
         estimate=estimate,
         covariance=covariance,
         table=chi_squared(graph, estimate, wanted),

@@ -74,11 +74,13 @@ class Ros:
         return self.make(COMPRESSED, header=self.header(time_s), format=form, data=data)
 
     def odometry(
-        self, x: float, y: float, theta: float, time_s: float, covariance: NDArray[Any]
-    ) -> Any:
-        """A pose on the floor; covariance of (x, y, theta)."""
-        wide = np.zeros((6, 6))
-        wide[np.ix_([0, 1, 5], [0, 1, 5])] = covariance
+        self, x: float, y: float, theta: float, time_s: float, covariance: NDArray[Any],
+        twist_covariance: NDArray[Any] | None = None,
+    ) -> Any:  # fmt: skip
+        """A pose on the floor; covariances of (x, y, theta) and of its rates."""
+        planar, wide, wide_twist = np.ix_([0, 1, 5], [0, 1, 5]), np.zeros((6, 6)), np.zeros((6, 6))
+        wide[planar] = covariance
+        wide_twist[planar] = 0.0 if twist_covariance is None else twist_covariance
         name = "geometry_msgs/msg/"
         pose = self.make(
             f"{name}Pose",
@@ -96,7 +98,7 @@ class Ros:
             twist=self.make(
                 f"{name}TwistWithCovariance",
                 twist=self.make(f"{name}Twist", linear=zero, angular=zero),
-                covariance=np.zeros(36),
+                covariance=wide_twist.ravel(),
             ),
         )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -191,3 +192,27 @@ def test_unknown_qualities_are_told(tmp_path: Path, capsys: Capture) -> None:
     )
     (frame,) = read_frames(output)
     assert frame.landmarks == (CircleLandmark(1.0, -2.0, 1.0, 0.01, 0.0, 0.01, (2,)),)
+
+
+def test_a_trajectory_with_times(tmp_path: Path, capsys: Capture) -> None:
+    """Of the file named, else of that beside the run which has all frames; the start has none."""
+    run = tmp_path / "run"
+    run.mkdir()
+    shutil.copy(DEMO / "map.circles", run)
+    prefixes = read_recording(run).prefixes
+    times = 1e9 + 0.25 * np.arange(len(prefixes))
+    rows = [f"{name} {time_s:.6f}\n" for name, time_s in zip(prefixes, times)]
+    (run / "b.times").write_text("# <image> <seconds>\n" + "".join(rows))
+    (run / "a.times").write_text("".join(rows[:-1]))
+    arguments = ["export", str(run), "--to", "tum", "-o"]
+    assert main([*arguments, str(tmp_path / "e.tum")]) == 0
+    exported = np.loadtxt(tmp_path / "e.tum")
+    np.testing.assert_array_equal(exported[:, 0], times)
+    poses = chain_steps(read_recording(run).steps)
+    np.testing.assert_allclose(exported[:, 1:3], from_dataset(poses, "robotics")[1:, :2])
+    named = [*arguments, str(tmp_path / "f.tum"), "--times"]
+    refused([*named, str(run / "a.times")], f"no time of {prefixes[-1]}: expected", capsys)
+    (tmp_path / "c.times").write_text(rows[0] + "e.0001 x\n")
+    refused([*named, str(tmp_path / "c.times")], "c.times:2: t is 'x': expected", capsys)
+    (tmp_path / "c.times").write_text("e.0001\n")
+    refused([*named, str(tmp_path / "c.times")], "c.times:1: 1 words: expected", capsys)

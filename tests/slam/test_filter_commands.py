@@ -162,8 +162,8 @@ def test_runs_that_can_not_be_mapped(
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--start-sigma", "0", "-1", "0"], "standard deviations not below 0"),
-        (["--start", "0", "nan", "0"], "expected finite numbers"),
+        (["--start-sigma", "0", "-1", "0"], "start_sigma"),
+        (["--start", "0", "nan", "0"], "expected a finite number"),
         (["--gate-probability", "1"], "gate_probability"),
         (["--reference", "short.csv"], "short.csv: 2 poses: expected 7"),
         (["--map", "other.csv"], "no row shows a landmark"),

@@ -18,6 +18,7 @@ from slam.mapping.initial_lines import place_lines
 from slam.mapping.run_map import MappedRun, map_run
 from slam.mapping.solve import solve
 from slam.mapping.solve_gtsam import solve_gtsam
+from slam.models.motion import move
 from slam.models.mounted_discs import rotation_exp
 from slam.models.mounting import directions_of_rows, rows_through_mounting
 from slam.recording import LineRows, Recording, read_recording, recording_of_frames
@@ -92,6 +93,20 @@ def test_errors_and_chi_squared_are_as_the_covariances_say(published_camera: Cam
     assert np.mean(disc_nees) == pytest.approx(2.0, abs=0.6)
     assert np.mean(line_nees) == pytest.approx(2.0, abs=0.6)
     assert np.mean(pose_nees) == pytest.approx(3.0, abs=4 * np.sqrt(2 * 3 / 30))
+
+
+def test_a_known_first_pose_moves_the_whole_map(published_camera: Camera) -> None:
+    recording, camera = small_run(2).recording, _with_camera_place(published_camera)
+    start = (3.0, -2.0, 0.7)
+    plain = map_run(recording, camera)
+    moved = map_run(recording, camera, start=start)
+    np.testing.assert_allclose(moved.estimate.poses[0], start)
+    expected = move(start, plain.estimate.poses)
+    np.testing.assert_allclose(moved.estimate.poses, expected, atol=1e-5)
+    for one, other in (("disc_xy", plain.estimate.disc_xy), ("line_xy", plain.estimate.line_xy)):
+        at = np.pad(other, ((0, 0), (0, 1)))
+        np.testing.assert_allclose(getattr(moved.estimate, one), move(start, at)[:, :2], atol=1e-5)
+    assert moved.table.chi_squared == pytest.approx(plain.table.chi_squared)
 
 
 def test_gtsam_finds_the_same_minimum(published_camera: Camera) -> None:

@@ -1,50 +1,137 @@
-"""A stranger's drive: images, a calibration and a trajectory without covariances, to a map."""
+"""Drives with a camera of one's own, from images, odometry and calibration to a map."""
 
 from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from detect.cli import main as detect
+from landmarks.map_file import read_path
 from slam.cli import main as slam
+from slam.formats.axes import from_dataset
+from slam.models.motion import chain_steps, relative_pose
+from slam.models.odometry_noise import OdometryNoise
+from tests.detect.recordings import Ros, Said
+
+FloatArray = NDArray[np.float64]
 
 FRAMES = 40
+TIMES = 1000.0 + 0.5 * np.arange(FRAMES)
+NAMES = [f"e.{number:04d}" for number in range(FRAMES)]
+WHEEL_BASE, TICK = 0.5, 0.0005
+# Standard deviations of a step forward and to the left (m), and of its turn, that the bag states.
+STATED = np.array([0.02, 0.01, 0.015])
+
+
+def steps_with_noise(true_poses: FloatArray, sigma: FloatArray) -> FloatArray:
+    """True steps with errors of standard deviations (left, backward, turn)."""
+    steps = relative_pose(true_poses[:-1], true_poses[1:])
+    return steps + sigma * np.random.default_rng(3).standard_normal(steps.shape)
+
+
+def assumed_sigma(true_poses: FloatArray) -> FloatArray:
+    steps = relative_pose(true_poses[:-1], true_poses[1:])
+    return np.sqrt(np.diagonal(OdometryNoise().covariance(steps), axis1=1, axis2=2))
+
+
+def image_folder(source: Path, folder: Path) -> Path:
+    folder.mkdir()
+    for name in NAMES:
+        shutil.copy(source / "images" / f"{name}.jpg", folder)
+    shutil.copy(source / "e.cam", folder)
+    rows = [f"{name} {time_s}\n" for name, time_s in zip(NAMES, TIMES)]
+    (folder / f"{folder.name}.times").write_text("".join(rows))
+    return folder
+
+
+def trajectory(source: Path, folder: Path, true_poses: FloatArray) -> list[str]:
+    """A TUM file: X forward, Y left."""
+    drive = image_folder(source, folder / "drive")
+    poses = chain_steps(steps_with_noise(true_poses, assumed_sigma(true_poses)))
+    half = 0.5 * (poses[:, 2] - 0.5 * np.pi)
+    zero = np.zeros(FRAMES)
+    columns = [TIMES, *poses[:, :2].T, zero, zero, zero, np.sin(half), np.cos(half)]
+    np.savetxt(folder / "drive.tum", np.column_stack(columns), fmt="%.9f")
+    return [str(drive), "--odometry", str(folder / "drive.tum")]
+
+
+def ticks(source: Path, folder: Path, true_poses: FloatArray) -> list[str]:
+    """Counters of two wheels."""
+    drive = image_folder(source, folder / "drive")
+    steps = steps_with_noise(true_poses, assumed_sigma(true_poses))
+    way = -steps[:, 1] / np.sinc(steps[:, 2] / np.pi)
+    ways = np.column_stack(
+        [way - 0.5 * WHEEL_BASE * steps[:, 2], way + 0.5 * WHEEL_BASE * steps[:, 2]]
+    )
+    counts = np.rint(np.cumsum(np.vstack([np.zeros((1, 2)), ways]), axis=0) / TICK)
+    np.savetxt(folder / "drive.ticks", np.column_stack([TIMES, counts]), fmt="%.3f %d %d")
+    wheels = ["--wheel-base-m", str(WHEEL_BASE), "--metres-per-tick", str(TICK)]
+    return [str(drive), "--odometry", str(folder / "drive.ticks"), *wheels]
+
+
+def bag(source: Path, folder: Path, true_poses: FloatArray) -> list[str]:
+    """A bag whose poses always have the same covariance; that of the twist is right."""
+    ros = Ros()
+    poses = chain_steps(steps_with_noise(true_poses, STATED[[1, 0, 2]]))
+    said = []
+    for name, time_s, (x, y, theta) in zip(NAMES, TIMES, poses.tolist()):
+        image = (source / "images" / f"{name}.jpg").read_bytes()
+        rates = np.diag(np.square(STATED / 0.5))
+        odometry = ros.odometry(x, y, theta - 0.5 * np.pi, time_s, 0.01 * np.eye(3), rates)
+        said.append(Said("/odom", time_s, odometry))
+        said.append(Said("/image", time_s, ros.compressed(image, "jpeg", time_s)))
+    shutil.copy(source / "e.cam", folder)
+    return [str(ros.write(folder / "drive", said))]
 
 
 @pytest.mark.long
-def test_a_trajectory_without_covariances_leads_to_a_map(
-    project_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("recorded", [trajectory, ticks, bag])
+def test_from_the_files_to_the_map(
+    recorded: Callable[[Path, Path, FloatArray], list[str]],
+    project_root: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    source, drive = project_root / "images" / "e", tmp_path / "drive"
-    drive.mkdir()
-    shutil.copy(source / "e.cam", drive)
-    for number in range(FRAMES):
-        shutil.copy(source / "images" / f"e.{number:04d}.jpg", drive)
-    times = [f"e.{number:04d} {number + 1}\n" for number in range(FRAMES)]
-    (drive / "drive.times").write_text("".join(times))
-    trajectory = tmp_path / "drive.tum"
-    assert slam(["export", str(source), "--to", "tum", "-o", str(trajectory)]) == 0
-
-    assert detect(["all", str(drive), "--odometry", str(trajectory)]) == 0
-    found = str(drive / "associated.circles")
-    assert slam(["associate", str(drive), "-o", found]) == 0
-    said = capsys.readouterr().err
-    assert f"{FRAMES} of {FRAMES} steps state no covariance: taken for 5 % of the way" in said
-    assert slam(["map", found, "-o", str(tmp_path / "map")]) == 0
-    places = str(tmp_path / "map" / "map.csv")
-    assert slam(["localize", found, "--map", places, "-o", str(tmp_path / "l")]) == 0
-    assert slam(["ekf", found, "-o", str(tmp_path / "ekf")]) == 0
-    assert slam(["export", found, "--to", "g2o", "-o", str(tmp_path / "drive.g2o")]) == 0
-
-    table = json.loads((tmp_path / "map" / "table.json").read_text())
-    assert 0.1 < table["table"]["factor"] < 1.3
+    source = project_root / "images" / "e"
     truth = json.loads((source / "truth.json").read_text())
-    assert 5 <= table["table"]["landmarks"] <= len(truth["discs"]) + 25
-    flags = ["--odometry-noise.per-metre", "0.5", "--force"]
-    assert slam(["map", found, "-o", str(tmp_path / "map"), *flags]) == 0
-    assert "taken for 50 % of the way" in capsys.readouterr().err
-    wider = json.loads((tmp_path / "map" / "table.json").read_text())
-    assert wider["table"]["odometry"] < table["table"]["odometry"]
+    true_poses = np.array([frame["pose"] for frame in truth["frames"][:FRAMES]])
+    arguments = recorded(source, tmp_path, true_poses)
+    run, start = tmp_path / "run", ["--start", *map(str, true_poses[0])]
+    found = str(run / "found.circles")
+
+    def off(result: str) -> float:
+        """Root mean square of the distances of the path from the true one (m)."""
+        path = read_path(tmp_path / result / "path.csv").poses
+        shift = path[1:, :2] - true_poses[:, :2]
+        return float(np.sqrt(np.mean(np.sum(shift**2, axis=1))))
+
+    assert detect(["all", *arguments, "-o", str(run)]) == 0
+    assert slam(["associate", str(run), "-o", found]) == 0
+    unstated = 1 if recorded is bag else FRAMES  # before the first image there is no movement
+    assert f"{unstated} of {FRAMES} steps state no covariance: taken for 5 % of the way" in (
+        capsys.readouterr().err
+    )
+    assert slam(["map", found, *start, "-o", str(tmp_path / "map")]) == 0
+    map_file = str(tmp_path / "map" / "map.csv")
+    assert slam(["localize", found, *start, "--map", map_file, "-o", str(tmp_path / "l")]) == 0
+    assert slam(["ekf", found, *start, "-o", str(tmp_path / "ekf")]) == 0
+    table = json.loads((tmp_path / "map" / "table.json").read_text())["table"]
+    assert table["factor"] < 1.0  # rows state a tilt of the whole run, which no frame contradicts
+    numbers = 2 if recorded is ticks else 3  # wheels do not slip sideways here
+    assert table["odometry"] / (numbers * (FRAMES - 1)) == pytest.approx(1.0, abs=0.4)
+    assert max(off(name) for name in ("map", "l", "ekf")) < 0.02
+
+    for form, name in (("g2o", "drive.g2o"), ("csv", "tables"), ("tum", "map.tum")):
+        output = ["-o", str(tmp_path / name), "--solution", str(tmp_path / "map")]
+        assert slam(["export", found, "--to", form, *output]) == 0
+    assert capsys.readouterr().err.count("steps state no covariance") == 5  # each but tum
+    exported = np.loadtxt(tmp_path / "map.tum")
+    np.testing.assert_allclose(exported[:, 0], TIMES, atol=1e-6)
+    path = read_path(tmp_path / "map" / "path.csv").poses
+    np.testing.assert_allclose(exported[:, 1:3], from_dataset(path, "robotics")[1:, :2])

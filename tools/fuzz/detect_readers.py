@@ -26,7 +26,7 @@ from detect.sources.gray import (
     gray_of_pixels,
     significant_bits_of_file,
 )
-from detect.sources.poses import step_between, tum_poses
+from detect.sources.poses import step_between, tick_poses, tum_poses
 from detect.sources.times import read_image_times
 from lut.cache import cached_vertical_table
 from storage import OutputExistsError
@@ -81,6 +81,11 @@ def _calibration_image(path: Path) -> object:
 
 def _trajectory(path: Path) -> object:
     poses = list(tum_poses(path))
+    return [step_between("e", *pair) for pair in pairwise(poses)]
+
+
+def _ticks(path: Path) -> object:
+    poses = list(tick_poses(path, 0.5, 0.001))
     return [step_between("e", *pair) for pair in pairwise(poses)]
 
 
@@ -233,6 +238,14 @@ DETECT_READERS: tuple[Reader, ...] = (
         _trajectory,
         (DetectError,),
         (b"# t x y z qx qy qz qw\n0 0 0 0 0 0 0 1\n1 0.5 0 0 0 0 0.1 0.995\n",),
+        NUMBERS,
+    ),
+    Reader(
+        "wheel ticks",
+        "e.ticks",
+        _ticks,
+        (DetectError,),
+        (b"# t left right\n0 0 0\n1 500 510\n",),
         NUMBERS,
     ),
     Reader(

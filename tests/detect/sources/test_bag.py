@@ -64,7 +64,7 @@ def recorded(ros: Ros, run: Path, compressed: bool = False) -> list[Said]:
         else:
             message = ros.image(image, "mono8", time_s, padding=5)
         said.append(Said("/front/image", time_s + 0.05, message))
-        odometry = ros.odometry(*pose, time_s, np.diag([1e-4, 1e-4, 0.0]) * k)
+        odometry = ros.odometry(*pose, time_s, np.diag([1e-4, 1e-4, 1e-6]) * k)
         said.append(Said("/odom", time_s + 0.01, odometry))
     return sorted(said, key=lambda item: item.time_s)
 
@@ -148,6 +148,25 @@ def test_covariances_that_do_not_grow_are_none(tmp_path: Path) -> None:
     steps = [frame.step for frame in open_source(ros.write(tmp_path / "d", said)).frames]
     assert [step.dy for step in steps] == pytest.approx([0.0, -0.3, -0.3])
     assert all(step.cxx == step.cyy == step.cphiphi == 0.0 for step in steps)
+
+
+def test_covariances_of_twists_where_those_of_poses_do_not_grow(tmp_path: Path) -> None:
+    """Of ten independent movements over 0.1 s, the variances add up; unless one is singular."""
+    twist = np.diag([0.04, 0.01, 0.0025])
+    for name, stated in (("full", twist), ("no_turn", np.diag([0.04, 0.01, 0.0]))):
+        ros = Ros()
+        said = []
+        for k in range(31):
+            time_s = 1.0 + 0.1 * k
+            message = ros.odometry(0.02 * k, 0.0, 1.0, time_s, 0.1 * np.eye(3), stated)
+            said.append(Said("/odom", time_s, message))
+            if k % 10 == 0:
+                image = ros.image(np.zeros((4, 4), np.uint8), "mono8", time_s)
+                said.append(Said("/i", time_s, image))
+        steps = [frame.step for frame in open_source(ros.write(tmp_path / name, said)).frames]
+        variances = np.array([[s.cxx, s.cyy, s.cphiphi] for s in steps[1:]])
+        expected = [1e-3, 4e-3, 2.5e-4] if name == "full" else [0.0, 0.0, 0.0]
+        np.testing.assert_allclose(variances, np.tile(expected, (3, 1)), atol=1e-5)
 
 
 def test_images_between_poses_and_beyond_them(tmp_path: Path) -> None:

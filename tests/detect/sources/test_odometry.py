@@ -15,7 +15,7 @@ from detect.errors import DetectError
 from detect.run import RunFrames
 from detect.sources.opening import open_source
 from detect.sources.options import SourceOptions
-from detect.sources.poses import TimedPose, pose_between, step_between, tum_poses
+from detect.sources.poses import TimedPose, pose_between, step_between, tick_poses, tum_poses
 from detect.sources.times import format_time, read_image_times
 from groundtruth.trajectories.streams import read_times
 from landmarks import read_frames
@@ -145,6 +145,40 @@ def test_headings_of_quaternions(tmp_path: Path) -> None:
     path.write_text(f"1 0 0 0 {qx} {qy} {qz} {qw}\n")
     (pose,) = tum_poses(path)
     assert pose.theta == pytest.approx(yaw)
+
+
+def test_ticks_of_wheels_give_the_path(tmp_path: Path) -> None:
+    """1 m ahead, then a quarter of a circle of 0.5 m to the left, then a turn on the spot."""
+    base, each = 0.4, 0.001
+    way = 0.5 * math.pi / 2
+    side = 0.2 * math.pi / 2
+    left, right = way - side, way + side
+    turn = 0.2 * 0.3
+    rows = np.cumsum([[0.0, 0.0], [1.0, 1.0], [left, right], [turn, -turn]], axis=0) / each
+    path = tmp_path / "a.ticks"
+    path.write_text("# t left right\n" + "".join(f"{k} {a} {b}\n" for k, (a, b) in enumerate(rows)))
+    poses = [(p.time_s, p.x, p.y, p.theta) for p in tick_poses(path, base, each)]
+    quarter = math.pi / 2
+    expected = [(0, 0, 0, 0), (1, 1, 0, 0), (2, 1.5, 0.5, quarter), (3, 1.5, 0.5, quarter - 0.3)]
+    np.testing.assert_allclose(poses, expected, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("content", "wheels", "told"),
+    [
+        ("1 2\n", (0.4, 0.01), r"a\.ticks:1: '1 2': expected 3 numbers: t left right"),
+        ("1 2 3\n", (0.0, 0.01), "expected --wheel-base-m and --metres-per-tick above 0"),
+        ("1 0 0\n2 1e200 0\n", (0.4, 0.01), r"a\.ticks:2: expected a way and a turn of at most"),
+    ],
+)
+def test_malformed_ticks(
+    timed_run: Path, tmp_path: Path, content: str, wheels: tuple[float, float], told: str
+) -> None:
+    path = tmp_path / "a.ticks"
+    path.write_text(content)
+    options = SourceOptions(odometry=str(path), wheel_base_m=wheels[0], metres_per_tick=wheels[1])
+    with pytest.raises(DetectError, match=told):
+        list(open_source(timed_run, None, options).frames)
 
 
 # -- laws -----------------------------------------------------------------------------------
