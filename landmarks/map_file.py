@@ -129,7 +129,7 @@ def read_map(path: FilePath) -> LandmarkMap:
         is negative; names file and line.
     """
     found: dict[str, dict[int, tuple[list[float], int]]] = {"disc": {}, "line": {}}
-    what = "a map, map.csv, of `slam map`"
+    what = "a map: map.csv of `slam map`"
     for line, words in _read(path, what, MAP_COLUMNS, SHORT_MAP_COLUMNS):
         if len(words) == len(SHORT_MAP_COLUMNS):
             words = ["disc", *words[:3], "0", "0", "0", words[3]]
