@@ -15,7 +15,6 @@ instead of removing it.
 from __future__ import annotations
 
 import math
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -31,30 +30,10 @@ from detect.verticals.judgement import (
     Judgement,
 )
 from detect.verticals.refinement import LineFits
-from detect.verticals.response import Strip
-from detect.verticals.tilt import level_matrix
-from detect.verticals.tilt_error import descending
+from detect.verticals.response import FloatArray, Strip
+from detect.verticals.tilt import TiltEstimate, level_matrix
 from detect.verticals.tracking import LineTracks
-
-FloatArray = NDArray[np.float64]
-
-
-class JoiningLimits(NamedTuple):
-    """Limits for joining lines; see `detect.line_settings.LineSettings`.
-
-    `equal` is whether joined lines count the same, `turn` 1 to undo the tilt and -1 to apply it
-    once more, `building_rad` see `turned_bearings`.
-    """
-
-    same_edge_px: float
-    join_px: float
-    join_share: float
-    shoulder_px: float
-    shoulder_share: float
-    sigma_px: float
-    equal: bool
-    turn: float
-    building_rad: float
+from landmarks import wrap_angle
 
 
 class Lines(NamedTuple):
@@ -83,123 +62,97 @@ class Lines(NamedTuple):
     bounds: NDArray[np.int64]
 
 
-@lru_cache(maxsize=16)
-def joining_of(settings: LineSettings) -> JoiningLimits:
-    """Limits for joining lines."""
-    level = settings.alpha == "level"
-    return JoiningLimits(
-        same_edge_px=float(settings.same_edge_px),
-        join_px=float(settings.join_px),
-        join_share=float(settings.join_share),
-        shoulder_px=float(settings.shoulder_px),
-        shoulder_share=float(settings.shoulder_share),
-        sigma_px=float(settings.sigma_px),
-        equal=settings.joined == "equal",
-        turn=1.0 if level else -1.0,
-        building_rad=math.radians(settings.building_deg) if level else math.inf,
-    )
-
-
-@njit(cache=True, error_model="numpy")
 def lines_of_tracks(
-    strip: Strip, tracks: LineTracks, judged: Judgement, limits: JoiningLimits
+    strip: Strip, tracks: LineTracks, judged: Judgement, settings: LineSettings
 ) -> Lines:
-    """Lines of accepted tracks.
-
-    The fate of tracks that are left out or joined is changed.
-    """
-    fits, evidence, tilt = judged.fits, judged.evidence, judged.tilt
-    count = len(evidence)
-    tilted = not np.isnan(tilt.pitch_rad)
-    pitch = tilt.pitch_rad if tilted else 0.0
-    roll = tilt.roll_rad if tilted else 0.0
-    rotation = level_matrix(limits.turn * pitch, limits.turn * roll)
-    building = limits.building_rad if tilted else np.inf
-    alpha, noise = turned_bearings(fits, rotation, pitch, roll, building)
-    members, bounds = group_tracks(alpha, tracks.polarity, judged, limits)
-    weight = np.ones(count) if limits.equal else evidence
-    joined, sigma = join_tracks(
-        alpha, noise, fits.pixel_rad, weight, members, bounds, limits.sigma_px
-    )
-    own_ends, own_beta = ends_of_lines(strip, tracks, fits, members)
-    ends = np.empty((len(joined), 4))
-    beta = np.empty(len(joined))
-    for n in range(len(joined)):
-        # The first member of a line is its strongest.
-        first = bounds[n]
-        last = bounds[n + 1] if limits.equal else first + 1
-        for k in range(4):
-            ends[n, k] = own_ends[first:last, k].mean()
-        beta[n] = own_beta[first:last].mean()
-    return Lines(ends, joined, beta, sigma, noise[members[bounds[:-1]]], members, bounds)
-
-
-@njit(cache=True, error_model="numpy")
-def group_tracks(
-    alpha: FloatArray, polarity: FloatArray, judged: Judgement, limits: JoiningLimits
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Gather accepted tracks to lines: one for each edge, close ones together.
-
-    Parameters
-    ----------
-    alpha, polarity : (T,) float64
-        Bearings (rad); 1 where the image is brighter on the right.
-    judged : Judgement
-        The fate of tracks that are left out or joined is changed.
-    limits
-        See there.
-
-    Returns
-    -------
-    members, bounds
-        See `Lines`.
-    """
-    pixel, contrast = judged.fits.pixel_rad, judged.fits.contrast
-    evidence, fate = judged.evidence, judged.fate
-    accepted = np.flatnonzero(fate == ACCEPTED)
-    kept = np.empty(len(accepted), np.int64)
-    near_px = np.empty(len(accepted))
-    places = np.empty(len(accepted))
-    n = 0
-    for k in descending(evidence[accepted]):
-        t = accepted[k]
-        reason = ACCEPTED
-        for s in kept[:n]:
-            near = abs(wrapped(alpha[s] - alpha[t])) / pixel[t]
-            if polarity[s] == polarity[t] and near < limits.same_edge_px:
-                reason = SAME_EDGE
-                break
-            if (near < limits.join_px and evidence[t] < limits.join_share * evidence[s]) or (
-                near < limits.shoulder_px and contrast[t] < limits.shoulder_share * contrast[s]
-            ):
-                reason = BESIDE_A_STRONGER_EDGE
-        fate[t] = reason
-        if reason == ACCEPTED:
-            kept[n] = t
-            places[n] = alpha[t]
-            near_px[n] = limits.join_px * pixel[t]
-            n += 1
-    group = chain_neighbours(places[:n], near_px[:n])
+    """Lines of accepted tracks; the fate of tracks that are left out or joined is changed."""
+    accepted = np.flatnonzero(judged.fate == ACCEPTED)
+    strongest_first = accepted[np.argsort(-judged.evidence[accepted], kind="stable")]
+    alpha, noise = _bearings(judged.fits, strongest_first, judged.tilt, settings)
+    fate = _left_out(strongest_first, alpha, tracks.polarity, judged, settings)
+    judged.fate[strongest_first] = fate
+    kept = np.flatnonzero(fate == ACCEPTED)
+    pixel = judged.fits.pixel_rad[strongest_first]
+    group = chain_neighbours(alpha[kept], settings.join_px * pixel[kept])
     # Leftmost first; stable: the strongest of each line stays its first.
-    by_group = descending(-group.astype(np.float64))
-    members = np.empty(n, np.int64)
-    for k in range(n):
-        members[k] = kept[by_group[k]]
-    bounds = np.zeros(n + 1, np.int64)
-    count = 0
-    for k in range(n):
-        if k > 0 and group[by_group[k]] == group[by_group[k - 1]]:
-            fate[members[k]] = JOINED
-        else:
-            count += 1
-        bounds[count] = k + 1
-    return members, bounds[: count + 1]
+    order = np.argsort(group, kind="stable")
+    kept = kept[order]
+    bounds = np.concatenate([[0], np.cumsum(np.bincount(group))])
+    first, members = bounds[:-1], strongest_first[kept]
+    later = np.ones(len(members), np.bool_)
+    later[first] = False
+    judged.fate[members[later]] = JOINED
+    equal = settings.joined == "equal"
+    weight = np.ones(len(members)) if equal else judged.evidence[members]
+    deviation = np.hypot(noise[kept], settings.sigma_px * pixel[kept])
+    joined, sigma = join_mixtures(alpha[kept], deviation, weight, first)
+    ends, beta = _ends_of_lines(strip, tracks, judged.fits, members)
+    if equal:
+        count = np.diff(bounds)
+        ends = np.add.reduceat(ends, first) / count[:, None]
+        beta = np.add.reduceat(beta, first) / count
+    else:
+        ends, beta = ends[first], beta[first]
+    return Lines(ends, joined, beta, sigma, noise[kept][first], members, bounds)
+
+
+def _bearings(
+    fits: LineFits, tracks: NDArray[np.intp], tilt: TiltEstimate | None, settings: LineSettings
+) -> tuple[FloatArray, FloatArray]:
+    """Levelled bearings of tracks, and their standard deviations due to noise.
+
+    Where the tilt is known, the measured lean b is replaced by its best estimate, given that it
+    should be that of a vertical up to `building_deg`, and a, which is correlated with it, follows.
+    """
+    sine, cosine = np.sin(fits.reference_rad[tracks]), np.cos(fits.reference_rad[tracks])
+    a, b = fits.line[tracks].T
+    covariance = fits.covariance[tracks]
+    variance, rotation = covariance[:, 0, 0], np.eye(3)
+    if tilt is not None and settings.alpha == "level":
+        rotation = level_matrix(tilt.pitch_rad, tilt.roll_rad)
+        building = math.radians(settings.building_deg)
+        gain = covariance[:, 0, 1] / (covariance[:, 1, 1] + building * building)
+        a = a - gain * (b - (tilt.pitch_rad * sine - tilt.roll_rad * cosine))
+        variance = variance - gain * covariance[:, 0, 1]
+    elif tilt is not None:
+        rotation = level_matrix(-tilt.pitch_rad, -tilt.roll_rad)
+    # Of the plane's two level directions (n_y, -n_x) is the one ahead of the camera.
+    x, y = rotation[:2] @ np.stack([cosine - a * sine, sine + a * cosine, -b])
+    return np.arctan2(y, x), np.sqrt(variance)
+
+
+def _left_out(
+    tracks: NDArray[np.intp], alpha: FloatArray, polarity: FloatArray, judged: Judgement,
+    settings: LineSettings,
+) -> NDArray[np.int8]:  # fmt: skip
+    """Fates of tracks, the strongest first, as stronger ones allow: accepted, or why not."""
+    near_px = np.abs(wrap_angle(alpha[:, None] - alpha)) / judged.fits.pixel_rad[tracks][:, None]
+    evidence, contrast = judged.evidence[tracks], judged.fits.contrast[tracks]
+    sign = polarity[tracks]
+    same = (sign[:, None] == sign) & (near_px < settings.same_edge_px)
+    faint = evidence[:, None] < settings.join_share * evidence
+    beside = (near_px < settings.join_px) & faint
+    fainter = contrast[:, None] < settings.shoulder_share * contrast
+    beside |= (near_px < settings.shoulder_px) & fainter
+    fate = np.empty(len(tracks), np.int8)
+    _suppress(same, beside, fate)
+    return fate
 
 
 @njit(cache=True, error_model="numpy")
-def chain_neighbours(
-    alpha: NDArray[np.float64], distance: NDArray[np.float64]
-) -> NDArray[np.int64]:
+def _suppress(same: NDArray[np.bool_], beside: NDArray[np.bool_], fate: NDArray[np.int8]) -> None:
+    """Keep each that is neither the same as, nor beside, one of those that are kept before it."""
+    for t in range(len(fate)):
+        fate[t] = ACCEPTED
+        for s in range(t):
+            if fate[s] == ACCEPTED and same[t, s]:
+                fate[t] = SAME_EDGE
+                break
+            if fate[s] == ACCEPTED and beside[t, s]:
+                fate[t] = BESIDE_A_STRONGER_EDGE
+
+
+def chain_neighbours(alpha: FloatArray, distance: FloatArray) -> NDArray[np.int64]:
     """Number the groups of bearings whose neighbours are close.
 
     Parameters
@@ -214,161 +167,48 @@ def chain_neighbours(
     (N,) int64
         The group of each, counted from 0 at the largest bearing (leftmost in the image).
     """
-    order = descending(alpha)
+    order = np.argsort(-alpha, kind="stable")
+    near = distance[order]
+    apart = alpha[order[:-1]] - alpha[order[1:]] >= np.minimum(near[:-1], near[1:])
     group = np.zeros(len(alpha), np.int64)
-    number = 0
-    for k in range(1, len(alpha)):
-        left = order[k - 1]
-        right = order[k]
-        if alpha[left] - alpha[right] >= min(distance[left], distance[right]):
-            number += 1
-        group[right] = number
+    group[order[1:]] = np.cumsum(apart)
     return group
 
 
-@njit(cache=True, error_model="numpy")
-def join_tracks(
-    alpha: NDArray[np.float64],
-    noise: NDArray[np.float64],
-    pixel: NDArray[np.float64],
-    evidence: NDArray[np.float64],
-    members: NDArray[np.int64],
-    bounds: NDArray[np.int64],
-    sigma_px: float,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Bearings of lines, and their standard deviations: mixtures of those of their tracks.
-
-    Parameters
-    ----------
-    alpha, noise : (T,) float64
-        Bearings of tracks and their noise (rad).
-    pixel : (T,) float64
-        Width of a pixel (rad).
-    evidence : (T,) float64
-        Weights of the mixture.
-    members, bounds
-        See `group_tracks`.
-    sigma_px : float
-        Standard deviation of an edge about the line of the building that it shows, pixels.
-
-    Returns
-    -------
-    alpha, sigma : (N,) float64
-        Means and standard deviations of the mixtures (rad).
-    """
-    count = len(bounds) - 1
-    joined = np.empty(count)
-    sigma = np.empty(count)
-    places = np.empty(len(members))
-    deviations = np.empty(len(members))
-    weights = np.empty(len(members))
-    for n in range(count):
-        begin, end = bounds[n], bounds[n + 1]
-        for k in range(begin, end):
-            t = members[k]
-            places[k] = alpha[t]
-            weights[k] = evidence[t]
-            systematic = sigma_px * pixel[t]
-            deviations[k] = math.sqrt(noise[t] * noise[t] + systematic * systematic)
-        joined[n], sigma[n] = join_mixture(
-            places[begin:end], deviations[begin:end], weights[begin:end]
-        )
-    return joined, sigma
-
-
-@njit(cache=True, error_model="numpy")
-def join_mixture(
-    alpha: NDArray[np.float64], sigma: NDArray[np.float64], weight: NDArray[np.float64]
-) -> tuple[float, float]:
-    """Mean and standard deviation of a mixture of Gaussians of bearings.
-
-    Parameters
-    ----------
-    alpha, sigma : (N,) float64
-        Means and standard deviations of the components (rad); all means within half a turn.
-    weight : (N,) float64
-        Their weights, not negative, of any sum.
-
-    Returns
-    -------
-    alpha, sigma : float
-        Of the mixture (rad).
-    """
-    total = 0.0
-    mean = 0.0
-    for k in range(len(alpha)):
-        total += weight[k]
-        mean += weight[k] * wrapped(alpha[k] - alpha[0])
-    mean /= total
-    variance = 0.0
-    for k in range(len(alpha)):
-        off = wrapped(alpha[k] - alpha[0]) - mean
-        variance += weight[k] * (sigma[k] * sigma[k] + off * off)
-    return wrapped(alpha[0] + mean), math.sqrt(variance / total)
-
-
-@njit(cache=True, error_model="numpy")
-def wrapped(angle: float) -> float:
-    """The angle in [-pi, pi) (rad)."""
-    return (angle + math.pi) % (2.0 * math.pi) - math.pi
-
-
-@njit(cache=True, error_model="numpy")
-def turned_bearings(
-    fits: LineFits, rotation: FloatArray, pitch: float, roll: float, building: float
+def join_mixtures(
+    alpha: FloatArray, sigma: FloatArray, weight: FloatArray, first: NDArray[np.int64]
 ) -> tuple[FloatArray, FloatArray]:
-    """Bearings of lines after a rotation, and their noise.
+    """Means and standard deviations of mixtures of Gaussians of bearings.
 
     Parameters
     ----------
-    fits : LineFits
-        The lines.
-    rotation : (3, 3) float64
-        The rotation of the normals of their planes.
-    pitch, roll : float
-        The tilt under which the lines are seen (rad).
-    building : float
-        Standard deviation of real verticals about the vertical (rad): the measured lean b is
-        replaced by its best estimate, given that it should be that of a vertical up to this, and a,
-        which is correlated with it, follows. Infinite: lines are not changed.
+    alpha, sigma : (M,) float64
+        Means and standard deviations of the components (rad), one mixture after the other; all
+        means of one are within half a turn.
+    weight : (M,) float64
+        Their weights, not negative, of any sum.
+    first : (N,) int64
+        The first component of each mixture.
 
     Returns
     -------
-    alpha, noise : (T,) float64
-        Bearings and their standard deviations (rad).
+    alpha, sigma : (N,) float64
+        Of the mixtures (rad).
     """
-    reference, line, covariance = fits.reference_rad, fits.line, fits.covariance
-    alpha = np.empty(len(reference))
-    noise = np.empty(len(reference))
-    for t in range(len(reference)):
-        sine = math.sin(reference[t])
-        cosine = math.cos(reference[t])
-        a = line[t, 0]
-        b = line[t, 1]
-        gain = covariance[t, 0, 1] / (covariance[t, 1, 1] + building * building)
-        a -= gain * (b - (pitch * sine - roll * cosine))
-        noise[t] = math.sqrt(covariance[t, 0, 0] - gain * covariance[t, 0, 1])
-        left = cosine - a * sine
-        back = sine + a * cosine
-        x = rotation[0, 0] * left + rotation[0, 1] * back - rotation[0, 2] * b
-        y = rotation[1, 0] * left + rotation[1, 1] * back - rotation[1, 2] * b
-        # Of the plane's two level directions (n_y, -n_x) is the one ahead of the camera.
-        alpha[t] = math.atan2(y, x)
-    return alpha, noise
+    count = np.diff(first, append=len(alpha))
+    share = weight / np.repeat(np.add.reduceat(weight, first), count)
+    off = wrap_angle(alpha - np.repeat(alpha[first], count))
+    mean = np.add.reduceat(share * off, first)
+    off -= np.repeat(mean, count)
+    variance = np.add.reduceat(share * (sigma * sigma + off * off), first)
+    return wrap_angle(alpha[first] + mean), np.sqrt(variance)
 
 
 @njit(cache=True, error_model="numpy")
-def ends_of_lines(
+def _ends_of_lines(
     strip: Strip, tracks: LineTracks, fits: LineFits, chosen: NDArray[np.int64]
 ) -> tuple[FloatArray, FloatArray]:
     """Where lines cross the first and the last row of their tracks, and how they are inclined.
-
-    Parameters
-    ----------
-    strip, tracks, fits
-        The table, the tracks, their lines.
-    chosen : (N,) int64
-        Which tracks.
 
     Returns
     -------
