@@ -31,9 +31,8 @@ from detect.verticals.judgement import (
 )
 from detect.verticals.refinement import LineFits
 from detect.verticals.response import FloatArray, Strip
-from detect.verticals.tilt import TiltEstimate, level_matrix
+from detect.verticals.tilt import level_matrix
 from detect.verticals.tracking import LineTracks
-from landmarks import wrap_angle
 
 
 class Lines(NamedTuple):
@@ -66,89 +65,109 @@ def lines_of_tracks(
     strip: Strip, tracks: LineTracks, judged: Judgement, settings: LineSettings
 ) -> Lines:
     """Lines of accepted tracks; the fate of tracks that are left out or joined is changed."""
+    fits, evidence, tilt = judged.fits, judged.evidence, judged.tilt
     accepted = np.flatnonzero(judged.fate == ACCEPTED)
-    strongest_first = accepted[np.argsort(-judged.evidence[accepted], kind="stable")]
-    alpha, noise = _bearings(judged.fits, strongest_first, judged.tilt, settings)
-    fate = _left_out(strongest_first, alpha, tracks.polarity, judged, settings)
-    judged.fate[strongest_first] = fate
-    kept = np.flatnonzero(fate == ACCEPTED)
-    pixel = judged.fits.pixel_rad[strongest_first]
-    group = chain_neighbours(alpha[kept], settings.join_px * pixel[kept])
+    strongest_first = accepted[np.argsort(-evidence[accepted], kind="stable")]
+    pitch, roll = (tilt.pitch_rad, tilt.roll_rad) if tilt is not None else (0.0, 0.0)
+    level = settings.alpha == "level"
+    turn = 1.0 if level else -1.0
+    building = math.radians(settings.building_deg) if level and tilt is not None else math.inf
+    alpha, noise = np.empty((2, len(evidence)))
+    _bearings(
+        fits, strongest_first, level_matrix(turn * pitch, turn * roll), (pitch, roll), building,
+        alpha, noise,
+    )  # fmt: skip
+    limits = _Limits(
+        float(settings.same_edge_px),
+        float(settings.join_px),
+        float(settings.join_share),
+        float(settings.shoulder_px),
+        float(settings.shoulder_share),
+    )
+    _leave_out(strongest_first, alpha, tracks.polarity, judged.fits, evidence, limits, judged.fate)
+    kept = strongest_first[judged.fate[strongest_first] == ACCEPTED]
+    pixel = fits.pixel_rad[kept]
+    group = chain_neighbours(alpha[kept], settings.join_px * pixel)
     # Leftmost first; stable: the strongest of each line stays its first.
     order = np.argsort(group, kind="stable")
-    kept = kept[order]
-    bounds = np.concatenate([[0], np.cumsum(np.bincount(group))])
-    first, members = bounds[:-1], strongest_first[kept]
-    later = np.ones(len(members), np.bool_)
-    later[first] = False
-    judged.fate[members[later]] = JOINED
+    members, pixel = kept[order], pixel[order]
+    count = np.bincount(group)
+    bounds = np.zeros(len(count) + 1, np.int64)
+    np.cumsum(count, out=bounds[1:])
+    first = bounds[:-1]
+    judged.fate[members] = JOINED
+    judged.fate[members[first]] = ACCEPTED
     equal = settings.joined == "equal"
-    weight = np.ones(len(members)) if equal else judged.evidence[members]
-    deviation = np.hypot(noise[kept], settings.sigma_px * pixel[kept])
-    joined, sigma = join_mixtures(alpha[kept], deviation, weight, first)
-    ends, beta = _ends_of_lines(strip, tracks, judged.fits, members)
+    weight = np.ones(len(members)) if equal else evidence[members]
+    deviation = np.hypot(noise[members], settings.sigma_px * pixel)
+    joined, sigma = join_mixtures(alpha[members], deviation, weight, first)
+    ends, beta = _ends_of_lines(strip, tracks, fits, members)
     if equal:
-        count = np.diff(bounds)
         ends = np.add.reduceat(ends, first) / count[:, None]
         beta = np.add.reduceat(beta, first) / count
     else:
         ends, beta = ends[first], beta[first]
-    return Lines(ends, joined, beta, sigma, noise[kept][first], members, bounds)
+    return Lines(ends, joined, beta, sigma, noise[members[first]], members, bounds)
 
 
-def _bearings(
-    fits: LineFits, tracks: NDArray[np.intp], tilt: TiltEstimate | None, settings: LineSettings
-) -> tuple[FloatArray, FloatArray]:
-    """Levelled bearings of tracks, and their standard deviations due to noise.
+class _Limits(NamedTuple):
+    """Limits for leaving out tracks; see `detect.line_settings.LineSettings`."""
 
-    Where the tilt is known, the measured lean b is replaced by its best estimate, given that it
-    should be that of a vertical up to `building_deg`, and a, which is correlated with it, follows.
-    """
-    sine, cosine = np.sin(fits.reference_rad[tracks]), np.cos(fits.reference_rad[tracks])
-    a, b = fits.line[tracks].T
-    covariance = fits.covariance[tracks]
-    variance, rotation = covariance[:, 0, 0], np.eye(3)
-    if tilt is not None and settings.alpha == "level":
-        rotation = level_matrix(tilt.pitch_rad, tilt.roll_rad)
-        building = math.radians(settings.building_deg)
-        gain = covariance[:, 0, 1] / (covariance[:, 1, 1] + building * building)
-        a = a - gain * (b - (tilt.pitch_rad * sine - tilt.roll_rad * cosine))
-        variance = variance - gain * covariance[:, 0, 1]
-    elif tilt is not None:
-        rotation = level_matrix(-tilt.pitch_rad, -tilt.roll_rad)
-    # Of the plane's two level directions (n_y, -n_x) is the one ahead of the camera.
-    x, y = rotation[:2] @ np.stack([cosine - a * sine, sine + a * cosine, -b])
-    return np.arctan2(y, x), np.sqrt(variance)
-
-
-def _left_out(
-    tracks: NDArray[np.intp], alpha: FloatArray, polarity: FloatArray, judged: Judgement,
-    settings: LineSettings,
-) -> NDArray[np.int8]:  # fmt: skip
-    """Fates of tracks, the strongest first, as stronger ones allow: accepted, or why not."""
-    near_px = np.abs(wrap_angle(alpha[:, None] - alpha)) / judged.fits.pixel_rad[tracks][:, None]
-    evidence, contrast = judged.evidence[tracks], judged.fits.contrast[tracks]
-    sign = polarity[tracks]
-    same = (sign[:, None] == sign) & (near_px < settings.same_edge_px)
-    faint = evidence[:, None] < settings.join_share * evidence
-    beside = (near_px < settings.join_px) & faint
-    fainter = contrast[:, None] < settings.shoulder_share * contrast
-    beside |= (near_px < settings.shoulder_px) & fainter
-    fate = np.empty(len(tracks), np.int8)
-    _suppress(same, beside, fate)
-    return fate
+    same_edge_px: float
+    join_px: float
+    join_share: float
+    shoulder_px: float
+    shoulder_share: float
 
 
 @njit(cache=True, error_model="numpy")
-def _suppress(same: NDArray[np.bool_], beside: NDArray[np.bool_], fate: NDArray[np.int8]) -> None:
-    """Keep each that is neither the same as, nor beside, one of those that are kept before it."""
-    for t in range(len(fate)):
-        fate[t] = ACCEPTED
-        for s in range(t):
-            if fate[s] == ACCEPTED and same[t, s]:
+def _wrapped(angle: float) -> float:
+    return (angle + math.pi) % (2.0 * math.pi) - math.pi
+
+
+@njit(cache=True, error_model="numpy")
+def _bearings(
+    fits: LineFits, tracks: NDArray[np.int64], rotation: FloatArray, tilt: tuple[float, float],
+    building: float, alpha: FloatArray, noise: FloatArray,
+) -> None:  # fmt: skip
+    """Levelled bearings of tracks, and their standard deviations due to noise.
+
+    The measured lean b is replaced by its best estimate, given that it should be that of a vertical
+    under the tilt up to the standard deviation `building`, and a, which is correlated with it,
+    follows.
+    """
+    for t in tracks:
+        sine, cosine = math.sin(fits.reference_rad[t]), math.cos(fits.reference_rad[t])
+        a, b, covariance = fits.line[t, 0], fits.line[t, 1], fits.covariance[t]
+        gain = covariance[0, 1] / (covariance[1, 1] + building * building)
+        a -= gain * (b - (tilt[0] * sine - tilt[1] * cosine))
+        # Of the plane's two level directions (n_y, -n_x) is the one ahead of the camera.
+        n_x, n_y = cosine - a * sine, sine + a * cosine
+        x = rotation[0, 0] * n_x + rotation[0, 1] * n_y - rotation[0, 2] * b
+        y = rotation[1, 0] * n_x + rotation[1, 1] * n_y - rotation[1, 2] * b
+        alpha[t] = math.atan2(y, x)
+        noise[t] = math.sqrt(covariance[0, 0] - gain * covariance[0, 1])
+
+
+@njit(cache=True, error_model="numpy")
+def _leave_out(
+    tracks: NDArray[np.int64], alpha: FloatArray, polarity: FloatArray, fits: LineFits,
+    evidence: FloatArray, limits: _Limits, fate: NDArray[np.int8],
+) -> None:  # fmt: skip
+    """Leave out, of tracks from the strongest on, what is of the same edge as, or beside, others."""
+    pixel, contrast = fits.pixel_rad, fits.contrast
+    for k in range(len(tracks)):
+        t = tracks[k]
+        for s in tracks[:k]:
+            if fate[s] != ACCEPTED:
+                continue
+            near_px = abs(_wrapped(alpha[t] - alpha[s])) / pixel[t]
+            if polarity[t] == polarity[s] and near_px < limits.same_edge_px:
                 fate[t] = SAME_EDGE
                 break
-            if fate[s] == ACCEPTED and beside[t, s]:
+            faint = evidence[t] < limits.join_share * evidence[s]
+            fainter = contrast[t] < limits.shoulder_share * contrast[s]
+            if (near_px < limits.join_px and faint) or (near_px < limits.shoulder_px and fainter):
                 fate[t] = BESIDE_A_STRONGER_EDGE
 
 
@@ -167,14 +186,23 @@ def chain_neighbours(alpha: FloatArray, distance: FloatArray) -> NDArray[np.int6
     (N,) int64
         The group of each, counted from 0 at the largest bearing (leftmost in the image).
     """
-    order = np.argsort(-alpha, kind="stable")
-    near = distance[order]
-    apart = alpha[order[:-1]] - alpha[order[1:]] >= np.minimum(near[:-1], near[1:])
     group = np.zeros(len(alpha), np.int64)
-    group[order[1:]] = np.cumsum(apart)
+    _number_groups(alpha, distance, np.argsort(-alpha, kind="stable"), group)
     return group
 
 
+@njit(cache=True, error_model="numpy")
+def _number_groups(
+    alpha: FloatArray, distance: FloatArray, order: NDArray[np.int64], group: NDArray[np.int64]
+) -> None:
+    number = 0
+    for k in range(1, len(order)):
+        left, right = order[k - 1], order[k]
+        number += alpha[left] - alpha[right] >= min(distance[left], distance[right])
+        group[right] = number
+
+
+@njit(cache=True, error_model="numpy")
 def join_mixtures(
     alpha: FloatArray, sigma: FloatArray, weight: FloatArray, first: NDArray[np.int64]
 ) -> tuple[FloatArray, FloatArray]:
@@ -195,13 +223,19 @@ def join_mixtures(
     alpha, sigma : (N,) float64
         Of the mixtures (rad).
     """
-    count = np.diff(first, append=len(alpha))
-    share = weight / np.repeat(np.add.reduceat(weight, first), count)
-    off = wrap_angle(alpha - np.repeat(alpha[first], count))
-    mean = np.add.reduceat(share * off, first)
-    off -= np.repeat(mean, count)
-    variance = np.add.reduceat(share * (sigma * sigma + off * off), first)
-    return wrap_angle(alpha[first] + mean), np.sqrt(variance)
+    mean, deviation = np.empty(len(first)), np.empty(len(first))
+    for n in range(len(first)):
+        begin, end = first[n], first[n + 1] if n + 1 < len(first) else len(alpha)
+        total = off = square = 0.0
+        for k in range(begin, end):
+            total += weight[k]
+            off += weight[k] * _wrapped(alpha[k] - alpha[begin])
+        off /= total
+        for k in range(begin, end):
+            own = _wrapped(alpha[k] - alpha[begin]) - off
+            square += weight[k] * (sigma[k] * sigma[k] + own * own)
+        mean[n], deviation[n] = _wrapped(alpha[begin] + off), math.sqrt(square / total)
+    return mean, deviation
 
 
 @njit(cache=True, error_model="numpy")

@@ -139,12 +139,14 @@ def _judge_each(
     )
     evidence, fate = np.empty(len(tracks.polarity)), np.empty(len(tracks.polarity), np.int8)
     _judge(strip, tracks, fits, limits, evidence, fate)
-    accepted = fate == ACCEPTED
-    if accepted.any():
+    accepted = np.flatnonzero(fate == ACCEPTED)
+    if len(accepted) > 0:
         # How sharp an edge can be depends on the image's focus and motion.
-        sharp = settings.least_sharpness * _quantile(fits.sharpness[accepted], 0.25)
-        soft = (fits.sharpness < sharp) & (fits.contrast < _quantile(fits.contrast[accepted], 0.5))
-        fate[accepted & soft & (evidence < settings.soft_evidence)] = SOFT
+        sharpness, contrast = fits.sharpness[accepted], fits.contrast[accepted]
+        soft = sharpness < settings.least_sharpness * _quantile(sharpness, 0.25)
+        soft &= contrast < _quantile(contrast, 0.5)
+        soft &= evidence[accepted] < settings.soft_evidence
+        fate[accepted[soft]] = SOFT
     return evidence, fate
 
 
@@ -153,11 +155,12 @@ def _judge(
     strip: Strip, tracks: LineTracks, fits: LineFits, limits: _Limits, evidence: FloatArray,
     fate: NDArray[np.int8],
 ) -> None:  # fmt: skip
+    score = tracks.score
     for t in range(len(fate)):
         begin, end = tracks.bounds[t], tracks.bounds[t + 1]
         total = 0.0
         for i in range(begin, end):
-            total += tracks.score[i]
+            total += score[i]
         evidence[t] = total * strip.row_aspect * fits.sharpness[t] ** 2
         horizon = strip.anchor_row[min(int(np.rint(tracks.column[begin])), len(strip.bearing) - 1)]
         gap = max(horizon - tracks.row[end - 1], tracks.row[begin] - horizon) * strip.row_aspect

@@ -196,25 +196,28 @@ def _fit_lines(
     image: NDArray[np.uint8], strip: Strip, tracks: LineTracks, filters: StepFilters,
     least_points: int, least_score: float, fits: LineFits,
 ) -> None:  # fmt: skip
-    height = image.shape[0]
-    chart_x, chart_z, column, by_a, by_b = np.empty((5, height))
+    scratch = np.empty((5, image.shape[0]))
+    chart_x, chart_z, column, by_a, by_b = (
+        scratch[0], scratch[1], scratch[2], scratch[3], scratch[4]
+    )  # fmt: skip
     fits.line[:], fits.covariance[:] = np.nan, np.nan
     fits.scatter_px[:], fits.shift_px[:] = np.nan, np.nan
     fits.spread[:], fits.contrast[:], fits.sharpness[:] = np.nan, np.nan, 1.0
+    tracked, score = tracks.column, tracks.score
     for t in range(len(tracks.polarity)):
         begin, end = tracks.bounds[t], tracks.bounds[t + 1]
         n, sign = end - begin, tracks.polarity[t]
         middle = total = 0.0
         for i in range(begin, end):
-            middle += tracks.column[i] / n
-            total += tracks.score[i]
-        origin = min(max(int(middle + 0.5), 1), len(strip.bearing) - 2)
+            middle += tracked[i]
+            total += score[i]
+        origin = min(max(int(middle / n + 0.5), 1), len(strip.bearing) - 2)
         pixel = 1.0 / abs(strip.columns_per_rad[origin])
         fits.reference_rad[t], fits.pixel_rad[t] = strip.bearing[origin], pixel
         if n < least_points or total < least_score:
             continue
         row, x, z = tracks.row[begin:end], chart_x[:n], chart_z[:n]
-        _place_in_chart(strip, row, tracks.column[begin:end], fits.reference_rad[t], x, z)
+        _place_in_chart(strip, row, tracked[begin:end], fits.reference_rad[t], x, z)
         line = _eigenline(x, z)
         fits.scatter_px[t], fits.spread[t] = math.sqrt(line.scatter) / pixel, line.spread
         if not line.spread > line.scatter:
@@ -226,7 +229,7 @@ def _fit_lines(
             fits.shift_px[t] = 0.0
         else:
             crossings = Crossings(row, column[:n], by_a[:n], by_b[:n])
-            _cross_rows(strip, tracks.column[begin:end], x, z, line, crossings)
+            _cross_rows(strip, tracked[begin:end], x, z, line, crossings)
             steps = _climb(image, crossings, filters, sign, line.middle, pixel)
             a, b, aa, ab, bb = (
                 a + steps.change_a, b + steps.change_b, steps.aa, steps.ab, steps.bb
@@ -266,13 +269,15 @@ def _eigenline(x: FloatArray, z: FloatArray) -> _Eigenline:
     """The line along the larger eigenvalue's eigenvector of the points' scatter."""
     n = len(x)
     mean_x = mean_z = xx = xz = zz = 0.0
+    share = 1.0 / n
     for i in range(n):
-        mean_x += x[i] / n
-        mean_z += z[i] / n
+        mean_x += share * x[i]
+        mean_z += share * z[i]
     for i in range(n):
-        xx += (x[i] - mean_x) ** 2 / n
-        xz += (x[i] - mean_x) * (z[i] - mean_z) / n
-        zz += (z[i] - mean_z) ** 2 / n
+        off_x, off_z = x[i] - mean_x, z[i] - mean_z
+        xx += share * off_x * off_x
+        xz += share * off_x * off_z
+        zz += share * off_z * off_z
     half = 0.5 * (xx - zz)
     smaller = max(0.5 * (xx + zz) - math.sqrt(half * half + xz * xz), 0.0)
     b = xz / (zz - smaller)
@@ -286,9 +291,10 @@ def _cross_rows(
 ) -> None:  # fmt: skip
     """Where a line crosses the rows of its track, whose points are near it."""
     bearing, column = strip.bearing, strip.column
+    row, crossing, by_a, by_b = crossings.row, crossings.column, crossings.by_a, crossings.by_b
     last = len(bearing) - 1
     for i in range(len(x)):
-        v = crossings.row[i]
+        v = row[i]
         j = min(int(tracked[i]), last - 1)
         # In the strip; by X in first order, d atan(X) = dX / (1 + X^2).
         by_x = 1.0 / ((1.0 + x[i] * x[i]) * (bearing[j + 1] - bearing[j]))
@@ -297,12 +303,12 @@ def _cross_rows(
         du_dc = column[j + 1, v] - column[j, v]
         # Beside it a vertical may have ended.
         if place >= 0.0 and place <= last and math.isfinite(du_dc):
-            crossings.column[i] = column[j, v] + (place - j) * du_dc
-            crossings.by_a[i] = by_x * du_dc
-            crossings.by_b[i] = by_x * du_dc * z[i]
+            crossing[i] = column[j, v] + (place - j) * du_dc
+            by_a[i] = by_x * du_dc
+            by_b[i] = by_x * du_dc * z[i]
         else:
-            crossings.column[i] = np.nan
-            crossings.by_a[i] = crossings.by_b[i] = 0.0
+            crossing[i] = np.nan
+            by_a[i] = by_b[i] = 0.0
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
@@ -314,6 +320,7 @@ def _climb(
 
     The steps move the crossings in proportion to their derivatives.
     """
+    column, by_a, by_b = crossings.column, crossings.by_a, crossings.by_b
     a = b = 0.0
     aa = ab = bb = np.nan
     moved_px = np.inf
@@ -329,9 +336,9 @@ def _climb(
         b += newton.change_b
         aa, ab, bb = newton.aa, newton.ab, newton.bb
         moved_px = 0.0
-        for i in range(len(crossings.column)):
-            change = newton.change_a * crossings.by_a[i] + newton.change_b * crossings.by_b[i]
-            crossings.column[i] += change
+        for i in range(len(column)):
+            change = newton.change_a * by_a[i] + newton.change_b * by_b[i]
+            column[i] += change
             moved_px = max(moved_px, abs(change))
     return NewtonStep(a, b, aa, ab, bb)
 
@@ -358,13 +365,15 @@ def newton_step(
     NewtonStep
         NaN where there is no maximum at this scale.
     """
+    # Numba counts references to arrays in tuples wherever they are taken out of these.
+    row, column, to_a, to_b = crossings.row, crossings.column, crossings.by_a, crossings.by_b
     used = 0
     g_a = g_b = h_aa = h_ab = h_bb = m_aa = m_ab = m_bb = 0.0
-    for i in range(len(crossings.row)):
-        seen, slope, bend, off = _see(image, crossings.row[i], crossings.column[i], weights, half)
+    for i in range(len(row)):
+        seen, slope, bend, off = _see(image, row[i], column[i], weights, half)
         if seen:
             used += 1
-            by_a, by_b = crossings.by_a[i], crossings.by_b[i]
+            by_a, by_b = to_a[i], to_b[i]
             own = slope + off * bend
             g_a += own * by_a
             g_b += own * by_b
@@ -396,10 +405,10 @@ def _contrasts(
     image: NDArray[np.uint8], crossings: Crossings, heights: SingleArray
 ) -> tuple[int, float, float]:
     """How many rows are seen, and the sums of their heights at two scales."""
+    row, column, half = crossings.row, crossings.column, heights.shape[2] // 2
     rows, fine, coarse = 0, 0.0, 0.0
-    for i in range(len(crossings.row)):
-        half = heights.shape[2] // 2
-        seen, one, other, _ = _see(image, crossings.row[i], crossings.column[i], heights, half)
+    for i in range(len(row)):
+        seen, one, other, _ = _see(image, row[i], column[i], heights, half)
         if seen:
             rows += 1
             fine += one

@@ -157,6 +157,9 @@ def band_response(image: NDArray[np.uint8], band: StartBand, regulariser: float)
     return response
 
 
+# Loops that become vectors have functions of their own, which take arrays one by one.
+
+
 @njit(cache=True, error_model="numpy")
 def _filter_band(
     pixels: NDArray[np.uint8], band: StartBand, regulariser: np.float32, between: SingleArray,
@@ -165,43 +168,75 @@ def _filter_band(
     """`between`, (R, 2 W), gets grey values and their squares; `response` the result."""
     levels, width = response.shape
     taps = band.across.shape[2]
-    inner = width - taps + 1
-    for row in range(len(between)):
-        pixel, left, right = band.pixel[row], band.left[row], band.right[row]
-        grey, square = between[row, :width], between[row, width:]
-        for c in range(width):
-            a = np.float32(pixels[pixel[c]]) - MIDDLE_GREY
-            b = np.float32(pixels[pixel[c] + 1]) - MIDDLE_GREY
-            grey[c] = left[c] * a + right[c] * b
-            square[c] = left[c] * (a * a) + right[c] * (b * b)
+    inner = slice(taps // 2, width - taps // 2)
+    sides = np.empty((2, width), np.uint8)
+    for k in range(len(between)):
+        _interpolate(pixels, band.pixel[k], band.left[k], band.right[k], sides, between[k])
     means = np.empty(2 * width, np.float32)
-    sums = np.empty((3, inner), np.float32)
+    sums = np.empty((3, width - taps + 1), np.float32)
+    for k in range(levels):
+        _average_along(between[k * band.spacing :], band.along, means)
+        _correlate_across(means, band.scale[k], band.across[k], sums)
+        _respond(sums, regulariser, band.row[k, inner], response[k, inner])
+
+
+@njit(cache=True, error_model="numpy")
+def _interpolate(
+    pixels: NDArray[np.uint8], pixel: NDArray[np.int32], left: SingleArray, right: SingleArray,
+    sides: NDArray[np.uint8], between: SingleArray,
+) -> None:  # fmt: skip
+    width = len(pixel)
+    on_left, on_right, grey, square = sides[0], sides[1], between[:width], between[width:]
+    for c in range(width):
+        place = np.uint64(pixel[c])
+        on_left[c] = pixels[place]
+        on_right[c] = pixels[place + np.uint64(1)]
+    for c in range(width):
+        a = np.float32(on_left[c]) - MIDDLE_GREY
+        b = np.float32(on_right[c]) - MIDDLE_GREY
+        grey[c] = left[c] * a + right[c] * b
+        square[c] = left[c] * (a * a) + right[c] * (b * b)
+
+
+@njit(cache=True, error_model="numpy")
+def _average_along(between: SingleArray, along: SingleArray, means: SingleArray) -> None:
+    means[:] = np.float32(0.0)
+    for k in range(len(along)):
+        row, weight = between[k], along[k]
+        for i in range(len(means)):
+            means[i] += weight * row[i]
+
+
+@njit(cache=True, error_model="numpy")
+def _correlate_across(
+    means: SingleArray, scale: SingleArray, across: SingleArray, sums: SingleArray
+) -> None:
+    """Mean, covariance and mean square in windows across verticals."""
     mean, cov, square = sums[0], sums[1], sums[2]
-    for level in range(levels):
-        means[:] = np.float32(0.0)
-        for k in range(len(band.along)):
-            row = between[level * band.spacing + k]
-            for i in range(2 * width):
-                means[i] += band.along[k] * row[i]
-        scale = band.scale[level]
-        for c in range(width):
-            means[c] *= scale[c]
-            means[width + c] *= scale[c]
-        sums[:] = np.float32(0.0)
-        for k in range(taps):
-            weight, lever = band.across[level, 0, k], band.across[level, 1, k]
-            grey, squares = means[k : k + inner], means[width + k : width + k + inner]
-            for c in range(inner):
-                mean[c] += weight * grey[c]
-                cov[c] += lever * grey[c]
-                square[c] += weight * squares[c]
-        found = response[level, taps // 2 : taps // 2 + inner]
-        row_of = band.row[level, taps // 2 : taps // 2 + inner]
-        for c in range(inner):
-            # Rounding can make a vanishing variance negative.
-            variance = abs(square[c] - mean[c] * mean[c])
-            value = cov[c] * abs(cov[c]) / (variance + regulariser)
-            found[c] = value if row_of[c] >= 0 else np.float32(0.0)
+    width = len(scale)
+    for c in range(width):
+        means[c] *= scale[c]
+        means[width + c] *= scale[c]
+    sums[:] = np.float32(0.0)
+    for k in range(across.shape[1]):
+        weight, lever = across[0, k], across[1, k]
+        grey, squares = means[k:], means[width + k :]
+        for c in range(len(mean)):
+            mean[c] += weight * grey[c]
+            cov[c] += lever * grey[c]
+            square[c] += weight * squares[c]
+
+
+@njit(cache=True, error_model="numpy")
+def _respond(
+    sums: SingleArray, regulariser: np.float32, row: NDArray[np.int32], response: SingleArray
+) -> None:
+    mean, cov, square = sums[0], sums[1], sums[2]
+    for c in range(len(response)):
+        # Rounding can make a vanishing variance negative.
+        variance = abs(square[c] - mean[c] * mean[c])
+        value = cov[c] * abs(cov[c]) / (variance + regulariser)
+        response[c] = value if row[c] >= 0 else np.float32(0.0)
 
 
 def find_maxima(response: SingleArray, threshold: float) -> Maxima:

@@ -146,17 +146,12 @@ def agreed_tilt(
     lines: Verticals, settings: LineSettings
 ) -> tuple[TiltEstimate | None, NDArray[np.bool_]]:
     """`consensus` with the covariance of least squares."""
-    prior = math.radians(settings.tilt_prior_deg)
-    limit = math.radians(settings.largest_tilt_deg)
+    limit, prior = math.radians(settings.largest_tilt_deg), math.radians(settings.tilt_prior_deg)
     proposers = np.argsort(-lines.weight, kind="stable")[: settings.proposers]
-    agrees = np.empty(len(lines.weight), np.bool_)
-    covariance = np.empty((2, 2))
-    pitch, roll = _vote_for_tilt(lines, proposers, limit, prior)
-    pitch, roll = _refine_tilt(lines, pitch, roll, prior, covariance, agrees)
-    count = int(np.count_nonzero(agrees))
+    agrees, covariance = np.empty(len(lines.weight), np.bool_), np.empty((2, 2))
+    pitch, roll, count, votes = _agree_on_tilt(lines, proposers, limit, prior, covariance, agrees)
     if count < settings.least_lines or abs(pitch) > limit or abs(roll) > limit:
         return None, np.abs(lines.normal[:, 2]) <= lines.tolerance
-    votes = float(lines.weight[agrees].sum() / lines.weight.sum())
     return TiltEstimate(pitch, roll, covariance, count, votes), agrees
 
 
@@ -171,13 +166,9 @@ def with_error(
         return tilt
     bearing = np.arctan2(lines.normal[:, 1], lines.normal[:, 0])
     together = gather(bearing, np.full(len(bearing), TOGETHER_RAD), lines.weight)
-    error = error_of_tilt(
-        merge_lines(lines, edge),
-        merge_lines(lines, together),
-        (tilt.pitch_rad, tilt.roll_rad),
-        math.radians(settings.tilt_prior_deg),
-        float(settings.stray_share),
-    )
+    prior = math.radians(settings.tilt_prior_deg)
+    place = tilt.pitch_rad, tilt.roll_rad
+    error = _error_of_tilt(lines, edge, together, place, prior, float(settings.stray_share), _GRID)
     return tilt._replace(covariance=error)
 
 
@@ -186,6 +177,38 @@ def lean_deviation(tilt: TiltEstimate, sine: FloatArray, cosine: FloatArray) -> 
     (pp, pr), (_, rr) = tilt.covariance.tolist()
     variance = sine * sine * pp - 2.0 * sine * cosine * pr + cosine * cosine * rr
     return math.sqrt(np.nanmax(variance, initial=0.0))
+
+
+@njit(cache=True, error_model="numpy")
+def _agree_on_tilt(
+    lines: Verticals, proposers: NDArray[np.int64], limit: float, prior: float,
+    covariance: FloatArray, agrees: NDArray[np.bool_],
+) -> tuple[float, float, int, float]:  # fmt: skip
+    """Pitch and roll, how many lines agree, and their share of the votes.
+
+    `covariance` gets that of the tilt, if lines err one by one, `agrees` which lines are vertical.
+    """
+    pitch, roll = _vote_for_tilt(lines, proposers, limit, prior)
+    pitch, roll = _refine_tilt(lines, pitch, roll, prior, covariance, agrees)
+    count, votes, total = 0, 0.0, 0.0
+    for i in range(len(agrees)):
+        total += lines.weight[i]
+        if agrees[i]:
+            count += 1
+            votes += lines.weight[i]
+    return pitch, roll, count, votes / total
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"}, forceinline=True)
+def _votes(
+    x: FloatArray, y: FloatArray, z: FloatArray, weight: FloatArray, pitch: float, roll: float
+) -> float:
+    """Votes of lines, whose normals are given in units of their tolerances, for a tilt."""
+    votes = 0.0
+    for i in range(len(weight)):
+        off = z[i] + pitch * y[i] - roll * x[i]
+        votes += weight[i] * max(1.0 - off * off, 0.0)
+    return votes
 
 
 @njit(cache=True, error_model="numpy")
@@ -198,7 +221,11 @@ def _vote_for_tilt(
     weight, less the farther it is from vertical. A tilt t loses t^2 / (2 prior^2) votes. No tilt is
     tried as well.
     """
-    normal, tolerance, weight = lines.normal, lines.tolerance, lines.weight
+    normal, weight = lines.normal, lines.weight
+    x, y, z = np.empty(len(weight)), np.empty(len(weight)), np.empty(len(weight))
+    for i in range(len(weight)):
+        share = 1.0 / lines.tolerance[i]
+        x[i], y[i], z[i] = share * normal[i, 0], share * normal[i, 1], share * normal[i, 2]
     best_pitch = best_roll = 0.0
     best = -math.inf
     for i in range(-1, len(proposers)):
@@ -214,12 +241,8 @@ def _vote_for_tilt(
                 roll = (normal[m, 2] * normal[n, 1] - normal[m, 1] * normal[n, 2]) / determinant
                 if not (abs(pitch) <= limit and abs(roll) <= limit):
                     continue
-            votes = -0.5 * (pitch * pitch + roll * roll) / (prior * prior)
-            for line in range(len(weight)):
-                off = normal[line, 2] + pitch * normal[line, 1] - roll * normal[line, 0]
-                off /= tolerance[line]
-                if off * off < 1.0:
-                    votes += weight[line] * (1.0 - off * off)
+            votes = _votes(x, y, z, weight, pitch, roll)
+            votes -= 0.5 * (pitch * pitch + roll * roll) / (prior * prior)
             if votes > best:
                 best, best_pitch, best_roll = votes, pitch, roll
     return best_pitch, best_roll
@@ -230,10 +253,8 @@ def _refine_tilt(
     lines: Verticals, pitch: float, roll: float, prior: float, covariance: FloatArray,
     agrees: NDArray[np.bool_],
 ) -> tuple[float, float]:  # fmt: skip
-    """Least squares of a tilt over the lines that agree with it, repeated.
-
-    `covariance` gets that of the tilt, if lines err one by one, `agrees` which lines are vertical.
-    """
+    """Least squares of a tilt over the lines that agree with it, repeated."""
+    normal, variance, tolerance = lines.normal, lines.variance, lines.tolerance
     for repetition in range(REFINEMENTS + 1):
         rotation = level_matrix(pitch, roll)
         pp = rr = 1.0 / (prior * prior)
@@ -242,13 +263,13 @@ def _refine_tilt(
         for i in range(len(agrees)):
             x = y = z = 0.0
             for k in range(3):
-                x += rotation[0, k] * lines.normal[i, k]
-                y += rotation[1, k] * lines.normal[i, k]
-                z += rotation[2, k] * lines.normal[i, k]
-            agrees[i] = abs(z) <= lines.tolerance[i]
+                x += rotation[0, k] * normal[i, k]
+                y += rotation[1, k] * normal[i, k]
+                z += rotation[2, k] * normal[i, k]
+            agrees[i] = abs(z) <= tolerance[i]
             if agrees[i]:
                 # A line of furniture or a shadow among few lines must not pull.
-                weight = 1.0 / (lines.variance[i] + (z / SOFTENING) ** 2)
+                weight = 1.0 / (variance[i] + (z / SOFTENING) ** 2)
                 pp += weight * y * y
                 pr -= weight * y * x
                 rr += weight * x * x
@@ -326,86 +347,100 @@ def _gather(
                 group[k] = first
 
 
+@njit(cache=True, error_model="numpy")
 def merge_lines(lines: Verticals, group: NDArray[np.int64]) -> FloatArray:
-    """(4, G) mean normals of groups of lines, and the variances of their inclinations.
+    """(G, 4) mean normals of groups of lines, and the variances of their inclinations.
 
     Lines are weighed by how well they are measured beside the middle scatter; the variances are
     without scatter.
     """
-    share = 1.0 / (lines.variance + SCATTER_RAD[1] ** 2)
-    total = np.bincount(group, share)
-    used = total > 0.0
-    share /= total[group]
-    sums = [np.bincount(group, share * each)[used] for each in lines.normal.T]
-    return np.stack([*sums, np.bincount(group, share * share * lines.variance)[used]])
+    normal, variance = lines.normal, lines.variance
+    share, total = np.empty(len(group)), np.zeros(len(group))
+    for k in range(len(group)):
+        share[k] = 1.0 / (variance[k] + SCATTER_RAD[1] ** 2)
+        total[group[k]] += share[k]
+    place = np.cumsum(total > 0.0) - 1
+    merged = np.zeros((len(np.flatnonzero(total)), 4))
+    for k in range(len(group)):
+        own = share[k] / total[group[k]]
+        to = merged[place[group[k]]]
+        for i in range(3):
+            to[i] += own * normal[k, i]
+        to[3] += own * own * variance[k]
+    return merged
 
 
-def error_of_tilt(
-    edges: FloatArray, groups: FloatArray, tilt: tuple[float, float], prior: float,
-    stray_share: float,
+@njit(cache=True, error_model="numpy")
+def _error_of_tilt(
+    lines: Verticals, edge: NDArray[np.int64], together: NDArray[np.int64],
+    tilt: tuple[float, float], prior: float, stray_share: float, grid: FloatArray,
 ) -> FloatArray:  # fmt: skip
-    """Mean square error of a tilt, over what its lines and those that disagree say.
+    """(2, 2) mean square error of a tilt, over what its lines and those that disagree say."""
+    edges, groups = merge_lines(lines, edge), merge_lines(lines, together)
+    xx, xy, yy = _stretch(groups, tilt, prior)
+    n = grid.shape[1]
+    pitch, roll, before, density = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
+    for i in range(n):
+        pitch[i] = tilt[0] + xx * grid[0, i] + xy * grid[1, i]
+        roll[i] = tilt[1] + xy * grid[0, i] + yy * grid[1, i]
+        squared = pitch[i] * pitch[i] + roll[i] * roll[i]
+        before[i] = grid[2, i] * math.exp(-0.5 * squared / (prior * prior))
+    error = np.zeros((2, 2))
+    total = 0.0
+    for m in range(len(SCATTER_RAD)):
+        density[:] = before
+        _multiply_likelihood(density, pitch, roll, edges, SCATTER_RAD[m], stray_share)
+        share = SCATTER_SHARE[m] * density.sum()
+        total += share
+        density[:] = before
+        _multiply_likelihood(density, pitch, roll, groups, SCATTER_RAD[m], stray_share)
+        share /= density.sum()
+        for i in range(n):
+            p, r = pitch[i] - tilt[0], roll[i] - tilt[1]
+            error[0, 0] += share * density[i] * p * p
+            error[0, 1] += share * density[i] * p * r
+            error[1, 1] += share * density[i] * r * r
+    error[1, 0] = error[0, 1]
+    return error / total
 
-    Parameters
-    ----------
-    edges, groups : (4, N) float64
-        Normals and variances of the edges, and of lines that lean together (`merge_lines`).
-    tilt : (float, float)
-        Pitch and roll (rad).
-    prior : float
-        Standard deviation of the tilt before anything is seen (rad).
-    stray_share : float
-        Share of lines that are no verticals, less than 1.
 
-    Returns
-    -------
-    (2, 2) float64
-        Of pitch and roll (rad^2).
-    """
-    off = _stretch(groups, tilt, prior) @ _GRID[:2]
-    place = off + np.array(tilt)[:, None]
-    before = _GRID[2] * np.exp(-0.5 * (place * place).sum(axis=0) / (prior * prior))
-    of_edges, of_groups = np.tile(before, (2, len(SCATTER_RAD), 1))
-    _multiply_likelihood(of_edges, place, edges, stray_share)
-    _multiply_likelihood(of_groups, place, groups, stray_share)
-    share = np.array(SCATTER_SHARE) * of_edges.sum(axis=1)
-    density = (share / of_groups.sum(axis=1)) @ of_groups
-    return np.asarray((density * off) @ off.T / share.sum())
-
-
-def _stretch(groups: FloatArray, tilt: tuple[float, float], prior: float) -> FloatArray:
+@njit(cache=True, error_model="numpy")
+def _stretch(
+    groups: FloatArray, tilt: tuple[float, float], prior: float
+) -> tuple[float, float, float]:
     """Symmetric matrix that turns a circle into the posterior's ellipse, its larger axis 1."""
-    x, y, z, variance = groups
-    off = z + tilt[0] * y - tilt[1] * x
-    weight = 1.0 / (variance + SCATTER_RAD[1] ** 2 + 0.25 * off * off)
-    pp = 1.0 / prior**2 + float(weight @ (y * y))
-    rr = 1.0 / prior**2 + float(weight @ (x * x))
-    pr = -float(weight @ (x * y))
+    pp = rr = 1.0 / (prior * prior)
+    pr = 0.0
+    for k in range(len(groups)):
+        x, y = groups[k, 0], groups[k, 1]
+        off = groups[k, 2] + tilt[0] * y - tilt[1] * x
+        weight = 1.0 / (groups[k, 3] + SCATTER_RAD[1] ** 2 + 0.25 * off * off)
+        pp += weight * y * y
+        pr -= weight * x * y
+        rr += weight * x * x
     # Of [[a, b], [b, d]] the eigenvalues are middle +- half, the axis of the first at this angle.
     half, middle = math.hypot(0.5 * (pp - rr), pr), 0.5 * (pp + rr)
     shortest = max(math.sqrt((middle - half) / (middle + half)), _SLENDEREST)
     angle = 0.5 * math.atan2(2.0 * pr, pp - rr)
     # The direction that is known best is the ellipse's short axis.
-    axis = np.array([math.cos(angle), math.sin(angle)])
-    return np.eye(2) + (shortest - 1.0) * np.outer(axis, axis)
+    c, s = math.cos(angle), math.sin(angle)
+    return shortest * c * c + s * s, (shortest - 1.0) * c * s, shortest * s * s + c * c
 
 
 @njit(cache=True, error_model="numpy")
 def _multiply_likelihood(
-    density: FloatArray, place: FloatArray, lines: FloatArray, stray_share: float
-) -> None:
-    """Multiply (S, N) densities of tilts, for each scatter, by the likelihood of the lines."""
+    density: FloatArray, pitch: FloatArray, roll: FloatArray, lines: FloatArray, scatter: float,
+    stray_share: float,
+) -> None:  # fmt: skip
+    """Multiply densities of tilts by the likelihood of the lines."""
     of_stray = stray_share / (math.pi * STRAY_RAD)
-    pitch, roll = place[0], place[1]
-    for m in range(len(SCATTER_RAD)):
-        own = density[m]
-        for k in range(lines.shape[1]):
-            three_variances = 3.0 * (lines[3, k] + SCATTER_RAD[m] ** 2)
-            of_vertical = (1.0 - stray_share) * 2.0 / (math.pi * math.sqrt(three_variances))
-            x, y, z = lines[0, k], lines[1, k], lines[2, k]
-            for i in range(len(own)):
-                off = z + pitch[i] * y - roll[i] * x
-                student = 1.0 / (1.0 + off * off / three_variances)
-                cauchy = of_stray / (1.0 + off * off / STRAY_RAD**2)
-                # In units in which products of a hundred stay in range.
-                own[i] *= (of_vertical * student * student + cauchy) * SCATTER_RAD[1]
+    for k in range(len(lines)):
+        three_variances = 3.0 * (lines[k, 3] + scatter * scatter)
+        of_vertical = (1.0 - stray_share) * 2.0 / (math.pi * math.sqrt(three_variances))
+        x, y, z = lines[k, 0], lines[k, 1], lines[k, 2]
+        for i in range(len(density)):
+            off = z + pitch[i] * y - roll[i] * x
+            student = 1.0 / (1.0 + off * off / three_variances)
+            cauchy = of_stray / (1.0 + off * off / STRAY_RAD**2)
+            # In units in which products of a hundred stay in range.
+            density[i] *= (of_vertical * student * student + cauchy) * SCATTER_RAD[1]

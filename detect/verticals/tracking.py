@@ -166,15 +166,18 @@ def _follow_edges(
 
     `followed`, (2, R, W), marks columns by polarity, on the rows from `lowest` on that have starts.
     """
-    height = rise.shape[1]
+    width, height = rise.shape
+    # Numba counts references to arrays in tuples wherever they are taken out of these.
+    start_row, start_column, start_value = starts.row, starts.column, starts.value
+    found_row, found_column, found_score = found.row, found.column, found.score
     # Of the edge that is followed, by row; no score where there is no point.
     column, score = np.empty(height), np.zeros(height, np.float32)
     tracks = n = counting = 0
-    for start in range(len(starts.row)):
+    for start in range(len(start_row)):
         if counting >= following.enough:
             break
-        v, c = starts.row[start], starts.column[start]
-        sign = np.float32(1.0) if starts.value[start] > 0.0 else np.float32(-1.0)
+        v, c = start_row[start], start_column[start]
+        sign = np.float32(1.0) if start_value[start] > 0.0 else np.float32(-1.0)
         marks = followed[0 if sign > 0.0 else 1]
         if marks[v - lowest, c]:
             continue
@@ -190,13 +193,14 @@ def _follow_edges(
         first, total = n, 0.0
         for row in range(top, bottom + 1):
             if score[row] > 0.0:
-                found.row[n], found.column[n], found.score[n] = row, column[row], score[row]
+                found_row[n], found_column[n], found_score[n] = row, column[row], score[row]
                 total += score[row]
                 score[row] = 0.0
                 n += 1
                 if 0 <= row - lowest < len(marks):
                     j = math.floor(column[row] + 0.5)
-                    marks[row - lowest, max(0, j - 1) : j + 2] = True
+                    for k in range(max(0, j - 1), min(width, j + 2)):
+                        marks[row - lowest, k] = True
         if n > first:
             found.polarity[tracks] = sign
             tracks += 1
@@ -204,6 +208,19 @@ def _follow_edges(
             if n - first >= following.least_points and total >= following.least_score:
                 counting += 1
     return tracks
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _place(column: int, part: float) -> tuple[int, float]:
+    """Whole columns, and what is left, in [-0.5, 0.5).
+
+    Whole columns change seldom: a processor that foresees them works on the next rows before it
+    knows where in this one the edge is.
+    """
+    if part < -0.5 or part >= 0.5:
+        whole = math.floor(part + 0.5)
+        return column + whole, part - whole
+    return column, part
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
@@ -223,23 +240,22 @@ def _follow(
     # Numba counts references to arrays in tuples wherever they are taken out of these.
     value, known, columns_per_rise = response.value, response.known, following.columns_per_rise
     pull, reach, threshold = following.pull, following.reach, following.threshold
+    border, max_gap = following.border, following.max_gap
     width, height = rise.shape
     v, place, direction = start
+    j, part = _place(0, place)
     n = gap = 0
     end = v
-    while gap <= following.max_gap:
-        j = math.floor(place + 0.5)
+    while gap <= max_gap:
         if n > 0:
             v += direction
-            if v < following.border or v > height - 1 - following.border:
-                break
-            if j < 1 or j > width - 2:
+            if v < border or v > height - 1 - border or j < 1 or j > width - 2:
                 break
             # A vertical leans in the strip of a tilted camera.
-            place += columns_per_rise[j] * (rise[j, v] - rise[j, v - direction])
-            if not math.isfinite(place):
+            moved = columns_per_rise[j] * (rise[j, v] - rise[j, v - direction])
+            if not math.isfinite(moved):
                 break
-            j = math.floor(place + 0.5)
+            j, part = _place(j, part + moved)
         if j < 2 or j > width - 3:
             break
         near = j
@@ -260,17 +276,17 @@ def _follow(
                 break
             near += -1 if left > right else 1
         seen = here >= threshold and here >= left and here >= right
-        off = near - place
+        off = near - j - part
         if seen:
             bend = left - here - here + right
             # The top of the parabola through the three.
             off += 0.5 * (left - right) / bend if bend < 0.0 else 0.0
         # A start is known to a column only.
         if seen and (n == 0 or abs(off) <= reach):
-            column[v], score[v] = place + off, here
+            column[v], score[v] = j + (part + off), here
             # The start counts as the expected position, not as a point that confirms it.
             yielding = max(pull, 1.0 / (n + 1.0)) if n > 0 else 1.0
-            place += yielding * off
+            j, part = _place(j, part + yielding * off)
             n += 1
             gap = 0
             end = v

@@ -154,8 +154,8 @@ def test_merged_lines_have_mean_normals() -> None:
     lines = Verticals(normal, variance, np.ones(3), np.ones(3))
     merged = merge_lines(lines, np.array([0, 0, 2]))
 
-    np.testing.assert_allclose(merged[:3].T, [normal[:2].mean(axis=0), normal[2]])
-    np.testing.assert_allclose(merged[3], [0.5e-6, 1e-6])
+    np.testing.assert_allclose(merged[:, :3], [normal[:2].mean(axis=0), normal[2]])
+    np.testing.assert_allclose(merged[:, 3], [0.5e-6, 1e-6])
 
 
 @pytest.mark.parametrize("share", [0.05, 0.3])
