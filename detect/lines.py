@@ -58,8 +58,6 @@ _BAND_PX = 60.0
 _LAG_PX = 0.1
 #: The refinement's steps that the first tilt needs.
 _FIRST_STEPS = 2
-#: Columns from one to the next at which the lean of verticals is predicted.
-_LEAN_SPACING = 16
 
 
 class _Prepared(NamedTuple):
@@ -168,14 +166,12 @@ def beyond_doubt(tilt: TiltEstimate | None, least_lines: int, strip: Strip) -> b
     """Whether a tilt of `least_lines` lines or more is good enough to follow all edges along it."""
     if tilt is None or tilt.lines < least_lines or tilt.votes < _FIRST_VOTES:
         return False
-    sine, cosine = strip.sine[::_LEAN_SPACING], strip.cosine[::_LEAN_SPACING]
-    return lean_deviation(tilt, sine, cosine) <= _FIRST_LEAN_RAD
+    return bool(lean_deviation(tilt.covariance, strip.sine, strip.cosine) <= _FIRST_LEAN_RAD)
 
 
 def _lag_px(tilt: TiltEstimate, guide: TiltEstimate, strip: Strip, settings: LineSettings) -> float:
     """How far tracks along `guide` were from edges of a tilt, where that is most, pixels."""
-    sine, cosine = strip.sine[::_LEAN_SPACING], strip.cosine[::_LEAN_SPACING]
-    pitch, roll = tilt.pitch_rad - guide.pitch_rad, tilt.roll_rad - guide.roll_rad
-    lean = float(np.nanmax(np.abs(pitch * sine - roll * cosine), initial=0.0))
+    change = np.array([tilt.pitch_rad - guide.pitch_rad, tilt.roll_rad - guide.roll_rad])
+    lean = lean_deviation(np.outer(change, change), strip.sine, strip.cosine)
     # A track follows a wrong lean at the distance where its correction per row equals it.
-    return lean * strip.row_aspect / settings.guided_pull
+    return float(lean * strip.row_aspect / settings.guided_pull)

@@ -154,7 +154,7 @@ def _leave_out(
     tracks: NDArray[np.int64], alpha: FloatArray, polarity: FloatArray, fits: LineFits,
     evidence: FloatArray, limits: _Limits, fate: NDArray[np.int8],
 ) -> None:  # fmt: skip
-    """Leave out, of tracks from the strongest on, what is of the same edge as, or beside, others."""
+    """Leave out tracks, from the strongest on, on the same edge as a stronger one or beside it."""
     pixel, contrast = fits.pixel_rad, fits.contrast
     for k in range(len(tracks)):
         t = tracks[k]

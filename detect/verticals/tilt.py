@@ -172,11 +172,17 @@ def with_error(
     return tilt._replace(covariance=error)
 
 
-def lean_deviation(tilt: TiltEstimate, sine: FloatArray, cosine: FloatArray) -> float:
+@njit(cache=True, error_model="numpy")
+def lean_deviation(covariance: FloatArray, sine: FloatArray, cosine: FloatArray) -> float:
     """Largest standard deviation of the lean of verticals at some bearings due to the tilt's."""
-    (pp, pr), (_, rr) = tilt.covariance.tolist()
-    variance = sine * sine * pp - 2.0 * sine * cosine * pr + cosine * cosine * rr
-    return math.sqrt(np.nanmax(variance, initial=0.0))
+    pp, pr, rr = covariance[0, 0], covariance[0, 1], covariance[1, 1]
+    largest = 0.0
+    for s, c in zip(sine, cosine):
+        variance = s * s * pp - 2.0 * s * c * pr + c * c * rr
+        # NaN where there is no vertical.
+        if variance > largest:
+            largest = variance
+    return math.sqrt(largest)
 
 
 @njit(cache=True, error_model="numpy")
@@ -199,19 +205,8 @@ def _agree_on_tilt(
     return pitch, roll, count, votes / total
 
 
+# Sums in any order become vectors; inlined, their order is that of the kernel that has them.
 @njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"}, forceinline=True)
-def _votes(
-    x: FloatArray, y: FloatArray, z: FloatArray, weight: FloatArray, pitch: float, roll: float
-) -> float:
-    """Votes of lines, whose normals are given in units of their tolerances, for a tilt."""
-    votes = 0.0
-    for i in range(len(weight)):
-        off = z[i] + pitch * y[i] - roll * x[i]
-        votes += weight[i] * max(1.0 - off * off, 0.0)
-    return votes
-
-
-@njit(cache=True, error_model="numpy")
 def _vote_for_tilt(
     lines: Verticals, proposers: NDArray[np.int64], limit: float, prior: float
 ) -> tuple[float, float]:
@@ -241,8 +236,10 @@ def _vote_for_tilt(
                 roll = (normal[m, 2] * normal[n, 1] - normal[m, 1] * normal[n, 2]) / determinant
                 if not (abs(pitch) <= limit and abs(roll) <= limit):
                     continue
-            votes = _votes(x, y, z, weight, pitch, roll)
-            votes -= 0.5 * (pitch * pitch + roll * roll) / (prior * prior)
+            votes = -0.5 * (pitch * pitch + roll * roll) / (prior * prior)
+            for line in range(len(weight)):
+                off = z[line] + pitch * y[line] - roll * x[line]
+                votes += weight[line] * max(1.0 - off * off, 0.0)
             if votes > best:
                 best, best_pitch, best_roll = votes, pitch, roll
     return best_pitch, best_roll
