@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import astuple, dataclass, replace
-from functools import cached_property
-from typing import TYPE_CHECKING, Literal
+from dataclasses import dataclass, replace
+from typing import Literal
 
 from detect.errors import DetectError
 from storage.bounds import ABOVE_0, LIMIT_OR_0, NOT_NEGATIVE, SHARE_ABOVE_0, demand, from_to, whole
-
-if TYPE_CHECKING:
-    from detect.verticals.tilt import ConsensusSettings
 
 BearingConvention = Literal["level", "published"]
 Joining = Literal["evidence", "equal"]
@@ -156,7 +152,7 @@ class LineSettings:
         With fewer lines that agree there is no tilt.
     stray_share : float
         Share of lines that are no verticals: the tilt's covariance is then the mean square error
-        of `detect.verticals.tilt_error`; 0 for that of least squares.
+        of `detect.verticals.tilt`; 0 for that of least squares.
     weight_limit : float
         Votes of a line in the consensus grow with its evidence up to this.
     same_edge_px : float
@@ -246,28 +242,6 @@ class LineSettings:
     def least_points(self, row_aspect: float) -> int:
         """Least number of points of a line, given the height of a row in widths of a pixel."""
         return max(self.least_rows, math.ceil(self.least_length_px / row_aspect))
-
-    @cached_property
-    def _hash(self) -> int:
-        # Numbers only: the hashes of strings differ between processes, and settings travel.
-        return hash(tuple(v for v in astuple(self) if not isinstance(v, str)))
-
-    def __hash__(self) -> int:
-        # Tables are looked up by the settings several times for each image.
-        return self._hash
-
-    @cached_property
-    def consensus(self) -> ConsensusSettings:
-        """The settings of the estimation of the tilt."""
-        from detect.verticals.tilt import ConsensusSettings  # numpy is too much for `--help`
-
-        return ConsensusSettings(
-            largest_rad=math.radians(self.largest_tilt_deg),
-            prior_rad=math.radians(self.tilt_prior_deg),
-            proposers=self.proposers,
-            least_lines=self.least_lines,
-            stray_share=self.stray_share,
-        )
 
 
 #: Reproduces the data set's own rows as far as these are known (docs/verticals.md).

@@ -13,49 +13,29 @@ The path of an image, each step a function of its own:
 The first pass is omitted if the starts alone, of which an edge has one on each of several rows,
 determine the tilt beyond doubt (`detect.verticals.judgement.tilt_of_chains`); a few edges suffice
 if these do. If all edges are blurred, everything is repeated with filters as wide as the blur
-(`detect.verticals.blur`). `detect_lines` does all of this in one compiled call (`find_lines`).
+(`detect.verticals.blur`).
 """
 
 from __future__ import annotations
 
 import math
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from detect.errors import FrameError
 from detect.line_settings import DEFAULT, LineSettings
 from detect.verticals.blur import median_sharpness, widened, width_for
 from detect.verticals.detections import LineDetections
-from detect.verticals.joining import JoiningLimits, Lines, joining_of, lines_of_tracks
-from detect.verticals.judgement import (
-    FATES,
-    Judgement,
-    JudgementLimits,
-    fit_and_judge,
-    limits_of,
-    tilt_of_chains,
-)
-from detect.verticals.refinement import LineFits, StepFilters, refinement_of
-from detect.verticals.response import (
-    LineFilter,
-    Strip,
-    line_filter,
-    strip_of,
-    strip_response,
-)
-from detect.verticals.starts import (
-    StartBand,
-    band_response,
-    find_maxima,
-    ordered_starts,
-    start_band,
-)
-from detect.verticals.tilt import TiltEstimate, largest_lean, no_tilt, with_error
-from detect.verticals.tracking import Following, LineTracks, follow_edges, following_of
+from detect.verticals.joining import lines_of_tracks
+from detect.verticals.judgement import FATES, Judgement, fit_and_judge, tilt_of_chains
+from detect.verticals.refinement import StepFilters, step_filters
+from detect.verticals.response import LineFilter, Strip, line_filter, strip_of, strip_response
+from detect.verticals.starts import StartBand, band_response, find_maxima, line_starts, start_band
+from detect.verticals.tilt import TiltEstimate, lean_deviation, with_error
+from detect.verticals.tracking import LineTracks, follow_edges
 from lut.verticals import VerticalTable
 
 __all__ = ["ACCEPTED", "JOINED", "LineDetections", "detect_lines"]
@@ -76,50 +56,31 @@ _BAND_PX = 60.0
 #: Edges that were followed along a tilt are followed again if their own tilt differs so much that
 #: tracks were farther than this from their edges, pixels.
 _LAG_PX = 0.1
-#: The refinement's steps that lines need for that.
+#: The refinement's steps that the first tilt needs.
 _FIRST_STEPS = 2
 
 
-class Search(NamedTuple):
-    """Inputs of `find_lines` besides the image.
-
-    Attributes
-    ----------
-    strip, window, band
-        The table, the filter, the rows on which tracks start.
-    filters, few_filters : StepFilters
-        Steps of the refinement, and those for the few edges that are followed first.
-    free, few, guided : Following
-        How edges are followed: all without a tilt, a few of them, and along a tilt.
-    limits, joining
-        Limits for accepting tracks and joining lines.
-    is_guided : bool
-        Whether edges are followed along a tilt at all.
-    by_few : bool
-        Whether a few are followed first.
-    by_chains : bool
-        Whether the band is high enough for chains of starts.
-    lag_rad : float
-        Edges followed along a tilt are followed again if their own tilt changes the lean by more.
-    least_sharpness : float
-        Images of less are done again with wider filters.
-    """
+class _Prepared(NamedTuple):
+    """What a table and settings decide before the first image."""
 
     strip: Strip
     window: LineFilter
     band: StartBand
-    filters: StepFilters
-    few_filters: StepFilters
-    free: Following
-    few: Following
-    guided: Following
-    limits: JudgementLimits
-    joining: JoiningLimits
-    is_guided: bool
-    by_few: bool
-    by_chains: bool
-    lag_rad: float
-    least_sharpness: float
+    no_steps: StepFilters
+    first_steps: StepFilters
+    all_steps: StepFilters
+
+
+@lru_cache(maxsize=16)
+def _prepared(table: VerticalTable, settings: LineSettings) -> _Prepared:
+    return _Prepared(
+        strip_of(table),
+        line_filter(settings),
+        start_band(table, settings),
+        step_filters(settings, 0),
+        step_filters(settings, _FIRST_STEPS),
+        step_filters(settings),
+    )
 
 
 def detect_lines(
@@ -151,107 +112,66 @@ def detect_lines(
             f"image is {image.dtype} of shape {image.shape}: expected uint8 of the table's shape "
             f"{table.column.shape}"
         )
-    search = _search(table, settings)
-    lines, tracks, fits, judged, tilt, sharpness = find_lines(np.ascontiguousarray(image), search)
-    evidence, fate = judged
-    judgement = Judgement(LineFits(*fits), evidence, fate, TiltEstimate(*tilt))
-    found = LineDetections(Lines(*lines), LineTracks(*tracks), judgement, sharpness)
-    if found.sharpness < search.least_sharpness:
-        wider = widened(settings, width_for(found.sharpness, settings))
-        return detect_lines(image, table, wider)
-    return found
+    image = np.ascontiguousarray(image)
+    tools = _prepared(table, settings)
+    tracks, judged = _tracks_of_verticals(image, tools, settings)
+    sharpness = median_sharpness(judged.fits)
+    if settings.blurred_widths and sharpness < settings.blurred_sharpness:
+        return detect_lines(image, table, widened(settings, width_for(sharpness, settings)))
+    if judged.tilt is not None:
+        tilt = with_error(judged.tilt, judged.verticals, judged.edge, settings)
+        judged = judged._replace(tilt=tilt)
+    lines = lines_of_tracks(tools.strip, tracks, judged, settings)
+    return LineDetections(lines, tracks, judged, sharpness)
 
 
-@lru_cache(maxsize=16)
-def _search(table: VerticalTable, settings: LineSettings) -> Search:
-    band, aspect = start_band(table, settings), table.row_aspect
-    band_px = 2.0 * settings.start_band_rows * aspect
-    by_few = settings.guided and settings.first_edges > 0
-    return Search(
-        strip=strip_of(table),
-        window=line_filter(settings),
-        band=band,
-        filters=refinement_of(settings),
-        few_filters=refinement_of(settings, _FIRST_STEPS),
-        free=following_of(settings, aspect, guided=False),
-        few=following_of(settings, aspect, guided=False, enough=settings.first_edges),
-        guided=following_of(settings, aspect, guided=True),
-        limits=limits_of(settings, aspect),
-        joining=joining_of(settings),
-        is_guided=settings.guided,
-        by_few=by_few,
-        by_chains=by_few and band.supported and band_px >= _BAND_PX,
-        # A track follows a wrong lean at the distance where its correction per row equals it.
-        lag_rad=_LAG_PX * settings.guided_pull / aspect,
-        least_sharpness=float(settings.blurred_sharpness) if settings.blurred_widths else 0.0,
-    )
+def _tracks_of_verticals(
+    image: NDArray[np.uint8], tools: _Prepared, settings: LineSettings
+) -> tuple[LineTracks, Judgement]:
+    """Tracks along the verticals of the image's tilt where that is found, and their fates."""
+    strip, band = tools.strip, tools.band
+    in_band = band_response(image, band, settings.regulariser)
+    maxima = find_maxima(in_band, settings.threshold)
+    starts = line_starts(maxima, band)
+    response = strip_response(image, strip, tools.window)
+
+    guide: TiltEstimate | None = None
+    passes = 1
+    if settings.guided and settings.first_edges > 0:
+        # The band is useless in images that are full of maxima everywhere.
+        if band.chained and band.height_px >= _BAND_PX and len(starts.row) <= image.shape[1]:
+            guide = tilt_of_chains(image, strip, maxima, band, settings, tools.no_steps)
+        if beyond_doubt(guide, _CHAINS, strip):
+            passes = 2
+        else:
+            tracks = follow_edges(response, strip, starts, settings, enough=settings.first_edges)
+            guide = fit_and_judge(image, strip, tracks, tools.first_steps, settings).tilt
+            if not beyond_doubt(guide, _FIRST_LINES, strip):
+                guide = None
+    if guide is None:
+        tracks = follow_edges(response, strip, starts, settings)
+        judged = fit_and_judge(image, strip, tracks, tools.all_steps, settings)
+        guide = judged.tilt if settings.guided else None
+    # Once more if the band's tilt, by which they were followed, was not quite that of the lines.
+    while guide is not None and passes > 0:
+        tracks = follow_edges(response, strip, starts, settings, (guide.pitch_rad, guide.roll_rad))
+        judged = fit_and_judge(image, strip, tracks, tools.all_steps, settings)
+        if judged.tilt is None or _lag_px(judged.tilt, guide, strip, settings) <= _LAG_PX:
+            break
+        guide, passes = judged.tilt, passes - 1
+    return tracks, judged
 
 
-@njit(cache=True, error_model="numpy")
-def beyond_doubt(tilt: TiltEstimate, least_lines: int) -> bool:
+def beyond_doubt(tilt: TiltEstimate | None, least_lines: int, strip: Strip) -> bool:
     """Whether a tilt of `least_lines` lines or more is good enough to follow all edges along it."""
-    # NaN is not.
-    sure = tilt.lines >= least_lines and tilt.votes >= _FIRST_VOTES
-    return bool(sure and tilt.lean_rad <= _FIRST_LEAN_RAD)
+    if tilt is None or tilt.lines < least_lines or tilt.votes < _FIRST_VOTES:
+        return False
+    return bool(lean_deviation(tilt.covariance, strip.sine, strip.cosine) <= _FIRST_LEAN_RAD)
 
 
-@njit(cache=True, error_model="numpy")
-def find_lines(image: NDArray[np.uint8], search: Search) -> tuple[Any, ...]:
-    """`detect_lines`, compiled.
-
-    Returns
-    -------
-    tuple
-        The numbers of `Lines`, of `LineTracks`, of `LineFits`, evidence and fate of each track, the
-        numbers of `TiltEstimate`, and the median sharpness. These are plain tuples: to make named
-        ones, compiled code calls Python, where an interrupt would be lost.
-    """
-    strip, band, pixels = search.strip, search.band, image.reshape(-1)
-    along_band = band_response(pixels, band, search.window.regulariser)
-    maxima = find_maxima(along_band, band.row, search.free.threshold, band.supported)
-    tilt = no_tilt()
-    # The band is useless in images that are full of maxima everywhere.
-    if search.by_chains and len(maxima.level) <= image.shape[1]:
-        tilt = tilt_of_chains(along_band, band.row, maxima, strip, search.limits)
-    starts = ordered_starts(along_band, band.row, maxima)
-
-    response = strip_response(pixels, strip, search.window)
-    # All by the tilt of the band, if that leaves no doubt about it, and once more if they show
-    # another one. Else a few edges, if they leave none; else all; then all by their tilt.
-    by_tilt = beyond_doubt(tilt, _CHAINS)
-    few = search.by_few and not by_tilt
-    times = 0
-    most = 2 if by_tilt else 1
-    while True:
-        expected = (0.0, 0.0)
-        following = search.few if few else search.free
-        if by_tilt:
-            expected = (tilt.pitch_rad, tilt.roll_rad)
-            following = search.guided
-            times += 1
-        tracks = follow_edges(response, strip, starts, following, expected)
-        few = not tracks.complete
-        filters = search.few_filters if few else search.filters
-        judged, verticals, edge = fit_and_judge(image, strip, tracks, filters, search.limits)
-        tilt = judged.tilt
-        sharpness = median_sharpness(judged.fits)
-        if sharpness < search.least_sharpness:
-            # All of it will be done again with wider filters.
-            break
-        if few and not beyond_doubt(tilt, _FIRST_LINES):
-            few = False
-            continue
-        few = False
-        if not search.is_guided or np.isnan(tilt.pitch_rad) or times == most:
-            break
-        changed = largest_lean(
-            strip.bearing, tilt.pitch_rad - expected[0], tilt.roll_rad - expected[1]
-        )
-        if by_tilt and changed <= search.lag_rad:
-            break
-        by_tilt = True
-    tilt = with_error(tilt, verticals, edge, search.limits.consensus)
-    judged = Judgement(judged.fits, judged.evidence, judged.fate, tilt)
-    lines = lines_of_tracks(strip, tracks, judged, search.joining)
-    fates = (judged.evidence, judged.fate)
-    return lines[:], tracks[:], judged.fits[:], fates, tilt[:], sharpness
+def _lag_px(tilt: TiltEstimate, guide: TiltEstimate, strip: Strip, settings: LineSettings) -> float:
+    """How far tracks along `guide` were from edges of a tilt, where that is most, pixels."""
+    change = np.array([tilt.pitch_rad - guide.pitch_rad, tilt.roll_rad - guide.roll_rad])
+    lean = lean_deviation(np.outer(change, change), strip.sine, strip.cosine)
+    # A track follows a wrong lean at the distance where its correction per row equals it.
+    return float(lean * strip.row_aspect / settings.guided_pull)

@@ -12,11 +12,9 @@ import math
 from functools import lru_cache
 
 import numpy as np
-from numba import njit
 
 from detect.line_settings import LineSettings
 from detect.verticals.refinement import LineFits
-from detect.verticals.tilt_error import descending
 
 #: A filter of this share of the blur's width is wide enough.
 _WIDE_ENOUGH = 0.68
@@ -34,22 +32,11 @@ _ACROSS = (
 
 
 def blur_of_sharpness(sharpness: float, fine_px: float, coarse_px: float) -> float:
-    """Standard deviation of the Gaussian blur of a step edge that has some sharpness.
+    """Standard deviation of the Gaussian blur of a step edge that has some sharpness, pixels.
 
     The derivative of a Gaussian of width s sees a step that is blurred by b with the contrast
-    s / sqrt(s^2 + b^2); sharpness is the ratio of that for two widths.
-
-    Parameters
-    ----------
-    sharpness : float
-        From fine_px / coarse_px, for endless blur, to 1.
-    fine_px, coarse_px : float
-        The widths, pixels.
-
-    Returns
-    -------
-    float
-        Pixels; infinite for less sharpness than endless blur leaves.
+    s / sqrt(s^2 + b^2); sharpness is the ratio of that for two widths. Infinite for less sharpness
+    than endless blur leaves, fine_px / coarse_px.
     """
     ratio = (sharpness * coarse_px / fine_px) ** 2
     if ratio <= 1.0:
@@ -58,20 +45,7 @@ def blur_of_sharpness(sharpness: float, fine_px: float, coarse_px: float) -> flo
 
 
 def width_for(sharpness: float, settings: LineSettings) -> float:
-    """Factor by which the filter must be widened for an image's edges.
-
-    Parameters
-    ----------
-    sharpness : float
-        Median sharpness of the edges (`median_sharpness`).
-    settings : LineSettings
-        By which they were found.
-
-    Returns
-    -------
-    float
-        The least of the settings' `blurred_widths` that suits the blur, or the largest.
-    """
+    """The least of `blurred_widths` that suits edges of a sharpness, or the largest."""
     blur_px = blur_of_sharpness(sharpness, settings.fine_scale_px, settings.coarse_scale_px)
     enough = [
         width
@@ -93,7 +67,6 @@ def widened(settings: LineSettings, width: float) -> LineSettings:
     return dataclasses.replace(settings, refine_steps_px=steps, blurred_widths=wider, **across)
 
 
-@njit(cache=True, error_model="numpy")
 def median_sharpness(fits: LineFits) -> float:
     """Median sharpness of the edges that were refined, lines or not; 1 where there are too few.
 
@@ -102,4 +75,4 @@ def median_sharpness(fits: LineFits) -> float:
     sharpness = fits.sharpness[~np.isnan(fits.contrast)]
     if len(sharpness) < _LEAST_EDGES:
         return 1.0
-    return float(sharpness[descending(sharpness)[len(sharpness) // 2]])
+    return float(np.sort(sharpness)[(len(sharpness) - 1) // 2])

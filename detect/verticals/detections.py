@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from detect.verticals.joining import Lines
 from detect.verticals.judgement import FATES, Judgement
 from detect.verticals.refinement import LineFits
-from detect.verticals.tilt import TiltEstimate, known
+from detect.verticals.tilt import TiltEstimate
 from detect.verticals.tracking import LineTracks
 from landmarks import LineLandmark, wrap_angle
 
@@ -87,7 +87,7 @@ class LineDetections:
     @property
     def tilt(self) -> TiltEstimate | None:
         """None where too few lines agree."""
-        return known(self.judged.tilt)
+        return self.judged.tilt
 
     @property
     def evidence(self) -> FloatArray:

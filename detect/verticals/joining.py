@@ -15,7 +15,6 @@ instead of removing it.
 from __future__ import annotations
 
 import math
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -31,30 +30,9 @@ from detect.verticals.judgement import (
     Judgement,
 )
 from detect.verticals.refinement import LineFits
-from detect.verticals.response import Strip
+from detect.verticals.response import FloatArray, Strip
 from detect.verticals.tilt import level_matrix
-from detect.verticals.tilt_error import descending
 from detect.verticals.tracking import LineTracks
-
-FloatArray = NDArray[np.float64]
-
-
-class JoiningLimits(NamedTuple):
-    """Limits for joining lines; see `detect.line_settings.LineSettings`.
-
-    `equal` is whether joined lines count the same, `turn` 1 to undo the tilt and -1 to apply it
-    once more, `building_rad` see `turned_bearings`.
-    """
-
-    same_edge_px: float
-    join_px: float
-    join_share: float
-    shoulder_px: float
-    shoulder_share: float
-    sigma_px: float
-    equal: bool
-    turn: float
-    building_rad: float
 
 
 class Lines(NamedTuple):
@@ -83,123 +61,117 @@ class Lines(NamedTuple):
     bounds: NDArray[np.int64]
 
 
-@lru_cache(maxsize=16)
-def joining_of(settings: LineSettings) -> JoiningLimits:
-    """Limits for joining lines."""
-    level = settings.alpha == "level"
-    return JoiningLimits(
-        same_edge_px=float(settings.same_edge_px),
-        join_px=float(settings.join_px),
-        join_share=float(settings.join_share),
-        shoulder_px=float(settings.shoulder_px),
-        shoulder_share=float(settings.shoulder_share),
-        sigma_px=float(settings.sigma_px),
-        equal=settings.joined == "equal",
-        turn=1.0 if level else -1.0,
-        building_rad=math.radians(settings.building_deg) if level else math.inf,
-    )
-
-
-@njit(cache=True, error_model="numpy")
 def lines_of_tracks(
-    strip: Strip, tracks: LineTracks, judged: Judgement, limits: JoiningLimits
+    strip: Strip, tracks: LineTracks, judged: Judgement, settings: LineSettings
 ) -> Lines:
-    """Lines of accepted tracks.
-
-    The fate of tracks that are left out or joined is changed.
-    """
+    """Lines of accepted tracks; the fate of tracks that are left out or joined is changed."""
     fits, evidence, tilt = judged.fits, judged.evidence, judged.tilt
-    count = len(evidence)
-    tilted = not np.isnan(tilt.pitch_rad)
-    pitch = tilt.pitch_rad if tilted else 0.0
-    roll = tilt.roll_rad if tilted else 0.0
-    rotation = level_matrix(limits.turn * pitch, limits.turn * roll)
-    building = limits.building_rad if tilted else np.inf
-    alpha, noise = turned_bearings(fits, rotation, pitch, roll, building)
-    members, bounds = group_tracks(alpha, tracks.polarity, judged, limits)
-    weight = np.ones(count) if limits.equal else evidence
-    joined, sigma = join_tracks(
-        alpha, noise, fits.pixel_rad, weight, members, bounds, limits.sigma_px
+    accepted = np.flatnonzero(judged.fate == ACCEPTED)
+    strongest_first = accepted[np.argsort(-evidence[accepted], kind="stable")]
+    pitch, roll = (tilt.pitch_rad, tilt.roll_rad) if tilt is not None else (0.0, 0.0)
+    level = settings.alpha == "level"
+    turn = 1.0 if level else -1.0
+    building = math.radians(settings.building_deg) if level and tilt is not None else math.inf
+    alpha, noise = np.empty((2, len(evidence)))
+    _bearings(
+        fits, strongest_first, level_matrix(turn * pitch, turn * roll), (pitch, roll), building,
+        alpha, noise,
+    )  # fmt: skip
+    limits = _Limits(
+        float(settings.same_edge_px),
+        float(settings.join_px),
+        float(settings.join_share),
+        float(settings.shoulder_px),
+        float(settings.shoulder_share),
     )
-    own_ends, own_beta = ends_of_lines(strip, tracks, fits, members)
-    ends = np.empty((len(joined), 4))
-    beta = np.empty(len(joined))
-    for n in range(len(joined)):
-        # The first member of a line is its strongest.
-        first = bounds[n]
-        last = bounds[n + 1] if limits.equal else first + 1
-        for k in range(4):
-            ends[n, k] = own_ends[first:last, k].mean()
-        beta[n] = own_beta[first:last].mean()
-    return Lines(ends, joined, beta, sigma, noise[members[bounds[:-1]]], members, bounds)
-
-
-@njit(cache=True, error_model="numpy")
-def group_tracks(
-    alpha: FloatArray, polarity: FloatArray, judged: Judgement, limits: JoiningLimits
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Gather accepted tracks to lines: one for each edge, close ones together.
-
-    Parameters
-    ----------
-    alpha, polarity : (T,) float64
-        Bearings (rad); 1 where the image is brighter on the right.
-    judged : Judgement
-        The fate of tracks that are left out or joined is changed.
-    limits
-        See there.
-
-    Returns
-    -------
-    members, bounds
-        See `Lines`.
-    """
-    pixel, contrast = judged.fits.pixel_rad, judged.fits.contrast
-    evidence, fate = judged.evidence, judged.fate
-    accepted = np.flatnonzero(fate == ACCEPTED)
-    kept = np.empty(len(accepted), np.int64)
-    near_px = np.empty(len(accepted))
-    places = np.empty(len(accepted))
-    n = 0
-    for k in descending(evidence[accepted]):
-        t = accepted[k]
-        reason = ACCEPTED
-        for s in kept[:n]:
-            near = abs(wrapped(alpha[s] - alpha[t])) / pixel[t]
-            if polarity[s] == polarity[t] and near < limits.same_edge_px:
-                reason = SAME_EDGE
-                break
-            if (near < limits.join_px and evidence[t] < limits.join_share * evidence[s]) or (
-                near < limits.shoulder_px and contrast[t] < limits.shoulder_share * contrast[s]
-            ):
-                reason = BESIDE_A_STRONGER_EDGE
-        fate[t] = reason
-        if reason == ACCEPTED:
-            kept[n] = t
-            places[n] = alpha[t]
-            near_px[n] = limits.join_px * pixel[t]
-            n += 1
-    group = chain_neighbours(places[:n], near_px[:n])
+    _leave_out(strongest_first, alpha, tracks.polarity, judged.fits, evidence, limits, judged.fate)
+    kept = strongest_first[judged.fate[strongest_first] == ACCEPTED]
+    pixel = fits.pixel_rad[kept]
+    group = chain_neighbours(alpha[kept], settings.join_px * pixel)
     # Leftmost first; stable: the strongest of each line stays its first.
-    by_group = descending(-group.astype(np.float64))
-    members = np.empty(n, np.int64)
-    for k in range(n):
-        members[k] = kept[by_group[k]]
-    bounds = np.zeros(n + 1, np.int64)
-    count = 0
-    for k in range(n):
-        if k > 0 and group[by_group[k]] == group[by_group[k - 1]]:
-            fate[members[k]] = JOINED
-        else:
-            count += 1
-        bounds[count] = k + 1
-    return members, bounds[: count + 1]
+    order = np.argsort(group, kind="stable")
+    members, pixel = kept[order], pixel[order]
+    count = np.bincount(group)
+    bounds = np.zeros(len(count) + 1, np.int64)
+    np.cumsum(count, out=bounds[1:])
+    first = bounds[:-1]
+    judged.fate[members] = JOINED
+    judged.fate[members[first]] = ACCEPTED
+    equal = settings.joined == "equal"
+    weight = np.ones(len(members)) if equal else evidence[members]
+    deviation = np.hypot(noise[members], settings.sigma_px * pixel)
+    joined, sigma = join_mixtures(alpha[members], deviation, weight, first)
+    ends, beta = _ends_of_lines(strip, tracks, fits, members)
+    if equal:
+        ends = np.add.reduceat(ends, first) / count[:, None]
+        beta = np.add.reduceat(beta, first) / count
+    else:
+        ends, beta = ends[first], beta[first]
+    return Lines(ends, joined, beta, sigma, noise[members[first]], members, bounds)
+
+
+class _Limits(NamedTuple):
+    """Limits for leaving out tracks; see `detect.line_settings.LineSettings`."""
+
+    same_edge_px: float
+    join_px: float
+    join_share: float
+    shoulder_px: float
+    shoulder_share: float
 
 
 @njit(cache=True, error_model="numpy")
-def chain_neighbours(
-    alpha: NDArray[np.float64], distance: NDArray[np.float64]
-) -> NDArray[np.int64]:
+def _wrapped(angle: float) -> float:
+    return (angle + math.pi) % (2.0 * math.pi) - math.pi
+
+
+@njit(cache=True, error_model="numpy")
+def _bearings(
+    fits: LineFits, tracks: NDArray[np.int64], rotation: FloatArray, tilt: tuple[float, float],
+    building: float, alpha: FloatArray, noise: FloatArray,
+) -> None:  # fmt: skip
+    """Levelled bearings of tracks, and their standard deviations due to noise.
+
+    The measured lean b is replaced by its best estimate, given that it should be that of a vertical
+    under the tilt up to the standard deviation `building`, and a, which is correlated with it,
+    follows.
+    """
+    for t in tracks:
+        sine, cosine = math.sin(fits.reference_rad[t]), math.cos(fits.reference_rad[t])
+        a, b, covariance = fits.line[t, 0], fits.line[t, 1], fits.covariance[t]
+        gain = covariance[0, 1] / (covariance[1, 1] + building * building)
+        a -= gain * (b - (tilt[0] * sine - tilt[1] * cosine))
+        # Of the plane's two level directions (n_y, -n_x) is the one ahead of the camera.
+        n_x, n_y = cosine - a * sine, sine + a * cosine
+        x = rotation[0, 0] * n_x + rotation[0, 1] * n_y - rotation[0, 2] * b
+        y = rotation[1, 0] * n_x + rotation[1, 1] * n_y - rotation[1, 2] * b
+        alpha[t] = math.atan2(y, x)
+        noise[t] = math.sqrt(covariance[0, 0] - gain * covariance[0, 1])
+
+
+@njit(cache=True, error_model="numpy")
+def _leave_out(
+    tracks: NDArray[np.int64], alpha: FloatArray, polarity: FloatArray, fits: LineFits,
+    evidence: FloatArray, limits: _Limits, fate: NDArray[np.int8],
+) -> None:  # fmt: skip
+    """Leave out tracks, from the strongest on, on the same edge as a stronger one or beside it."""
+    pixel, contrast = fits.pixel_rad, fits.contrast
+    for k in range(len(tracks)):
+        t = tracks[k]
+        for s in tracks[:k]:
+            if fate[s] != ACCEPTED:
+                continue
+            near_px = abs(_wrapped(alpha[t] - alpha[s])) / pixel[t]
+            if polarity[t] == polarity[s] and near_px < limits.same_edge_px:
+                fate[t] = SAME_EDGE
+                break
+            faint = evidence[t] < limits.join_share * evidence[s]
+            fainter = contrast[t] < limits.shoulder_share * contrast[s]
+            if (near_px < limits.join_px and faint) or (near_px < limits.shoulder_px and fainter):
+                fate[t] = BESIDE_A_STRONGER_EDGE
+
+
+def chain_neighbours(alpha: FloatArray, distance: FloatArray) -> NDArray[np.int64]:
     """Number the groups of bearings whose neighbours are close.
 
     Parameters
@@ -214,161 +186,63 @@ def chain_neighbours(
     (N,) int64
         The group of each, counted from 0 at the largest bearing (leftmost in the image).
     """
-    order = descending(alpha)
     group = np.zeros(len(alpha), np.int64)
-    number = 0
-    for k in range(1, len(alpha)):
-        left = order[k - 1]
-        right = order[k]
-        if alpha[left] - alpha[right] >= min(distance[left], distance[right]):
-            number += 1
-        group[right] = number
+    _number_groups(alpha, distance, np.argsort(-alpha, kind="stable"), group)
     return group
 
 
 @njit(cache=True, error_model="numpy")
-def join_tracks(
-    alpha: NDArray[np.float64],
-    noise: NDArray[np.float64],
-    pixel: NDArray[np.float64],
-    evidence: NDArray[np.float64],
-    members: NDArray[np.int64],
-    bounds: NDArray[np.int64],
-    sigma_px: float,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Bearings of lines, and their standard deviations: mixtures of those of their tracks.
-
-    Parameters
-    ----------
-    alpha, noise : (T,) float64
-        Bearings of tracks and their noise (rad).
-    pixel : (T,) float64
-        Width of a pixel (rad).
-    evidence : (T,) float64
-        Weights of the mixture.
-    members, bounds
-        See `group_tracks`.
-    sigma_px : float
-        Standard deviation of an edge about the line of the building that it shows, pixels.
-
-    Returns
-    -------
-    alpha, sigma : (N,) float64
-        Means and standard deviations of the mixtures (rad).
-    """
-    count = len(bounds) - 1
-    joined = np.empty(count)
-    sigma = np.empty(count)
-    places = np.empty(len(members))
-    deviations = np.empty(len(members))
-    weights = np.empty(len(members))
-    for n in range(count):
-        begin, end = bounds[n], bounds[n + 1]
-        for k in range(begin, end):
-            t = members[k]
-            places[k] = alpha[t]
-            weights[k] = evidence[t]
-            systematic = sigma_px * pixel[t]
-            deviations[k] = math.sqrt(noise[t] * noise[t] + systematic * systematic)
-        joined[n], sigma[n] = join_mixture(
-            places[begin:end], deviations[begin:end], weights[begin:end]
-        )
-    return joined, sigma
+def _number_groups(
+    alpha: FloatArray, distance: FloatArray, order: NDArray[np.int64], group: NDArray[np.int64]
+) -> None:
+    number = 0
+    for k in range(1, len(order)):
+        left, right = order[k - 1], order[k]
+        number += alpha[left] - alpha[right] >= min(distance[left], distance[right])
+        group[right] = number
 
 
 @njit(cache=True, error_model="numpy")
-def join_mixture(
-    alpha: NDArray[np.float64], sigma: NDArray[np.float64], weight: NDArray[np.float64]
-) -> tuple[float, float]:
-    """Mean and standard deviation of a mixture of Gaussians of bearings.
-
-    Parameters
-    ----------
-    alpha, sigma : (N,) float64
-        Means and standard deviations of the components (rad); all means within half a turn.
-    weight : (N,) float64
-        Their weights, not negative, of any sum.
-
-    Returns
-    -------
-    alpha, sigma : float
-        Of the mixture (rad).
-    """
-    total = 0.0
-    mean = 0.0
-    for k in range(len(alpha)):
-        total += weight[k]
-        mean += weight[k] * wrapped(alpha[k] - alpha[0])
-    mean /= total
-    variance = 0.0
-    for k in range(len(alpha)):
-        off = wrapped(alpha[k] - alpha[0]) - mean
-        variance += weight[k] * (sigma[k] * sigma[k] + off * off)
-    return wrapped(alpha[0] + mean), math.sqrt(variance / total)
-
-
-@njit(cache=True, error_model="numpy")
-def wrapped(angle: float) -> float:
-    """The angle in [-pi, pi) (rad)."""
-    return (angle + math.pi) % (2.0 * math.pi) - math.pi
-
-
-@njit(cache=True, error_model="numpy")
-def turned_bearings(
-    fits: LineFits, rotation: FloatArray, pitch: float, roll: float, building: float
+def join_mixtures(
+    alpha: FloatArray, sigma: FloatArray, weight: FloatArray, first: NDArray[np.int64]
 ) -> tuple[FloatArray, FloatArray]:
-    """Bearings of lines after a rotation, and their noise.
+    """Means and standard deviations of mixtures of Gaussians of bearings.
 
     Parameters
     ----------
-    fits : LineFits
-        The lines.
-    rotation : (3, 3) float64
-        The rotation of the normals of their planes.
-    pitch, roll : float
-        The tilt under which the lines are seen (rad).
-    building : float
-        Standard deviation of real verticals about the vertical (rad): the measured lean b is
-        replaced by its best estimate, given that it should be that of a vertical up to this, and a,
-        which is correlated with it, follows. Infinite: lines are not changed.
+    alpha, sigma : (M,) float64
+        Means and standard deviations of the components (rad), one mixture after the other; all
+        means of one are within half a turn.
+    weight : (M,) float64
+        Their weights, not negative, of any sum.
+    first : (N,) int64
+        The first component of each mixture.
 
     Returns
     -------
-    alpha, noise : (T,) float64
-        Bearings and their standard deviations (rad).
+    alpha, sigma : (N,) float64
+        Of the mixtures (rad).
     """
-    reference, line, covariance = fits.reference_rad, fits.line, fits.covariance
-    alpha = np.empty(len(reference))
-    noise = np.empty(len(reference))
-    for t in range(len(reference)):
-        sine = math.sin(reference[t])
-        cosine = math.cos(reference[t])
-        a = line[t, 0]
-        b = line[t, 1]
-        gain = covariance[t, 0, 1] / (covariance[t, 1, 1] + building * building)
-        a -= gain * (b - (pitch * sine - roll * cosine))
-        noise[t] = math.sqrt(covariance[t, 0, 0] - gain * covariance[t, 0, 1])
-        left = cosine - a * sine
-        back = sine + a * cosine
-        x = rotation[0, 0] * left + rotation[0, 1] * back - rotation[0, 2] * b
-        y = rotation[1, 0] * left + rotation[1, 1] * back - rotation[1, 2] * b
-        # Of the plane's two level directions (n_y, -n_x) is the one ahead of the camera.
-        alpha[t] = math.atan2(y, x)
-    return alpha, noise
+    mean, deviation = np.empty(len(first)), np.empty(len(first))
+    for n in range(len(first)):
+        begin, end = first[n], first[n + 1] if n + 1 < len(first) else len(alpha)
+        total = off = square = 0.0
+        for k in range(begin, end):
+            total += weight[k]
+            off += weight[k] * _wrapped(alpha[k] - alpha[begin])
+        off /= total
+        for k in range(begin, end):
+            own = _wrapped(alpha[k] - alpha[begin]) - off
+            square += weight[k] * (sigma[k] * sigma[k] + own * own)
+        mean[n], deviation[n] = _wrapped(alpha[begin] + off), math.sqrt(square / total)
+    return mean, deviation
 
 
 @njit(cache=True, error_model="numpy")
-def ends_of_lines(
+def _ends_of_lines(
     strip: Strip, tracks: LineTracks, fits: LineFits, chosen: NDArray[np.int64]
 ) -> tuple[FloatArray, FloatArray]:
     """Where lines cross the first and the last row of their tracks, and how they are inclined.
-
-    Parameters
-    ----------
-    strip, tracks, fits
-        The table, the tracks, their lines.
-    chosen : (N,) int64
-        Which tracks.
 
     Returns
     -------

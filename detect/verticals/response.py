@@ -13,14 +13,12 @@ detection). Affine changes of brightness change it only through the regulariser.
 
 Moments are taken across the vertical in each row of the image, and averaged along the vertical as
 far as that is seen (normalised convolution: H. Knutsson and C.-F. Westin, CVPR 1993). Tracks need
-few of the strip's columns: each is evaluated where a track comes by (`StripResponse`), and all of
-them for drawings only (`line_response`).
+few pixels of the strip: these are evaluated where a track comes by (`extend`).
 """
 
 from __future__ import annotations
 
 import math
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -31,6 +29,7 @@ from detect.line_settings import LineSettings
 from lut.verticals import VerticalTable
 
 FloatArray = NDArray[np.float64]
+SingleArray = NDArray[np.float32]
 
 #: Grey values about 0 keep small variances exact in single precision.
 MIDDLE_GREY = np.float32(128.0)
@@ -70,29 +69,30 @@ class LineFilter(NamedTuple):
 
 
 class Strip(NamedTuple):
-    """A table of verticals as compiled code reads it: vertical by vertical.
+    """A table of verticals as compiled code reads it, vertical by vertical.
 
     Attributes
     ----------
-    column : (W, H) float32
-        Column at which each vertical crosses each row; NaN where it is not seen.
+    column, rise : (W, H) float32
+        Column at which each vertical crosses each row, and the tangent of the elevation there; NaN
+        where it is not seen.
     first_row, last_row : (W,) int32
         First and last row in which each is seen.
-    rise : (W, H) float32
-        Tangent of the elevation there.
-    lean_by_pitch, lean_by_roll : (W,) float64
-        By how many columns of the strip a vertical moves for a rise of 1 in a camera of unit pitch,
-        and of unit roll; NaN where there is no vertical, or none beside it.
+    sine, cosine : (W,) float64
+        Of their bearings.
+    columns_per_rad : (W,) float64
+        Columns per bearing there; NaN at the ends.
     bearing, anchor_row, robot_from_camera, row_aspect
         See `lut.verticals.VerticalTable`.
     """
 
-    column: NDArray[np.float32]
+    column: SingleArray
+    rise: SingleArray
     first_row: NDArray[np.int32]
     last_row: NDArray[np.int32]
-    rise: NDArray[np.float32]
-    lean_by_pitch: FloatArray
-    lean_by_roll: FloatArray
+    sine: FloatArray
+    cosine: FloatArray
+    columns_per_rad: FloatArray
     bearing: FloatArray
     anchor_row: FloatArray
     robot_from_camera: FloatArray
@@ -133,13 +133,6 @@ class StripResponse(NamedTuple):
     taken: NDArray[np.int32]
 
 
-def gaussian_window(sigma: float) -> FloatArray:
-    """Weights of sum 1 at whole pixels within three standard deviations of the middle."""
-    reach = math.ceil(3.0 * sigma)
-    weight = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
-    return np.asarray(weight / weight.sum())
-
-
 def weights_across(sigma_px: float, spacing_px: float = 1.0) -> FloatArray:
     """(2, 2r + 1) weights of samples that are a distance apart, and the same times the lever."""
     reach = math.ceil(3.0 * sigma_px)
@@ -149,14 +142,13 @@ def weights_across(sigma_px: float, spacing_px: float = 1.0) -> FloatArray:
     return np.stack([weight, weight * distance / np.sqrt(weight @ distance**2)])
 
 
-@lru_cache(maxsize=16)
 def line_filter(settings: LineSettings) -> LineFilter:
     """The filter of some settings."""
     weights = weights_across(settings.sigma_across_px)
     # Moments between two pixels are those of both, interpolated; so are the weights.
     left = np.pad(weights, [(0, 0), (0, 1)])
     step = np.pad(weights, [(0, 0), (1, 0)]) - left
-    along = gaussian_window(settings.sigma_along_rows)
+    along = weights_across(settings.sigma_along_rows)[0]
     s = len(along) // 2
     along = np.pad(along, (0, -len(along) % _VECTOR))
     across = np.stack([left[0], step[0], left[1], step[1]])
@@ -170,29 +162,44 @@ def line_filter(settings: LineSettings) -> LineFilter:
     )
 
 
-@lru_cache(maxsize=4)
 def strip_of(table: VerticalTable) -> Strip:
-    """The strip of a table; made once for each."""
-    bearing = table.bearing_rad
-    per_rad = np.full(len(bearing), np.nan)
-    per_rad[1:-1] = 2.0 / (bearing[2:] - bearing[:-2])
+    """The strip of a table."""
+    per_rad = np.full(len(table.bearing_rad), np.nan)
+    per_rad[1:-1] = 2.0 / (table.bearing_rad[2:] - table.bearing_rad[:-2])
     return Strip(
         column=np.ascontiguousarray(table.column.T),
+        rise=np.ascontiguousarray(table.elevation_tan.T),
         first_row=table.first_row,
         last_row=table.last_row,
-        rise=np.ascontiguousarray(table.elevation_tan.T),
-        lean_by_pitch=np.sin(bearing) * per_rad,
-        lean_by_roll=-np.cos(bearing) * per_rad,
-        bearing=bearing,
+        sine=np.sin(table.bearing_rad),
+        cosine=np.cos(table.bearing_rad),
+        columns_per_rad=per_rad,
+        bearing=table.bearing_rad,
         anchor_row=table.anchor_row,
         robot_from_camera=table.robot_from_camera,
         row_aspect=table.row_aspect,
     )
 
 
+def strip_response(image: NDArray[np.uint8], strip: Strip, window: LineFilter) -> StripResponse:
+    """The response of an image, of which nothing is evaluated yet."""
+    width, height = strip.column.shape
+    return StripResponse(
+        image.reshape(-1),
+        strip.column,
+        strip.first_row,
+        strip.last_row,
+        window,
+        value=np.empty((width, height), np.float32),
+        known=np.zeros((width, 2), np.int32),
+        moments=np.empty((_PLACES, 3, height), np.float32),
+        taken=np.full((_PLACES, 3), -1, np.int32),
+    )
+
+
 def line_response(
     image: NDArray[np.uint8], table: VerticalTable, settings: LineSettings
-) -> NDArray[np.float32]:
+) -> SingleArray:
     """The response at every pixel of the strip.
 
     Parameters
@@ -209,36 +216,15 @@ def line_response(
     (H, W) float32
         In [-1, 1], positive where the image is brighter on the right; 0 where it is not defined.
     """
-    pixels = np.ascontiguousarray(image).reshape(-1)
-    return whole_response(pixels, strip_of(table), line_filter(settings)).T
+    response = strip_response(np.ascontiguousarray(image), strip_of(table), line_filter(settings))
+    _extend_all(response)
+    return response.value.T
 
 
 @njit(cache=True, error_model="numpy")
-def whole_response(
-    pixels: NDArray[np.uint8], strip: Strip, window: LineFilter
-) -> NDArray[np.float32]:
-    """(W, H) response of all verticals."""
-    response = strip_response(pixels, strip, window)
+def _extend_all(response: StripResponse) -> None:
     width, height = response.value.shape
     extend(response, (0, width), (0, height))
-    return response.value
-
-
-@njit(cache=True, error_model="numpy")
-def strip_response(pixels: NDArray[np.uint8], strip: Strip, window: LineFilter) -> StripResponse:
-    """The response of an image, of which nothing is evaluated yet."""
-    width, height = strip.column.shape
-    return StripResponse(
-        pixels,
-        strip.column,
-        strip.first_row,
-        strip.last_row,
-        window,
-        np.empty((width, height), np.float32),
-        np.zeros((width, 2), np.int32),
-        np.empty((_PLACES, 3, height), np.float32),
-        np.full((_PLACES, 3), -1, np.int32),
-    )
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)

@@ -1,4 +1,4 @@
-"""Tilt consensus: the camera's tilt from the verticals that it sees.
+"""Tilt consensus: the camera's tilt from the verticals that it sees, and its mean square error.
 
 A calibration gives the mounting of the camera on the robot, not the robot's tilt: the robot pitches
 and rolls on its springs, and the mounting itself drifts. Real verticals show the tilt. The plane
@@ -9,8 +9,23 @@ the tilt, is level:
 
 R takes directions measured with the calibrated mounting to level ones. (DLR Spatial Cognition data
 set report, line detection; the data set's own rows apply the inverse of this rotation.) The tilt is
-the one on which most lines agree, refined by least squares with Cauchy's weights; its error is
-estimated in `detect.verticals.tilt_error`.
+the one on which most lines agree, refined by least squares with Cauchy's weights.
+
+Least squares assume that errors of lines are independent. Lines of a real building have common
+errors: both edges of a board that leans, the folds of a curtain, a row of trees. And some frames
+show carpentry, others clutter. The mean square error of a tilt t is therefore taken over a
+posterior
+
+    p(t, s) ~ p(t) p(s) prod_k [(1 - q) T3(z_k(t); v_k + s^2) + q Cauchy(z_k(t); c)]
+
+of the tilt and of the scatter s of verticals about the vertical, where z_k(t) is the inclination
+of line k levelled by t, v_k the variance of its measurement, T3 Student's density of three degrees
+of freedom, and q the share of lines that are no verticals. For s each edge counts by itself; given
+s, all lines within `TOGETHER_RAD` of bearing count as a single one, since they lean together. The
+sums are over a polar grid round the tilt, stretched according to the information.
+
+Student's density for errors whose scale is not known: K. L. Lange, R. J. A. Little and J. M. G.
+Taylor, Robust Statistical Modeling Using the t Distribution, JASA 84 (1989).
 """
 
 from __future__ import annotations
@@ -22,7 +37,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from detect.verticals.tilt_error import descending, error_of_tilt
+from detect.line_settings import DEFAULT, LineSettings
 
 FloatArray = NDArray[np.float64]
 
@@ -30,8 +45,32 @@ FloatArray = NDArray[np.float64]
 REFINEMENTS = 6
 #: Standard deviations from which on a line's pull no longer grows.
 SOFTENING = 2.0
-#: Columns from one to the next at which the lean is predicted.
-_LEAN_SPACING = 16
+
+#: Scatter of verticals about the vertical (rad), and how often it is about that.
+SCATTER_RAD = (math.radians(0.05), math.radians(0.2), math.radians(0.6))
+SCATTER_SHARE = (0.2, 0.4, 0.4)
+#: Lines whose bearings differ less than this lean together (rad).
+TOGETHER_RAD = 0.15
+#: Half width at half height of the inclinations of lines that are no verticals (rad).
+STRAY_RAD = math.radians(1.0)
+
+
+def _polar_grid(directions: int, radii: int, nearest: float, farthest: float) -> FloatArray:
+    """(3, N) places x, y of a grid round 0 and the areas of its cells."""
+    growth = (farthest / nearest) ** (1.0 / (radii - 1))
+    radius = nearest * growth ** np.arange(radii)
+    # Cells are bounded half way between radii.
+    bound = nearest * growth ** (np.arange(radii + 1) - 0.5)
+    area = np.pi * np.diff(bound**2) / directions
+    angle = 2.0 * np.pi * np.arange(directions) / directions
+    x, y = np.outer(radius, np.cos(angle)), np.outer(radius, np.sin(angle))
+    cells = np.stack([x.ravel(), y.ravel(), np.repeat(area, directions)])
+    return np.column_stack([[0.0, 0.0, np.pi * bound[0] ** 2], cells])
+
+
+_GRID = _polar_grid(12, 10, math.radians(0.02), math.radians(6.0))
+#: The grid is stretched by no more than this.
+_SLENDEREST = 0.1
 
 
 class TiltEstimate(NamedTuple):
@@ -41,16 +80,13 @@ class TiltEstimate(NamedTuple):
     ----------
     pitch_rad, roll_rad : float
         Rotation vector (pitch, roll, 0) about the robot's X and Y that turns measured directions
-        level. Compiled code has NaN for none.
+        level.
     covariance : (2, 2) float64
         Of (pitch, roll) (rad^2).
     lines : int
         How many verticals agree with it.
     votes : float
         Their share of all votes.
-    lean_rad : float
-        Standard deviation, due to that of the tilt, of the lean that verticals should show, where
-        in the image it is largest.
     """
 
     pitch_rad: float
@@ -58,32 +94,6 @@ class TiltEstimate(NamedTuple):
     covariance: FloatArray
     lines: int
     votes: float = math.nan
-    lean_rad: float = math.nan
-
-
-class ConsensusSettings(NamedTuple):
-    """How the tilt that most verticals agree with is found.
-
-    Attributes
-    ----------
-    largest_rad : float
-        Largest absolute pitch and roll.
-    prior_rad : float
-        Standard deviation of the tilt; decides only between tilts that the lines support alike.
-    proposers : int
-        Candidates for the tilt come from pairs of this many lines, the strongest.
-    least_lines : int
-        With fewer lines that agree there is no estimate.
-    stray_share : float
-        Share of lines that are no verticals: the covariance is then the mean square error of
-        `detect.verticals.tilt_error`; 0 for that of least squares.
-    """
-
-    largest_rad: float = math.radians(5.0)
-    prior_rad: float = math.radians(2.0)
-    proposers: int = 24
-    least_lines: int = 3
-    stray_share: float = 0.15
 
 
 class Verticals(NamedTuple):
@@ -108,7 +118,7 @@ class Verticals(NamedTuple):
 
 
 def consensus(
-    lines: Verticals, settings: ConsensusSettings
+    lines: Verticals, settings: LineSettings = DEFAULT
 ) -> tuple[TiltEstimate | None, NDArray[np.bool_]]:
     """Estimate the tilt from the largest consistent set of lines; returns the set as well.
 
@@ -116,8 +126,8 @@ def consensus(
     ----------
     lines : Verticals
         The lines, each an edge of its own.
-    settings : ConsensusSettings
-        Limits and tolerances.
+    settings : LineSettings
+        Largest tilt, its prior, number of lines that propose and that must agree, share of strays.
 
     Returns
     -------
@@ -126,152 +136,98 @@ def consensus(
     consistent : (N,) bool
         Lines that are vertical under that tilt; without an estimate, under no tilt.
     """
-    tilt, consistent = agreed_tilt(lines, np.empty(0), settings)
-    edge = np.arange(len(lines.weight))
-    return known(with_error(tilt, lines, edge, settings)), consistent
+    tilt, consistent = agreed_tilt(lines, settings)
+    if tilt is None:
+        return None, consistent
+    return with_error(tilt, lines, np.arange(len(lines.weight)), settings), consistent
 
 
-def known(tilt: TiltEstimate) -> TiltEstimate | None:
-    """None where compiled code has NaN."""
-    return None if math.isnan(tilt.pitch_rad) else tilt
-
-
-@njit(cache=True, error_model="numpy")
-def no_tilt() -> TiltEstimate:
-    """The value in compiled code for no estimate."""
-    return TiltEstimate(np.nan, np.nan, np.full((2, 2), np.nan), 0, np.nan, np.nan)
-
-
-@njit(cache=True, error_model="numpy")
 def agreed_tilt(
-    lines: Verticals, bearing: FloatArray, settings: ConsensusSettings
-) -> tuple[TiltEstimate, NDArray[np.bool_]]:
-    """The tilt that most lines agree with, if they are enough.
-
-    Parameters
-    ----------
-    lines, settings
-        As for `consensus`.
-    bearing : (W,) float64
-        Bearings at which the lean of verticals is of interest.
-
-    Returns
-    -------
-    tilt : TiltEstimate
-        NaN where too few lines agree; its covariance is that of least squares.
-    agrees : (N,) bool
-        Lines that agree with it; where there is none, with no tilt.
-    """
-    weight, limit = lines.weight, settings.largest_rad
-    pitch, roll, covariance, agrees = agree_on_tilt(lines, settings)
-    count = 0
-    votes = 0.0
-    total = 0.0
-    for k in range(len(weight)):
-        total += weight[k]
-        if agrees[k]:
-            count += 1
-            votes += weight[k]
+    lines: Verticals, settings: LineSettings
+) -> tuple[TiltEstimate | None, NDArray[np.bool_]]:
+    """`consensus` with the covariance of least squares."""
+    limit, prior = math.radians(settings.largest_tilt_deg), math.radians(settings.tilt_prior_deg)
+    proposers = np.argsort(-lines.weight, kind="stable")[: settings.proposers]
+    agrees, covariance = np.empty(len(lines.weight), np.bool_), np.empty((2, 2))
+    pitch, roll, count, votes = _agree_on_tilt(lines, proposers, limit, prior, covariance, agrees)
     if count < settings.least_lines or abs(pitch) > limit or abs(roll) > limit:
-        for k in range(len(weight)):
-            agrees[k] = abs(lines.normal[k, 2]) <= lines.tolerance[k]
-        return no_tilt(), agrees
-    lean = _largest_lean_deviation(bearing, covariance)
-    return TiltEstimate(pitch, roll, covariance, count, votes / total, lean), agrees
+        return None, np.abs(lines.normal[:, 2]) <= lines.tolerance
+    return TiltEstimate(pitch, roll, covariance, count, votes), agrees
 
 
-@njit(cache=True, error_model="numpy")
 def with_error(
-    tilt: TiltEstimate, lines: Verticals, edge: NDArray[np.int64], settings: ConsensusSettings
+    tilt: TiltEstimate, lines: Verticals, edge: NDArray[np.int64], settings: LineSettings
 ) -> TiltEstimate:
     """The tilt with its mean square error as covariance, unless settings leave that out.
 
     `edge` is one of the lines for each, the same for all of an edge.
     """
-    if np.isnan(tilt.pitch_rad) or not settings.stray_share > 0.0:
+    if settings.stray_share == 0.0:
         return tilt
-    pitch, roll = tilt.pitch_rad, tilt.roll_rad
-    covariance = error_of_tilt(
-        lines.normal, lines.variance, lines.weight, edge, (pitch, roll), settings.prior_rad,
-        settings.stray_share,
-    )  # fmt: skip
-    return TiltEstimate(pitch, roll, covariance, tilt.lines, tilt.votes, tilt.lean_rad)
+    bearing = np.arctan2(lines.normal[:, 1], lines.normal[:, 0])
+    together = gather(bearing, np.full(len(bearing), TOGETHER_RAD), lines.weight)
+    prior = math.radians(settings.tilt_prior_deg)
+    place = tilt.pitch_rad, tilt.roll_rad
+    error = _error_of_tilt(lines, edge, together, place, prior, float(settings.stray_share), _GRID)
+    return tilt._replace(covariance=error)
 
 
 @njit(cache=True, error_model="numpy")
-def _largest_lean_deviation(bearing: NDArray[np.float64], covariance: NDArray[np.float64]) -> float:
-    """Standard deviation of the lean of a vertical due to that of the tilt, where it is largest."""
+def lean_deviation(covariance: FloatArray, sine: FloatArray, cosine: FloatArray) -> float:
+    """Largest standard deviation of the lean of verticals at some bearings due to the tilt's."""
+    pp, pr, rr = covariance[0, 0], covariance[0, 1], covariance[1, 1]
     largest = 0.0
-    for c in range(0, len(bearing), _LEAN_SPACING):
-        if math.isfinite(bearing[c]):
-            sine = math.sin(bearing[c])
-            cosine = math.cos(bearing[c])
-            variance = (
-                sine * sine * covariance[0, 0]
-                - 2.0 * sine * cosine * covariance[0, 1]
-                + cosine * cosine * covariance[1, 1]
-            )
-            largest = max(largest, variance)
+    for s, c in zip(sine, cosine):
+        variance = s * s * pp - 2.0 * s * c * pr + c * c * rr
+        # NaN where there is no vertical.
+        if variance > largest:
+            largest = variance
     return math.sqrt(largest)
 
 
 @njit(cache=True, error_model="numpy")
-def largest_lean(bearing: NDArray[np.float64], pitch: float, roll: float) -> float:
-    """How far a vertical leans in a camera of some tilt, where that is most (rad)."""
-    largest = 0.0
-    for c in range(0, len(bearing), _LEAN_SPACING):
-        if math.isfinite(bearing[c]):
-            lean = pitch * math.sin(bearing[c]) - roll * math.cos(bearing[c])
-            largest = max(largest, abs(lean))
-    return largest
+def _agree_on_tilt(
+    lines: Verticals, proposers: NDArray[np.int64], limit: float, prior: float,
+    covariance: FloatArray, agrees: NDArray[np.bool_],
+) -> tuple[float, float, int, float]:  # fmt: skip
+    """Pitch and roll, how many lines agree, and their share of the votes.
+
+    `covariance` gets that of the tilt, if lines err one by one, `agrees` which lines are vertical.
+    """
+    pitch, roll = _vote_for_tilt(lines, proposers, limit, prior)
+    pitch, roll = _refine_tilt(lines, pitch, roll, prior, covariance, agrees)
+    count, votes, total = 0, 0.0, 0.0
+    for i in range(len(agrees)):
+        total += lines.weight[i]
+        if agrees[i]:
+            count += 1
+            votes += lines.weight[i]
+    return pitch, roll, count, votes / total
 
 
+# Sums in any order become vectors; inlined, their order is that of the kernel that has them.
 @njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"}, forceinline=True)
-def _votes(
-    x: NDArray[np.float64],
-    y: NDArray[np.float64],
-    z: NDArray[np.float64],
-    weight: NDArray[np.float64],
-    pitch: float,
-    roll: float,
-) -> float:
-    """Votes of lines, whose normals are given in units of their tolerances, for a tilt."""
-    votes = 0.0
-    for line in range(len(weight)):
-        off = z[line] + pitch * y[line] - roll * x[line]
-        votes += weight[line] * max(1.0 - off * off, 0.0)
-    return votes
-
-
-@njit(cache=True, error_model="numpy")
-def vote_for_tilt(lines: Verticals, settings: ConsensusSettings) -> tuple[float, float]:
-    """Pitch and roll that the largest weight of lines agrees with.
+def _vote_for_tilt(
+    lines: Verticals, proposers: NDArray[np.int64], limit: float, prior: float
+) -> tuple[float, float]:
+    """Pitch and roll that the largest weight of lines agrees with; of equal ones the first.
 
     Each pair of proposers gives the tilt that makes both vertical; a line votes for it with its
     weight, less the farther it is from vertical. A tilt t loses t^2 / (2 prior^2) votes. No tilt is
     tried as well.
-
-    Returns
-    -------
-    pitch, roll : float
-        The tilt (rad); the first of those with the most votes.
     """
-    normal, tolerance, weight = lines.normal, lines.tolerance, lines.weight
-    limit, prior = settings.largest_rad, settings.prior_rad
-    proposer = descending(weight)[: settings.proposers]
-    best_pitch = 0.0
-    best_roll = 0.0
+    normal, weight = lines.normal, lines.weight
+    x, y, z = np.empty(len(weight)), np.empty(len(weight)), np.empty(len(weight))
+    for i in range(len(weight)):
+        share = 1.0 / lines.tolerance[i]
+        x[i], y[i], z[i] = share * normal[i, 0], share * normal[i, 1], share * normal[i, 2]
+    best_pitch = best_roll = 0.0
     best = -math.inf
-    x = normal[:, 0] / tolerance
-    y = normal[:, 1] / tolerance
-    z = normal[:, 2] / tolerance
-    for i in range(-1, len(proposer)):
-        for k in range(i + 1, len(proposer) if i >= 0 else 1):
-            pitch = 0.0
-            roll = 0.0
+    for i in range(-1, len(proposers)):
+        for k in range(i + 1, len(proposers) if i >= 0 else 1):
+            pitch = roll = 0.0
             if i >= 0:
-                m = proposer[i]
-                n = proposer[k]
+                m, n = proposers[i], proposers[k]
                 # n_z + pitch n_y - roll n_x = 0 for both.
                 determinant = normal[m, 0] * normal[n, 1] - normal[m, 1] * normal[n, 0]
                 if determinant == 0.0:
@@ -281,79 +237,28 @@ def vote_for_tilt(lines: Verticals, settings: ConsensusSettings) -> tuple[float,
                 if not (abs(pitch) <= limit and abs(roll) <= limit):
                     continue
             votes = -0.5 * (pitch * pitch + roll * roll) / (prior * prior)
-            votes += _votes(x, y, z, weight, pitch, roll)
+            for line in range(len(weight)):
+                off = z[line] + pitch * y[line] - roll * x[line]
+                votes += weight[line] * max(1.0 - off * off, 0.0)
             if votes > best:
-                best = votes
-                best_pitch = pitch
-                best_roll = roll
+                best, best_pitch, best_roll = votes, pitch, roll
     return best_pitch, best_roll
 
 
 @njit(cache=True, error_model="numpy")
-def level_matrix(pitch: float, roll: float) -> NDArray[np.float64]:
-    """(3, 3) rotation exp([pitch, roll, 0]x)."""
-    squared = pitch * pitch + roll * roll
-    angle = math.sqrt(squared)
-    # sin(x) / x and (1 - cos(x)) / x^2.
-    first = 1.0 - squared / 6.0
-    second = 0.5 - squared / 24.0
-    if angle > 1e-3:
-        first = math.sin(angle) / angle
-        second = 2.0 * (math.sin(0.5 * angle) / angle) ** 2
-    rotation = np.empty((3, 3))
-    rotation[0, 0] = 1.0 - second * roll * roll
-    rotation[0, 1] = second * pitch * roll
-    rotation[0, 2] = first * roll
-    rotation[1, 0] = second * pitch * roll
-    rotation[1, 1] = 1.0 - second * pitch * pitch
-    rotation[1, 2] = -first * pitch
-    rotation[2, 0] = -first * roll
-    rotation[2, 1] = first * pitch
-    rotation[2, 2] = 1.0 - second * squared
-    return rotation
-
-
-@njit(cache=True, error_model="numpy")
-def refine_tilt(
-    lines: Verticals, pitch: float, roll: float, prior: float
-) -> tuple[float, float, FloatArray, NDArray[np.bool_]]:
-    """Least squares of a tilt over the lines that agree with it, repeated.
-
-    Parameters
-    ----------
-    lines
-        See `Verticals`.
-    pitch, roll : float
-        To begin with (rad).
-    prior : float
-        Standard deviation of the tilt (rad).
-
-    Returns
-    -------
-    pitch, roll : float
-        The tilt (rad).
-    covariance : (2, 2) float64
-        Of it (rad^2), if lines err one by one (else `detect.verticals.tilt_error`).
-    agrees : (N,) bool
-        Lines that are vertical under it.
-    """
+def _refine_tilt(
+    lines: Verticals, pitch: float, roll: float, prior: float, covariance: FloatArray,
+    agrees: NDArray[np.bool_],
+) -> tuple[float, float]:  # fmt: skip
+    """Least squares of a tilt over the lines that agree with it, repeated."""
     normal, variance, tolerance = lines.normal, lines.variance, lines.tolerance
-    count = len(variance)
-    covariance = np.zeros((2, 2))
-    covariance[0, 0] = prior * prior
-    covariance[1, 1] = prior * prior
-    agrees = np.empty(count, np.bool_)
     for repetition in range(REFINEMENTS + 1):
         rotation = level_matrix(pitch, roll)
-        pp = 1.0 / (prior * prior)
+        pp = rr = 1.0 / (prior * prior)
         pr = 0.0
-        rr = pp
-        gradient_p = pitch / (prior * prior)
-        gradient_r = roll / (prior * prior)
-        for i in range(count):
-            x = 0.0
-            y = 0.0
-            z = 0.0
+        gradient_p, gradient_r = pitch * pp, roll * rr
+        for i in range(len(agrees)):
+            x = y = z = 0.0
             for k in range(3):
                 x += rotation[0, k] * normal[i, k]
                 y += rotation[1, k] * normal[i, k]
@@ -370,19 +275,169 @@ def refine_tilt(
         if repetition == REFINEMENTS:
             break
         determinant = pp * rr - pr * pr
-        covariance[0, 0] = rr / determinant
-        covariance[0, 1] = -pr / determinant
-        covariance[1, 0] = -pr / determinant
-        covariance[1, 1] = pp / determinant
+        covariance[0, 0], covariance[1, 1] = rr / determinant, pp / determinant
+        covariance[0, 1] = covariance[1, 0] = -pr / determinant
         pitch -= covariance[0, 0] * gradient_p + covariance[0, 1] * gradient_r
         roll -= covariance[1, 0] * gradient_p + covariance[1, 1] * gradient_r
-    return pitch, roll, covariance, agrees
+    return pitch, roll
 
 
 @njit(cache=True, error_model="numpy")
-def agree_on_tilt(
-    lines: Verticals, settings: ConsensusSettings
-) -> tuple[float, float, FloatArray, NDArray[np.bool_]]:
-    """The tilt that most lines vote for, refined; results as of `refine_tilt`."""
-    pitch, roll = vote_for_tilt(lines, settings)
-    return refine_tilt(lines, pitch, roll, settings.prior_rad)
+def level_matrix(pitch: float, roll: float) -> FloatArray:
+    """(3, 3) rotation exp([pitch, roll, 0]x)."""
+    squared = pitch * pitch + roll * roll
+    angle = math.sqrt(squared)
+    # sin(x) / x and (1 - cos(x)) / x^2.
+    first = 1.0 - squared / 6.0
+    second = 0.5 - squared / 24.0
+    if angle > 1e-3:
+        first = math.sin(angle) / angle
+        second = 2.0 * (math.sin(0.5 * angle) / angle) ** 2
+    rotation = np.empty((3, 3))
+    rotation[0, 0] = 1.0 - second * roll * roll
+    rotation[1, 1] = 1.0 - second * pitch * pitch
+    rotation[2, 2] = 1.0 - second * squared
+    rotation[0, 1] = rotation[1, 0] = second * pitch * roll
+    rotation[0, 2], rotation[2, 0] = first * roll, -first * roll
+    rotation[1, 2], rotation[2, 1] = -first * pitch, first * pitch
+    return rotation
+
+
+def gather(
+    place: FloatArray, reach: FloatArray, strength: FloatArray,
+    kind: FloatArray | None = None,
+) -> NDArray[np.int64]:  # fmt: skip
+    """Groups of lines of one kind near the strongest of those that are in no group yet.
+
+    Parameters
+    ----------
+    place, reach, strength : (N,) float64
+        Where each is, how near others belong to it, how strong it is.
+    kind : (N,) float64, optional
+        Only equal ones are gathered.
+
+    Returns
+    -------
+    (N,) int64
+        The first line of the group of each.
+    """
+    order = np.argsort(-strength, kind="stable")
+    group = np.full(len(place), -1, np.int64)
+    _gather(place, reach, np.zeros(len(place)) if kind is None else kind, order, group)
+    return group
+
+
+@njit(cache=True, error_model="numpy")
+def _gather(
+    place: FloatArray, reach: FloatArray, kind: FloatArray, order: NDArray[np.int64],
+    group: NDArray[np.int64],
+) -> None:  # fmt: skip
+    for strongest in order:
+        if group[strongest] >= 0:
+            continue
+        first = -1
+        for k in range(len(group)):
+            near = abs(place[k] - place[strongest]) < reach[strongest]
+            if group[k] < 0 and kind[k] == kind[strongest] and near:
+                if first < 0:
+                    first = k
+                group[k] = first
+
+
+@njit(cache=True, error_model="numpy")
+def merge_lines(lines: Verticals, group: NDArray[np.int64]) -> FloatArray:
+    """(G, 4) mean normals of groups of lines, and the variances of their inclinations.
+
+    Lines are weighed by how well they are measured beside the middle scatter; the variances are
+    without scatter.
+    """
+    normal, variance = lines.normal, lines.variance
+    share, total = np.empty(len(group)), np.zeros(len(group))
+    for k in range(len(group)):
+        share[k] = 1.0 / (variance[k] + SCATTER_RAD[1] ** 2)
+        total[group[k]] += share[k]
+    place = np.cumsum(total > 0.0) - 1
+    merged = np.zeros((len(np.flatnonzero(total)), 4))
+    for k in range(len(group)):
+        own = share[k] / total[group[k]]
+        to = merged[place[group[k]]]
+        for i in range(3):
+            to[i] += own * normal[k, i]
+        to[3] += own * own * variance[k]
+    return merged
+
+
+@njit(cache=True, error_model="numpy")
+def _error_of_tilt(
+    lines: Verticals, edge: NDArray[np.int64], together: NDArray[np.int64],
+    tilt: tuple[float, float], prior: float, stray_share: float, grid: FloatArray,
+) -> FloatArray:  # fmt: skip
+    """(2, 2) mean square error of a tilt, over what its lines and those that disagree say."""
+    edges, groups = merge_lines(lines, edge), merge_lines(lines, together)
+    xx, xy, yy = _stretch(groups, tilt, prior)
+    n = grid.shape[1]
+    pitch, roll, before, density = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
+    for i in range(n):
+        pitch[i] = tilt[0] + xx * grid[0, i] + xy * grid[1, i]
+        roll[i] = tilt[1] + xy * grid[0, i] + yy * grid[1, i]
+        squared = pitch[i] * pitch[i] + roll[i] * roll[i]
+        before[i] = grid[2, i] * math.exp(-0.5 * squared / (prior * prior))
+    error = np.zeros((2, 2))
+    total = 0.0
+    for m in range(len(SCATTER_RAD)):
+        density[:] = before
+        _multiply_likelihood(density, pitch, roll, edges, SCATTER_RAD[m], stray_share)
+        share = SCATTER_SHARE[m] * density.sum()
+        total += share
+        density[:] = before
+        _multiply_likelihood(density, pitch, roll, groups, SCATTER_RAD[m], stray_share)
+        share /= density.sum()
+        for i in range(n):
+            p, r = pitch[i] - tilt[0], roll[i] - tilt[1]
+            error[0, 0] += share * density[i] * p * p
+            error[0, 1] += share * density[i] * p * r
+            error[1, 1] += share * density[i] * r * r
+    error[1, 0] = error[0, 1]
+    return error / total
+
+
+@njit(cache=True, error_model="numpy")
+def _stretch(
+    groups: FloatArray, tilt: tuple[float, float], prior: float
+) -> tuple[float, float, float]:
+    """Symmetric matrix that turns a circle into the posterior's ellipse, its larger axis 1."""
+    pp = rr = 1.0 / (prior * prior)
+    pr = 0.0
+    for k in range(len(groups)):
+        x, y = groups[k, 0], groups[k, 1]
+        off = groups[k, 2] + tilt[0] * y - tilt[1] * x
+        weight = 1.0 / (groups[k, 3] + SCATTER_RAD[1] ** 2 + 0.25 * off * off)
+        pp += weight * y * y
+        pr -= weight * x * y
+        rr += weight * x * x
+    # Of [[a, b], [b, d]] the eigenvalues are middle +- half, the axis of the first at this angle.
+    half, middle = math.hypot(0.5 * (pp - rr), pr), 0.5 * (pp + rr)
+    shortest = max(math.sqrt((middle - half) / (middle + half)), _SLENDEREST)
+    angle = 0.5 * math.atan2(2.0 * pr, pp - rr)
+    # The direction that is known best is the ellipse's short axis.
+    c, s = math.cos(angle), math.sin(angle)
+    return shortest * c * c + s * s, (shortest - 1.0) * c * s, shortest * s * s + c * c
+
+
+@njit(cache=True, error_model="numpy")
+def _multiply_likelihood(
+    density: FloatArray, pitch: FloatArray, roll: FloatArray, lines: FloatArray, scatter: float,
+    stray_share: float,
+) -> None:  # fmt: skip
+    """Multiply densities of tilts by the likelihood of the lines."""
+    of_stray = stray_share / (math.pi * STRAY_RAD)
+    for k in range(len(lines)):
+        three_variances = 3.0 * (lines[k, 3] + scatter * scatter)
+        of_vertical = (1.0 - stray_share) * 2.0 / (math.pi * math.sqrt(three_variances))
+        x, y, z = lines[k, 0], lines[k, 1], lines[k, 2]
+        for i in range(len(density)):
+            off = z + pitch[i] * y - roll[i] * x
+            student = 1.0 / (1.0 + off * off / three_variances)
+            cauchy = of_stray / (1.0 + off * off / STRAY_RAD**2)
+            # In units in which products of a hundred stay in range.
+            density[i] *= (of_vertical * student * student + cauchy) * SCATTER_RAD[1]

@@ -197,11 +197,11 @@ def tilt_error(
     prior: float,
     stray_share: float,
 ) -> FloatArray:
-    """(2, 2) mean square error of a tilt over the posterior of `detect.verticals.tilt_error`.
+    """(2, 2) mean square error of a tilt over the posterior of `detect.verticals.tilt`.
 
     Summed over an even grid of 0.05 degrees, seven degrees to all sides.
     """
-    from detect.verticals.tilt_error import SCATTER_RAD, SCATTER_SHARE, STRAY_RAD, TOGETHER_RAD
+    from detect.verticals.tilt import SCATTER_RAD, SCATTER_SHARE, STRAY_RAD, TOGETHER_RAD
 
     def merged(label: NDArray[np.int64]) -> list[tuple[FloatArray, float]]:
         found = []

@@ -6,19 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from detect.line_settings import LineSettings
-from detect.verticals.judgement import Judgement, fit_and_judge, limits_of
-from detect.verticals.refinement import refinement_of
+from detect.verticals import starts
+from detect.verticals.judgement import Judgement, fit_and_judge
+from detect.verticals.refinement import step_filters
 from detect.verticals.response import StripResponse, line_filter, strip_of, strip_response
-from detect.verticals.starts import (
-    LineStarts,
-    StartBand,
-    band_response,
-    find_maxima,
-    ordered_starts,
-    start_band,
-)
+from detect.verticals.starts import LineStarts, StartBand, band_response, find_maxima, start_band
 from detect.verticals.tilt import TiltEstimate, with_error
-from detect.verticals.tracking import ALL_EDGES, LineTracks, follow_edges, following_of
+from detect.verticals.tracking import ALL_EDGES, LineTracks, follow_edges
 from lut.verticals import VerticalTable
 
 
@@ -27,7 +21,7 @@ def start_response(
 ) -> tuple[NDArray[np.float32], StartBand]:
     """The response on the rows on which tracks start, and which rows these are."""
     band = start_band(table, settings)
-    return band_response(image.reshape(-1), band, line_filter(settings).regulariser), band
+    return band_response(image, band, settings.regulariser), band
 
 
 def line_starts(
@@ -35,15 +29,14 @@ def line_starts(
 ) -> LineStarts:
     """Maxima of the response on the horizon and on rows near it, the highest first."""
     response, band = start_response(image, table, settings)
-    maxima = find_maxima(response, band.row, settings.threshold, band.supported)
-    return ordered_starts(response, band.row, maxima)
+    return starts.line_starts(find_maxima(response, settings.threshold), band)
 
 
 def response_to(
     image: NDArray[np.uint8], table: VerticalTable, settings: LineSettings
 ) -> StripResponse:
     """The response to an image, of which nothing is evaluated yet."""
-    return strip_response(image.reshape(-1), strip_of(table), line_filter(settings))
+    return strip_response(image, strip_of(table), line_filter(settings))
 
 
 def line_tracks(
@@ -56,9 +49,8 @@ def line_tracks(
 ) -> LineTracks:
     """Edges followed from starts: along the verticals of a tilt, or in any direction."""
     response = image if isinstance(image, StripResponse) else response_to(image, table, settings)
-    following = following_of(settings, table.row_aspect, tilt is not None, enough)
-    expected = (0.0, 0.0) if tilt is None else (float(tilt.pitch_rad), float(tilt.roll_rad))
-    return follow_edges(response, strip_of(table), starts, following, expected)
+    expected = None if tilt is None else (float(tilt.pitch_rad), float(tilt.roll_rad))
+    return follow_edges(response, strip_of(table), starts, settings, expected, enough)
 
 
 def judge_tracks(
@@ -69,8 +61,7 @@ def judge_tracks(
     steps: int | None = None,
 ) -> Judgement:
     """Lines through tracks, refined in all or some steps, their fates, and the tilt."""
-    limits = limits_of(settings, table.row_aspect)
-    judged, lines, edge = fit_and_judge(
-        image, strip_of(table), tracks, refinement_of(settings, steps), limits
-    )
-    return judged._replace(tilt=with_error(judged.tilt, lines, edge, limits.consensus))
+    judged = fit_and_judge(image, strip_of(table), tracks, step_filters(settings, steps), settings)
+    if judged.tilt is None:
+        return judged
+    return judged._replace(tilt=with_error(judged.tilt, judged.verticals, judged.edge, settings))

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from camera import Camera
-from detect.verticals.joining import chain_neighbours, join_mixture
+from detect.verticals.joining import chain_neighbours, join_mixtures
 from detect.verticals.tilt import TiltEstimate, level_matrix
 from landmarks import LineLandmark, parse_record
 from tests.reference.verticals import (
@@ -101,6 +101,14 @@ def test_plane_normals_do_not_depend_on_where_the_ends_are(published_camera: Cam
     assert inclinations(normal[0]) == pytest.approx(np.arcsin(normal[0, 2]))
 
 
+def joined(alpha: np.ndarray, sigma: np.ndarray, weight: np.ndarray) -> tuple[float, float]:
+    """Mean and deviation of a mixture, behind another one."""
+    two = [np.concatenate([values[:1], values]) for values in (alpha, sigma, weight)]
+    means, deviations = join_mixtures(two[0], two[1], two[2], np.array([0, 1]))
+    assert (means[0], deviations[0]) == pytest.approx((two[0][0], two[1][0]))
+    return float(means[1]), float(deviations[1])
+
+
 components = st.integers(1, 6).flatmap(
     lambda n: st.tuples(
         hnp.arrays(np.float64, n, elements=st.floats(-0.2, 0.2)),
@@ -118,7 +126,7 @@ def test_joining_conserves_mean_and_variance(
 ) -> None:
     offset, sigma, weight, turn, _ = mixture
     alpha = (offset + turn + np.pi) % (2 * np.pi) - np.pi
-    mean, deviation = join_mixture(alpha, sigma, weight)
+    mean, deviation = joined(alpha, sigma, weight)
     np.testing.assert_allclose((mean, deviation), join_bearings(alpha, sigma, weight), atol=1e-9)
     share = weight / weight.sum()
     expected = share @ offset
@@ -132,8 +140,8 @@ def test_joining_does_not_depend_on_the_order(
     mixture: tuple[np.ndarray, np.ndarray, np.ndarray, float, list[int]],
 ) -> None:
     offset, sigma, weight, _, order = mixture
-    straight = join_mixture(offset, sigma, weight)
-    shuffled = join_mixture(offset[order], sigma[order], weight[order])
+    straight = joined(offset, sigma, weight)
+    shuffled = joined(offset[order], sigma[order], weight[order])
     np.testing.assert_allclose(shuffled, straight, rtol=1e-9, atol=1e-12)
     np.testing.assert_array_equal(
         chain_neighbours(offset[order], np.full(len(offset), 0.02)),

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from detect.verticals import judgement
 from detect.verticals.judgement import FATES
 from detect.verticals.refinement import SUBPIXELS, gaussian_steps
-from detect.verticals.tilt_error import descending
 
 
 def test_numbers_of_fates_are_places_of_their_names() -> None:
@@ -44,10 +41,3 @@ def test_tabulated_filters_are_derivatives(sigma: float) -> None:
     np.testing.assert_allclose((second @ signal)[2:-2], change[2:-2], rtol=0.02, atol=0.1)
     for table in (height, first, second):
         np.testing.assert_allclose(table.sum(axis=1), 0.0, atol=1e-4)
-
-
-@given(st.lists(st.sampled_from([0.0, -1.0, 2.5, 2.5000001, 7.0, -np.inf, np.inf]), max_size=40))
-@settings(max_examples=40, deadline=None)
-def test_order_is_that_of_a_stable_sort(values: list[float]) -> None:
-    numbers = np.array(values)
-    np.testing.assert_array_equal(descending(numbers), np.argsort(-numbers, kind="stable"))

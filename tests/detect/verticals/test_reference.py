@@ -13,11 +13,10 @@ from camera import read_camera
 from detect.line_settings import DEFAULT, PUBLISHED, LineSettings
 from detect.sources.gray import decode_gray
 from detect.verticals.refinement import (
-    SUBPIXELS,
     Crossings,
-    fit_eigenlines,
+    fit_lines,
     newton_step,
-    refinement_of,
+    step_filters,
 )
 from detect.verticals.response import line_response, strip_of
 from detect.verticals.starts import LineStarts
@@ -80,8 +79,7 @@ def test_tracks_are_those_of_the_reference(kind: str, settings: LineSettings) ->
         start = LineStarts(
             np.array([row], np.int32),
             np.array([column], np.int32),
-            np.sign(response[row, column : column + 1]).astype(np.float32),
-            score[columns == column].astype(np.float32),
+            response[row, column : column + 1].astype(np.float32),
         )
         tracks = line_tracks(image, start, TABLE, settings)
         expected = reference.follow(response, int(row), int(column), settings)
@@ -104,11 +102,12 @@ def test_lines_through_tracks_are_those_of_the_reference() -> None:
         row = np.arange(30, 100, dtype=np.int32)
         column = middle + 0.02 * (row - 60) + rng.normal(0.0, 0.2, len(row))
         bounds, score = np.array([0, len(row)]), np.ones(len(row), np.float32)
-        tracks = LineTracks(np.ones(1), bounds, row, column, score, True)
-        fits = fit_eigenlines(strip_of(table), tracks, 5, 0.0)
+        tracks = LineTracks(np.ones(1), bounds, row, column, score)
+        image = np.zeros((CAMERA.height, CAMERA.width), np.uint8)
+        fits = fit_lines(image, strip_of(table), tracks, step_filters(DEFAULT, 0), 5, 0.0)
         bearing = np.interp(column, columns, table.bearing_rad)
         rise = [np.interp(c, columns, table.elevation_tan[v]) for v, c in zip(row, column)]
-        expected = reference.eigenline(bearing, np.array(rise), float(fits.reference[0]))
+        expected = reference.eigenline(bearing, np.array(rise), float(fits.reference_rad[0]))
         np.testing.assert_allclose(fits.line[0], expected, rtol=1e-5, atol=1e-7)
 
 
@@ -118,17 +117,16 @@ def test_steps_of_the_refinement_are_those_of_the_reference(step: int, sign: flo
     edge = Edge(0.0, 80.0 * sign)
     grey = 80.0 if sign > 0.0 else 200.0
     image = render(CAMERA, [edge], grey=grey, noise=2.0, rng=np.random.default_rng(9))
-    filters = refinement_of(DEFAULT)
+    filters = step_filters(DEFAULT)
     sigma, _ = DEFAULT.refine_steps_px[step]
-    half, begin = int(filters.half[step]), filters.begin[step]
-    weights = filters.derivatives[begin : begin + 4 * half * SUBPIXELS]
+    half = int(filters.half[step])
     row = np.arange(20, 110, dtype=np.int32)
     nearest = int(np.nanargmin(np.abs(TABLE.bearing_rad)))
     at = TABLE.column[row, nearest].astype(np.float64) + 0.3
     at[[5, 17]] = np.nan
     by = np.stack([np.full(len(row), 150.0), 150.0 * (row - 65.0) / 150.0], axis=1)
-    crossings = Crossings(row, at, by[:, 0].copy(), by[:, 1].copy(), np.empty((3, len(row))))
-    found = newton_step(image, crossings, weights.reshape(2, SUBPIXELS, 2 * half), sign)
+    crossings = Crossings(row, at, by[:, 0].copy(), by[:, 1].copy())
+    found = newton_step(image, crossings, filters.weights[step], half, sign)
     change, covariance = reference.newton_step(image, row, at, by, sigma, half, sign)
     # In pixels: weights are tabulated at 64 positions in a pixel, and straight between them.
     moved = by @ np.array([found.change_a, found.change_b])

@@ -13,22 +13,20 @@ from scipy.ndimage import gaussian_filter
 from detect.line_settings import DEFAULT
 from detect.lines import detect_lines
 from detect.verticals.judgement import share_edges
-from detect.verticals.refinement import LineFits
 from detect.verticals.tilt import (
-    ConsensusSettings,
     TiltEstimate,
     Verticals,
-    agree_on_tilt,
+    agreed_tilt,
     consensus,
-    largest_lean,
+    gather,
     level_matrix,
 )
 from lut.verticals import build_vertical_table
 from tests.detect.line_scene import Edge, pinhole, render, tilted
 
-SETTINGS = ConsensusSettings()
+SETTINGS = replace(DEFAULT, largest_tilt_deg=5.0)
 #: The covariance is that of least squares: lines err one by one.
-ONE_BY_ONE = ConsensusSettings(stray_share=0.0)
+ONE_BY_ONE = replace(SETTINGS, stray_share=0.0)
 
 
 def seen_normals(
@@ -148,11 +146,12 @@ def test_lines_that_no_small_tilt_explains_give_none() -> None:
     assert not consistent.all()
 
 
-def at(place: np.ndarray) -> LineFits:
-    """Lines at bearings in a camera of a thousand pixels per radian."""
-    count = len(place)
-    none, two, four = np.zeros(count), np.zeros((count, 2)), np.zeros((count, 2, 2))
-    return LineFits(place, np.full(count, 1e-3), two, four, none, none, none, none, none)
+def edges_at(
+    place: np.ndarray, evidence: np.ndarray, polarity: np.ndarray | None = None
+) -> np.ndarray:
+    """Edges of lines at bearings in a camera of a thousand pixels per radian."""
+    near = np.full(len(place), 1e-3 * DEFAULT.same_edge_px)
+    return gather(place, near, evidence, polarity)
 
 
 def test_lines_of_one_edge_tell_as_much_as_one() -> None:
@@ -169,11 +168,11 @@ def test_lines_of_one_edge_tell_as_much_as_one() -> None:
         normal = np.stack([np.cos(bearing), np.sin(bearing), -lean_], axis=-1)[which]
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
         lines = Verticals(normal, variance, np.full(count, 0.015), weight)
-        fits, every = at(place), np.arange(count)
-        share_edges(fits, np.ones(count), evidence, every, DEFAULT.same_edge_px, lines)
-        pitch, roll, covariance, _ = agree_on_tilt(lines, ConsensusSettings(largest_rad=0.1))
-        assert weight.sum() == pytest.approx(16.0)
-        return np.array([pitch, roll]), covariance
+        lines = share_edges(lines, edges_at(place, evidence))
+        tilt, _ = agreed_tilt(lines, DEFAULT)
+        assert tilt is not None
+        assert lines.weight.sum() == pytest.approx(16.0)
+        return np.array([tilt.pitch_rad, tilt.roll_rad]), tilt.covariance
 
     once, covariance = told(bearing, np.arange(8))
     both, of_both = told(place, twice)
@@ -185,17 +184,15 @@ def test_lines_of_one_edge_tell_as_much_as_one() -> None:
 def test_edges_of_other_polarity_or_farther_away_are_not_the_same() -> None:
     variance, weight = np.full(5, 1e-6), np.full(5, 3.0)
     lines = Verticals(np.zeros((5, 3)), variance, np.ones(5), weight)
-    edge = share_edges(
-        at(np.array([0.0, 1e-3, 1e-3, 4e-3, 4.5e-3])),
-        np.array([1.0, 1.0, -1.0, 1.0, 1.0]),
+    edge = edges_at(
+        np.array([0.0, 1e-3, 1e-3, 4e-3, 4.5e-3]),
         np.array([10.0, 12.0, 30.0, 9.0, 8.0]),
-        np.arange(5),
-        DEFAULT.same_edge_px,
-        lines,
+        np.array([1.0, 1.0, -1.0, 1.0, 1.0]),
     )
+    shared = share_edges(lines, edge)
     np.testing.assert_array_equal(edge, [0, 0, 2, 3, 3])
-    np.testing.assert_allclose(variance, [2e-6, 2e-6, 1e-6, 2e-6, 2e-6])
-    np.testing.assert_allclose(weight, [1.5, 1.5, 3.0, 1.5, 1.5])
+    np.testing.assert_allclose(shared.variance, [2e-6, 2e-6, 1e-6, 2e-6, 2e-6])
+    np.testing.assert_allclose(shared.weight, [1.5, 1.5, 3.0, 1.5, 1.5])
 
 
 @pytest.mark.parametrize("narrow", [True, False])
@@ -224,12 +221,3 @@ def test_blurred_edges_among_texture_do_not_overstate_the_tilt(narrow: bool) -> 
         error = np.array([found.tilt.pitch_rad, found.tilt.roll_rad]) - true
         squared.append(error @ np.linalg.solve(found.tilt.covariance, error) / 2.0)
     assert (0.4 if narrow else 0.1) < np.mean(squared) < 1.6
-
-
-def test_lean_is_what_a_tilted_camera_sees() -> None:
-    bearing, pitch, roll = 0.4, 0.01, -0.02
-    level = np.array([np.cos(bearing), np.sin(bearing), 0.0])
-    measured = level @ level_matrix(pitch, roll)
-    # In the chart X = a + b Z the plane's normal is (left - a ahead, -b).
-    seen = largest_lean(np.array([bearing]), pitch, roll)
-    assert abs(measured[2]) == pytest.approx(seen, abs=3e-4)

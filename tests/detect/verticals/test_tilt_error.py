@@ -2,27 +2,42 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from detect.verticals.tilt import ConsensusSettings, Verticals, consensus
-from detect.verticals.tilt_error import (
+from detect.line_settings import DEFAULT
+from detect.verticals.tilt import (
     SCATTER_RAD,
     SCATTER_SHARE,
     STRAY_RAD,
     TOGETHER_RAD,
-    error_of_tilt,
-    gather_lines,
+    TiltEstimate,
+    Verticals,
+    consensus,
+    gather,
     merge_lines,
+    with_error,
 )
 from tests.reference.verticals import tilt_error
 
-SETTINGS = ConsensusSettings()
+SETTINGS = replace(DEFAULT, largest_tilt_deg=5.0)
 
 
 def normals(bearing: np.ndarray, inclination: np.ndarray) -> np.ndarray:
     normal = np.stack([np.cos(bearing), np.sin(bearing), inclination], axis=-1)
     return np.asarray(normal / np.linalg.norm(normal, axis=1, keepdims=True))
+
+
+def stated_error(
+    normal: np.ndarray, variance: np.ndarray, weight: np.ndarray, edge: np.ndarray,
+    tilt: tuple[float, float], share: float,
+) -> np.ndarray:  # fmt: skip
+    """The covariance of a tilt that has a prior of 0.035 rad."""
+    settings = replace(DEFAULT, tilt_prior_deg=float(np.degrees(0.035)), stray_share=share)
+    lines = Verticals(normal, variance, np.ones(len(weight)), weight)
+    return with_error(TiltEstimate(*tilt, np.eye(2), len(weight)), lines, edge, settings).covariance
 
 
 def building(
@@ -55,7 +70,7 @@ def test_errors_are_as_large_as_stated() -> None:
         given_ = Verticals(normal, variance, np.full(count, np.radians(0.9)), np.ones(count))
         for chosen, into in (
             (SETTINGS, squared),
-            (ConsensusSettings(stray_share=0.0), one_by_one),
+            (replace(SETTINGS, stray_share=0.0), one_by_one),
         ):
             tilt, _ = consensus(given_, chosen)
             if tilt is not None and tilt.lines >= 5:
@@ -82,7 +97,7 @@ def test_is_the_mean_square_over_the_posterior() -> None:
         edge[1] = 0
         tilt = (float(true[0]) + 1e-3, float(true[1]) - 1e-3)
 
-        error = error_of_tilt(normal, variance, weight, edge, tilt, 0.035, share)
+        error = stated_error(normal, variance, weight, edge, tilt, share)
 
         expected = tilt_error(normal, variance, weight, edge, tilt, 0.035, share)
         ratios.append(np.sort(np.linalg.eigvals(np.linalg.solve(expected, error)).real))
@@ -127,19 +142,20 @@ def test_lines_are_gathered_round_the_strongest() -> None:
     bearing = np.array([0.0, 0.5, 0.1, 0.2, 0.9]) * TOGETHER_RAD * 2.0
     weight = np.array([1.0, 4.0, 3.0, 2.0, 5.0])
 
-    group = gather_lines(bearing, weight, TOGETHER_RAD)
+    group = gather(bearing, np.full(5, TOGETHER_RAD), weight)
 
-    np.testing.assert_array_equal(group, [2, 4, 2, 2, 4])
+    np.testing.assert_array_equal(group, [0, 1, 0, 0, 1])
 
 
 def test_merged_lines_have_mean_normals() -> None:
     normal = normals(np.array([0.1, 0.2, 0.5]), np.array([0.01, 0.03, 0.0]))
     variance = np.full(3, 1e-6)
 
-    merged, of_merged = merge_lines(normal, variance, np.array([0, 0, 2]))
+    lines = Verticals(normal, variance, np.ones(3), np.ones(3))
+    merged = merge_lines(lines, np.array([0, 0, 2]))
 
-    np.testing.assert_allclose(merged, [normal[:2].mean(axis=0), normal[2]])
-    np.testing.assert_allclose(of_merged, [0.5e-6, 1e-6])
+    np.testing.assert_allclose(merged[:, :3], [normal[:2].mean(axis=0), normal[2]])
+    np.testing.assert_allclose(merged[:, 3], [0.5e-6, 1e-6])
 
 
 @pytest.mark.parametrize("share", [0.05, 0.3])
@@ -148,8 +164,8 @@ def test_a_tilt_that_rivals_contradict_is_in_doubt(share: float) -> None:
     bearing = np.linspace(-0.6, 0.6, 16)
     rival = np.radians(1.5)
     lean = np.where(np.arange(16) % 2 == 0, 0.0, rival) * np.cos(bearing)
-    error = error_of_tilt(
-        normals(bearing, lean), np.full(16, np.radians(0.03) ** 2), np.ones(16), np.arange(16),
-        (0.0, 0.0), 0.035, share,
-    )  # fmt: skip
+    variance = np.full(16, np.radians(0.03) ** 2)
+    error = stated_error(
+        normals(bearing, lean), variance, np.ones(16), np.arange(16), (0.0, 0.0), share
+    )
     assert np.sqrt(error[1, 1]) > 0.3 * rival
