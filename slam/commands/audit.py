@@ -45,8 +45,6 @@ def perform(options: Options) -> int:
         if path.exists() and not options.force:
             raise OutputExistsError(path)
     recording = recording_of(options)
-    if len(recording.lines):
-        raise SlamError(f"{options.run}: has lines: expected discs, the only ones that are audited")
     camera = None
     if options.calibrate or options.pictures:
         camera = camera_of_run(options.images or options.run, options.camera)

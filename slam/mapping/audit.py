@@ -19,6 +19,7 @@ from scipy.sparse.linalg import SuperLU
 from scipy.stats import chi2
 
 from camera import Camera
+from slam.errors import SlamError
 from slam.mapping.chi_squared import ChiSquared, chi_squared
 from slam.mapping.graph import Estimate, Graph, graph_of_recording, whitening
 from slam.mapping.graph_terms import Weighting, errors, linearise
@@ -118,7 +119,7 @@ def audit_run(
     Parameters
     ----------
     recording : Recording
-        The run. Only its discs are examined.
+        The run, without lines.
     camera : Camera, optional
         As calibrated.
     calibrate : bool
@@ -135,8 +136,10 @@ def audit_run(
     Raises
     ------
     SlamError
-        As `map_run`.
+        If the run has lines; else as `map_run`.
     """
+    if len(recording.lines):
+        raise SlamError(f"{name}: has lines: expected discs, the only ones that are audited")
     plain = Weighting(calibrate=calibrate, row_errors="recorded")
     loss = replace(plain, loss="geman-mcclure", loss_scale=_SUSPECT)
     before = map_run(recording, camera, plain, name=name).table
