@@ -32,15 +32,16 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 Kind = Literal["exchange", "split", "drop"]
 
-# Standard deviations beyond which a row is held against the map of the others.
-_SUSPECT = 3.0
+# Standard deviations from which on rows pull less.
+_LOSS_SCALE = 3.0
+# Rows whose squared error in the robust map is this share of the gate are held against the others.
+_SUSPECT_SHARE = 0.25
 # Rows of an identifier further apart than this belong to different groups (frames).
 _LONGEST_GAP = 10
 # How far a landmark may be from where a group lies, to be tried (m).
 _NEAR_M = 1.0
 # Rows are explained by a landmark unless their squared error is less probable.
 _LEAST_PROBABILITY = 1e-3
-_ROWS_AT_ONCE = 200
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,19 +142,22 @@ def audit_run(
     if len(recording.lines):
         raise SlamError(f"{name}: has lines: expected discs, the only ones that are audited")
     plain = Weighting(calibrate=calibrate, row_errors="recorded")
-    loss = replace(plain, loss="geman-mcclure", loss_scale=_SUSPECT)
+    loss = replace(plain, loss="geman-mcclure", loss_scale=_LOSS_SCALE)
     before = map_run(recording, camera, plain, name=name).table
     robust = map_run(recording, camera, loss, name=name)
     ids = recording.circles.ids.copy()
     known = np.flatnonzero(ids >= 0)
     squared = np.sum(errors(robust.graph, robust.estimate, plain).discs ** 2, axis=1)
-    suspects = known[squared > _SUSPECT**2]
+    suspects = known[squared > _SUSPECT_SHARE * gate]
     trusted = ids.copy()
     trusted[suspects] = UNKNOWN_ID
     fit = _fit(recording, trusted, robust.estimate, camera, plain)
-    score = _row_scores(recording, fit, suspects)
-    accused = suspects[score > gate]
-    of_row = dict(zip(suspects.tolist(), score.tolist()))
+    score = {
+        int(k): _misfit(recording, fit, np.array([k]), int(ids[k]))
+        for k in suspects
+        if ids[k] in fit.graph.disc_ids
+    }
+    accused = np.array([k for k, value in score.items() if value > gate], dtype=np.int64)
     ids[accused] = UNKNOWN_ID
     fit = _fit(recording, ids, fit.estimate, camera, plain)
     dropped = fit.table
@@ -161,7 +165,7 @@ def audit_run(
     groups = []
     # The largest first: what they show may be what smaller ones show as well.
     for rows in sorted(_groups(recording, accused), key=lambda rows: (-len(rows), rows[0])):
-        group = _explained(recording, fit, rows, np.array([of_row[int(k)] for k in rows]))
+        group = _explained(recording, fit, rows, np.array([score[int(k)] for k in rows]))
         groups.append(group)
         if group.new_id != UNKNOWN_ID:
             ids[rows] = group.new_id
@@ -188,20 +192,6 @@ def _fit(
     equations = normal_equations(linearise(graph, estimate, weighting))
     table = chi_squared(graph, estimate, weighting)
     return _Fit(graph, estimate, weighting, factor(equations.matrix), table)
-
-
-def _row_scores(recording: Recording, fit: _Fit, rows: IntArray) -> FloatArray:
-    """Squared error of each row against a map without it; 0 if that lacks its landmark."""
-    ids = recording.circles.ids
-    score = np.zeros(len(rows))
-    mapped = np.flatnonzero(np.isin(ids[rows], fit.graph.disc_ids))
-    for some in np.array_split(mapped, len(mapped) // _ROWS_AT_ONCE + 1):
-        error, spread, _ = _innovation(recording, fit, rows[some], ids[rows[some]])
-        n = np.arange(len(some))
-        own = spread.reshape(len(n), 2, len(n), 2)[n, :, n]
-        each = error.reshape(-1, 2)
-        score[some] = np.sum(each * np.linalg.solve(own, each[..., None])[..., 0], axis=1)
-    return score
 
 
 def _misfit(

@@ -33,8 +33,12 @@ def second_lap(run: SmallRun, number: int) -> IntArray:
     return np.flatnonzero((circles.ids == number) & (circles.frame >= 120))
 
 
-def spoilt(run: SmallRun, **changed: NDArray[np.generic]) -> Recording:
-    return replace(run.recording, circles=replace(run.recording.circles, **changed))
+def spoilt(
+    run: SmallRun, *, ids: IntArray | None = None, xy: NDArray[np.float64] | None = None
+) -> Recording:
+    circles = run.recording.circles
+    ids, xy = circles.ids if ids is None else ids, circles.xy if xy is None else xy
+    return replace(run.recording, circles=replace(circles, ids=ids, xy=xy))
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
