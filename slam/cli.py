@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import sys
 
-from slam.options import Associate, Ekf, Export, Import, Localize, Map, Noise
+from slam.options import Associate, Audit, Ekf, Export, Import, Localize, Map, Noise
 from storage.command_line import Program
 
 PROGRAM = Program(
@@ -17,6 +17,7 @@ PROGRAM = Program(
     "Example: slam map images/e --circles --lines -o /tmp/e-map",
     {
         Map: "slam.commands.map",
+        Audit: "slam.commands.audit",
         Localize: "slam.commands.localize",
         Ekf: "slam.commands.ekf",
         Associate: "slam.commands.associate",

@@ -92,6 +92,38 @@ class Map(RunFlags):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Audit(RunFlags):
+    """Find discs whose identifiers contradict the rest of the run, and write the run without them.
+
+    Example: slam audit images/e -o /tmp/audited.circles
+
+    Parameters
+    ----------
+    calibrate : bool
+        Estimate the camera's mounting as well.
+    gate : float
+        Squared error of a row, in units of its covariance, from which on it contradicts.
+    apply : str
+        `mend`: rows get the identifier of the landmark that they show, -1 where none explains
+        them; `drop`: their lines are left out.
+    pictures : Path
+        Folder for pictures of what the rows show.
+    images : Path
+        Folder of the run's images; by default that of the rows.
+    output : Path
+        The landmark file to write; by default audited.circles in the run folder. The list goes
+        into a .csv beside.
+    """
+
+    calibrate: bool = False
+    gate: float = 100.0
+    apply: Literal["mend", "drop"] = "mend"
+    pictures: MaybePath = None
+    images: MaybePath = None
+    output: Annotated[MaybePath, arg(aliases=["-o"])] = None
+
+
+@dataclass(frozen=True, kw_only=True)
 class FilterFlags(RunFlags):
     """Options of both filters.
 
@@ -315,4 +347,4 @@ class Import:
     force: bool = False
 
 
-Command = Map | Localize | Ekf | Associate | Noise | Export | Import
+Command = Map | Audit | Localize | Ekf | Associate | Noise | Export | Import

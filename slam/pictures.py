@@ -6,12 +6,14 @@ gives the same bytes; a user's own matplotlib settings do not matter.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_rgb
+from matplotlib.image import imread
 from matplotlib.ticker import MultipleLocator
 from numpy.typing import ArrayLike, NDArray
 
@@ -19,6 +21,7 @@ from landmarks import is_positive_definite, squared_mahalanobis, wrap_angle
 from landmarks.map_file import LandmarkMap, Landmarks, Path2D
 from slam.errors import SlamError
 from slam.figure_file import picture
+from slam.recording import PICTURES
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -31,6 +34,8 @@ NEES_BAND = (0.21579528262389785, 9.348403604496145)
 _PATH, _REFERENCE, _DISC, _LINE, _BAND = "#1f5f99", "#777777", "#c8501e", "#3a8f4c", "#2a78b5"
 _SIGMA = "\N{GREEK SMALL LETTER SIGMA}"
 _ELLIPSE_POINTS = 40
+# Crops in a row, and their half width.
+_CROPS_ABREAST, _CROP_PX = 8, 48.0
 # Largest number of discs that are labelled with their numbers.
 _MOST_NUMBERED = 40
 # How far beyond path and discs a vertical may be and still be drawn.
@@ -378,3 +383,48 @@ def _draw_landmarks(
 
 def _rgb(colour: str) -> tuple[float, float, float]:
     return to_rgb(colour)
+
+
+class Crop(NamedTuple):
+    """A part of an image: its file, the pixel (u, v) in the middle, and what it is called."""
+
+    file: Path
+    pixel: tuple[float, float]
+    name: str
+
+
+def picture_of_frame(folder: Path, prefix: str) -> Path | None:
+    """The image of a frame in a folder or its subfolder ``images``; None where there is none."""
+    for place in (folder, folder / "images"):
+        for name in (prefix, *(f"{prefix}{suffix}" for suffix in sorted(PICTURES))):
+            if Path(name).suffix.lower() in PICTURES and (place / name).is_file():
+                return place / name
+    return None
+
+
+def draw_crops(png: Path, crops: Sequence[Crop], *, title: str, overwrite: bool = False) -> None:
+    """Draw parts of images side by side, a cross-hair with a gap in the middle of each.
+
+    Parameters
+    ----------
+    png : Path
+        The picture's file.
+    crops : sequence of Crop
+    title : str
+    overwrite : bool
+        Whether an existing file may be replaced.
+    """
+    rows = -(-len(crops) // _CROPS_ABREAST)
+    size = (1.6 * _CROPS_ABREAST, 0.4 + 1.5 * rows)
+    with picture(png, size, overwrite=overwrite, interactive=False) as figure:
+        figure.suptitle(title)
+        axes = figure.subplots(rows, _CROPS_ABREAST, squeeze=False)
+        for some in axes.flat:
+            some.set_axis_off()
+        for some, crop in zip(axes.flat, crops):
+            u, v = crop.pixel
+            some.imshow(imread(crop.file), cmap="gray", aspect="auto")
+            some.plot([u - 14, u + 14], [v, v], "+", color=_DISC, markersize=5)
+            some.set_xlim(u - _CROP_PX, u + _CROP_PX)
+            some.set_ylim(v + _CROP_PX / 2, v - _CROP_PX / 2)
+            some.set_title(crop.name, fontsize=8)

@@ -22,7 +22,8 @@ UNKNOWN_ID = -1
 #: The noise of odometry that states none.
 ASSUMED = OdometryNoise()
 
-_PICTURES = {".bmp", ".gif", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff"}
+#: Suffixes of images.
+PICTURES = {".bmp", ".gif", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff"}
 _STEP_COLUMNS = (
     *("dx", "dy", "dphi"),
     *("cxx", "cxy", "cxphi"),
@@ -172,7 +173,7 @@ def demand_landmarks(path: Path) -> Path:
             f"{path}: no such landmark file or folder: expected a run folder, or a .circles or "
             ".lines file"
         )
-    if path.suffix.lower() in _PICTURES:
+    if path.suffix.lower() in PICTURES:
         raise SlamError(
             f"{path}: is a picture: expected a run folder, or a .circles or .lines file: `detect "
             "circles` and `detect lines` find the landmarks in pictures"

@@ -29,6 +29,8 @@ Solver = Literal["separable", "gtsam"]
 
 # Near enough to the minimum for the final optimisation.
 _COARSE = 1e-3
+# Multiples of the scale of a loss that is not convex, from nearly least squares down.
+_GRADUATION = tuple(2.0 ** (k / 2) for k in range(8, 0, -1))
 
 
 @dataclass(frozen=True)
@@ -171,6 +173,13 @@ def map_run(
         fixed = replace(wanted, calibrate=False, tilt_sigma_rad=0.0)
         if fixed.loss != "none":
             estimate = keep(solve(graph, estimate, plain, tolerance=_COARSE))
+        if fixed.loss == "geman-mcclure":
+            # Graduated non-convexity: from where it is nearly least squares, rows that do not fit
+            # are let go one by one (A. Blake, A. Zisserman, Visual Reconstruction, 1987).
+            for factor in _GRADUATION:
+                scale = factor * fixed.loss_scale
+                wide = replace(fixed, loss_scale=scale)
+                estimate = keep(solve(graph, estimate, wide, tolerance=_COARSE))
         estimate = keep(descend(graph, estimate, fixed))
     as_calibrated = trail[-1].cost
     if wanted.calibrate or wanted.tilt_sigma_rad > 0.0:
