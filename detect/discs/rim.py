@@ -46,7 +46,7 @@ LEAST_TRUSTED = 8
 _PLACING_STEPS, _FAR_OFF = 4, 2.5
 #: Stretches of directions that are left out in turn; their spread is the covariance, with this
 #: share of what independent points of `POINT_SIGMA_PX` would state.
-_STRETCHES, _INDEPENDENT_SHARE = 8, 0.35
+_STRETCHES, _INDEPENDENT_SHARE = 8, 0.5
 #: How far the starts of the circle are from the candidate, nominal radii; the first is at it.
 _START = 0.3
 _STARTS = 9
