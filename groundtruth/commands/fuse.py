@@ -51,6 +51,7 @@ def perform(options: Fuse) -> int:
         ),
         "used": fusion.used,
         "odometry": asdict(fusion.odometry),
+        "localisation": asdict(fusion.localisation) if fusion.localisation else None,
         "covariances_repaired": fusion.repaired,
         "measurements_repeated": fusion.repeated,
         "restarts_s": fusion.restarts_s,
