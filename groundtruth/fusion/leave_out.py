@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from groundtruth.clocks.headings import segments_between_gaps
 from groundtruth.errors import GroundTruthError
 from groundtruth.fusion.fuse import FuseSettings, fuse
 from groundtruth.trajectories.alignment import moved_poses, planar_alignment
@@ -80,7 +79,8 @@ def leave_out(
     own = last_of_each_time(odometry)
     inside = (truth.times_s >= own.times_s[0]) & (truth.times_s <= own.times_s[-1])
     truth = _some(truth, inside)
-    parts = segments_between_gaps(truth.times_s, _SEGMENT_GAP_S) if len(truth) else []
+    cuts = np.flatnonzero(np.diff(truth.times_s) > _SEGMENT_GAP_S) + 1
+    parts = [times for times in np.split(truth.times_s, cuts) if len(times)]
     if len(parts) < 3:
         raise GroundTruthError(
             f"{len(parts)} segments of ground truth within the odometry's time: expected 3 or "
@@ -88,7 +88,7 @@ def leave_out(
         )
     return tuple(
         _left_out(own, streams, truth, float(times[0]), float(times[-1]), settings)
-        for times in (truth.times_s[part] for part in parts[1:-1])
+        for times in parts[1:-1]
     )
 
 
