@@ -42,6 +42,8 @@ _JUMP_SIGMAS = 3.5
 _LEAST_JUMP_S = 0.004
 _LARGEST_DRIFT_OF_A_QUARTZ = 2e-4
 _FEWEST_SAMPLES = 20
+# Of variances: movement's are stated with a margin, so it is left only where headings clearly win.
+_MUCH_LESS_CERTAIN = 4.0
 
 
 @dataclass(frozen=True)
@@ -136,7 +138,9 @@ def synchronise(
             f"truth from {groundtruth.times_s[0]:.3f} s to {groundtruth.times_s[-1]:.3f} s do not "
             f"overlap within {bounds.largest_offset_s:g} s"
         )
-    best = min(on_one_line(by_movement), on_one_line(by_headings), key=_uncertainty)
+    best, alone = on_one_line(by_movement), on_one_line(by_headings)
+    if _uncertainty(best) > _MUCH_LESS_CERTAIN * _uncertainty(alone):
+        best = alone
     return tuple(_told_by_the_others(best))
 
 
