@@ -14,7 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize
+from scipy.optimize import Bounds, minimize
 
 from groundtruth.clocks.clock import ClockModel, ClockSegment
 from groundtruth.errors import GroundTruthError
@@ -38,6 +38,7 @@ def refine_by_movement(
     segments: Sequence[ClockSegment],
     odometry: PlanarPoses,
     groundtruth: PlanarPoses,
+    largest: tuple[float, float],
 ) -> list[ClockSegment]:
     """Move each segment's offset and rate to where the movements fit best.
 
@@ -49,23 +50,30 @@ def refine_by_movement(
         The robot's own poses on its own clock.
     groundtruth : PlanarPoses
         Poses with covariances.
+    largest : (float, float)
+        Bounds of the offset (s) and the drift, either way.
 
     Returns
     -------
     list of ClockSegment
         Refined if their status is `ok` or `jump`, the robot drove a metre or more, and the result
-        is near the estimate by headings; the others unchanged.
+        is near the estimate by headings and within the bounds; the others unchanged.
     """
     if groundtruth.covariances is None:
         return list(segments)
     return [
-        _refined(segment, odometry, groundtruth) if segment.status in ("ok", "jump") else segment
+        _refined(segment, odometry, groundtruth, largest)
+        if segment.status in ("ok", "jump")
+        else segment
         for segment in segments
     ]
 
 
 def _refined(
-    segment: ClockSegment, odometry: PlanarPoses, groundtruth: PlanarPoses
+    segment: ClockSegment,
+    odometry: PlanarPoses,
+    groundtruth: PlanarPoses,
+    largest: tuple[float, float],
 ) -> ClockSegment:
     assert groundtruth.covariances is not None
     here = (groundtruth.times_s >= segment.from_s) & (groundtruth.times_s <= segment.to_s)
@@ -89,6 +97,8 @@ def _refined(
     # segment's middle and at its ends.
     half = 0.5 * (segment.to_s - segment.from_s)
     unit = np.array([max(segment.sigma_offset_s, 1e-3), max(segment.sigma_rate, 1e-3 / half)])
+    start = np.array([segment.offset_s, segment.rate - 1.0])
+    bounds = Bounds((-np.array(largest) - start) / unit, (np.array(largest) - start) / unit)
 
     def surprise(x: FloatArray) -> float:
         moved = replace(
@@ -116,12 +126,14 @@ def _refined(
                 surprise,
                 best,
                 method="Nelder-Mead",
+                bounds=bounds,
                 options={"xatol": 0.01, "fatol": 0.01, "initial_simplex": best + _SIMPLEX},
             )
             best = found.x
     except GroundTruthError:
         return segment
-    if np.max(np.abs(best)) > _FARTHEST:
+    at_bound = np.abs(start + unit * best) > _AT_A_BOUND * np.array(largest)
+    if np.max(np.abs(best)) > _FARTHEST or np.any(at_bound):
         return segment
     covariance = _covariance(surprise, best)
     if covariance is None:
@@ -139,6 +151,8 @@ def _refined(
 _SIMPLEX = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
 # Largest distance from the estimate by headings, in its deviations; beyond it is rejected.
 _FARTHEST = 8.0
+# Share of the bounds beyond which the search has not found a minimum within them.
+_AT_A_BOUND = 0.999
 
 
 def _covariance(surprise: Callable[[FloatArray], float], at: FloatArray) -> FloatArray | None:

@@ -42,6 +42,8 @@ _JUMP_SIGMAS = 3.5
 _LEAST_JUMP_S = 0.004
 _LARGEST_DRIFT_OF_A_QUARTZ = 2e-4
 _FEWEST_SAMPLES = 20
+# Of variances: movement's are stated with a margin, so it is left only where headings clearly win.
+_MUCH_LESS_CERTAIN = 4.0
 
 
 @dataclass(frozen=True)
@@ -112,7 +114,9 @@ def synchronise(
             raise GroundTruthError(
                 f"{name} has {len(poses)} poses: expected {_FEWEST_SAMPLES} or more"
             )
-    found: list[ClockSegment] = []
+    by_headings: list[ClockSegment] = []
+    by_movement: list[ClockSegment] = []
+    limits = (bounds.largest_offset_s, bounds.largest_drift)
     for part in segments_between_gaps(groundtruth.times_s, bounds.segment_gap_s):
         covariances = groundtruth.covariances
         segment = PlanarPoses(
@@ -120,22 +124,34 @@ def synchronise(
             groundtruth.poses[part],
             covariances[part] if covariances is not None and bounds.use_movement else None,
         )
-        determined = refine_by_movement(
-            _segment(odometry, segment, bounds, _MOST_JUMPS), odometry, segment
-        )
-        if len(determined) > 1 and not _differ(determined):
+        own = _segment(odometry, segment, bounds, _MOST_JUMPS)
+        refined = refine_by_movement(own, odometry, segment, limits)
+        if len(refined) > 1 and not _differ(refined):
             # Headings suggested a jump of the clock that the whole movement does not confirm.
-            determined = refine_by_movement(
-                _segment(odometry, segment, bounds, 0), odometry, segment
-            )
-        found.extend(determined)
-    if all(segment.turned_rad == 0.0 and segment.note == "no odometry" for segment in found):
+            own = _segment(odometry, segment, bounds, 0)
+            refined = refine_by_movement(own, odometry, segment, limits)
+        by_headings.extend(own)
+        by_movement.extend(refined)
+    if all(segment.turned_rad == 0.0 and segment.note == "no odometry" for segment in by_headings):
         raise GroundTruthError(
             f"odometry from {odometry.times_s[0]:.3f} s to {odometry.times_s[-1]:.3f} s and ground "
             f"truth from {groundtruth.times_s[0]:.3f} s to {groundtruth.times_s[-1]:.3f} s do not "
             f"overlap within {bounds.largest_offset_s:g} s"
         )
-    return tuple(_told_by_the_others(on_one_line(found)))
+    best, alone = on_one_line(by_movement), on_one_line(by_headings)
+    if _uncertainty(best) > _MUCH_LESS_CERTAIN * _uncertainty(alone):
+        best = alone
+    return tuple(_told_by_the_others(best))
+
+
+def _uncertainty(segments: list[ClockSegment]) -> float:
+    """Variances of the offsets at the ends of the segments that are determined, summed up (s^2)."""
+    return sum(
+        segment.sigma_offset_s**2
+        + (0.5 * segment.sigma_rate * (segment.to_s - segment.from_s)) ** 2
+        for segment in segments
+        if segment.status != "no turns"
+    )
 
 
 def _segment(

@@ -13,6 +13,7 @@ from groundtruth.commands.options import Fuse
 from groundtruth.commands.outputs import check_outputs, provenance, write_account
 from groundtruth.errors import GroundTruthError
 from groundtruth.fusion.fuse import FuseSettings, fuse
+from groundtruth.fusion.leave_out import leave_out
 from groundtruth.trajectories.streams import PlanarPoses, read_planar_poses, write_planar_poses
 
 
@@ -44,6 +45,7 @@ def perform(options: Fuse) -> int:
                 f"{files[name]}: no covariances: expected t, x, y, theta and 9 more, as of {name}"
             )
     fusion = fuse(odometry, streams, settings)
+    left_out = leave_out(odometry, streams, settings) if options.leave_out else ()
     document = {
         **provenance(
             settings,
@@ -51,6 +53,8 @@ def perform(options: Fuse) -> int:
         ),
         "used": fusion.used,
         "odometry": asdict(fusion.odometry),
+        "localisation": asdict(fusion.localisation) if fusion.localisation else None,
+        "left_out": [asdict(segment) for segment in left_out],
         "covariances_repaired": fusion.repaired,
         "measurements_repeated": fusion.repeated,
         "restarts_s": fusion.restarts_s,
@@ -69,6 +73,20 @@ def perform(options: Fuse) -> int:
         f"{len(fusion.rejected)} rejected, {len(fusion.restarts_s)} restarts; "
         f"median sigma {sigma:.1f} mm"
     )
+    if fusion.localisation is not None:
+        print(
+            f"{options.odometry} is taken for a localisation: its errors are stationary, of "
+            f"{1e3 * fusion.localisation.position_sigma:.0f} mm in x and y and "
+            f"{np.degrees(fusion.localisation.heading_sigma):.2f} degrees"
+        )
+    for segment in left_out:
+        print(
+            f"without {segment.from_s:.1f} s to {segment.to_s:.1f} s: predicted to "
+            f"{segment.position_rms_m:.3f} m, {np.degrees(segment.heading_rms_rad):.2f} degrees "
+            f"(rms; NEES {segment.normalised_error:.2f}); odometry aligned rigidly: "
+            f"{segment.aligned_position_rms_m:.3f} m, "
+            f"{np.degrees(segment.aligned_heading_rms_rad):.2f} degrees"
+        )
     if fusion.pauses_s:
         begin, end = max(fusion.pauses_s, key=lambda pause: pause[1] - pause[0])
         print(

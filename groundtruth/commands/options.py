@@ -313,6 +313,9 @@ class Fuse:
         Share of right poses that pass the gate.
     covariance_scale : two floats
         Factors on the covariances of laser and camera.
+    leave_out : bool
+        Leave each segment of the ground truth between two others out as well, predict it, and print
+        how far off the prediction is (pauses of more than 5 s begin another segment).
     output : Path
         The file to write (t, x, y, theta and 9 of covariance). What was rejected, settings and
         version go into a .json beside it.
@@ -331,6 +334,7 @@ class Fuse:
     learn_noise: bool = True
     gate_probability: float = 0.9999
     covariance_scale: tuple[float, float] = (1.0, 1.0)
+    leave_out: bool = False
     output: Annotated[Path, arg(aliases=["-o"])] = Path("fused.csv")
     force: bool = False
 

@@ -9,14 +9,21 @@ arcs; so no measurement is interpolated, which would count the same noise twice.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from groundtruth.errors import GroundTruthError
 from groundtruth.fusion.controls import pauses_of
-from groundtruth.fusion.learning import likeliest_noise, looser_over_seconds, noise_of
+from groundtruth.fusion.learning import (
+    likeliest_noise,
+    looser_over_seconds,
+    noise_of,
+    terms_that_pay,
+)
+from groundtruth.fusion.localisation import LocalisationErrors, as_localisation
 from groundtruth.fusion.movement import movement_problem
 from groundtruth.fusion.settings import FuseSettings
 from groundtruth.trajectories.streams import PlanarPoses, last_of_each_time
@@ -91,6 +98,8 @@ class Fusion:
         Measurements that went in, by stream.
     odometry : OdometryErrors
         The estimated errors of odometry.
+    localisation : LocalisationErrors or None
+        Errors of odometry that is a localisation, along which the path was estimated then.
     repaired : dict of str to int
         Covariances that were not positive definite as written, by stream; they were raised by their
         file's rounding.
@@ -106,6 +115,7 @@ class Fusion:
     restarts_s: tuple[float, ...]
     used: dict[str, int]
     odometry: OdometryErrors
+    localisation: LocalisationErrors | None
     repaired: dict[str, int]
     repeated: dict[str, int]
     pauses_s: tuple[tuple[float, float], ...]
@@ -149,30 +159,45 @@ def fuse(
     noise = likeliest_noise(problem) if chosen.learn_noise else noise_of(chosen)
     looser = looser_over_seconds(problem, noise) if chosen.learn_noise else 1.0
     smoothed, spread, account = problem.smooth(noise, looser)
+    deviations = np.sqrt(np.maximum(np.diagonal(spread[-1])[3:], 0.0))
+    over_seconds = math.sqrt(looser) * noise
+    kept = terms_that_pay(problem, over_seconds, smoothed[-1, 3:], deviations)
+    if not np.all(kept):
+        problem = replace(problem, settings=chosen.with_terms(kept))
+        smoothed, spread, account = problem.smooth(noise, looser)
 
     at = np.searchsorted(problem.times_s, inside)
     poses = smoothed[at, :3]
     poses[:, 2] = wrap_angle(poses[:, 2])
+    path = PlanarPoses(inside, poses, spread[at][:, :3, :3].copy())
+    squared, accepted, restarted = account.squared, account.accepted, account.restarted > 0
+    localisation = None
+    if chosen.learn_noise:
+        found = as_localisation(last_of_each_time(odometry), problem, over_seconds, inside)
+        if found is not None:
+            path, squared, localisation = found
+            accepted, restarted = squared <= problem.gate(), np.zeros_like(restarted)
     # Odometry's errors are constants: their final estimate uses all measurements.
     last_spread = np.sqrt(np.maximum(np.diagonal(spread[-1]), 0.0))
     return Fusion(
-        poses=PlanarPoses(inside, poses, spread[at][:, :3, :3].copy()),
+        poses=path,
         rejected=tuple(
             Rejected(
                 problem.streams[i],
                 float(problem.times_s[problem.nodes[i]]),
-                float(account.squared[i]),
+                float(squared[i]),
             )
-            for i in np.flatnonzero(~account.accepted)
+            for i in np.flatnonzero(~accepted)
         ),
-        restarts_s=tuple(float(time) for time in problem.times_s[account.restarted > 0]),
+        restarts_s=tuple(float(time) for time in problem.times_s[restarted]),
         used={
-            name: int(np.count_nonzero(account.accepted & (np.array(problem.streams) == name)))
+            name: int(np.count_nonzero(accepted & (np.array(problem.streams) == name)))
             for name in streams
         },
         odometry=OdometryErrors(
             *np.concatenate([smoothed[-1, 3:], last_spread[3:], noise, [looser]]).tolist()
         ),
+        localisation=localisation,
         repaired=problem.repaired,
         repeated=problem.repeated,
         pauses_s=tuple(

@@ -25,6 +25,10 @@ _LEARNING_ROUNDS = 2
 _SPACING_S = 2.0
 _LOOSENING_ROUNDS = 3
 _DOUBT = 0.001
+# Akaike's: an estimate fits its own measurements that much better by chance.
+_COST_OF_TERM = 2.0
+# Share of its deviation before anything was measured below which an estimate counts as measured.
+_MEASURED = 0.5
 
 
 def noise_of(settings: FuseSettings) -> FloatArray:
@@ -108,3 +112,43 @@ def looser_over_seconds(problem: MovementProblem, noise: FloatArray) -> float:
             return 1.0
         looser *= max(squared / numbers, 1.0)
     return looser
+
+
+def terms_that_pay(
+    problem: MovementProblem, noise: FloatArray, means: FloatArray, deviations: FloatArray
+) -> NDArray[np.bool_]:
+    """Which of odometry's systematic errors, as estimated, make better predictions over seconds.
+
+    They are estimated from sample to sample. Where odometry's own jitter is a part of these
+    samples, measured poses deny it, and a share of turns comes out that is none (regression
+    dilution). Over seconds, and over gaps, such an estimate predicts worse than none.
+
+    Parameters
+    ----------
+    problem : MovementProblem
+    noise : (4,) array
+        Odometry's random errors over seconds.
+    means, deviations : (3,) arrays
+        The estimates.
+
+    Returns
+    -------
+    (3,) bool
+    """
+    thin = problem.thinned(_SPACING_S)
+    kept = deviations > 0.0
+
+    def surprise(terms: NDArray[np.bool_]) -> float:
+        account = thin.account(noise, (means * terms, deviations * terms))
+        return account.surprise + _COST_OF_TERM * np.count_nonzero(terms)
+
+    best = surprise(kept)
+    # What was hardly measured stays as uncertain as it is.
+    measured = deviations < _MEASURED * problem.settings.systematic_sigmas()
+    while np.any(kept & measured):
+        fewer = [kept & (np.arange(3) != term) for term in np.flatnonzero(kept & measured)]
+        tried = [surprise(terms) for terms in fewer]
+        if min(tried) > best:
+            break
+        best, kept = min(tried), fewer[int(np.argmin(tried))]
+    return kept

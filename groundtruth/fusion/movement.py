@@ -149,13 +149,20 @@ class MovementProblem:
         """Minus twice the logarithm of the measurements' likelihood."""
         return self.account(noise).surprise
 
-    def account(self, noise: FloatArray) -> MeasurementAccount:
-        """How a forward-only filter uses the measurements."""
+    def account(
+        self, noise: FloatArray, systematic: tuple[FloatArray, FloatArray] | None = None
+    ) -> MeasurementAccount:
+        """How a forward-only filter uses the measurements.
+
+        It begins with the given means and deviations of odometry's systematic errors, by default
+        with those of the settings.
+        """
         return self._forward(
             self._variances(noise),
             np.empty((1, STATE)),
             np.zeros(len(self.times_s), dtype=np.bool_),
             None,
+            systematic,
         )
 
     def thinned(self, spacing_s: float) -> MovementProblem:
@@ -284,17 +291,14 @@ class MovementProblem:
         points: FloatArray,
         cuts: NDArray[np.bool_],
         history: FilterHistory | None,
+        systematic: tuple[FloatArray, FloatArray] | None = None,
     ) -> MeasurementAccount:
-        systematic = (
-            self.settings.turn_scale_sigma,
-            self.settings.turn_bias_per_metre_sigma,
-            self.settings.distance_scale_sigma,
-        )
+        means, deviations = systematic or (np.zeros(3), self.settings.systematic_sigmas())
         return MeasurementAccount(
             *filter_forward(
                 Odometry(self.controls, variances),
-                np.concatenate([self.measured[0], np.zeros(3)]),
-                np.diag(np.concatenate([_RESTART_VARIANCES, np.square(systematic)])),
+                np.concatenate([self.measured[0], means]),
+                np.diag(np.concatenate([_RESTART_VARIANCES, np.square(deviations)])),
                 MeasuredPoses(self.nodes, self.measured, self.covariances),
                 Gating(
                     self.gate(),

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
 
 from groundtruth.errors import GroundTruthError
 
@@ -39,7 +42,8 @@ class FuseSettings:
         what makes the measurements likeliest; they only begin the search then.
     turn_scale_sigma, turn_bias_per_metre_sigma, distance_scale_sigma : float
         Standard deviations, before anything was measured, of what odometry is off by: the share of
-        each turn, the turn per metre (rad), the share of each way.
+        each turn, the turn per metre (rad), the share of each way. Terms that make no better
+        predictions are left out.
     gate_probability : float
         Share of right poses that pass the gate.
     covariance_scale : dict of str to float
@@ -74,3 +78,19 @@ class FuseSettings:
         for name, value in (self.covariance_scale or {}).items():
             if not (math.isfinite(value) and value > 0.0):
                 raise GroundTruthError(f"covariance scale of {name} is {value}: expected above 0")
+
+    def systematic_sigmas(self) -> NDArray[np.float64]:
+        """(3,) of the turns' share, the turn per metre (rad) and the ways' share."""
+        return np.array(
+            [self.turn_scale_sigma, self.turn_bias_per_metre_sigma, self.distance_scale_sigma]
+        )
+
+    def with_terms(self, kept: NDArray[np.bool_]) -> FuseSettings:
+        """With some of these three alone; the others are taken to be 0."""
+        turn, bend, way = np.where(kept, self.systematic_sigmas(), 0.0).tolist()
+        return replace(
+            self,
+            turn_scale_sigma=turn,
+            turn_bias_per_metre_sigma=bend,
+            distance_scale_sigma=way,
+        )

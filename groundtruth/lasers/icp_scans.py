@@ -4,6 +4,11 @@ ICP finds the nearest minimum, which for two scans of a turning robot is often a
 coarse ICP is started from headings all round. Its results are scored by the share of *both* scans
 that coincides with the other, and the best few are refined and scored again.
 
+In a corridor poses along it explain both scans about equally, while the few readings that tell them
+apart may be of somebody who walks there: residuals then say nothing of the error. So other poses
+that explain nearly as much are looked for among the refined ones and along the direction that is
+known least; where there are any, the match is ambiguous and its covariance reaches them.
+
 References
 ----------
 A. Censi, "An ICP variant using a point-to-line metric", ICRA 2008.
@@ -26,6 +31,11 @@ from storage.bounds import ABOVE_0, LIMIT, SHARE_ABOVE_0, Bounds, demand, whole
 
 FloatArray = NDArray[np.float64]
 
+# Share of what the best pose explains, beyond which a refined pose or one along the direction that
+# is known least is as good; and how far along (m).
+_RIVAL_SHARE = 0.8
+_RIVAL_SHARE_ALONG = 0.95
+_ALONG_M = np.array([sign * step for sign in (-1.0, 1.0) for step in np.arange(2, 11) / 10.0])
 
 _TURN_DEG = Bounds("above 0, at most 360", 0.0, 360.0, above=True)
 
@@ -104,14 +114,16 @@ class ScanMatch:
     pose : (3,) float64
         x, y (m), theta (rad) of the scan in the target's frame.
     covariance : (3, 3) float64
-        From the residuals' size and the geometry; infinite on the diagonal where nothing is
-        determined.
+        From the residuals' size and the geometry, and wide enough for rivals where it is ambiguous;
+        infinite on the diagonal where nothing is determined.
     explained : float
         Share of both scans' points that coincide with the other scan, 0 to 1.
     rival : float
         The same of the best other pose found, 0 without one.
     undetermined : (k, 3) float64
         Directions that the geometry leaves open, as in `groundtruth.lasers.icp.IcpResult`.
+    ambiguous : bool
+        Another pose explains nearly as much: the match may be grossly wrong.
     """
 
     pose: FloatArray
@@ -119,6 +131,7 @@ class ScanMatch:
     explained: float
     rival: float
     undetermined: FloatArray
+    ambiguous: bool
 
 
 def match_scans(
@@ -180,7 +193,40 @@ def match_scans(
     share, pose = fine[0]
     pose[2] = wrap_angle(pose[2])
     covariance, undetermined = _uncertainty(moving, fixed, normals * good[:, None], pose, s)
-    return ScanMatch(pose, covariance, share, fine[1][0] if len(fine) > 1 else 0.0, undetermined)
+    away = [rival - pose for other, rival in fine[1:] if other > _RIVAL_SHARE * share]
+    away += _as_good_along(moving, fixed, normals * good[:, None], pose, covariance, s)
+    for difference in away:
+        difference[2] = wrap_angle(difference[2])
+        # As wide as the error is if one of the rivals is right.
+        covariance = covariance + np.outer(difference, difference) / len(away)
+    rival = fine[1][0] if len(fine) > 1 else 0.0
+    return ScanMatch(pose, covariance, share, rival, undetermined, bool(away))
+
+
+def _as_good_along(
+    moving: FloatArray,
+    fixed: FloatArray,
+    normals: FloatArray,
+    pose: FloatArray,
+    covariance: FloatArray,
+    s: ScanMatchSettings,
+) -> list[FloatArray]:
+    """Shifts along the direction that is known least that leave points as near to their lines."""
+    if not np.isfinite(covariance).all():
+        return []
+    direction = np.append(np.linalg.eigh(covariance[:2, :2])[1][:, 1], 0.0)
+
+    def near(shift: float) -> float:
+        world = moved(moving, pose + shift * direction)
+        index, squared = nearest_points(world, fixed)
+        normal = normals[index]
+        across = np.sum(normal * (world - fixed[index]), axis=1) ** 2
+        on_line = np.any(normal != 0.0, axis=1) & (squared < _ALONG_M[-1] ** 2)
+        off = np.where(on_line, across, squared)
+        return float(np.mean(np.exp(-0.5 * off / s.fine_sigma_m**2)))
+
+    least = _RIVAL_SHARE_ALONG * near(0.0)
+    return [shift * direction for shift in _ALONG_M if near(shift) > least]
 
 
 def _distinct(found: list[tuple[float, FloatArray]]) -> list[tuple[float, FloatArray]]:

@@ -95,12 +95,15 @@ def perform(options: LaserLog) -> int:
     match_scans(points[1], points[0], settings)  # compiles
     found = np.full((len(pairs), 3), np.nan)
     share = np.zeros((len(pairs), 2))
+    ambiguous = np.zeros(len(pairs), dtype=np.bool_)
+    covariances = np.tile(np.eye(3), (len(pairs), 1, 1))
     began = time.perf_counter()
     for row, i in enumerate(pairs):
         try:
             match = match_scans(points[i + 1], points[i], settings)
         except GeometryError:
             continue
+        ambiguous[row], covariances[row] = match.ambiguous, match.covariance
         found[row], share[row] = match.pose, (match.explained, match.rival)
     elapsed = time.perf_counter() - began
     truth = between(poses[:-1], poses[1:])[pairs]
@@ -110,6 +113,17 @@ def perform(options: LaserLog) -> int:
     gross = (shift_m > 0.15) | (turn_deg > 3.0)
     print(f"pairs {len(pairs)}, {1e3 * elapsed / len(pairs):.1f} ms each")
     print(f"gross failures (> 0.15 m or > 3 deg): {100 * gross.mean():.2f} % ({gross.sum()})")
+    print(
+        f"gross failures that are not flagged: {100 * np.mean(gross & ~ambiguous):.2f} % "
+        f"({np.sum(gross & ~ambiguous)}); flagged: {np.sum(gross & ambiguous)} of them, "
+        f"{np.sum(~gross & ambiguous)} of {np.sum(~gross)} others"
+    )
+    if np.any(gross & ~np.isnan(found[:, 0])):
+        rows = gross & np.isfinite(covariances).all(axis=(1, 2)) & ~np.isnan(found[:, 0])
+        error = found[rows] - truth[rows]
+        error[:, 2] = wrap_angle(error[:, 2])
+        normalised = np.einsum("ni,nij,nj->n", error, np.linalg.inv(covariances[rows]), error)
+        print(f"gross failures: median squared error, normalised, {np.median(normalised) / 3:.1f}")
     for percent in (50, 90, 95):
         print(
             f"{percent:3d} %: {np.percentile(shift_m, percent):.4f} m "

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -215,6 +217,7 @@ def test_scans_are_matched_from_no_motion(turn_deg: float) -> None:
     assert wrap_angle(match.pose[2] - truth[2]) == pytest.approx(0.0, abs=np.radians(0.4))
     assert match.explained > match.rival
     assert len(match.undetermined) == 0
+    assert not match.ambiguous
 
 
 def test_one_start_is_not_enough_for_a_large_turn() -> None:
@@ -225,3 +228,26 @@ def test_one_start_is_not_enough_for_a_large_turn() -> None:
     lone = ScanMatchSettings(heading_step_deg=360.0, largest_shift_m=100.0)
     one = match_scans(scan(second, rng), scan(first, rng), lone)
     assert abs(one.pose[2] - np.radians(80.0)) > np.radians(3.0)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_corridor_is_ambiguous_and_the_covariance_says_so(seed: int) -> None:
+    """A few readings of somebody who walks along with the robot tell it that it stands."""
+    rng = np.random.default_rng(seed)
+    walls = np.array([[-40.0, -1.0, 40.0, -1.0], [40.0, 1.0, -40.0, 1.0]])
+    angles = np.radians(np.arange(-90.0, 90.1, 0.25))
+    scans = []
+    for x in (0.0, 0.4):
+        ranges = cast(np.array([x, 0.0, 0.0]), angles, walls)
+        ranges += rng.normal(0.0, 0.01, len(angles))
+        seen = ranges < 5.0
+        beams = np.stack([np.cos(angles), np.sin(angles)], axis=-1)[seen]
+        person = np.array([2.0, 0.3]) + rng.normal(0.0, 0.01, (8, 2))
+        scans.append(np.concatenate([ranges[seen, None] * beams, person]))
+    match = match_scans(scans[1], scans[0])
+    error = match.pose - [0.4, 0.0, 0.0]
+    assert match.ambiguous
+    assert abs(error[0]) > 0.15
+    assert math.sqrt(match.covariance[0, 0]) > 0.15
+    assert math.sqrt(match.covariance[1, 1]) < 0.1
+    assert abs(error[0]) < 3.0 * math.sqrt(match.covariance[0, 0])
