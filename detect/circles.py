@@ -135,7 +135,9 @@ def detect_circles(
         more = second_looks_at(image, camera, table, settings, floor_xy, noise)
         is_disc = more.log_odds >= 0.0
         more_xy = more.floor_xy[is_disc]
-        pixels = np.concatenate([pixels, np.rint(camera.project_floor(more_xy)).astype(np.int64)])
+        last = [camera.width - 1, camera.height - 1]
+        more_pixels = np.clip(np.rint(camera.project_floor(more_xy)), 0, last).astype(np.int64)
+        pixels = np.concatenate([pixels, more_pixels])
         order = np.argsort(pixels[:, 1] * image.shape[1] + pixels[:, 0], kind="stable")
         pixels = pixels[order]
         found_quality = np.concatenate([found_quality, more.quality[is_disc]])[order]

@@ -120,6 +120,8 @@ def hough_candidates(
     least_step : float
         Least gradient of an edge, grey levels per pixel.
     """
+    if not table.usable.any():
+        return HoughCandidates(np.empty((0, 2)), np.empty(0))
     cells = _cells(camera, table, radius)
     edges = edges_of(image)
     votes = count_votes(
@@ -227,8 +229,12 @@ def _cells(camera: Camera, table: DiscTable, radius: float) -> Cells:
     floor = table.floor_xy.astype(np.float64)
     offset = floor - foot
     distance = np.hypot(offset[..., 0], offset[..., 1])
-    bearing = np.arctan2(offset[..., 0], -offset[..., 1])
     usable = table.usable & np.isfinite(distance)
+    # Directions count from the middle of what is seen: where they wrap nothing is seen.
+    ahead = offset[usable].mean(axis=0)
+    ahead /= max(float(np.hypot(*ahead)), 1e-9)
+    aside = np.array([-ahead[1], ahead[0]])
+    bearing = np.arctan2(offset @ aside, offset @ ahead)
     edges = _ring_edges(distance, usable, radius)
     middle = 0.5 * (edges[1:] + edges[:-1])
     pixel = _CELL_PX * np.hypot(middle, height) / camera.scale_x
@@ -251,9 +257,11 @@ def _cells(camera: Camera, table: DiscTable, radius: float) -> Cells:
     high = floor[usable].max(axis=0) + 2.0 * radius
     per_metre = _RASTER_PER_RADIUS / radius
     places = [np.arange(math.ceil((b - a) * per_metre)) + 0.5 for a, b in zip(low, high)]
-    x, y = np.meshgrid(low[0] + places[0] / per_metre, low[1] + places[1] / per_metre)
-    far = np.hypot(x - foot[0], y - foot[1])
-    along = np.arctan2(x - foot[0], -(y - foot[1])) - first
+    grid = np.meshgrid(low[0] + places[0] / per_metre, low[1] + places[1] / per_metre)
+    place = np.stack(grid, axis=-1) - foot
+    far = np.hypot(place[..., 0], place[..., 1])
+    along = np.arctan2(place @ aside, place @ ahead) - first
+    angle = (turn + first)[:, None]
     return Cells(
         raster=cell_of(np.searchsorted(edges, far, side="right") - 1, along).astype(np.int32),
         origin=low,
@@ -261,8 +269,7 @@ def _cells(camera: Camera, table: DiscTable, radius: float) -> Cells:
         above=cell_of(of_ring + 1, turn),
         below=cell_of(of_ring - 1, turn),
         ring=ring[:-1],
-        floor_xy=foot
-        + middle[of_ring, None] * np.stack([np.sin(turn + first), -np.cos(turn + first)], axis=-1),
+        floor_xy=foot + middle[of_ring, None] * (np.cos(angle) * ahead + np.sin(angle) * aside),
         first_row=int(np.flatnonzero(np.isfinite(distance).any(axis=1))[0]),
     )
 

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from camera import Camera
+from camera.calibration.floor import with_pose
 from detect.circles import disc_shape
 from detect.discs.hough import count_votes, edges_of, hough_candidates
 from detect.settings import CircleSettings
-from lut import DiscTable, build_disc_table
+from lut import DiscShape, DiscTable, build_disc_table
 from tests.detect.painted_floor import DARK, FLOOR, LIGHT, PaintedFloor
 
 PLACES = np.array([(0.3, -1.2), (-0.5, -2.0), (0.5, -3.2)])
@@ -38,6 +39,24 @@ def test_the_best_candidates_are_the_discs(
     assert (distance.min(axis=1) < 0.05).all()
     other = hough_candidates(floor.image(seed=1), published_camera, table, 0.1, -sign, 4.0)
     assert not len(other.score) or other.score[0] < found.score[len(PLACES) - 1]
+
+
+def test_a_camera_that_looks_back_sees_the_same(published_camera: Camera) -> None:
+    """Directions about the camera's foot begin where nothing is seen."""
+    turned = np.array(published_camera.robot_from_camera)
+    turned[:2] *= -1.0
+    camera = with_pose(published_camera, turned)
+    table = build_disc_table(camera, disc_shape(CircleSettings()))
+    for place in [(0.0, 1.3), (0.02, 2.0), (-0.02, 2.6)]:
+        image = PaintedFloor(camera).disc(place).image(seed=4)
+        found = hough_candidates(image, camera, table, 0.1, 1.0, 4.0)
+        assert np.hypot(*(found.floor_xy[0] - place)) < 0.05
+
+
+def test_a_table_without_centres_has_no_candidates(published_camera: Camera) -> None:
+    table = build_disc_table(published_camera, DiscShape(far_limit_m_per_px=1e-9))
+    image = PaintedFloor(published_camera).disc(PLACES[0]).image(seed=1)
+    assert len(hough_candidates(image, published_camera, table, 0.1, 1.0, 4.0).score) == 0
 
 
 def test_nothing_on_a_bare_floor(published_camera: Camera, table: DiscTable) -> None:
