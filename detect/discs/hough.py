@@ -4,7 +4,7 @@ At the rim of a light disc the gradient of the grey value, taken on the floor, p
 one radius away. With A the derivative of the floor position X by the pixel and g the gradient in
 the image, the centre is
 
-    X + r n,  n = A^-T g / |A^-T g|,
+    X + r n,  n = m / norm(m),  m = A^-T g,
 
 and X - r n for a dark disc. Every pixel with a strong gradient votes for one centre, by the share
 of the rim that it sees; so whatever hides or lights a part of a disc takes its own share of the
