@@ -232,7 +232,9 @@ def _blurred(
     cdf = [NormalDist(0.0, blur_cells).cdf(end - 0.5) for end in range(-2, 4)]
     shares = (np.diff(cdf) / (cdf[-1] - cdf[0])).astype(np.float32)
     padded = np.pad(patterns, ((0, 0), (2, 2), (2, 2)), constant_values=around)
-    grey = sliding_window_view(padded, (5, 5), axis=(1, 2)) @ shares @ shares
+    # Not by `@`, whose vector instructions may flag values beyond the end of a window as invalid.
+    windows = sliding_window_view(padded, (5, 5), axis=(1, 2))
+    grey = np.einsum("nijkl,k,l->nij", windows, shares, shares)
     flat = grey.reshape(len(grey), -1)
     flat = flat - flat.mean(axis=1, keepdims=True)
     length = np.linalg.norm(flat, axis=1, keepdims=True)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from detect.errors import DetectError
-from storage.bounds import demand, whole
+from storage.bounds import NOT_NEGATIVE, demand, whole
 
 #: Axes of a robot's poses: X forward and Y left, or the data set's X left and Y backward.
 Axes = Literal["robotics", "dataset"]
@@ -55,7 +55,10 @@ class SourceOptions:
     bits: int = 0
 
     def __post_init__(self) -> None:
-        demand(self, DetectError, frames=whole(0))
+        demand(
+            self, DetectError,
+            frames=whole(0), wheel_base_m=NOT_NEGATIVE, metres_per_tick=NOT_NEGATIVE,
+        )  # fmt: skip
         if self.bits and not 8 <= self.bits <= 16:
             raise DetectError(f"bits is {self.bits}: expected 8 to 16, or 0")
 

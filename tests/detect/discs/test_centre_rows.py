@@ -7,7 +7,7 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -63,6 +63,7 @@ def test_no_usable_centre_is_too_far_from_those_tested(camera: Camera, apart_m: 
     some = build_disc_table(camera, shape)
     every = build_disc_table(camera, disc_shape(EVERY_ROW))
     rows = np.unique(some.row)
+    assume(len(rows) > 0)  # images of a few pixels may show no whole disc in any row tested
     floor = every.floor_xy.astype(np.float64)
     for v in np.unique(every.row).tolist():
         columns = np.flatnonzero(every.usable[v])[::16]
@@ -72,11 +73,12 @@ def test_no_usable_centre_is_too_far_from_those_tested(camera: Camera, apart_m: 
         by_v /= min(v + 1, camera.height - 1) - max(v - 1, 0)
         length = np.linalg.norm(by_u, axis=1)
         if v in rows:
-            # The next tested centre is at most half a stride away, or the next pixel.
+            # The next tested centre is at most half a stride away, more where pixels grow along the
+            # row, or the next pixel.
             tested = np.flatnonzero(some.usable[v])
             between = (columns >= tested[0]) & (columns <= tested[-1])
             off = np.abs(columns[:, None] - tested).min(axis=1)
-            assert np.all((off * length)[between] <= 0.6 * apart_m + length[between])
+            assert np.all((off * length)[between] <= 0.9 * apart_m + length[between])
         elif rows[0] < v < rows[-1]:
             # How far the next row's line of sight is from this one, where they meet the floor.
             across = np.abs(by_u[:, 0] * by_v[:, 1] - by_u[:, 1] * by_v[:, 0]) / length
