@@ -12,7 +12,7 @@ the greatest and the least of each channel, and weighs these together with some 
 
 A turn of the disc turns a and b and changes nothing else. Networks that were trained from several
 seeds are averaged. Their weights, some 2,000 each, are trained by `python -m tools.evaluation
-evidence-weights`.
+train-rim-network`.
 """
 
 from __future__ import annotations

@@ -20,14 +20,12 @@ import itertools
 from dataclasses import dataclass, replace
 from statistics import NormalDist
 
-import cv2
 import numpy as np
 from cv2 import aruco
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from detect.errors import DetectError
-from detect.markers.settings import MarkerSettings
 
 FloatArray = NDArray[np.float64]
 
@@ -266,14 +264,3 @@ def _decoys(
     apart = flat.sum(axis=1)[:, None] + known.sum(axis=1)[None] - 2.0 * flat @ known.T
     near = apart < 2.0
     return flat[~near.any(axis=1)], near.any(axis=0)
-
-
-def specimen_image(settings: MarkerSettings) -> NDArray[np.uint8]:
-    """A grey image of one of the expected markers on white, seen from the front."""
-    templates = templates_of(settings.dictionary, settings.ids)
-    widths = np.diff(templates.lines) / templates.dictionary.cell
-    pixels = np.maximum(1, np.rint(widths * _CELL_PX)).astype(np.intp)
-    black = np.repeat(np.repeat(templates.blackness(0), pixels, axis=0), pixels, axis=1)
-    grey = np.where(np.pad(black, _MARGIN_PX) > 0.5, 40.0, 200.0)
-    # Soft edges, as all images have them.
-    return np.asarray(np.rint(cv2.blur(grey, (3, 3))), np.uint8)
