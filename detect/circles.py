@@ -26,7 +26,7 @@ from detect.discs.fit import blur_ratio_of, fit_settings
 from detect.discs.hough import hough_candidates
 from detect.discs.positions import published_positions as pixel_positions
 from detect.discs.positions import refined_covariances
-from detect.discs.quality import Limits, centres_of
+from detect.discs.quality import Limits, centres_of, least_part_quality
 from detect.discs.quality import quality_of_centres as quality_of_centres
 from detect.discs.rim_network import RimNetwork, rim_network
 from detect.discs.search import DiscSearch, Scene, search_discs
@@ -49,8 +49,8 @@ _SIGNS: dict[Polarity, int] = {"any": 0, "light": 1, "dark": -1}
 _NOISE_ROWS = 32
 #: Least gradient of an edge that votes, and least step of a rim, grey levels (per pixel).
 _EDGE, _LEAST_STEP = 4.0, 8.0
-#: Of the least quality, every second direction of what is fitted must have this share.
-_HALF_QUALITY = 0.8
+#: Of the least quality, part of the directions of what is fitted must have this share.
+_PART_QUALITY = 0.8
 #: Discs of so little more than the least evidence are for the second look, where there is one.
 _DOUBTFUL = 0.5
 
@@ -121,7 +121,7 @@ def detect_circles(
     noise = estimate_noise(image, _NOISE_ROWS)
     weakest = settings.noise_floor * max(noise, _LEAST_NOISE)
     least, sign = settings.threshold, _SIGNS[settings.polarity]
-    centres = centres_of(image, table, Limits(least, _HALF_QUALITY * least, sign=sign))
+    centres = centres_of(image, table, Limits(least, _PART_QUALITY * least, sign=sign))
     kernel = _kernel_camera(camera)
     scene = Scene(
         image, table.floor_xy, _first_search(settings), fit_settings(noise, kernel.blur_ratio),
@@ -203,20 +203,15 @@ def _without_fit(
     if settings.noise_floor > 0.0:
         noise = estimate_noise(image, _NOISE_ROWS)
         weakest = max(weakest, settings.noise_floor * max(noise, _LEAST_NOISE))
-    limits = Limits(
-        settings.threshold,
-        max(2.0 * settings.threshold - 1.0, 0.0),
-        weakest,
-        _SIGNS[settings.polarity],
-    )
+    least_part = least_part_quality(settings.threshold, settings.samples)
+    least = math.nextafter(settings.threshold, 1.0)
+    limits = Limits(least, least_part, weakest, _SIGNS[settings.polarity])
     pixels, quality, _ = centres_of(image, table, limits)
     if settings.stride == 0.0:
         qualities = np.zeros(image.shape)
         qualities[pixels[:, 1], pixels[:, 0]] = quality
         keep = local_maxima(qualities, settings.threshold)[pixels[:, 1], pixels[:, 0]]
         pixels, quality = pixels[keep], quality[keep]
-    above = quality > settings.threshold
-    pixels, quality = pixels[above], quality[above]
     seen_xy = table.floor_xy[pixels[:, 1], pixels[:, 0]]
     keep = alone_published(seen_xy, quality, settings.separation_m)
     pixels, quality = pixels[keep], quality[keep]

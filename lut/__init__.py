@@ -3,7 +3,10 @@
 from lut.cache import TABLE_VERSION, cache_folder, cached_disc_table, cached_vertical_table
 from lut.errors import TableError
 from lut.outlines import (
+    GROUP_COLUMNS,
+    GROUP_SAMPLES,
     MIN_SHARE_INSIDE,
+    CentreGroups,
     DiscShape,
     DiscTable,
     build_disc_table,
@@ -13,8 +16,11 @@ from lut.outlines import (
 from lut.verticals import VerticalTable, build_vertical_table
 
 __all__ = [
+    "GROUP_COLUMNS",
+    "GROUP_SAMPLES",
     "MIN_SHARE_INSIDE",
     "TABLE_VERSION",
+    "CentreGroups",
     "DiscShape",
     "DiscTable",
     "TableError",

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +28,8 @@ FloatArray = NDArray[np.float64]
 
 #: Part of an outline's samples that must lie inside the image.
 MIN_SHARE_INSIDE = 0.5
+#: Samples of each outline that the centres of a group share, and columns that it covers.
+GROUP_SAMPLES, GROUP_COLUMNS = 10, 16
 
 
 @dataclass(frozen=True)
@@ -90,6 +93,22 @@ class DiscShape:
             )
 
 
+class CentreGroups(NamedTuple):
+    """Neighbouring centres that have some samples at the same place beside themselves.
+
+    A group's centres are in one row, within `GROUP_COLUMNS` of each other.
+    """
+
+    first: NDArray[np.int32]
+    """(G,) the first centre of each."""
+    columns: NDArray[np.int32]
+    """(G,) the columns of its centres, counted from the first: a bit each."""
+    samples: NDArray[np.uint32]
+    """(G, GROUP_SAMPLES, 2) the pixels of these samples of the inner and of the outer outline for
+    the first centre, each `GROUP_COLUMNS` or more before the end of the image; 0 for a centre that
+    has not so many."""
+
+
 @dataclass(frozen=True, eq=False)
 class DiscTable:
     """The centres that are tested, and the pixels of their outlines; compared by identity.
@@ -111,9 +130,9 @@ class DiscTable:
     floor_xy: NDArray[np.float32]
 
     @cached_property
-    def whole(self) -> NDArray[np.bool_]:
-        """(N,) whether all samples of a centre count."""
-        return np.asarray(np.all(self.samples < self.floor_xy[..., 0].size, axis=(1, 2)))
+    def groups(self) -> CentreGroups:
+        """Neighbouring centres, by samples that they share."""
+        return _groups(self.samples, self.row, self.column, self.floor_xy[..., 0].size)
 
     @cached_property
     def usable(self) -> NDArray[np.bool_]:
@@ -182,6 +201,39 @@ def build_disc_table(camera: Camera, shape: DiscShape) -> DiscTable:
         column=np.concatenate(columns),
         floor_xy=floor_xy.astype(np.float32),
     )
+
+
+def _groups(
+    samples: NDArray[np.uint32], row: NDArray[np.int32], column: NDArray[np.int32], outside: int
+) -> CentreGroups:
+    n = len(samples)
+    if samples.shape[1] < GROUP_SAMPLES or n == 0:
+        single = np.arange(n, dtype=np.int32), np.ones(n, np.int32)
+        return CentreGroups(*single, np.zeros((n, GROUP_SAMPLES, 2), np.uint32))
+    # The first centre that sees a sample elsewhere beside itself, or where a group would overrun.
+    beside = samples.astype(np.int32) - column[:, None, None]
+    moves = (beside[1:] != beside[:-1]) | (row[1:] != row[:-1])[:, None, None]
+    in_image = samples <= outside - GROUP_COLUMNS
+    moves |= ~in_image[1:]
+    until = np.full(samples.shape, n, np.int32)
+    until[:-1][moves] = np.nonzero(moves)[0] + 1
+    until = np.minimum.accumulate(until[::-1])[::-1]
+    until[~in_image] = 0
+    place = row * (column.max() + GROUP_COLUMNS) + column
+    in_reach = np.searchsorted(place, place + GROUP_COLUMNS)
+    shared_until = np.partition(until, -GROUP_SAMPLES, axis=1)[:, -GROUP_SAMPLES].min(axis=1)
+    end = np.maximum(np.minimum(in_reach, shared_until), np.arange(1, n + 1)).tolist()
+    start = [0]
+    while start[-1] < n:
+        start.append(end[start[-1]])
+    first = np.array(start[:-1], np.int32)
+    bits = 1 << (column - np.repeat(column[first], np.diff(start)))
+    shared = until[first] >= np.array(start[1:])[:, None, None]
+    # Of those that are shared, the first.
+    chosen = np.argsort(~shared, axis=1, kind="stable")[:, :GROUP_SAMPLES]
+    group_samples = np.take_along_axis(samples[first], chosen, axis=1)
+    group_samples[np.count_nonzero(shared, axis=1).min(axis=1) < GROUP_SAMPLES] = 0
+    return CentreGroups(first, np.bitwise_or.reduceat(bits, first), group_samples)
 
 
 def _sample_pixels(

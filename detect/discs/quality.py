@@ -13,28 +13,31 @@ image,
 
 All of these are whole numbers, so the only rounding is that of the final division.
 
-Most centres are ruled out by half of their pairs of samples, every second direction. If all have
-the quality q, these have at least 2 q - 1: with the contrast d and the variance s within the
-classes, and e and 0 in the other half, the variance within the classes of both together is at least
-s / 2 + ((d - e) / 4)^2, that between them ((d + e) / 4)^2, whatever e is.
+Most centres are ruled out by a part of their samples, as many of either outline: if these are a
+share f of all, what the classes leave unexplained of all is at least f times what they do of these,
+1 - q >= f (1 - q_f). Proof: let these have the contrast d and the variance s within the classes,
+the rest e and 0. All have at least f s + f (1 - f) ((d - e) / 2)^2 within the classes then, and
+((f d + (1 - f) e) / 2)^2 between them. The former's share of both is least at e = d + 4 s / d, and
+is f (1 - q_f) there. (Samples outside the image make f larger.) Neighbouring centres share such
+samples (`lut.CentreGroups`), and the columns of a group are summed side by side.
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from detect.errors import FrameError
-from lut import DiscTable
+from lut import GROUP_COLUMNS, GROUP_SAMPLES, CentreGroups, DiscTable
 
-#: Pairs of samples by which most centres are ruled out: half of 16 (a constant number, so that the
-#: compiler writes them out).
-_FIRST = 8
 # Unsigned: an index that is none of those counted from the end.
-_U64, _I32 = np.uint64, np.int32
+_U64, _I32, _F32 = np.uint64, np.int32, np.float32
+_SAMPLES, _COLUMNS = _U64(GROUP_SAMPLES), _U64(GROUP_COLUMNS)
+#: Single precision is enough to rule out, if a little less is asked for than was meant.
+_ROUNDING = 1e-6
 
 
 class Limits(NamedTuple):
@@ -42,8 +45,8 @@ class Limits(NamedTuple):
 
     quality: float
     """At least, and above 0,"""
-    half_quality: float = 0.0
-    """in every second direction at least this,"""
+    part_quality: float = 0.0
+    """in the samples that a group shares at least this,"""
     contrast: float = 0.0
     """and more than this, grey levels, of either sign."""
     sign: int = 0
@@ -61,77 +64,95 @@ class Centres(NamedTuple):
     """(N,) of the inner outline to the outer, grey levels."""
 
 
+def least_part_quality(quality: float, samples: int) -> float:
+    """Quality that the samples of a group must have if all of both outlines have `quality`."""
+    return 1.0 - (1.0 - quality) * samples / GROUP_SAMPLES
+
+
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _rules_out(
-    pixels: NDArray[np.uint8], samples: NDArray[np.uint32], i: int, least_quality: float
-) -> bool:
-    """Whether the first directions have too little quality; all are in the image."""
-    a = b = squares = _I32(0)
-    for k in range(_U64(_FIRST)):
-        x, y = _I32(pixels[samples[i, k, 0]]), _I32(pixels[samples[i, k, 1]])
-        a += x
-        b += y
-        squares += x * x + y * y
-    difference, total = a - b, a + b
-    spread = 2 * _FIRST * squares - total * total
-    return bool(difference * difference < least_quality * spread)
+def _columns_left(
+    pixels: NDArray[np.uint8], samples: NDArray[np.uint32], g: int, least_quality: np.float32
+) -> np.int32:
+    """Which columns of a group the samples that they share do not rule out, a bit each."""
+    left = _I32(0)
+    for column in range(_COLUMNS):
+        a = b = squares = _I32(0)
+        for k in range(_SAMPLES):
+            x = _I32(pixels[samples[g, k, 0] + column])
+            y = _I32(pixels[samples[g, k, 1] + column])
+            a, b = _I32(a + x), _I32(b + y)
+            squares = _I32(squares + _I32(_I32(x * x) + _I32(y * y)))
+        difference, total = _I32(a - b), _I32(a + b)
+        spread = _I32(_I32(2 * GROUP_SAMPLES) * squares) - _I32(total * total)
+        enough = _F32(_I32(difference * difference)) >= least_quality * _F32(_I32(spread))
+        left = _I32(left | _I32(_I32(enough) << _I32(column)))
+    return left
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _quality_of(
-    pixels: NDArray[np.uint8], samples: NDArray[np.uint32], i: int
+    pixels: NDArray[np.uint8], samples: NDArray[np.uint32], i: int, outside: int
 ) -> tuple[float, float]:
     """Quality and contrast of a centre."""
-    outside = len(pixels) - 1
-    a: Any = 0
-    b: Any = 0
-    squares: Any = 0
+    # Whole numbers all, and exact: but sums of floats stay in order, one sample after the other,
+    # which is faster than vectors put together from single samples.
+    a = b = squares = 0.0
     n_inner = n_outer = 0
     for k in range(_U64(samples.shape[1])):
-        x, y = np.int64(pixels[samples[i, k, 0]]), np.int64(pixels[samples[i, k, 1]])
+        inner, outer = samples[i, k, 0], samples[i, k, 1]
+        x = float(pixels[inner]) if inner < outside else 0.0
+        y = float(pixels[outer]) if outer < outside else 0.0
         a += x
         b += y
         squares += x * x + y * y
-        n_inner += samples[i, k, 0] < outside
-        n_outer += samples[i, k, 1] < outside
-    difference, pairs = n_outer * a - n_inner * b, n_inner * n_outer
+        n_inner += inner < outside
+        n_outer += outer < outside
+    difference, pairs = n_outer * a - n_inner * b, float(n_inner * n_outer)
     spread = (n_inner + n_outer) * squares - (a + b) * (a + b)
-    quality = float(difference * difference) / float(pairs * spread) if spread > 0 else 0.0
-    return quality, difference / pairs if pairs > 0 else 0.0
+    quality = difference * difference / (pairs * spread) if spread > 0.0 else 0.0
+    return quality, difference / pairs if pairs > 0.0 else 0.0
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def find_centres(
-    pixels: NDArray[np.uint8], samples: NDArray[np.uint32], whole: NDArray[np.bool_], limits: Limits
-) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float32]]:
+    pixels: NDArray[np.uint8], outside: int, samples: NDArray[np.uint32], groups: CentreGroups,
+    limits: Limits,
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float32]]:  # fmt: skip
     """The centres within some limits: (M,) indices, qualities and contrasts.
 
     Parameters
     ----------
-    pixels : (H W + 1,) uint8
-        The image in scan order, and a zero, which adds nothing to any sum.
-    samples, whole : (N, K, 2) uint32, (N,) bool
+    pixels : (M,) uint8
+        The image in scan order, and anything after it up to `GROUP_COLUMNS` pixels.
+    outside : int
+        H W.
+    samples, groups
         Of `lut.DiscTable`.
     limits : Limits
     """
-    n, pairs = len(samples), samples.shape[1]
-    index, count = np.empty(n, np.int64), 0
-    screened = _FIRST <= pairs <= 2 * _FIRST
-    for i in range(_U64(n)):
-        if screened and whole[i] and _rules_out(pixels, samples, i, limits.half_quality):
+    least_part = _F32((1.0 - _ROUNDING) * limits.part_quality)
+    any_left = np.empty(len(groups.samples), np.bool_)
+    for g in range(_U64(len(any_left))):
+        any_left[g] = _columns_left(pixels, groups.samples, g, least_part) != 0
+    most = np.count_nonzero(any_left) * GROUP_COLUMNS
+    index, quality, contrast = np.empty(most, np.int64), np.empty(most), np.empty(most, np.float32)
+    found = 0
+    for g in range(_U64(len(any_left))):
+        if not any_left[g]:
             continue
-        index[count] = i
-        count += 1
-    quality, contrast = np.empty(count), np.empty(count, np.float32)
-    kept = 0
-    for i in index[:count]:
-        of_centre, step = _quality_of(pixels, samples, i)
-        signed = limits.sign == 0 or limits.sign * step >= 0.0
-        strong = limits.contrast == 0.0 or abs(step) > limits.contrast
-        if of_centre >= limits.quality and of_centre > 0.0 and signed and strong:
-            index[kept], quality[kept], contrast[kept] = i, of_centre, step
-            kept += 1
-    return index[:kept], quality[:kept], contrast[:kept]
+        left = _columns_left(pixels, groups.samples, g, least_part) & groups.columns[g]
+        i = groups.first[g] - 1
+        for k in range(GROUP_COLUMNS if left else 0):
+            i += (groups.columns[g] >> k) & 1
+            if not (left >> k) & 1:
+                continue
+            of_centre, step = _quality_of(pixels, samples, i, outside)
+            signed = limits.sign == 0 or limits.sign * step >= 0.0
+            strong = limits.contrast == 0.0 or abs(step) > limits.contrast
+            if of_centre >= limits.quality and of_centre > 0.0 and signed and strong:
+                index[found], quality[found], contrast[found] = i, of_centre, step
+                found += 1
+    return index[:found], quality[:found], contrast[:found]
 
 
 def centres_of(image: NDArray[np.uint8], table: DiscTable, limits: Limits) -> Centres:
@@ -156,8 +177,10 @@ def centres_of(image: NDArray[np.uint8], table: DiscTable, limits: Limits) -> Ce
             f"the image is {image.dtype} of shape {image.shape}: the table is for uint8 of shape "
             f"{expected}"
         )
-    pixels = np.append(image, np.uint8(0))
-    index, quality, contrast = find_centres(pixels, table.samples, table.whole, limits)
+    pixels = image.ravel()
+    if image.size < GROUP_COLUMNS:
+        pixels = np.append(pixels, np.zeros(GROUP_COLUMNS, np.uint8))
+    index, quality, contrast = find_centres(pixels, image.size, table.samples, table.groups, limits)
     places = np.empty((len(index), 2), np.int64)
     places[:, 0], places[:, 1] = table.column[index], table.row[index]
     return Centres(places, quality, contrast)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,8 @@ from camera import Camera
 from camera.distortion import largest_distorted_radius
 from landmarks import read_frames
 from lut import (
+    GROUP_COLUMNS,
+    GROUP_SAMPLES,
     DiscShape,
     DiscTable,
     TableError,
@@ -79,7 +82,27 @@ def assert_table_is(table: DiscTable, plain: Outlines) -> None:
     order = np.concatenate([np.arange(0, samples, 2), np.arange(1, samples, 2)])
     pairs = np.stack([expected[:, :samples], expected[:, samples:]], axis=-1)
     assert np.array_equal(table.samples, pairs[:, order])
-    assert np.array_equal(table.whole, plain.inside[v, u].all(axis=1))
+    assert_groups(table)
+
+
+def assert_groups(table: DiscTable) -> None:
+    """Each centre is in one group, and sees the group's samples at its own column."""
+    groups, outside = table.groups, table.floor_xy[..., 0].size
+    assert groups.samples.shape == (len(groups.first), GROUP_SAMPLES, 2)
+    assert groups.samples.max(initial=0) <= max(outside - GROUP_COLUMNS, 0)
+    members = [np.flatnonzero(bits >> np.arange(GROUP_COLUMNS) & 1) for bits in groups.columns]
+    assert sum(len(columns) for columns in members) == len(table.row)
+    for first, columns, samples in zip(groups.first, members, groups.samples, strict=True):
+        of_group = slice(first, first + len(columns))
+        assert np.array_equal(table.column[of_group], table.column[first] + columns)
+        assert np.all(table.row[of_group] == table.row[first])
+        if samples.any():
+            for outline in range(2):
+                seen = samples[:, outline] + columns[:, None]
+                own = table.samples[of_group, :, outline]
+                assert not any(Counter(a) - Counter(b) for a, b in zip(seen, own, strict=True))
+        else:
+            assert len(columns) == 1
 
 
 # -- the published calibration --------------------------------------------------------------------
