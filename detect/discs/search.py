@@ -55,6 +55,8 @@ _MOST_UNEVEN = 0.14
 _BY_FIT = 0.5
 #: From this share of the rim on, the fit of the whole disc gives the place better.
 _WHOLE_RIM = 0.9
+#: A rim whose step varies by less than this over the directions, relative to its mean, is even.
+_EVEN = 0.18
 #: A fit that explains less of the variance than this may place the disc worse than half of its rim.
 _WELL_EXPLAINED, _HALF_RIM = 0.97, 0.5
 
@@ -225,9 +227,18 @@ def _with_rim(scene: Scene, quality: float, log_odds: float, result: Any) -> flo
         return by_fit
     if by_rim < search.least_evidence and log_odds >= search.least_evidence:
         return by_fit
-    if rim.agreeing < _WHOLE_RIM:
+    if _places_well(rim):
         _place_by_rim(result, rim)
     return by_rim
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _places_well(rim: Rim) -> bool:
+    """Whether a rim is hidden in part, and steps by as much all round where it is not.
+
+    Where movement blurs it, it steps less on two sides, and is found beside its place.
+    """
+    return rim.agreeing < _WHOLE_RIM and rim.unevenness < _EVEN
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -249,7 +260,7 @@ def _place_by_the_surer(scene: Scene, result: Any) -> None:
     rim = _rim_of(scene, result)
     by_fit = result[fit.COV_XX] + result[fit.COV_YY]
     enough = rim.agreeing >= _HALF_RIM and rim.radius_px >= LEAST_RIM_PX
-    if enough and rim.cov_xx + rim.cov_yy < by_fit:
+    if enough and _places_well(rim) and rim.cov_xx + rim.cov_yy < by_fit:
         _place_by_rim(result, rim)
 
 
