@@ -17,7 +17,8 @@ from detect.errors import DetectError
 from detect.line_settings import LineSettings
 from detect.mounting import HEIGHT_STEPS, mounting_of_run, remounted
 from detect.run_tilt import LEAST_FRAMES, frame_tilts
-from detect.runs.frame import FramePlan, FrameTask, detect_batch, tables_of
+from detect.runs.frame import detect_batch
+from detect.runs.plan import FramePlan, FrameTask
 from detect.runs.progress import progress_bar
 from detect.settings import CircleSettings
 from detect.sources.opening import open_calibrated
@@ -33,12 +34,11 @@ def perform(options: Level) -> int:
     plan = FramePlan(
         camera, LineSettings(), CircleSettings(radius_m=options.radius_m), levelling="none"
     )
-    tables = tables_of(plan)
     tilts, pitches = [], []
     with progress_bar("verticals and outlines", run.frames.expected) as advance:
         for frame in run.frames:
             advance()
-            (found,) = detect_batch([FrameTask(frame)], plan, tables)
+            (found,) = detect_batch([FrameTask(frame)], plan)
             if found.error is not None or found.seen is None:
                 print(f"left out: {found.error}", file=sys.stderr)
                 continue

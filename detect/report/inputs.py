@@ -13,7 +13,8 @@ from detect.comparison.result import CompareOptions, DiscComparison, Gates, Line
 from detect.drawing.inputs import RunRows, SeenRows, open_rows
 from detect.errors import DetectError, FrameError
 from detect.run import ImageRun, Run, read_image
-from detect.runs.frame import FramePlan, FrameTask, detect_batch, tables_of
+from detect.runs.frame import detect_batch
+from detect.runs.plan import FramePlan, FrameTask
 from detect.seen import Sight
 from detect.viewing_options import RowFiles
 
@@ -91,7 +92,6 @@ def _timing(run: ImageRun, files: RunRows, count: int, wanted: int) -> Timing | 
     if not isinstance(run, Run) or (circles is None and lines is None):
         raise DetectError("--time-frames: expected a calibration, and rows of discs or verticals")
     plan = FramePlan(run.camera, lines=lines, circles=circles)
-    tables = tables_of(plan)
     every = max(1, count // wanted)
     chosen = list(islice(run.frames, 0, every * wanted, every))
     decoding, detecting = [], []
@@ -101,7 +101,7 @@ def _timing(run: ImageRun, files: RunRows, count: int, wanted: int) -> Timing | 
             start = time.thread_time()
             read_image(frame, run.camera)
             between = time.thread_time()
-            detect_batch([FrameTask(frame)], plan, tables)
+            detect_batch([FrameTask(frame)], plan)
             end = time.thread_time()
         except FrameError:
             continue

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,11 +18,10 @@ from detect.errors import EXIT_FRAMES_FAILED, DetectError, FrameError, WorkerErr
 from detect.options import All, Circles, DetectorFlags, DiscIdOptions, Lines, Markers
 from detect.run import ImageRun, Run, read_image
 from detect.runs.dispatch import Workers
-from detect.runs.frame import Drawing, FramePlan
 from detect.runs.known import FramesByImage, Known, MapByImage
-from detect.runs.outputs import Conduct, frames_tilt_place, log_place
+from detect.runs.outputs import frames_tilt_place
+from detect.runs.plan import Drawing, FramePlan, Job, RunSummary
 from detect.runs.progress import print_failures, progress_bar
-from detect.runs.rows import RunSummary
 from detect.runs.stream import detect_run, make_folder
 from detect.runs.workers import cluster_workers, default_jobs, local_workers
 from detect.settings import CircleSettings
@@ -37,41 +35,18 @@ _RADIUS_IMAGES = 12
 _FEWEST_FRAMES, _OTHER_RADIUS = 10, 0.15
 
 
-class _Job(NamedTuple):
-    """What a command does: see `detect.runs.stream.detect_run`."""
-
-    label: str
-    run: ImageRun
-    plan: FramePlan
-    places: Mapping[str, Path]
-    known: Known | None = None
-    pictures: Path | None = None
-    crlf: bool = False
-    log: Path | None = None  # beside the first of the places, if it is not named
-
-
 def perform(command: DetectorFlags) -> int:
     """Carry a command out; returns the exit code."""
-    job = _job_of(command)
-    conduct = Conduct(
-        overwrite=command.force,
-        crlf=job.crlf,
-        log=job.log or log_place(next(iter(job.places.values()))),
+    job = replace(
+        _job_of(command),
         command=type(command).__name__.lower(),
+        overwrite=command.force,
         strict=command.strict,
         resume=command.resume,
     )
-    with progress_bar(job.label, job.run.frames.expected) as advance:
-        summary = detect_run(
-            job.run,
-            job.plan,
-            job.places,
-            known=job.known,
-            pictures=job.pictures,
-            workers=_workers(command, job),
-            on_progress=advance,
-            conduct=conduct,
-        )
+    workers = _workers(command, job)
+    with progress_bar(", ".join(job.places), job.run.frames.expected) as advance:
+        summary = detect_run(job, workers, advance)
     _print_results(job, summary)
     for hint in _hints(job, summary):
         print(hint, file=sys.stderr)
@@ -81,7 +56,7 @@ def perform(command: DetectorFlags) -> int:
     return EXIT_FRAMES_FAILED if summary.failed else 0
 
 
-def _job_of(command: DetectorFlags) -> _Job:
+def _job_of(command: DetectorFlags) -> Job:
     if isinstance(command, Markers):
         return _markers(command)
     run = open_calibrated(command.run, command.camera, command.source)
@@ -93,49 +68,49 @@ def _job_of(command: DetectorFlags) -> _Job:
     return _all(command, run)
 
 
-def _circles(command: Circles, run: Run) -> _Job:
+def _circles(command: Circles, run: Run) -> Job:
     places = {"circles": _output(command, run, "circles")}
     if command.json is not None:
         places["json"] = command.json
-    drawing: Drawing | None = None if command.draw is None else "discs"
     settings = _with_radius(command.settings, run) if command.find_radius else command.settings
-    plan = FramePlan(run.camera, circles=settings, drawing=drawing)
-    known = replace(
-        _known_discs(command.ids), tilts=None if command.tilt is None else read_tilts(command.tilt)
+    plan = FramePlan(
+        run.camera, circles=settings, drawing=None if command.draw is None else "discs"
     )
-    return _Job("discs", run, plan, places, known, command.draw, command.line_ends == "crlf")
+    tilts = None if command.tilt is None else read_tilts(command.tilt)
+    known = replace(_known_discs(command.ids), tilts=tilts)
+    return Job(run, plan, places, known, command.draw, crlf=command.line_ends == "crlf")
 
 
-def _lines(command: Lines, run: Run) -> _Job:
+def _lines(command: Lines, run: Run) -> Job:
     output = _output(command, run, "lines")
     settings = command.settings
-    drawing: Drawing | None = None
     if command.join_threshold is not None:
         # On the horizon straight ahead, a bearing of one radian is scale_x pixels wide.
         settings = replace(settings, join_px=command.join_threshold * run.camera.scale_x)
-    if command.draw is not None:
-        drawing = "tracks" if command.rejected else "lines"
+    drawing: Drawing = "tracks" if command.rejected else "lines"
+    draws = command.draw is not None
     plan = FramePlan(
         run.camera,
         lines=settings,
-        drawing=drawing,
-        draw_response=command.draw is not None and command.response,
+        drawing=drawing if draws else None,
+        draw_response=draws and command.response,
     )
     places = {"lines": output, "tilt": command.tilt or output.with_suffix(".tilt")}
     known = Known(lines=_frames(command.ids_from))
-    return _Job("lines", run, plan, places, known, command.draw, command.line_ends == "crlf")
+    return Job(run, plan, places, known, command.draw, crlf=command.line_ends == "crlf")
 
 
-def _markers(command: Markers) -> _Job:
+def _markers(command: Markers) -> Job:
     run = open_source(command.run, command.camera, command.source)
-    camera = run.camera if isinstance(run, Run) else None
-    drawing: Drawing | None = None if command.draw is None else "markers"
-    plan = FramePlan(camera, markers=command.settings, drawing=drawing)
-    places = {"markers": _output(command, run, "markers")}
-    return _Job("markers", run, plan, places, pictures=command.draw)
+    plan = FramePlan(
+        run.camera if isinstance(run, Run) else None,
+        markers=command.settings,
+        drawing=None if command.draw is None else "markers",
+    )
+    return Job(run, plan, {"markers": _output(command, run, "markers")}, pictures=command.draw)
 
 
-def _all(command: All, run: Run) -> _Job:
+def _all(command: All, run: Run) -> Job:
     if command.output is not None:
         make_folder(command.output)
     places = {
@@ -143,14 +118,13 @@ def _all(command: All, run: Run) -> _Job:
         for kind in ("lines", "tilt", "circles")
     }
     circles = _with_radius(command.circles, run) if command.find_radius else command.circles
-    return _Job(
-        "lines, tilt and discs",
+    return Job(
         run,
         FramePlan(run.camera, lines=command.lines, circles=circles, levelling=command.tilt),
         places,
         replace(_known_discs(command.ids), lines=_frames(command.line_ids_from)),
+        log=places["lines"].with_suffix(".log.json"),
         crlf=command.line_ends == "crlf",
-        log=log_place(places["lines"].with_suffix("")),
     )
 
 
@@ -210,19 +184,18 @@ def _known_discs(options: DiscIdOptions) -> Known:
     )
 
 
-def _workers(command: DetectorFlags, job: _Job) -> Workers:
+def _workers(command: DetectorFlags, job: Job) -> Workers:
     """The workers of a command."""
     frames = job.run.frames
-    large = job.pictures is not None or frames.ships_images
     if command.cluster is not None:
         if command.jobs is not None:
             raise WorkerError("--jobs and --cluster: expected one of them")
-        return cluster_workers(command.cluster, large=large)
+        return cluster_workers(command.cluster, large=job.ships_images)
     jobs = command.jobs if command.jobs is not None else default_jobs(frames.expected or 0)
-    return local_workers(jobs, large=large)
+    return local_workers(jobs, large=job.ships_images)
 
 
-def _print_results(job: _Job, summary: RunSummary) -> None:
+def _print_results(job: Job, summary: RunSummary) -> None:
     found, places = summary.found, job.places
     if "lines" in places:
         print(f"{places['lines']}: {found['lines']} lines in {summary.frames} frames")
@@ -252,7 +225,7 @@ def _other_frames(plan: FramePlan, summary: RunSummary) -> str:
     return f"; the other {others} count as level within {plan.circles.tilt_sigma_deg:g} degrees"
 
 
-def _hints(job: _Job, summary: RunSummary) -> Iterator[str]:
+def _hints(job: Job, summary: RunSummary) -> Iterator[str]:
     """Why hardly anything was found, and what to try."""
     plan, camera, found = job.plan, job.plan.camera, summary.found
     if camera is None:
@@ -275,7 +248,7 @@ def _hints(job: _Job, summary: RunSummary) -> Iterator[str]:
         yield from _hints_on_discs(job, plan.circles, summary)
 
 
-def _hints_on_discs(job: _Job, settings: CircleSettings, summary: RunSummary) -> Iterator[str]:
+def _hints_on_discs(job: Job, settings: CircleSettings, summary: RunSummary) -> Iterator[str]:
     if not isinstance(job.run, Run) or job.run.frames.expected is None:
         return
     from detect.discs.radius import find_radius

@@ -6,8 +6,8 @@ time, so that neither what waits nor what is finished grows with the run, and a 
 others up only when they are a window ahead of it.
 
 A worker that dies, killed or out of memory, loses no other frame: all frames under way are
-processed again, one chunk at a time and then one frame at a time, until the frame that kills its
-worker is alone; that one is reported like an image that cannot be read.
+processed again, one at a time, until the frame that kills its worker is alone; that one is reported
+like an image that cannot be read.
 """
 
 from __future__ import annotations
@@ -20,8 +20,7 @@ from dataclasses import dataclass
 from itertools import islice
 
 from detect.errors import WorkerError
-from detect.runs.frame import FramePlan, FrameTask, tables_of
-from detect.runs.rows import FrameRows, rows_of_failure, rows_of_frames
+from detect.runs.plan import FramePlan, FrameRows, FrameTask, rows_of_failure
 
 Chunk = tuple[FrameTask, ...]
 
@@ -72,19 +71,22 @@ def detect_chunks(
     """
     source = iter(tasks)
     chunks = iter(lambda: tuple(islice(source, workers.chunk)), ())
+    # A chunk without a future is suspect: to be processed while nothing else is under way.
+    under_way: deque[tuple[Chunk, Future[list[FrameRows]] | None]] = deque()
     with ExitStack() as started:
         crew = _Crew(workers, plan, started)
-        # A chunk without a future is suspect: to be processed while nothing else is under way.
-        under_way: deque[tuple[Chunk, Future[list[FrameRows]] | None]] = deque()
         while True:
-            suspects = any(future is None for _, future in under_way)
-            more = 0 if suspects else max(0, workers.window() - len(under_way))
-            under_way.extend((chunk, crew.submit(chunk)) for chunk in islice(chunks, more))
+            if all(future is not None for _, future in under_way):
+                more = max(0, workers.window() - len(under_way))
+                under_way.extend((chunk, crew.submit(chunk)) for chunk in islice(chunks, more))
             if not under_way:
                 return
             chunk, future = under_way.popleft()
+            if future is None:
+                yield [(task, crew.rows_alone(task)) for task in chunk]
+                continue
             try:
-                rows = crew.alone(chunk) if future is None else crew.finished(future)
+                rows = crew.rows(future)
             except crew.died as error:
                 crew.dismiss(error)
                 under_way.appendleft((chunk, None))
@@ -95,7 +97,9 @@ def detect_chunks(
 
 def work_on_chunk(plan: FramePlan, chunk: Chunk) -> list[FrameRows]:
     """Process a task in a worker; its input and output are small."""
-    return rows_of_frames(chunk, plan, tables_of(plan))
+    from detect.runs.rows import rows_of_frames  # loads the compiler, which only workers need
+
+    return rows_of_frames(chunk, plan)
 
 
 class _Crew:
@@ -117,8 +121,8 @@ class _Crew:
             failed.set_exception(error)
             return failed
 
-    def finished(self, future: Future[list[FrameRows]]) -> list[FrameRows]:
-        """The rows of a chunk."""
+    def rows(self, future: Future[list[FrameRows]]) -> list[FrameRows]:
+        """The rows of a chunk; waits for them."""
         try:
             rows = future.result()
         except ImportError as error:
@@ -129,6 +133,22 @@ class _Crew:
             raise WorkerError("the workers are gone: expected the cluster to stay") from None
         self._deadly = 0
         return rows
+
+    def rows_alone(self, task: FrameTask) -> FrameRows:
+        """The rows of a frame during which a worker may have died."""
+        for _ in range(2):
+            try:
+                (rows,) = self.rows(self.submit((task,)))
+                return rows
+            except self.died as error:
+                self.dismiss(error)
+        reason = f"{task.name}: every worker died that was given this frame"
+        self._deadly += 1
+        if self._deadly == _DEADLY_FRAMES:
+            raise WorkerError(
+                f"{reason} or one of the {_DEADLY_FRAMES - 1} before it: killed, or out of memory?"
+            )
+        return rows_of_failure(task, f"{reason}: out of memory?")
 
     def dismiss(self, error: BaseException) -> None:
         """End the rest of broken workers; the next chunk gets new ones."""
@@ -143,22 +163,3 @@ class _Crew:
         if not future.done():
             return self._executor is None
         return isinstance(future.exception(), self.died)
-
-    def alone(self, chunk: Chunk) -> list[FrameRows]:
-        """The rows of a chunk during which a worker died: once more, then frame by frame."""
-        for _ in range(2 if len(chunk) == 1 else 1):
-            try:
-                return self.finished(self.submit(chunk))
-            except self.died as error:
-                self.dismiss(error)
-        if len(chunk) > 1:
-            return [rows for task in chunk for rows in self.alone((task,))]
-        (task,) = chunk
-        self._deadly += 1
-        if self._deadly == _DEADLY_FRAMES:
-            raise WorkerError(
-                f"{task.name}: every worker died that was given this frame or one of the "
-                f"{_DEADLY_FRAMES - 1} before it: killed, or out of memory?"
-            )
-        reason = f"{task.name}: every worker died that was given this frame: out of memory?"
-        return [rows_of_failure(task, reason)]

@@ -21,9 +21,8 @@ import numpy as np
 
 from detect import __version__
 from detect.run import RunFrame
-from detect.runs.frame import FramePlan, FrameTask
 from detect.runs.outputs import Output
-from detect.runs.rows import FrameRows
+from detect.runs.plan import FramePlan, FrameRows, FrameTask
 from storage.parts import PartFile
 
 #: Incremented with every change of the format of a journal or of the rows in it.

@@ -1,4 +1,4 @@
-"""The files that a run is written to: each its kind, its place, its head, its rows.
+"""The files that a run is written to: each its kind, its place, its head, its rows; and the log.
 
 The log, ``<output>.log.json``, states the program and its settings, the frames that could not be
 processed and why, how much was found, and the size and hash of the other files. Nothing in it
@@ -18,14 +18,10 @@ from typing import Any
 from detect import __version__
 from detect.errors import EXIT_FRAMES_FAILED
 from detect.run import ImageRun
-from detect.runs.frame import FramePlan
-from detect.runs.rows import RunSummary
+from detect.runs.plan import FramePlan, Job, RunSummary
 from detect.sources.times import TIMES_HEAD
 from landmarks import format_head
 from storage import OutputExistsError
-
-#: Endings of files of landmarks.
-LANDMARK_SUFFIXES = frozenset({".circles", ".lines", ".markers"})
 
 #: In the head of files whose positions are levelled, or corrected for the tilt.
 LEVEL = "level robot frame"
@@ -45,34 +41,6 @@ _TILT_ROWS = (
 
 
 @dataclass(frozen=True)
-class Conduct:
-    """How a run is carried out, apart from what is detected.
-
-    Attributes
-    ----------
-    overwrite : bool
-        Whether existing files may be replaced.
-    crlf : bool
-        Whether the lines of files of landmarks end with CR and LF.
-    log : path or None
-        Where the log goes. A run with a log can be resumed (see `detect.runs.journal`).
-    command : str
-        What the log calls the run.
-    strict : bool
-        Whether the first frame that cannot be worked on ends the run.
-    resume : bool
-        Whether the frames that an unfinished run kept are taken over.
-    """
-
-    overwrite: bool = False
-    crlf: bool = False
-    log: Path | None = None
-    command: str = ""
-    strict: bool = False
-    resume: bool = False
-
-
-@dataclass(frozen=True)
 class Output:
     """A file of a run: `FrameRows.rows` of a kind, between head and tail and separated."""
 
@@ -89,14 +57,9 @@ class Output:
         return text.encode("utf-8", "surrogateescape")
 
 
-def outputs_of(
-    run: ImageRun, plan: FramePlan, places: Mapping[str, Path], *, crlf: bool, levelled: bool
-) -> list[Output]:
-    """The files of a run (see `detect.runs.stream.detect_run`).
-
-    `crlf` is how the lines of files of landmarks end; `levelled`, whether discs are corrected for
-    the tilt.
-    """
+def outputs_of(job: Job) -> list[Output]:
+    """The files of a run, without its log."""
+    run, plan, places = job.run, job.plan, job.places
     outputs = []
     by_run = plan.levelling == "run" and plan.lines is not None
 
@@ -110,11 +73,11 @@ def outputs_of(
         path = frames_tilt_place(places["tilt"]) if by_run else places["tilt"]
         add(path, "tilt", *_tilt_text(by_run=by_run))
     if "lines" in places:
-        add(places["lines"], "lines", *_lines_text(run, plan), crlf=crlf)
+        add(places["lines"], "lines", *_lines_text(run, plan), crlf=job.crlf)
     if "tilt" in places and "circles" in places and by_run:
         add(places["tilt"], RUN_TILT, *_run_tilt_text())
     if "circles" in places:
-        add(places["circles"], "circles", *_circles_text(run, plan, levelled=levelled), crlf=crlf)
+        add(places["circles"], "circles", *_circles_text(job), crlf=job.crlf)
     if "markers" in places:
         add(places["markers"], "markers", *_markers_text(run, plan))
     if run.has_times:
@@ -133,19 +96,22 @@ def _times_place(results: list[Path]) -> Path:
     It is called like the file of landmarks, with ``.times`` behind; where there are several, like
     what they have in common: ``detected.circles.times``, but ``detected.times``.
     """
-    landmarks = [path for path in results if path.suffix in LANDMARK_SUFFIXES]
+    landmarks = [path for path in results if path.suffix in (".circles", ".lines", ".markers")]
     path = landmarks[0] if landmarks else results[-1]
     return path.with_name(f"{path.stem if len(landmarks) > 1 else path.name}.times")
 
 
-def _circles_text(run: ImageRun, plan: FramePlan, *, levelled: bool) -> list[str]:
+def _circles_text(job: Job) -> list[str]:
+    plan = job.plan
     assert plan.circles is not None
-    refined = plan.circles.refine
-    position = "fitted to the grey values" if refined else "that of the pixel in the middle"
+    position = (
+        "fitted to the grey values" if plan.circles.refine else "that of the pixel in the middle"
+    )
+    levelled = plan.levelling != "none" and (plan.lines or job.known.tilts is not None)
     level = f"  positions are {LEVELLED}: # levelled <pitch> <roll>"
     return [
         f"Discs on the floor, detected by redetect {__version__}.",
-        *(_ROBOT, _STEP, _odometry(run)),
+        *(_ROBOT, _STEP, _odometry(job.run)),
         "LANDMARK_C <pX> <pY> <quality> <cXX> <cXY> <cYY> <ID>",
         f"  position {position}; quality is Otsu's, 0 to 1; ID -1: unknown",
         *([level] if levelled else []),
@@ -231,9 +197,10 @@ def _made_with(plan: FramePlan, settings: Any) -> tuple[str, str]:
 # -- the log --------------------------------------------------------------------------------
 
 
-def log_place(output: Path) -> Path:
-    """Path of the log of a result."""
-    return output.with_name(f"{output.name}.log.json")
+def log_place(job: Job) -> Path:
+    """Path of the log of a run: beside the first of its results, if none is named."""
+    output = next(iter(job.places.values()))
+    return job.log or output.with_name(f"{output.name}.log.json")
 
 
 def demand_log_place(place: Path, *, overwrite: bool) -> None:
@@ -248,18 +215,18 @@ def demand_log_place(place: Path, *, overwrite: bool) -> None:
 
 
 def log_text(
-    plan: FramePlan,
-    command: str,
+    job: Job,
     summary: RunSummary,
     failures: Sequence[Mapping[str, object]],
     written: Sequence[Mapping[str, object]],
 ) -> str:
     """The content of a log: `failures` of frames, and what was `written`."""
+    plan = job.plan
     settings = {"circles": plan.circles, "lines": plan.lines, "markers": plan.markers}
     document = {
         "program": "redetect",
         "version": __version__,
-        "command": command,
+        "command": job.command,
         "camera": None if plan.camera is None else plan.camera.content_hash,
         "settings": {
             kind: dataclasses.asdict(values) for kind, values in settings.items() if values

@@ -9,7 +9,7 @@ after them:
 
 When all frames are done, the results are written from the journal to parts (`storage.parts`) and
 brought to the disk; the journal says so; they take their places. A process killed in between leaves
-this last step to the next run. The journal of a run without a log is never resumed.
+this last step to the next run.
 """
 
 from __future__ import annotations
@@ -24,10 +24,9 @@ from itertools import chain
 from pathlib import Path
 
 from detect.errors import DetectError
-from detect.runs.frame import FramePlan, FrameTask
 from detect.runs.journal import Journal, made_by, task_digest
-from detect.runs.outputs import Conduct, Output, demand_log_place, log_text
-from detect.runs.rows import FrameRows, RunSummary
+from detect.runs.outputs import Output, demand_log_place, log_place, log_text, outputs_of
+from detect.runs.plan import FrameRows, FrameTask, Job, RunSummary
 from storage import OutputExistsError
 from storage.parts import PartFile, demand_place, folder_locked, left_part, new_part
 
@@ -42,16 +41,13 @@ SecondPass = Callable[[Callable[[], RowsOfFrames]], RowsOfFrames]
 class RunFiles:
     """The files of a run: a context manager that begins or resumes its journal, and ends it."""
 
-    def __init__(self, outputs: Sequence[Output], plan: FramePlan, conduct: Conduct) -> None:
-        self._outputs, self._plan, self._conduct = outputs, plan, conduct
-        self._paths = [output.path for output in outputs]
-        base = self._paths[0]
-        if conduct.log is not None:
-            self._paths.append(conduct.log)
-            base = conduct.log.with_name(conduct.log.name.removesuffix(".log.json"))
-        self._base, self._made_by = base, made_by(outputs, plan)
-        self._overwrite = conduct.overwrite
-        self._resumable = conduct.log is not None
+    def __init__(self, job: Job) -> None:
+        self._job, self._outputs = job, outputs_of(job)
+        self._log_path = log_place(job)
+        self._paths = [*(output.path for output in self._outputs), self._log_path]
+        self._base = self._log_path.with_name(self._log_path.name.removesuffix(".log.json"))
+        self._made_by = made_by(self._outputs, job.plan)
+        self._overwrite, self._resumable = job.overwrite, True
         self._frames = self._taken_over = 0
         self._resumes = self._done = False
         self._journal: Journal
@@ -64,37 +60,39 @@ class RunFiles:
             if places.count(place) > 1:  # the last one would be all there is
                 raise DetectError(f"{path}: named for two results: expected a file for each")
         left = left_part(self._base, "journal", named=self._paths[0])
-        if left is None:
+        try:
+            if left is not None:
+                self._take_up(left)
             self._demand_places()
+        except BaseException:
+            if left is not None:
+                left.close()
+            raise
+        if not self._resumes:
+            if left is not None:
+                left.remove()
             self._begin()
-            return self
-        with ExitStack() as unless_taken_over:
-            unless_taken_over.callback(left.close)
-            journal = Journal(left)
-            resumes = self._conduct.resume and journal.is_by(self._made_by)
-            complete = journal.complete()
-            if complete is not None:
-                self._complete(*complete)
-                self._overwrite |= resumes  # the files are its own
-                if not resumes:
-                    left.remove()
-            self._demand_places()
-            if resumes:
-                self._journal, self._resumes = journal, True
-                unless_taken_over.pop_all()
-                return self
-            if self._conduct.resume:
-                _log.info(
-                    "what an unfinished run left was made with other settings, another camera or "
-                    "version: beginning anew"
-                )
-            elif complete is None:
-                _log.info(
-                    "removing what an unfinished run left (--resume would have gone on with it)"
-                )
-            left.remove()
-        self._begin()
         return self
+
+    def _take_up(self, left: PartFile) -> None:
+        """See whether a journal that was left can be resumed, and complete its run if it ended."""
+        journal = Journal(left)
+        self._resumes = self._job.resume and journal.is_by(self._made_by)
+        complete = journal.complete()
+        if complete is not None:
+            self._complete(*complete)
+        if self._resumes:
+            self._journal = journal
+            self._overwrite |= complete is not None  # the files are its own
+        elif complete is not None:
+            left.remove()
+        elif self._job.resume:
+            _log.info(
+                "what an unfinished run left was made with other settings, another camera or "
+                "version: beginning anew"
+            )
+        else:
+            _log.info("removing what an unfinished run left (--resume would have gone on with it)")
 
     def _complete(self, numbers: Sequence[int], overwrite: bool) -> None:
         """Complete a run that was killed while its files took their places."""
@@ -107,18 +105,17 @@ class RunFiles:
 
     def _begin(self) -> None:
         file = new_part(self._base, "journal", named=self._paths[0])
-        if file.number > 0 and self._resumable:
-            self._resumable = False
-            if not self._overwrite:
-                file.remove()
-                place = self._base.with_name(f".{self._base.name}.journal")
-                raise DetectError(
-                    f"{place}: another run is writing these files: wait for it, or, if it was "
-                    "killed on another machine, remove this file"
-                )
-            _log.info("another run is writing these files: this one cannot be resumed")
         self._journal = Journal(file)
         try:
+            if file.number > 0:
+                self._resumable = False
+                if not self._overwrite:
+                    place = self._base.with_name(f".{self._base.name}.journal")
+                    raise DetectError(
+                        f"{place}: another run is writing these files: wait for it, or, if it was "
+                        "killed on another machine, remove this file"
+                    )
+                _log.info("another run is writing these files: this one cannot be resumed")
             self._journal.write([self._made_by])
         except BaseException:
             file.remove()
@@ -128,12 +125,11 @@ class RunFiles:
         """Refuse to replace what must not be, or cannot be."""
         for path in self._paths:
             demand_place(path, overwrite=self._may_replace(path))
-        if self._conduct.log is not None:
-            demand_log_place(self._conduct.log, overwrite=self._overwrite)
+        demand_log_place(self._log_path, overwrite=self._overwrite)
 
     def _may_replace(self, path: Path) -> bool:
         """Whether an existing file may be replaced: the log always, if it is one."""
-        return self._overwrite or path == self._conduct.log
+        return self._overwrite or path == self._log_path
 
     # -- frames -----------------------------------------------------------------------------
 
@@ -149,8 +145,7 @@ class RunFiles:
             if task is None or digest != task_digest(task):
                 beyond = [] if task is None else [task]
                 break
-            if rows.error is not None and self._conduct.strict:
-                raise DetectError(f"{rows.error} (--strict: nothing is written)")
+            self._demand_strictly(rows)
             self._frames += 1
             count(rows)
         self._journal.cut()
@@ -165,12 +160,18 @@ class RunFiles:
 
     def add(self, frames: Sequence[tuple[FrameTask, FrameRows]]) -> None:
         """Note the next frames."""
-        for _, rows in frames:
-            if rows.error is not None and self._conduct.strict:
-                self._journal.file.remove()
-                raise DetectError(f"{rows.error} (--strict: nothing is written)")
+        try:
+            for _, rows in frames:
+                self._demand_strictly(rows)
+        except DetectError:
+            self._resumable = False  # nothing is kept
+            raise
         self._journal.write_frames(frames)
         self._frames += len(frames)
+
+    def _demand_strictly(self, rows: FrameRows) -> None:
+        if rows.error is not None and self._job.strict:
+            raise DetectError(f"{rows.error} (--strict: nothing is written)")
 
     # -- ending -----------------------------------------------------------------------------
 
@@ -192,15 +193,13 @@ class RunFiles:
                         separators[output.kind] = output.between
             for output, part in results:
                 part.stream.write(output.encoded(output.tail))
-            if self._conduct.log is not None:
-                written = [_described(output, part) for output, part in results]
-                failures = [
-                    {"frame": number, "prefix": rows.prefix, "reason": rows.error}
-                    for number, (_, rows) in enumerate(self._journal.frames())
-                    if rows.error is not None
-                ]
-                text = log_text(self._plan, self._conduct.command, summary, failures, written)
-                parts[-1].stream.write(text.encode())
+            written = [_described(output, part) for output, part in results]
+            failures = [
+                {"frame": number, "prefix": rows.prefix, "reason": rows.error}
+                for number, (_, rows) in enumerate(self._journal.frames())
+                if rows.error is not None
+            ]
+            parts[-1].stream.write(log_text(self._job, summary, failures, written).encode())
             for part in parts:
                 part.sync()
             self._place(parts)
@@ -210,7 +209,7 @@ class RunFiles:
         return (rows.rows for _, rows in self._journal.frames())
 
     def _place(self, parts: Sequence[PartFile]) -> None:
-        with folder_locked(self._paths[-1].parent):
+        with folder_locked(self._log_path.parent):
             for path in self._paths:
                 demand_place(path, overwrite=self._may_replace(path))
             self._journal.write_complete([part.number for part in parts], overwrite=self._overwrite)

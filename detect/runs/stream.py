@@ -9,35 +9,22 @@ all.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import replace
 from functools import partial
-from itertools import chain
 from pathlib import Path
 
 from detect.errors import DetectError
-from detect.run import ImageRun
 from detect.runs.dispatch import Workers, detect_chunks
-from detect.runs.frame import FramePlan, FrameTask
-from detect.runs.known import Known
-from detect.runs.outputs import Conduct, outputs_of
-from detect.runs.rows import FrameRows, RunSummary
+from detect.runs.plan import FrameRows, FrameTask, Job, RunSummary
 from detect.runs.run_files import RunFiles
 from detect.runs.workers import local_workers
 from storage import write_whole
 
 
 def detect_run(
-    run: ImageRun,
-    plan: FramePlan,
-    places: Mapping[str, Path],
-    *,
-    known: Known | None = None,
-    pictures: Path | None = None,
-    workers: Workers | None = None,
-    on_progress: Callable[[], None] | None = None,
-    conduct: Conduct | None = None,
+    job: Job, workers: Workers | None = None, on_progress: Callable[[], None] | None = None
 ) -> RunSummary:
     """Process every frame of a run by a plan, and write the results.
 
@@ -48,24 +35,11 @@ def detect_run(
 
     Parameters
     ----------
-    run : ImageRun
-        The run; without a calibration, only markers can be detected.
-    plan : FramePlan
-        The landmarks to detect.
-    places : mapping
-        The files to write, by kind: "circles", "lines", "tilt", "markers", "json" (the discs once
-        more). Where the frames' times are known, they go beside them.
-    known : Known, optional
-        Prior data on the frames.
-    pictures : path, optional
-        Folder for the plan's pictures.
+    job : Job
     workers : Workers, optional
         The workers; by default this process (see `detect.runs.workers`).
     on_progress : callable, optional
         Called once after every frame.
-    conduct : Conduct, optional
-        Whether files may be replaced, whether there is a log, what bad frames cost, and whether an
-        unfinished run is resumed.
 
     Returns
     -------
@@ -83,15 +57,11 @@ def detect_run(
         If another run is writing the same files, a frame fails where every frame is demanded, or
         there is no such dictionary of markers.
     """
-    known = Known() if known is None else known
-    conduct = Conduct() if conduct is None else conduct
-    plan = replace(plan, json="json" in places, working_folder=Path.cwd())
-    levelled = plan.levelling != "none" and (plan.lines is not None or known.tilts is not None)
-    outputs = outputs_of(run, plan, places, crlf=conduct.crlf, levelled=levelled)
-    if pictures is not None:
-        make_folder(pictures)
-    if workers is None:
-        workers = local_workers(1, large=pictures is not None or run.frames.ships_images)
+    plan = replace(job.plan, json="json" in job.places)
+    job = replace(job, plan=plan)
+    if job.pictures is not None:
+        make_folder(job.pictures)
+    workers = workers or local_workers(1, large=job.ships_images)
     summary = RunSummary()
 
     def count(rows: FrameRows) -> None:
@@ -100,18 +70,18 @@ def detect_run(
             on_progress()
 
     with ExitStack() as stack:
-        files = stack.enter_context(RunFiles(outputs, plan, conduct))
-        tasks = files.take_over(stack.enter_context(closing(_tasks(run, known))), count)
+        files = stack.enter_context(RunFiles(job))
+        tasks = files.take_over(stack.enter_context(closing(_tasks(job))), count)
         for frames in stack.enter_context(closing(detect_chunks(tasks, plan, workers))):
-            if pictures is not None:
-                _write_pictures(frames, pictures, overwrite=files.may_replace_pictures)
+            if job.pictures is not None:
+                _write_pictures(frames, job.pictures, overwrite=files.may_replace_pictures)
             files.add(frames)
             for _, rows in frames:
                 count(rows)
-        summary.images_without_step = run.images_without_step
+        summary.images_without_step = job.run.images_without_step
         second_pass = None
         if plan.levelling == "run" and plan.camera and plan.lines and plan.circles:
-            from detect.runs.level_run import level_run
+            from detect.runs.level_run import level_run  # loads the compiler
 
             sigma_rad = math.radians(plan.circles.tilt_sigma_deg)
             second_pass = partial(level_run, plan.camera, sigma_rad, summary)
@@ -129,15 +99,16 @@ def make_folder(folder: Path) -> None:
         ) from None
 
 
-def _tasks(run: ImageRun, known: Known) -> Generator[FrameTask, None, None]:
-    with closing(iter(run.frames)) as frames:
+def _tasks(job: Job) -> Generator[FrameTask, None, None]:
+    with closing(iter(job.run.frames)) as frames:
         for frame in frames:
-            yield FrameTask(frame, known.of(frame.step.prefix))
+            yield FrameTask(frame, job.known.of(frame.step.prefix))
 
 
 def _write_pictures(
     frames: Sequence[tuple[FrameTask, FrameRows]], folder: Path, *, overwrite: bool
 ) -> None:
-    for name, picture in chain.from_iterable(rows.pictures for _, rows in frames):
-        with write_whole(folder / name, overwrite=overwrite) as stream:
-            stream.write(picture)
+    for _, rows in frames:
+        for name, picture in rows.pictures:
+            with write_whole(folder / name, overwrite=overwrite) as stream:
+                stream.write(picture)

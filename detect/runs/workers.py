@@ -17,8 +17,10 @@ from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from contextlib import contextmanager, suppress
 from functools import lru_cache
 from multiprocessing.connection import wait
-from multiprocessing.synchronize import Lock
+from multiprocessing.synchronize import RLock
 from typing import TYPE_CHECKING, ParamSpec, TypeVar, cast
+
+import cv2
 
 from detect.announcing import (
     announce_compiling,
@@ -30,7 +32,7 @@ from detect.announcing import (
 from detect.errors import WorkerError
 from detect.interrupts import interrupts_deferred
 from detect.runs.dispatch import Workers
-from detect.runs.frame import FramePlan, tables_of
+from detect.runs.plan import FramePlan
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -136,8 +138,7 @@ class _ProcessPool(ProcessPoolExecutor):
 
     def __init__(self, count: int, plan: FramePlan) -> None:
         context = multiprocessing.get_context("spawn")
-        locks = (context.Lock(), context.Lock())
-        arguments = (plan, *locks, announcements_are_shown())
+        arguments = (plan, context.RLock(), announcements_are_shown())
         super().__init__(count, mp_context=context, initializer=_begin, initargs=arguments)
 
     def submit(self, fn: Callable[P, R], /, *args: P.args, **kwargs: P.kwargs) -> Future[R]:
@@ -165,30 +166,31 @@ class _ProcessPool(ProcessPoolExecutor):
 
 
 #: Held by the process that compiles kernels, until it has done what it needs them for.
-_compiling: list[Lock] = []
+_compiling: list[RLock] = []
 
 
-def _begin(plan: FramePlan, tables: Lock, kernels: Lock, show: bool) -> None:
+def _begin(plan: FramePlan, lock: RLock, show: bool) -> None:
     """Make a new process a worker; the first one to need them fills the caches for all."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     if show:
         show_announcements()
-    import cv2
-
     cv2.setNumThreads(1)
-    on_compilation(lambda: _compile_or_wait(kernels))
-    with suppress(Exception), tables:  # any error recurs, and is reported, with the first task
-        _in_worker(tables_of, plan)
+    on_compilation(lambda: _compile_or_wait(lock))
+    with suppress(Exception):  # any error recurs, and is reported, with the first task
+        from detect.runs.frame import tables_of  # loads detectors, which only workers need
+
+        with lock:
+            _in_worker(tables_of, plan)
 
 
-def _compile_or_wait(kernels: Lock) -> None:
-    if not _compiling and kernels.acquire(block=False):
-        _compiling.append(kernels)
+def _compile_or_wait(lock: RLock) -> None:
+    if not _compiling and lock.acquire(block=False):
+        _compiling.append(lock)
         say_compiling()
     elif not _compiling:
         # All kernels but this one will be loaded: the other process has kept them.
-        with kernels:
+        with lock:
             pass
 
 

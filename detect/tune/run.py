@@ -8,7 +8,6 @@ from concurrent.futures import Executor
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, replace
 from itertools import chain
-from pathlib import Path
 
 from detect.comparison.circles import compare_frames
 from detect.comparison.lines import compare_line_frames
@@ -16,8 +15,9 @@ from detect.comparison.result import CompareOptions, DiscComparison, LineCompari
 from detect.line_settings import LineSettings
 from detect.run import Run, RunFrame
 from detect.runs.dispatch import Workers, detect_chunks
-from detect.runs.frame import FramePlan, FrameTask, tables_of
+from detect.runs.frame import tables_of
 from detect.runs.known import ByPrefix, Known
+from detect.runs.plan import FramePlan, FrameTask
 from detect.settings import CircleSettings
 from landmarks import Frame, FrameTilt, frames_of_rows, parse_rows
 
@@ -129,5 +129,5 @@ def _kept(workers: Workers, plan: FramePlan) -> Iterator[Callable[[], Workers]]:
 
 def _plan(run: Run, settings: Settings) -> FramePlan:
     if isinstance(settings, CircleSettings):
-        return FramePlan(run.camera, circles=settings, working_folder=Path.cwd())
-    return FramePlan(run.camera, lines=settings, working_folder=Path.cwd())
+        return FramePlan(run.camera, circles=settings)
+    return FramePlan(run.camera, lines=settings)

@@ -24,8 +24,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 if TYPE_CHECKING:
-    from detect.runs.frame import FrameTask
-    from detect.runs.rows import FrameRows
+    from detect.runs.plan import FrameRows, FrameTask
 
 #: Nothing takes that long, but to compile kernels on a slow machine.
 PATIENCE_S = 600.0

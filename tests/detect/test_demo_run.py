@@ -14,10 +14,8 @@ from detect.comparison.lines import compare_line_runs
 from detect.comparison.result import CompareOptions, DiscComparison, LineComparison
 from detect.line_settings import LineSettings
 from detect.run import open_run
-from detect.runs.frame import FramePlan
 from detect.runs.known import FramesByImage, Known
-from detect.runs.outputs import Conduct
-from detect.runs.rows import RunSummary
+from detect.runs.plan import FramePlan, Job, RunSummary
 from detect.runs.stream import detect_run
 from detect.settings import PUBLISHED, REPORT, CircleSettings
 from landmarks import read_frames
@@ -33,7 +31,7 @@ def detected(
     opened = open_run(run)
     plan = FramePlan(opened.camera, circles=settings)
     ids = Known() if known is None else Known(discs=FramesByImage(known))
-    return detect_run(opened, plan, {"circles": output}, known=ids, conduct=Conduct(crlf=crlf))
+    return detect_run(Job(opened, plan, {"circles": output}, ids, crlf=crlf))
 
 
 def redetected(run: Path, settings: CircleSettings, folder: Path) -> DiscComparison:
@@ -120,7 +118,7 @@ def redetected_lines(run: Path, folder: Path) -> LineComparison:
     output = folder / "detected.lines"
     opened = open_run(run)
     plan = FramePlan(opened.camera, lines=LineSettings())
-    summary = detect_run(opened, plan, {"lines": output, "tilt": folder / "detected.tilt"})
+    summary = detect_run(Job(opened, plan, {"lines": output, "tilt": folder / "detected.tilt"}))
     assert summary.failures == []
     return compare_line_runs(run, detected=output)
 

@@ -17,7 +17,7 @@ ROOMS = ("camera", "detect", "groundtruth", "landmarks", "lut", "slam")
 #: commands hand on to settings.
 NO_SETTINGS = frozenset(
     {
-        "Conduct", "FileHead", "FrameRows", "PickedFrames",
+        "FileHead", "FrameRows", "PickedFrames",
         "RowCount", "RowFiles", "RunSummary", "SeenRows", "_Rows",
     }
 )  # fmt: skip

@@ -490,13 +490,13 @@ def _print_tilt_errors(run: Path, tilts: dict[str, FrameTilt]) -> None:
 
 def _detect_lines(run: Path, settings: LineSettings, output: Path) -> None:
     from detect.run import open_run
-    from detect.runs.frame import FramePlan
+    from detect.runs.plan import FramePlan, Job
     from detect.runs.stream import detect_run
 
     opened = open_run(run)
     places = {"lines": output, "tilt": output.with_suffix(".tilt")}
     plan = FramePlan(opened.camera, lines=settings)
-    summary = detect_run(opened, plan, places)
+    summary = detect_run(Job(opened, plan, places))
     for failure in summary.failures:
         print(failure, file=sys.stderr)
 
@@ -505,17 +505,13 @@ def _detect(
     run: Path, settings: CircleSettings, output: Path, tilts: dict[str, FrameTilt] | None = None
 ) -> None:
     from detect.run import open_run
-    from detect.runs.frame import FramePlan
     from detect.runs.known import Known
+    from detect.runs.plan import FramePlan, Job
     from detect.runs.stream import detect_run
 
     opened = open_run(run)
-    summary = detect_run(
-        opened,
-        FramePlan(opened.camera, circles=settings),
-        {"circles": output},
-        known=Known(tilts=tilts),
-    )
+    plan = FramePlan(opened.camera, circles=settings)
+    summary = detect_run(Job(opened, plan, {"circles": output}, Known(tilts=tilts)))
     for failure in summary.failures:
         print(failure, file=sys.stderr)
 

@@ -12,7 +12,7 @@ from camera import Camera, write_camera
 from detect.cli import main
 from detect.markers.settings import MarkerSettings
 from detect.run import Run, open_images
-from detect.runs.frame import FramePlan
+from detect.runs.plan import FramePlan, Job
 from detect.runs.stream import detect_run
 from landmarks import read_frames
 from tests.detect.markers.rendering import View, exposed, render, view_corners
@@ -93,7 +93,7 @@ def test_a_calibration_is_used_where_there_is_one(folder: Path) -> None:
     assert isinstance(run, Run)
     assert run.camera == camera
     plan = FramePlan(run.camera, markers=MarkerSettings())
-    summary = detect_run(run, plan, {"markers": folder / "detected.markers"})
+    summary = detect_run(Job(run, plan, {"markers": folder / "detected.markers"}))
     assert summary.found["markers"] == 3
     assert summary.frames == 3
 

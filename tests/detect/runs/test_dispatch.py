@@ -17,8 +17,7 @@ from camera import Camera
 from detect.errors import WorkerError
 from detect.run import RunFrame
 from detect.runs.dispatch import Chunk, Workers, detect_chunks
-from detect.runs.frame import FramePlan, FrameTask
-from detect.runs.rows import FrameRows
+from detect.runs.plan import FramePlan, FrameRows, FrameTask
 from landmarks import Step
 
 

@@ -12,10 +12,11 @@ import pytest
 
 from detect.run import RunFrame, open_run
 from detect.runs import rows as rows_module
-from detect.runs.frame import FrameDetections, FramePlan, FrameTask, detect_batch, tables_of
+from detect.runs.frame import FrameDetections, detect_batch
 from detect.runs.journal import Journal, task_digest
 from detect.runs.known import KnownOfFrame
-from detect.runs.rows import FrameRows, rows_of_frames
+from detect.runs.plan import FramePlan, FrameRows, FrameTask
+from detect.runs.rows import rows_of_frames
 from detect.settings import PUBLISHED
 from landmarks import FrameTilt
 from storage.parts import left_part, new_part
@@ -43,8 +44,8 @@ def test_frames_have_the_same_rows_together_and_alone(
     tasks_and_plan: tuple[list[FrameTask], FramePlan],
 ) -> None:
     tasks, plan = tasks_and_plan
-    together = rows_of_frames(tasks, plan, tables_of(plan))
-    assert together == [rows for t in tasks for rows in rows_of_frames([t], plan, tables_of(plan))]
+    together = rows_of_frames(tasks, plan)
+    assert together == [rows for t in tasks for rows in rows_of_frames([t], plan)]
     assert [place for place, rows in enumerate(together) if rows.error is not None] == [3, 9]
     for rows, task in zip(together, tasks):
         circles = rows.rows["circles"]
@@ -65,7 +66,7 @@ def test_no_more_images_are_in_memory_than_agreed(
 
     monkeypatch.setattr(rows_module, "detect_batch", noted)
     monkeypatch.setattr(rows_module, "PIXELS_AT_ONCE", 5 * plan.camera.width * plan.camera.height)
-    rows_of_frames(tasks, plan, tables_of(plan))
+    rows_of_frames(tasks, plan)
     assert sizes == [5, 5, 2]
 
 

@@ -13,8 +13,7 @@ from pathlib import Path
 import pytest
 
 from detect.cli import main
-from detect.runs.frame import FrameTask
-from detect.runs.rows import FrameRows
+from detect.runs.plan import FrameRows, FrameTask
 from detect.runs.run_files import RunFiles
 from storage.parts import PartFile
 from tests.detect.interrupted_runs import (

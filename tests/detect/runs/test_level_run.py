@@ -15,7 +15,7 @@ from detect.cli import main
 from detect.levelling import level_positions
 from detect.run_tilt import LEAST_FRAMES
 from detect.runs.level_run import level_run
-from detect.runs.rows import RunSummary
+from detect.runs.plan import RunSummary
 from landmarks.reading import frames_of_rows, parse_rows
 
 LEAN = -0.04, 0.01

@@ -14,7 +14,7 @@ from camera import write_camera
 from detect.cli import main
 from detect.line_settings import LineSettings
 from detect.run import open_run
-from detect.runs.frame import FramePlan
+from detect.runs.plan import FramePlan, Job
 from detect.runs.stream import detect_run
 from detect.verticals.detections import carry_ids
 from landmarks import LineLandmark, read_frames, read_tilts
@@ -53,7 +53,7 @@ def test_rows_and_tilts_are_written(short_run: Path, project_root: Path, tmp_pat
     output, tilt = tmp_path / "out.lines", tmp_path / "out.tilt"
     run = open_run(short_run)
     plan = FramePlan(run.camera, lines=LineSettings())
-    summary = detect_run(run, plan, {"lines": output, "tilt": tilt})
+    summary = detect_run(Job(run, plan, {"lines": output, "tilt": tilt}))
     frames = list(read_frames(output))
     assert [frame.step.prefix for frame in frames] == [f"e.{k:04d}" for k in range(4)]
     assert sum(len(frame.lines) for frame in frames) == summary.found["lines"] >= 20

@@ -11,7 +11,7 @@ import pytest
 
 from detect.cli import main
 from detect.run import open_run
-from detect.runs.frame import FramePlan
+from detect.runs.plan import FramePlan, Job
 from detect.runs.stream import detect_run
 from detect.runs.workers import local_workers
 from detect.settings import CircleSettings
@@ -101,9 +101,11 @@ def test_workers_tell_what_is_wrong_with_the_tables(small_run: Path) -> None:
     before = sorted(small_run.iterdir())
     with pytest.raises(TableError, match=r"the camera is -1\.5 m above the floor: expected more"):
         detect_run(
-            replace(run, camera=under),
-            FramePlan(under, circles=CircleSettings()),
-            {"circles": small_run / "out.circles"},
-            workers=local_workers(2),
+            Job(
+                replace(run, camera=under),
+                FramePlan(under, circles=CircleSettings()),
+                {"circles": small_run / "out.circles"},
+            ),
+            local_workers(2),
         )
     assert sorted(small_run.iterdir()) == before

@@ -13,9 +13,8 @@ import pytest
 
 from detect.line_settings import LineSettings
 from detect.run import RunFrame, open_run
-from detect.runs.frame import FramePlan
 from detect.runs.known import FramesByImage, Known
-from detect.runs.rows import KEPT_FAILURES, RunSummary
+from detect.runs.plan import KEPT_FAILURES, FramePlan, Job, RunSummary
 from detect.runs.stream import detect_run
 from detect.runs.workers import local_workers
 from detect.settings import CircleSettings
@@ -49,7 +48,7 @@ def detect(
     wanted = FramePlan(opened.camera, **plan)
     pictures = places.pop("pictures", None)
     workers = local_workers(jobs, large=pictures is not None)
-    return detect_run(opened, wanted, places, known=known, pictures=pictures, workers=workers)
+    return detect_run(Job(opened, wanted, places, known or Known(), pictures), workers)
 
 
 def in_folder(folder: Path, *kinds: str) -> dict[str, Path]:
@@ -87,8 +86,10 @@ def test_one_pass_writes_what_two_passes_do(run_folder: Path, tmp_path: Path) ->
     once, twice = folder_of(tmp_path / "once"), folder_of(tmp_path / "twice")
     in_two_passes(run_folder, twice)
     in_one_pass(run_folder, once, jobs=1)
-    assert files_in(once) == files_in(twice)
-    assert sorted(files_in(once)) == ["detected.circles", "detected.lines", "detected.tilt"]
+    names = ["detected.circles", "detected.lines", "detected.tilt"]
+    assert sorted(files_in(once)) == sorted([*names, "detected.lines.log.json"])
+    for name in names:
+        assert (once / name).read_bytes() == (twice / name).read_bytes()
 
 
 @pytest.mark.long
@@ -199,9 +200,7 @@ def test_only_files_are_asked_for_ahead(
     frames = Arriving([*opened.frames] * 5, ships_images=ships_images)
     run = replace(opened, frames=frames)
     summary = detect_run(
-        run,
-        FramePlan(run.camera, circles=LIGHT),
-        {"circles": tmp_path / "a.circles"},
+        Job(run, FramePlan(run.camera, circles=LIGHT), {"circles": tmp_path / "a.circles"}),
         on_progress=frames.advance,
     )
     assert summary.frames == frames.done == 5 * FRAMES

@@ -25,7 +25,7 @@ from detect.errors import WorkerError
 from detect.line_settings import LineSettings
 from detect.run import open_run
 from detect.runs.dispatch import Workers
-from detect.runs.frame import FramePlan
+from detect.runs.plan import FramePlan, Job
 from detect.runs.stream import detect_run
 from detect.runs.workers import FRAMES_PER_PROCESS, cluster_workers, default_jobs, local_workers
 from detect.settings import CircleSettings
@@ -61,7 +61,7 @@ def detected(
     places = {kind: output / f"detected.{kind}" for kind in KINDS}
     opened = open_run(run)
     plan = FramePlan(opened.camera, LineSettings(), CircleSettings(polarity="light"))
-    summary = detect_run(opened, plan, places, workers=workers, on_progress=on_progress)
+    summary = detect_run(Job(opened, plan, places), workers, on_progress)
     assert (summary.frames, summary.failures) == (FRAMES, [])
     return [path.read_bytes() for path in places.values()]
 

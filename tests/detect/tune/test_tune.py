@@ -24,7 +24,7 @@ from detect.errors import DetectError
 from detect.line_settings import LineSettings
 from detect.run import open_run
 from detect.runs.dispatch import Workers
-from detect.runs.frame import FramePlan
+from detect.runs.plan import FramePlan
 from detect.runs.workers import local_workers
 from detect.settings import CircleSettings
 from detect.tune.grid import combinations, parameter_values
