@@ -55,13 +55,10 @@ def has_brown(terms: NDArray[np.float64]) -> bool:
 
 
 @njit(cache=True, error_model="numpy")
-def project_floor_point(
-    numbers: NDArray[np.float64], x_robot: float, y_robot: float
+def project_direction(
+    numbers: NDArray[np.float64], dx: float, dy: float, dz: float
 ) -> tuple[float, float]:
-    """Pixel (u, v) of a floor point; both NaN where the projection is undefined."""
-    dx = x_robot - numbers[19]
-    dy = y_robot - numbers[20]
-    dz = -numbers[21]
+    """Pixel (u, v) of a direction in the robot frame; both NaN where the projection is undefined."""
     z = numbers[16] * dx + numbers[17] * dy + numbers[18] * dz
     if not z > 0.0:
         return math.nan, math.nan
@@ -81,3 +78,11 @@ def project_floor_point(
         u += numbers[0] * x_shift
         v += numbers[1] * y_shift
     return u + numbers[2], v + numbers[3]
+
+
+@njit(cache=True, error_model="numpy")
+def project_floor_point(
+    numbers: NDArray[np.float64], x_robot: float, y_robot: float
+) -> tuple[float, float]:
+    """Pixel (u, v) of a floor point; both NaN where the projection is undefined."""
+    return project_direction(numbers, x_robot - numbers[19], y_robot - numbers[20], -numbers[21])

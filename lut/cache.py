@@ -15,6 +15,7 @@ from __future__ import annotations
 import hashlib
 import io
 import logging
+import math
 import os
 import stat
 from collections.abc import Callable
@@ -26,7 +27,6 @@ import numpy as np
 
 from camera import Camera
 from lut.outlines import DiscShape, DiscTable, build_disc_table
-from lut.table_checks import check_disc_table, check_vertical_table
 from lut.verticals import VerticalTable, build_vertical_table
 from storage import write_whole
 
@@ -75,7 +75,7 @@ def cached_disc_table(camera: Camera, shape: DiscShape, folder: Path | None = No
         As `lut.build_disc_table`.
     """
     path = (folder or cache_folder()) / f"discs-{_key(camera, shape)}.table"
-    table = _read(path, DiscTable, lambda table: check_disc_table(table, camera, shape))
+    table = _read(path, DiscTable, lambda table: disc_table_fits(table, camera, shape))
     if table is None:
         _log.info("computing the table of discs, once for this calibration")
         table = build_disc_table(camera, shape)
@@ -84,22 +84,9 @@ def cached_disc_table(camera: Camera, shape: DiscShape, folder: Path | None = No
 
 
 def cached_vertical_table(camera: Camera, folder: Path | None = None) -> VerticalTable:
-    """The table of verticals of a camera, from the cache or computed, as `cached_disc_table`.
-
-    Parameters
-    ----------
-    camera : Camera
-        The calibrated camera.
-    folder : path, optional
-        The cache; by default `cache_folder`.
-
-    Returns
-    -------
-    VerticalTable
-        Equal to that of `lut.build_vertical_table`.
-    """
+    """The table of verticals of a camera, equal to `lut.build_vertical_table`'s; as above."""
     path = (folder or cache_folder()) / f"verticals-{_key(camera)}.table"
-    table = _read(path, VerticalTable, lambda table: check_vertical_table(table, camera))
+    table = _read(path, VerticalTable, lambda table: vertical_table_fits(table, camera))
     if table is None:
         _log.info("computing the table of verticals, once for this calibration")
         table = build_vertical_table(camera)
@@ -114,24 +101,74 @@ def _key(camera: Camera, shape: DiscShape | None = None) -> str:
     return hashlib.sha256(" ".join(parts).encode()).hexdigest()[:32]
 
 
-def _read(path: Path, kind: type[Table], check: Callable[[Table], None]) -> Table | None:
+def _read(path: Path, kind: type[Table], fits: Callable[[Table], bool]) -> Table | None:
     """The table that a file holds; None if there is no file, or one that must not be used."""
     content = _own_content(path)
     if content is None:
         return None
     digest, payload = content[:_DIGEST_BYTES], content[_DIGEST_BYTES:]
     try:
-        if _digest(path, payload) != digest:
-            raise ValueError("damaged")
-        with np.load(io.BytesIO(payload), allow_pickle=False) as arrays:
-            found: dict[str, Any] = {name: arrays[name] for name in arrays.files}
-        # Numbers were stored as arrays without dimensions.
-        table = kind(**{name: a if a.ndim else a.item() for name, a in found.items()})
-        check(table)
-    except Exception:  # a damaged or forged archive can raise anything
-        _log.info("%s: is damaged: it is computed again", path)
-        return None
-    return table
+        if _digest(path, payload) == digest:
+            with np.load(io.BytesIO(payload), allow_pickle=False) as arrays:
+                found: dict[str, Any] = {name: arrays[name] for name in arrays.files}
+            # Numbers were stored as arrays without dimensions.
+            table = kind(**{name: a if a.ndim else a.item() for name, a in found.items()})
+            if fits(table):
+                return table
+    except Exception:
+        pass  # a damaged or forged archive can raise anything
+    _log.info("%s: is damaged: it is computed again", path)
+    return None
+
+
+def disc_table_fits(table: DiscTable, camera: Camera, shape: DiscShape) -> bool:
+    """Whether a table's arrays are such that no loop leaves the image, or the arrays themselves."""
+    height, width, centres = camera.height, camera.width, len(table.row)
+    return (
+        _is_array(table.samples, np.uint32, (centres, shape.samples, 2))
+        and _is_array(table.row, np.int32, (centres,))
+        and _is_array(table.column, np.int32, (centres,))
+        and _is_array(table.floor_xy, np.float32, (height, width, 2))
+        and bool(np.all(table.samples <= height * width))
+        and bool(np.all((table.row >= 0) & (table.row < height)))
+        and bool(np.all((table.column >= 0) & (table.column < width)))
+    )
+
+
+def vertical_table_fits(table: VerticalTable, camera: Camera) -> bool:
+    """As `disc_table_fits`; that numbers are there where they are used, too."""
+    height, width = camera.height, camera.width
+    first, last, anchor = table.first_row, table.last_row, table.anchor_row
+    elevation = table.anchor_elevation_rad
+    if not (
+        all(_is_array(array, np.float64, (width,)) for array in (anchor, table.bearing_rad))
+        and all(_is_array(array, np.int32, (width,)) for array in (first, last))
+        and all(
+            _is_array(array, np.float32, (height, width)) and array.flags.f_contiguous
+            for array in (table.column, table.elevation_tan)
+        )
+        and np.array_equal(table.robot_from_camera, camera.rotation)
+        and table.row_aspect == camera.scale_x / camera.scale_y
+        and isinstance(elevation, float)
+        and abs(elevation) < 0.5 * math.pi
+    ):
+        return False
+    inside = (anchor >= 0.0) & (anchor <= height - 1.0)  # NaN is not
+    row = np.arange(height)[:, None]
+    followed = table.usable & (row >= first) & (row <= last)
+    seen = (table.column >= 0.0) & (table.column <= width - 1.0)
+    return bool(
+        np.all(inside == np.isfinite(table.bearing_rad))
+        and np.all(inside | np.isnan(anchor))
+        and np.all(inside[table.usable])
+        and np.all((first >= 0) & (last < height))
+        and np.all(seen == followed)
+        and np.all(np.isfinite(table.elevation_tan) == followed)
+    )
+
+
+def _is_array(array: object, dtype: type[np.generic], shape: tuple[int, ...]) -> bool:
+    return isinstance(array, np.ndarray) and array.dtype == dtype and array.shape == shape
 
 
 def _own_content(path: Path) -> bytes | None:

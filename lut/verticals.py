@@ -15,16 +15,16 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from camera import Camera
-from camera.kernels import camera_numbers
-from lut.vertical_kernels import trace_verticals
+from camera.kernels import camera_numbers, project_direction
 
 #: Verticals farther than this from the image's vertical are not followed: du/dv of 45 deg.
 STEEPEST_SLOPE = 1.0
 
-_ROOT_STEPS = 12
+_NEWTON_STEPS, _STEP_RAD, _TOLERANCE_PX = 12, 1e-7, 1e-9
 
 #: The horizon is the anchor where at least this share of the columns see it.
 _LEAST_SEEN = 0.5
@@ -75,18 +75,6 @@ class VerticalTable:
     def usable(self) -> NDArray[np.bool_]:
         """(W,) bool, the columns that have a vertical."""
         return self.first_row <= self.last_row
-
-    def columns_at(self, bearing_rad: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(N,) columns at which (N,) bearings lie on the anchor; at its ends for those outside.
-
-        NaN where the table has no verticals.
-        """
-        columns = np.flatnonzero(self.usable)
-        if not len(columns):
-            return np.full(bearing_rad.shape, np.nan)
-        bearing = self.bearing_rad[columns]
-        order = np.argsort(bearing)
-        return np.asarray(np.interp(bearing_rad, bearing[order], columns[order]))
 
 
 def build_vertical_table(camera: Camera) -> VerticalTable:
@@ -198,26 +186,73 @@ def _roots(
     before: NDArray[np.intp],
     above: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Rows between `before` and the next at which columns see the elevation of this sine.
-
-    Regula falsi (the Illinois variant): it needs no derivative through the distortion and does not
-    leave the interval; where the rise is as smooth as here, a few steps reach 1e-13 px.
-    """
+    """Rows between `before` and the next at which columns see the elevation of this sine."""
     low, high = before.astype(np.float64), before + 1.0
-    at_low, at_high = above[before, columns], above[before + 1, columns]
-    middle = low
-    for _ in range(_ROOT_STEPS):
-        middle = high - at_high * (high - low) / (at_high - at_low)
+    rises = above[before, columns] <= 0.0
+    for _ in range(50):
+        middle = 0.5 * (low + high)
         at = camera.undistort(np.stack([columns.astype(np.float64), middle], axis=-1))
-        value = _above(camera, at, sine)
-        crossed = (value > 0.0) != (at_high > 0.0)
-        # The end that stays counts half, so that it does not stay for long.
-        low = np.where(crossed, high, low)
-        at_low = np.where(crossed, at_high, 0.5 * at_low)
-        high, at_high = middle, value
-        if np.all(np.abs(value) < 1e-15):
-            break
-    return middle
+        beyond = (_above(camera, at, sine) > 0.0) == rises
+        low, high = np.where(beyond, low, middle), np.where(beyond, middle, high)
+    return np.asarray(0.5 * (low + high))
+
+
+@njit(cache=True, error_model="numpy")
+def trace_verticals(
+    numbers: NDArray[np.float64],
+    bearing: NDArray[np.float64],
+    anchor_row: NDArray[np.float64],
+    anchor_elevation: float,
+    column: NDArray[np.float64],
+    elevation: NDArray[np.float64],
+) -> None:
+    """Follow (N,) verticals from the anchor up and down, row by row, through a camera.
+
+    Results are (H, N) `column` and `elevation` (rad) of each vertical in each row; NaN where it is
+    not seen, or not without a break from the anchor on.
+    """
+    column[:] = elevation[:] = math.nan
+    for n in range(len(bearing)):
+        if not (math.isfinite(bearing[n]) and math.isfinite(anchor_row[n])):
+            continue
+        first = math.floor(anchor_row[n])
+        for direction in (-1, 1):
+            v = first if direction < 0 else first + 1
+            angle, orientation = anchor_elevation, 0.0
+            while 0 <= v < len(column):
+                u, angle, slope = _crossing(numbers, bearing[n], v, angle)
+                # A vertical that turns back would show a row twice.
+                if not math.isfinite(slope) or orientation * slope < 0.0:
+                    break
+                column[v, n], elevation[v, n] = u, angle
+                orientation = slope
+                v += direction
+                angle += direction / slope
+
+
+@njit(cache=True, error_model="numpy")
+def _crossing(
+    numbers: NDArray[np.float64], bearing: float, row: float, angle: float
+) -> tuple[float, float, float]:
+    """Column and elevation at which a row shows a vertical, and its rows per radian there.
+
+    By Newton's method from an elevation nearby; no numbers where it does not show it.
+    """
+    for _ in range(_NEWTON_STEPS):
+        u, v = _seen(numbers, bearing, angle)
+        slope = (_seen(numbers, bearing, angle + _STEP_RAD)[1] - v) / _STEP_RAD
+        if abs(row - v) < _TOLERANCE_PX:
+            return u, angle, slope
+        angle += (row - v) / slope
+    return math.nan, math.nan, math.nan
+
+
+@njit(cache=True, error_model="numpy")
+def _seen(numbers: NDArray[np.float64], bearing: float, elevation: float) -> tuple[float, float]:
+    ahead = math.cos(elevation)
+    return project_direction(
+        numbers, ahead * math.sin(bearing), -ahead * math.cos(bearing), math.sin(elevation)
+    )
 
 
 def _unbroken(

@@ -12,8 +12,9 @@ import hashlib
 import json
 from collections import deque
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict
+from dataclasses import replace
 from importlib.metadata import version
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -114,9 +115,8 @@ def made_by(outputs: Sequence[Output], plan: FramePlan) -> str:
         __version__,
         # A process that has others do the work does not load the compiler, which takes long.
         (np.__version__, cv2.__version__, version("numba")),
-        [values and asdict(values) for values in (plan.circles, plan.lines, plan.markers)],
+        replace(plan, camera=None, working_folder=Path()),
         plan.camera and plan.camera.content_hash,
-        (plan.json, plan.drawing, plan.draw_response, plan.levelling),
         [(output.kind, output.head, output.tail, output.crlf) for output in outputs],
     )
     return _digest_of(repr(values))

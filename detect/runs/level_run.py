@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 
 import numpy as np
@@ -20,16 +21,17 @@ _Tilted = tuple[str, int, FrameTilt | None]
 
 def level_run(
     camera: Camera,
-    tilt_sigma_rad: float,
-    summary: RunSummary,
+    tilt_sigma_deg: float,
     read: Callable[[], Iterable[Mapping[str, str]]],
+    summary: RunSummary,
 ) -> Iterator[Mapping[str, str]]:
     """The rows of each frame with levelled discs, and `RUN_TILT`.
 
     Where too few frames have a tilt to learn from (`detect.run_tilt.LEAST_FRAMES`), each frame is
-    levelled by its own; `tilt_sigma_rad` is the standard deviation of an unknown one. The summary
+    levelled by its own; `tilt_sigma_deg` is the standard deviation of an unknown one. The summary
     is given the tilt of the run. `read` gives the rows of all frames as seen, and is called twice.
     """
+    unknown_variance = math.radians(tilt_sigma_deg) ** 2
     frames: list[_Tilted] = []
     outlines: list[FrameTilt | None] = []
     for rows in read():
@@ -42,8 +44,8 @@ def level_run(
             pitch, roll = summary.tilt.tilt[k].tolist()
             cpp, crr = summary.tilt.variance[k].tolist()
             tilt = tilt_as_written(FrameTilt(prefix, pitch, roll, cpp, 0.0, crr, lines))
-        elif tilt is None and tilt_sigma_rad > 0.0:
-            tilt = FrameTilt(prefix, 0.0, 0.0, tilt_sigma_rad**2, 0.0, tilt_sigma_rad**2, 0)
+        elif tilt is None and unknown_variance > 0.0:
+            tilt = FrameTilt(prefix, 0.0, 0.0, unknown_variance, 0.0, unknown_variance, 0)
         circles = rows["circles"]
         yield {
             **rows,

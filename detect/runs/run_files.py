@@ -32,11 +32,6 @@ from storage.parts import PartFile, demand_place, folder_locked, left_part, new_
 
 _log = logging.getLogger("redetect")
 
-#: Rows of each frame, by kind, in the order of the run.
-RowsOfFrames = Iterable[Mapping[str, str]]
-#: Makes the rows that are written from those of the frames, which can be read more than once.
-SecondPass = Callable[[Callable[[], RowsOfFrames]], RowsOfFrames]
-
 
 class RunFiles:
     """The files of a run: a context manager that begins or resumes its journal, and ends it."""
@@ -175,7 +170,11 @@ class RunFiles:
 
     # -- ending -----------------------------------------------------------------------------
 
-    def finish(self, summary: RunSummary, second_pass: SecondPass | None = None) -> None:
+    def rows(self) -> Iterator[Mapping[str, str]]:
+        """The rows of each frame, by kind; can be read more than once."""
+        return (rows.rows for _, rows in self._journal.frames())
+
+    def finish(self, rows_of_frames: Iterable[Mapping[str, str]], summary: RunSummary) -> None:
         """Write the results, and move them to their final paths."""
         if not self._journal.file.is_in_place():
             # Another folder may have come in its place: nothing in it is touched.
@@ -186,7 +185,7 @@ class RunFiles:
             for output, part in results:
                 part.stream.write(output.encoded(output.head))
             separators = dict.fromkeys((output.kind for output in self._outputs), "")
-            for rows in self._rows() if second_pass is None else second_pass(self._rows):
+            for rows in rows_of_frames:
                 for output, part in results:
                     if text := rows.get(output.kind):
                         part.stream.write(output.encoded(separators[output.kind] + text))
@@ -204,9 +203,6 @@ class RunFiles:
                 part.sync()
             self._place(parts)
         self._done = True
-
-    def _rows(self) -> Iterator[Mapping[str, str]]:
-        return (rows.rows for _, rows in self._journal.frames())
 
     def _place(self, parts: Sequence[PartFile]) -> None:
         with folder_locked(self._log_path.parent):

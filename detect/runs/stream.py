@@ -8,11 +8,9 @@ all.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Generator, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 from detect.errors import DetectError
@@ -79,13 +77,12 @@ def detect_run(
             for _, rows in frames:
                 count(rows)
         summary.images_without_step = job.run.images_without_step
-        second_pass = None
+        written = files.rows()
         if plan.levelling == "run" and plan.camera and plan.lines and plan.circles:
             from detect.runs.level_run import level_run  # loads the compiler
 
-            sigma_rad = math.radians(plan.circles.tilt_sigma_deg)
-            second_pass = partial(level_run, plan.camera, sigma_rad, summary)
-        files.finish(summary, second_pass)
+            written = level_run(plan.camera, plan.circles.tilt_sigma_deg, files.rows, summary)
+        files.finish(written, summary)
     return summary
 
 

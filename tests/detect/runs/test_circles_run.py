@@ -209,7 +209,9 @@ def test_all_outputs_or_none(small_run: Path, tmp_path: Path) -> None:
     assert left_in(small_run) == before
 
 
-def test_an_interrupted_run_writes_no_more_than_its_journal(small_run: Path, tmp_path: Path) -> None:
+def test_an_interrupted_run_writes_no_more_than_its_journal(
+    small_run: Path, tmp_path: Path
+) -> None:
     output, as_json = small_run / "out.circles", small_run / "out.json"
     before = left_in(small_run)
     ticks = []

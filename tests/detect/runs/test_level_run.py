@@ -30,7 +30,7 @@ def level(camera: Camera, frames: int) -> dict[str, bytes]:
         pitch, roll = np.array(LEAN) + 1e-4 * rng.standard_normal(2)
         tilt = f"TILT {k} {pitch:.6f} {roll:.6f} 1e-8 0 1e-8 9\n" if k else "NOTILT 0 2\n"
         seen.append({"tilt": tilt, "circles": STEP.format(k) + DISC})
-    written = list(level_run(camera, 0.0, RunSummary(), lambda: seen))
+    written = list(level_run(camera, 0.0, lambda: seen, RunSummary()))
     return {
         kind: "".join(rows[kind] for rows in written).encode() for kind in ("run tilt", "circles")
     }
