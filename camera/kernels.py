@@ -58,7 +58,7 @@ def has_brown(terms: NDArray[np.float64]) -> bool:
 def project_direction(
     numbers: NDArray[np.float64], dx: float, dy: float, dz: float
 ) -> tuple[float, float]:
-    """Pixel (u, v) of a direction in the robot frame; both NaN where the projection is undefined."""
+    """Pixel (u, v) of a direction in the robot frame; both NaN where it is undefined."""
     z = numbers[16] * dx + numbers[17] * dy + numbers[18] * dz
     if not z > 0.0:
         return math.nan, math.nan

@@ -4,73 +4,25 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Annotated, Literal
 
 from detect.errors import DetectError
-from storage.bounds import ABOVE_0, LIMIT_OR_0, NOT_NEGATIVE, SHARE_ABOVE_0, demand, from_to, whole
+from storage.bounds import (
+    Bounds,
+    LimitOr0,
+    NotNegative,
+    Positive,
+    Share,
+    ShareAbove0,
+    demand_fields,
+    from_to,
+    whole,
+)
 
 BearingConvention = Literal["level", "published"]
 Joining = Literal["evidence", "equal"]
 
-_BOUNDS = {
-    **dict.fromkeys(
-        (
-            "sigma_across_px",
-            "sigma_along_rows",
-            "regulariser",
-            "guided_reach_px",
-            "fine_scale_px",
-            "coarse_scale_px",
-            "weight_limit",
-            "sigma_px",
-            "largest_tilt_deg",
-            "tilt_prior_deg",
-            "building_deg",
-        ),
-        ABOVE_0,
-    ),
-    **dict.fromkeys(
-        (
-            "least_length_px",
-            "least_evidence",
-            "least_sharpness",
-            "soft_evidence",
-            "bend_px",
-            "lean_noise",
-            "same_edge_px",
-            "join_px",
-            "join_share",
-            "shoulder_px",
-            "shoulder_share",
-        ),
-        NOT_NEGATIVE,
-    ),
-    **dict.fromkeys(
-        (
-            "largest_horizon_gap_px",
-            "largest_scatter_px",
-            "largest_shift_px",
-            "largest_noise_px",
-            "largest_lean_deg",
-            "largest_lean_sigmas",
-            "largest_lean_px",
-        ),
-        LIMIT_OR_0,
-    ),
-    **dict.fromkeys(("border_rows", "start_band_rows", "gap_rows", "first_edges"), whole(0)),
-    **dict.fromkeys(("threshold", "guided_pull"), SHARE_ABOVE_0),
-    "start_spacing_rows": whole(1),
-    "least_rows": whole(5),
-    "blurred_sharpness": from_to(0.0, 1.0),
-    "least_lines": whole(2),
-    "stray_share": from_to(0.0, 0.5),
-    "proposers": whole(2, 1000),
-}
-
-
-def _expect(condition: bool, name: str, value: float, expected: str) -> None:
-    if not condition:
-        raise DetectError(f"{name} is {value:g}: expected {expected}")
+_WIDTH = Bounds("a number above 1, at most 10", 1.0, 10.0, above=True)
 
 
 @dataclass(frozen=True)
@@ -179,65 +131,67 @@ class LineSettings:
         Bearings compensated for the tilt, or with the sign that the data set's own rows have.
     """
 
-    sigma_across_px: float = 0.8
-    sigma_along_rows: float = 2.0
-    regulariser: float = 40.0
-    threshold: float = 0.12
-    border_rows: int = 2
-    start_band_rows: int = 20
-    start_spacing_rows: int = 4
-    gap_rows: int = 6
+    sigma_across_px: Positive = 0.8
+    sigma_along_rows: Positive = 2.0
+    regulariser: Positive = 40.0
+    threshold: ShareAbove0 = 0.12
+    border_rows: Annotated[int, whole(0)] = 2
+    start_band_rows: Annotated[int, whole(0)] = 20
+    start_spacing_rows: Annotated[int, whole(1)] = 4
+    gap_rows: Annotated[int, whole(0)] = 6
     guided: bool = True
-    first_edges: int = 10
-    guided_pull: float = 0.07
-    guided_reach_px: float = 0.75
+    first_edges: Annotated[int, whole(0)] = 10
+    guided_pull: ShareAbove0 = 0.07
+    guided_reach_px: Positive = 0.75
     refine_steps_px: tuple[tuple[float, float], ...] = (
         (1.2, math.inf),
         (0.8, 1.5),
         (0.8, 1.5),
         (1.8, 0.1),
     )
-    fine_scale_px: float = 0.8
-    coarse_scale_px: float = 1.6
-    least_rows: int = 14
-    least_length_px: float = 24.0
-    least_evidence: float = 7.0
-    least_sharpness: float = 0.87
-    soft_evidence: float = 40.0
-    largest_horizon_gap_px: float = 11.0
-    largest_scatter_px: float = 1.0
-    largest_shift_px: float = 1.0
-    largest_noise_px: float = 0.3
-    bend_px: float = 0.06
-    lean_noise: float = 3.0
-    largest_lean_deg: float = 0.7
-    largest_lean_sigmas: float = 8.0
-    largest_lean_px: float = 1.5
-    largest_tilt_deg: float = 8.0
-    tilt_prior_deg: float = 2.0
-    building_deg: float = 0.025
-    proposers: int = 24
-    least_lines: int = 3
-    stray_share: float = 0.15
-    weight_limit: float = 3.0
-    same_edge_px: float = 2.0
-    join_px: float = 2.7
-    join_share: float = 0.5
+    fine_scale_px: Positive = 0.8
+    coarse_scale_px: Positive = 1.6
+    least_rows: Annotated[int, whole(5)] = 14
+    least_length_px: NotNegative = 24.0
+    least_evidence: NotNegative = 7.0
+    least_sharpness: NotNegative = 0.87
+    soft_evidence: NotNegative = 40.0
+    largest_horizon_gap_px: LimitOr0 = 11.0
+    largest_scatter_px: LimitOr0 = 1.0
+    largest_shift_px: LimitOr0 = 1.0
+    largest_noise_px: LimitOr0 = 0.3
+    bend_px: NotNegative = 0.06
+    lean_noise: NotNegative = 3.0
+    largest_lean_deg: LimitOr0 = 0.7
+    largest_lean_sigmas: LimitOr0 = 8.0
+    largest_lean_px: LimitOr0 = 1.5
+    largest_tilt_deg: Positive = 8.0
+    tilt_prior_deg: Positive = 2.0
+    building_deg: Positive = 0.025
+    proposers: Annotated[int, whole(2, 1000)] = 24
+    least_lines: Annotated[int, whole(2)] = 3
+    stray_share: Annotated[float, from_to(0.0, 0.5)] = 0.15
+    weight_limit: Positive = 3.0
+    same_edge_px: NotNegative = 2.0
+    join_px: NotNegative = 2.7
+    join_share: NotNegative = 0.5
     joined: Joining = "evidence"
-    shoulder_px: float = 5.0
-    shoulder_share: float = 0.5
-    sigma_px: float = 0.9
-    blurred_sharpness: float = 0.62
-    blurred_widths: tuple[float, ...] = (1.5, 2.0, 3.0, 4.0, 6.0)
+    shoulder_px: NotNegative = 5.0
+    shoulder_share: NotNegative = 0.5
+    sigma_px: Positive = 0.9
+    blurred_sharpness: Share = 0.62
+    blurred_widths: Annotated[tuple[float, ...], _WIDTH] = (1.5, 2.0, 3.0, 4.0, 6.0)
     alpha: BearingConvention = "level"
 
     def __post_init__(self) -> None:
-        demand(self, DetectError, **_BOUNDS)
+        demand_fields(self, DetectError)
         for scale, farthest in self.refine_steps_px:
-            _expect(0.3 <= scale < 20.0, "refine_steps_px", scale, "a width of 0.3 to 20")
-            _expect(farthest >= 0.0, "refine_steps_px", farthest, "a distance of 0 or more")
-        for width in self.blurred_widths:
-            _expect(1.0 < width <= 10.0, "blurred_widths", width, "a number above 1, at most 10")
+            if not 0.3 <= scale < 20.0:
+                raise DetectError(f"refine_steps_px is {scale:g}: expected a width of 0.3 to 20")
+            if not farthest >= 0.0:
+                raise DetectError(
+                    f"refine_steps_px is {farthest:g}: expected a distance, 0 or more"
+                )
 
     def least_points(self, row_aspect: float) -> int:
         """Least number of points of a line, given the height of a row in widths of a pixel."""

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 from detect.errors import DetectError
 from storage.bounds import (
-    ABOVE_0,
     FINITE,
-    LIMIT,
-    NOT_NEGATIVE,
-    SHARE_ABOVE_0,
-    demand,
+    Bounds,
+    Limit,
+    NotNegative,
+    Positive,
+    Share,
+    ShareAbove0,
+    demand_fields,
     from_to,
     whole,
 )
@@ -21,6 +23,9 @@ from storage.bounds import (
 #: Tilt by which positions are corrected.
 Levelling = Literal["none", "frame", "run"]
 Polarity = Literal["any", "light", "dark"]
+
+_INSIDE = Bounds("less than 1, the disc's edge, and above 0", 0.0, 1.0, above=True, below=True)
+_OUTSIDE = Bounds("more than 1, the disc's edge", 1.0, above=True, below=True)
 
 
 @dataclass(frozen=True)
@@ -85,58 +90,30 @@ class CircleSettings:
         refined position's covariance if the frame's tilt is unknown.
     """
 
-    radius_m: float = 0.10
-    inner_ring: float = 0.6
-    outer_ring: float = 1.4
-    samples: int = 16
-    pairs_inside: float = 0.0
-    apart_px: float = 0.0
-    stride: float = 0.0
-    threshold: float = 0.5
-    border_px: int = 6
-    far_limit: float = 1.2
+    radius_m: Positive = 0.10
+    inner_ring: Annotated[float, _INSIDE] = 0.6
+    outer_ring: Annotated[float, _OUTSIDE] = 1.4
+    samples: Annotated[int, whole(3, 128)] = 16
+    pairs_inside: Share = 0.0
+    apart_px: NotNegative = 0.0
+    stride: NotNegative = 0.0
+    threshold: ShareAbove0 = 0.5
+    border_px: Annotated[int, whole(0)] = 6
+    far_limit: Limit = 1.2
     polarity: Polarity = "any"
-    rows_apart: float = 0.75
-    least_contrast: float = 0.0
-    noise_floor: float = 3.0
-    separation: float = 1.4
+    rows_apart: Share = 0.75
+    least_contrast: NotNegative = 0.0
+    noise_floor: NotNegative = 3.0
+    separation: NotNegative = 1.4
     verify: bool = True
-    evidence: float = 0.6
-    blur_px: float = 1.0
+    evidence: Annotated[float, FINITE] = 0.6
+    blur_px: NotNegative = 1.0
     refine: bool = True
-    systematic_px: float = 0.002
-    tilt_sigma_deg: float = 0.3
+    systematic_px: NotNegative = 0.002
+    tilt_sigma_deg: Annotated[float, from_to(0.0, 90.0)] = 0.3
 
     def __post_init__(self) -> None:
-        demand(
-            self,
-            DetectError,
-            threshold=SHARE_ABOVE_0,
-            radius_m=ABOVE_0,
-            inner_ring=ABOVE_0,
-            outer_ring=ABOVE_0,
-            samples=whole(3, 128),
-            pairs_inside=from_to(0.0, 1.0),
-            apart_px=NOT_NEGATIVE,
-            stride=NOT_NEGATIVE,
-            border_px=whole(0),
-            far_limit=LIMIT,
-            rows_apart=from_to(0.0, 1.0),
-            least_contrast=NOT_NEGATIVE,
-            noise_floor=NOT_NEGATIVE,
-            separation=NOT_NEGATIVE,
-            evidence=FINITE,
-            blur_px=NOT_NEGATIVE,
-            systematic_px=NOT_NEGATIVE,
-            tilt_sigma_deg=from_to(0.0, 90.0),
-        )
-        for name, least, most in (("inner_ring", 0.0, 1.0), ("outer_ring", 1.0, math.inf)):
-            value = getattr(self, name)
-            expected = "less" if name == "inner_ring" else "more"
-            if not least < value < most:
-                raise DetectError(
-                    f"{name} is {value:g}: expected {expected} than 1, the disc's edge"
-                )
+        demand_fields(self, DetectError)
 
     @property
     def inner_radius_m(self) -> float:

@@ -2,6 +2,8 @@
 
     demand(self, DetectError, radius_m=ABOVE_0, samples=whole(3, 128))
 
+A dataclass of many may annotate its fields instead, and call `demand_fields`.
+
 NaN is always refused; infinity is refused unless it means "no limit".
 """
 
@@ -9,8 +11,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cache
 from numbers import Integral
-from typing import Any
+from typing import Annotated, Any, get_type_hints
 
 from storage.messages import excerpt
 
@@ -67,6 +70,14 @@ SHARE = from_to(0.0, 1.0)
 SHARE_ABOVE_0 = Bounds("above 0, at most 1", 0.0, 1.0, above=True)
 PROBABILITY = inside(0.0, 1.0)
 
+#: Types of fields for `demand_fields`.
+Positive = Annotated[float, ABOVE_0]
+NotNegative = Annotated[float, NOT_NEGATIVE]
+Limit = Annotated[float, LIMIT]
+LimitOr0 = Annotated[float, LIMIT_OR_0]
+ShareAbove0 = Annotated[float, SHARE_ABOVE_0]
+Share = Annotated[float, SHARE]
+
 
 def demand(settings: object, error: type[Exception], /, **bounds: Bounds) -> None:
     """Refuse settings with a number out of its bounds.
@@ -86,3 +97,20 @@ def demand(settings: object, error: type[Exception], /, **bounds: Bounds) -> Non
             if not allowed.hold(number):
                 shown = f"{number:g}" if isinstance(number, float) else excerpt(number)
                 raise error(f"{name} is {shown}: expected {allowed.expected}")
+
+
+def demand_fields(settings: object, error: type[Exception]) -> None:
+    """Refuse settings, a dataclass, with a number out of the bounds that annotate its field."""
+    kind: Any = type(settings)
+    demand(settings, error, **_annotated(kind))
+
+
+@cache
+def _annotated(kind: type) -> dict[str, Bounds]:
+    hints = get_type_hints(kind, include_extras=True)
+    return {
+        name: bounds
+        for name, hint in hints.items()
+        for bounds in getattr(hint, "__metadata__", ())
+        if isinstance(bounds, Bounds)
+    }

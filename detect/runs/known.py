@@ -10,6 +10,7 @@ from typing import NamedTuple, Protocol, TypeVar
 import numpy as np
 
 from detect.discs.identity import MappedDisc
+from detect.errors import DetectError
 from detect.sources.image_names import image_name
 from landmarks import (
     CircleLandmark,
@@ -22,6 +23,7 @@ from landmarks import (
     read_rows,
 )
 from landmarks.map_file import read_map, read_path
+from storage.bounds import NOT_NEGATIVE, demand
 
 T_co = TypeVar("T_co", covariant=True)
 
@@ -73,6 +75,9 @@ class Known:
     discs_level: bool = False
     mapped: ByPrefix[Sequence[MappedDisc]] | None = None
     slack_m: float = 0.1
+
+    def __post_init__(self) -> None:
+        demand(self, DetectError, slack_m=NOT_NEGATIVE)
 
     def of(self, prefix: str) -> KnownOfFrame:
         """Prior data on a frame."""
