@@ -288,11 +288,6 @@ def published_positions(camera: Camera, pixels: NDArray[np.int64]) -> tuple[Floa
     )  # fmt: skip
 
 
-def published_covariance(camera: Camera, pixels: NDArray[np.int64]) -> FloatArray:
-    """The covariance of `published_positions`."""
-    return published_positions(camera, pixels)[1]
-
-
 class _KernelCamera(NamedTuple):
     """A camera in the forms that kernels take."""
 

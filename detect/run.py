@@ -110,7 +110,7 @@ class RunFrames:
     def _frame(self, step: Step, place: int | None = None) -> RunFrame:
         try:
             found = self._images.place_of(step.prefix) if place is None else place
-            image = None if found is None else self._images.checked(found)[0]
+            image = None if found is None else self._images.checked(found)
         except FrameError as error:
             return RunFrame(step, None, failure=str(error))
         return RunFrame(step, image, bits=self._bits)

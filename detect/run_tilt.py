@@ -26,8 +26,6 @@ FloatArray = NDArray[np.float64]
 
 #: With fewer measured frames the errors cannot be separated from the tilt.
 LEAST_FRAMES = 20
-#: The model's constants are learned from no more frames than this, evenly spaced runs of them.
-LEARNED_FROM = 4000
 #: See `_joined`.
 _OUTLIER_SIGMAS, _STATED_FRAMES = 3.0, 4.0
 #: Prior of the spread of the true tilt about its constant, a robot on an even floor (rad), and the
@@ -137,7 +135,7 @@ def tilt_of_run(verticals: FrameTilts, outlines: FrameTilts | None = None) -> Ru
     axes, tilts, variances = [], [], []
     for values, of_values in zip(measured.T, variance.T):
         sigma = np.sqrt(of_values)
-        axis = _learned(*_part(values, sigma))
+        axis = _learned(values, sigma)
         _, deviation, of_deviation = smooth_axis(values - axis.lean, sigma, axis.spread)
         axes.append(axis)
         tilts.append(axis.lean + deviation)
@@ -168,19 +166,6 @@ def _joined(verticals: FrameTilts, outlines: FrameTilts) -> FrameTilts:
     with np.errstate(divide="ignore", invalid="ignore"):
         mean = (information * np.nan_to_num(values)).sum(axis=0) / total
         return FrameTilts(mean, scale / total)
-
-
-def _part(values: FloatArray, sigma: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Some stretches of a long run, frames without a tilt between them."""
-    if len(values) <= LEARNED_FROM:
-        return values, sigma
-    stretch = LEARNED_FROM // 8
-    gap = np.full(50, np.nan)
-    starts = np.linspace(0, len(values) - stretch, 8).astype(int)
-    return tuple(  # type: ignore[return-value]
-        np.concatenate([part for k in starts for part in (array[k : k + stretch], gap)])
-        for array in (values, sigma)
-    )
 
 
 def _learned(values: FloatArray, sigma: FloatArray) -> AxisModel:

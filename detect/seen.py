@@ -49,26 +49,40 @@ def image_positions(
 
 
 def level_seen(
-    camera: Camera, floor_xy: ArrayLike, levelled_by: Tilt, raised_m: float = 0.0
+    camera: Camera, floor_xy: ArrayLike, levelled_by: ArrayLike, raised_m: float = 0.0
 ) -> FloatArray:
-    """Level positions (m) of discs that the calibrated camera sees at `floor_xy`, (N, 2).
+    """Level positions of discs that the calibrated camera sees on the floor.
 
-    The other parameters are as in `image_positions`; NaN where the levelled ray does not meet the
-    floor.
+    Parameters
+    ----------
+    camera, raised_m
+        As in `image_positions`.
+    floor_xy : (N, 2) or (M, N, 2) array_like
+        Positions computed without knowledge of the tilt, metres.
+    levelled_by : (2,) or (M, 2) array_like
+        Pitch and roll (rad).
+
+    Returns
+    -------
+    (N, 2) or (M, N, 2) float64
+        Metres; NaN where the levelled ray does not meet the floor.
     """
-    xy = np.asarray(floor_xy, dtype=np.float64).reshape(-1, 2)
+    xy = np.asarray(floor_xy, dtype=np.float64)
     turn = level_matrix(levelled_by)
-    rays = (np.column_stack([xy, np.zeros(len(xy))]) - camera.centre) @ turn.T
-    centre = turn @ (camera.centre + np.array([0.0, 0.0, raised_m]))
-    down = np.where(rays[:, 2] < 0.0, rays[:, 2], np.nan)
-    return np.asarray(centre[:2] - (centre[2] / down)[:, None] * rays[:, :2])
+    points = np.concatenate([xy, np.zeros_like(xy[..., :1])], axis=-1)
+    rays = (points - camera.centre) @ turn.swapaxes(-1, -2)
+    centre = (turn @ (camera.centre + np.array([0.0, 0.0, raised_m])))[..., None, :]
+    down = np.where(rays[..., 2:] < 0.0, rays[..., 2:], np.nan)
+    return np.asarray(centre[..., :2] - centre[..., 2:] / down * rays[..., :2])
 
 
-def level_matrix(levelled_by: Tilt) -> FloatArray:
-    """(3, 3) rotation exp([pitch, roll, 0]x) that turns measured directions level."""
+def level_matrix(levelled_by: ArrayLike) -> FloatArray:
+    """(..., 3, 3) rotations exp([pitch, roll, 0]x) that turn measured directions level."""
     from scipy.spatial.transform import Rotation  # a process that delegates starts without SciPy
 
-    return np.asarray(Rotation.from_rotvec([*levelled_by, 0.0]).as_matrix())
+    tilt = np.asarray(levelled_by, dtype=np.float64)
+    turns = np.concatenate([tilt, np.zeros_like(tilt[..., :1])], axis=-1)
+    return np.asarray(Rotation.from_rotvec(turns).as_matrix())
 
 
 def circle_on_floor(centre_xy: ArrayLike, radius_m: float, points: int = _POINTS) -> FloatArray:

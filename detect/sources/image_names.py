@@ -9,7 +9,6 @@ import fnmatch
 import hashlib
 import os
 import re
-import stat
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -21,9 +20,6 @@ from storage.inside import leads_out, link_out
 from storage.messages import excerpt
 
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".pgm", ".ppm", ".tif", ".tiff", ".bmp"})
-
-#: Size in bytes and time of change in nanoseconds: they identify a state of a file.
-FileStamp = tuple[int, int]
 
 #: Longer names are known by their digest, bytes.
 _LONGEST = 64
@@ -93,24 +89,15 @@ class ImageNames:
             raise FrameError(f"{excerpt(prefix)}: the prefix {why}: expected an image of the run")
         return self.find(last_part(name))
 
-    def checked(self, index: int) -> tuple[Path, FileStamp | None]:
-        """The image at a place, and its file's stamp: None if it is a link, or nothing is there.
-
-        A link that leads out of the run is a FrameError.
-        """
+    def checked(self, index: int) -> Path:
+        """The image at a place; a link that leads out of the run is a FrameError."""
         path = self.path(index)
-        try:
-            status = path.lstat()
-        except (OSError, ValueError):
-            return path, None
-        if not stat.S_ISLNK(status.st_mode):
-            return path, (status.st_size, status.st_mtime_ns)
-        if link_out(path, *self._homes):
+        if path.is_symlink() and link_out(path, *self._homes):
             raise FrameError(
                 f"{path}: cannot be read: is a link that leads out of the run: expected an image "
                 "in it"
             )
-        return path, None
+        return path
 
 
 def images_of_folder(folder: Path) -> ImageNames:

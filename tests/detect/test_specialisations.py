@@ -19,7 +19,7 @@ from numba import typeof
 from camera import Camera, parse_camera
 from detect.circles import CircleDetections, refined_covariance
 from detect.discs.positions import refined_covariances
-from detect.levelling import level_covariances, level_positions, levelled
+from detect.levelling import levelled
 from detect.settings import CircleSettings
 from landmarks import FrameTilt
 from lut import DiscShape, cached_disc_table, cached_vertical_table
@@ -71,8 +71,6 @@ def test_cameras_that_are_read_and_handed_over_are_of_one_kind() -> None:
     tilt = FrameTilt("e.0000", 0.01, 0.02, 1e-6, 0.0, 1e-6, 9)
     compiled = []
     for camera in (read, handed_over):
-        level_positions(camera, FLOOR_XY, 0.01, 0.02)
-        level_covariances(camera, FLOOR_XY, COVARIANCE, 0.01, 0.02, np.eye(2))
         levelled(discs, camera, tilt)
         refined_covariance(camera, FLOOR_XY, COVARIANCE, CircleSettings())
         compiled.append([set(kernel.signatures) for kernel in kernels])

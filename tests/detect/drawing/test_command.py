@@ -16,9 +16,8 @@ from detect.comparison.result import CompareOptions
 from detect.drawing.frame import draw_rows, line_curves, sigma_bars
 from detect.drawing.inputs import SeenRows, read_head, select_frames
 from detect.errors import DetectError
-from detect.levelling import level_positions
 from detect.run import open_images
-from detect.seen import Sight, image_positions
+from detect.seen import Sight, image_positions, level_seen
 from detect.settings import CircleSettings
 from landmarks import CircleLandmark, Frame, FrameTilt, LineLandmark, Step, circle_landmarks
 from tests.detect.drawing.test_detections import changed
@@ -61,7 +60,7 @@ def test_positions_corrected_for_the_tilt_are_drawn_where_they_were_seen(
 ) -> None:
     tilt = FrameTilt("e.0000", 0.031, -0.017, 1e-6, 0.0, 1e-6, 9)
     seen = np.array([[0.4, -1.2], [-0.9, -2.5], [0.1, -3.9]])
-    level = level_positions(published_camera, seen, tilt.pitch, tilt.roll)
+    level = level_seen(published_camera, seen, (tilt.pitch, tilt.roll))
     assert np.abs(level - seen).max() > 0.05
     drawn = image_positions(published_camera, level, (tilt.pitch, tilt.roll))
     np.testing.assert_allclose(drawn, published_camera.project_floor(seen), atol=1e-9)

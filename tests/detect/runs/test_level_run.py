@@ -12,10 +12,10 @@ import pytest
 
 from camera import Camera
 from detect.cli import main
-from detect.levelling import level_positions
 from detect.run_tilt import LEAST_FRAMES
 from detect.runs.level_run import level_run
 from detect.runs.plan import RunSummary
+from detect.seen import level_seen
 from landmarks.reading import frames_of_rows, parse_rows
 
 LEAN = -0.04, 0.01
@@ -39,7 +39,7 @@ def level(camera: Camera, frames: int) -> dict[str, bytes]:
 def test_discs_come_out_level_also_in_a_frame_without_verticals(published_camera: Camera) -> None:
     written = level(published_camera, 3 * LEAST_FRAMES)
 
-    expected = level_positions(published_camera, np.array([[0.5, -2.5]]), *LEAN)[0]
+    expected = level_seen(published_camera, np.array([[0.5, -2.5]]), LEAN)[0]
     frames = list(frames_of_rows(parse_rows(io.BytesIO(written["circles"]))))
     assert len(frames) == 3 * LEAST_FRAMES
     for frame in frames:
