@@ -40,8 +40,13 @@ class DetectorFlags(RunFlags):
         Run folder of the data set's layout; a folder of images, or a pattern in quotes
         ('drive/*.png'); a video; a ROS 1 or 2 bag or MCAP file; or a camera of this machine,
         camera:0. With a .cam beside it, in the bag, or named by --camera.
+    output : Path
+        The file to write; by default detected.circles, .lines or .markers in the run folder, or
+        named after the video or bag and beside it.
     preset : str
         Values that the other flags start from.
+    line_ends : str
+        How lines end in files of landmarks; the data set's own end with CR and LF.
     jobs : int
         Processes that share the work, 1 for none beside this one; by default one for every 500
         frames, at most as many as there are cores. What is written is the same.
@@ -54,6 +59,7 @@ class DetectorFlags(RunFlags):
     """
 
     preset: Preset = "default"
+    line_ends: LineEnds = "lf"
     jobs: MaybeInt = None
     cluster: MaybeStr = None
     source: OmitArgPrefixes[SourceOptions] = field(default_factory=SourceOptions)
@@ -99,9 +105,6 @@ class Circles(DetectorFlags):
     preset : str
         Values that the other flags start from: `published` is the detector that made the data set's
         rows (all of them and only those), `report` what the report prints of it.
-    output : Path
-        The file to write; by default detected.circles in the run folder, or named after the video
-        or bag and beside it.
     tilt : Path
         Tilts of the frames (written by `detect lines`): positions are corrected for them.
     draw : Path
@@ -110,15 +113,12 @@ class Circles(DetectorFlags):
         Write the rows with their pixels and evidence as JSON as well.
     find_radius : bool
         Find the radius of the discs in some of the images first; so says --radius-m auto, too.
-    line_ends : str
-        How lines end; the data set's own end with CR and LF.
     """
 
     preset: DiscPreset = "default"  # type: ignore[assignment]
     tilt: MaybePath = None
     find_radius: bool = False
     ids: OmitArgPrefixes[DiscIdOptions] = field(default_factory=DiscIdOptions)
-    line_ends: LineEnds = "lf"
     draw: MaybePath = None
     json: MaybePath = None
     settings: OmitArgPrefixes[CircleSettings] = field(default_factory=CircleSettings)
@@ -136,9 +136,6 @@ class Lines(DetectorFlags):
     preset : str
         Values that the other flags start from: `published` gives the data set's own rows as far as
         they are known, `report` is what the report prints of their detector.
-    output : Path
-        The file to write; by default detected.lines in the run folder, or named after the video
-        or bag and beside it.
     tilt : Path
         The tilt file to write; by default the output's name with the ending .tilt.
     ids_from : Path
@@ -151,8 +148,6 @@ class Lines(DetectorFlags):
         Draw all tracks instead, the rejected ones with the reason.
     response : bool
         Draw the filter's response as well, into files of their own.
-    line_ends : str
-        How lines end; the data set's own end with CR and LF.
     """
 
     preset: Literal["default", "published", "report"] = "default"  # type: ignore[assignment]
@@ -162,7 +157,6 @@ class Lines(DetectorFlags):
     draw: MaybePath = None
     rejected: bool = False
     response: bool = False
-    line_ends: LineEnds = "lf"
     settings: OmitArgPrefixes[LineSettings] = field(default_factory=LineSettings)
 
 
@@ -182,9 +176,6 @@ class Markers(DetectorFlags):
         without one, edges are taken to be straight in the images.
     preset : str
         Values that the other flags start from: `published` is the report's detector.
-    output : Path
-        The file to write; by default detected.markers in the run folder, or named after the video
-        or bag and beside it.
     draw : Path
         Folder for images with the markers drawn in, and with what was rejected.
     """
@@ -210,8 +201,6 @@ class All(DetectorFlags):
     find_radius : bool
         Find the radius of the discs in some of the images first; so says --circles.radius-m auto,
         too.
-    line_ends : str
-        How lines end in files of landmarks; the data set's own end with CR and LF.
     tilt : str
         What levels the discs: `none`, the tilt of the single `frame`, or the `run`'s (a constant
         lean, and the estimated deviation of each frame from it).
@@ -221,7 +210,6 @@ class All(DetectorFlags):
     line_ids_from: MaybePath = None
     tilt: Levelling = "run"
     find_radius: bool = False
-    line_ends: LineEnds = "lf"
     circles: CircleSettings = field(default_factory=CircleSettings)
     lines: LineSettings = field(default_factory=LineSettings)
 

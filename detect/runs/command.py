@@ -40,6 +40,7 @@ def perform(command: DetectorFlags) -> int:
     job = replace(
         _job_of(command),
         command=type(command).__name__.lower(),
+        crlf=command.line_ends == "crlf",
         overwrite=command.force,
         strict=command.strict,
         resume=command.resume,
@@ -78,7 +79,7 @@ def _circles(command: Circles, run: Run) -> Job:
     )
     tilts = None if command.tilt is None else read_tilts(command.tilt)
     known = replace(_known_discs(command.ids), tilts=tilts)
-    return Job(run, plan, places, known, command.draw, crlf=command.line_ends == "crlf")
+    return Job(run, plan, places, known, command.draw)
 
 
 def _lines(command: Lines, run: Run) -> Job:
@@ -97,7 +98,7 @@ def _lines(command: Lines, run: Run) -> Job:
     )
     places = {"lines": output, "tilt": command.tilt or output.with_suffix(".tilt")}
     known = Known(lines=_frames(command.ids_from))
-    return Job(run, plan, places, known, command.draw, crlf=command.line_ends == "crlf")
+    return Job(run, plan, places, known, command.draw)
 
 
 def _markers(command: Markers) -> Job:
@@ -124,7 +125,6 @@ def _all(command: All, run: Run) -> Job:
         places,
         replace(_known_discs(command.ids), lines=_frames(command.line_ids_from)),
         log=places["lines"].with_suffix(".log.json"),
-        crlf=command.line_ends == "crlf",
     )
 
 

@@ -79,7 +79,7 @@ def outputs_of(job: Job) -> list[Output]:
     if "circles" in places:
         add(places["circles"], "circles", *_circles_text(job), crlf=job.crlf)
     if "markers" in places:
-        add(places["markers"], "markers", *_markers_text(run, plan))
+        add(places["markers"], "markers", *_markers_text(run, plan), crlf=job.crlf)
     if run.has_times:
         add(_times_place([output.path for output in outputs]), "times", TIMES_HEAD)
     return outputs
