@@ -19,7 +19,7 @@ PROGRAM = Program(
         Calibrate: "camera.commands.calibrate",
         Floor: "camera.commands.floor",
         # Needs detection, so the command is implemented in `detect`.
-        Level: "detect.mounting_command",
+        Level: "detect.mounting",
         Convert: "camera.commands.convert",
     },
 )

@@ -1,4 +1,6 @@
-"""Estimates a camera's mounting from a run: its constant lean, and its height over the floor.
+"""``camera level``: a camera's mounting from a run: its constant lean, and its height.
+
+The command is one of the program `camera`; it is implemented here because it needs detection.
 
 The lean comes from the verticals of all frames (`detect.run_tilt`). The height follows from the
 outlines of discs of known size: at a wrong height they agree with a circle at another pitch than
@@ -8,14 +10,25 @@ that of the verticals (`detect.discs.outline_tilt`). Both assume that the lens i
 from __future__ import annotations
 
 import math
+import sys
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from camera import Camera
-from detect.run_tilt import COMMON_RAD, LEAST_FRAMES, FrameTilts, tilt_of_run
+from camera import Camera, write_camera
+from camera.options import Level
+from detect.discs.outline_tilt import tilt_of_outlines
+from detect.errors import DetectError
+from detect.line_settings import LineSettings
+from detect.run_tilt import COMMON_RAD, LEAST_FRAMES, FrameTilts, frame_tilts, tilt_of_run
+from detect.runs.frame import detect_batch
+from detect.runs.plan import FramePlan, FrameTask
+from detect.runs.progress import progress_bar
+from detect.settings import CircleSettings
+from detect.sources.opening import open_calibrated
+from storage import OutputExistsError
 
 FloatArray = NDArray[np.float64]
 
@@ -25,6 +38,45 @@ HEIGHT_STEPS = (-0.06, 0.0, 0.06)
 _RADIUS_SIGMA = 0.01
 #: Number of neighbouring frames that see the same discs.
 _TOGETHER = 5.0
+
+
+def perform(options: Level) -> int:
+    """Carry the command out; returns the exit code."""
+    if options.output.exists() and not options.force:
+        raise OutputExistsError(options.output)
+    run = open_calibrated(options.run, options.camera)
+    camera, height_m = run.camera, float(run.camera.centre[2])
+    plan = FramePlan(
+        camera, LineSettings(), CircleSettings(radius_m=options.radius_m), levelling="none"
+    )
+    tilts, pitches = [], []
+    with progress_bar("verticals and outlines", run.frames.expected) as advance:
+        for frame in run.frames:
+            advance()
+            (found,) = detect_batch([FrameTask(frame)], plan)
+            if found.error is not None or found.seen is None:
+                print(f"left out: {found.error}", file=sys.stderr)
+                continue
+            outlines = [
+                tilt_of_outlines(
+                    found.pixels, camera, found.seen.floor_xy, options.radius_m, share * height_m
+                )
+                for share in HEIGHT_STEPS
+            ]
+            tilts.append(found.tilt)
+            pitches.append([math.nan if one is None else one.pitch for one in outlines])
+    mounting = mounting_of_run(
+        height_m, frame_tilts(tilts), np.reshape(pitches, (-1, len(HEIGHT_STEPS)))
+    )
+    if mounting is None:
+        raise DetectError(
+            f"{options.run}: too few frames with a tilt from verticals: expected {LEAST_FRAMES}; "
+            "drive where doors, shelves or walls are in view"
+        )
+    print("\n".join(mounting.sentences()))
+    write_camera(remounted(camera, mounting), options.output, overwrite=options.force)
+    print(f"written: {options.output}")
+    return 0
 
 
 @dataclass(frozen=True)

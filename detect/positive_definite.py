@@ -16,27 +16,23 @@ _LEAST_PIVOT = 1e-13
 
 
 @njit(cache=True, error_model="numpy")
-def _cholesky(matrix: NDArray[np.float64], lower: NDArray[np.float64]) -> bool:
+def solve_positive(
+    matrix: NDArray[np.float64], right: NDArray[np.float64], solution: NDArray[np.float64]
+) -> bool:
+    """Solve matrix @ solution = right for a positive definite matrix; False if it is not one."""
     n = matrix.shape[0]
+    lower = np.empty_like(matrix)  # Cholesky's factor
     for i in range(n):
         for j in range(i + 1):
             total = matrix[i, j]
             for k in range(j):
                 total -= lower[i, k] * lower[j, k]
-            if i == j:
-                if not total > _LEAST_PIVOT * abs(matrix[i, i]):
-                    return False
+            if i > j:
+                lower[i, j] = total / lower[j, j]
+            elif total > _LEAST_PIVOT * abs(matrix[i, i]):
                 lower[i, i] = math.sqrt(total)
             else:
-                lower[i, j] = total / lower[j, j]
-    return True
-
-
-@njit(cache=True, error_model="numpy")
-def _substitute(
-    lower: NDArray[np.float64], right: NDArray[np.float64], solution: NDArray[np.float64]
-) -> None:
-    n = lower.shape[0]
+                return False
     for i in range(n):
         total = right[i]
         for k in range(i):
@@ -47,17 +43,6 @@ def _substitute(
         for k in range(i + 1, n):
             total -= lower[k, i] * solution[k]
         solution[i] = total / lower[i, i]
-
-
-@njit(cache=True, error_model="numpy")
-def solve_positive(
-    matrix: NDArray[np.float64], right: NDArray[np.float64], solution: NDArray[np.float64]
-) -> bool:
-    """Solve matrix @ solution = right for a positive definite matrix; False if it is not one."""
-    lower = np.empty_like(matrix)
-    if not _cholesky(matrix, lower):
-        return False
-    _substitute(lower, right, solution)
     return bool(np.all(np.isfinite(solution)))
 
 
@@ -65,15 +50,11 @@ def solve_positive(
 def invert_positive(matrix: NDArray[np.float64], inverse: NDArray[np.float64]) -> bool:
     """Inverse of a positive definite matrix; False if it is not one."""
     n = matrix.shape[0]
-    lower = np.empty_like(matrix)
-    if not _cholesky(matrix, lower):
-        return False
-    unit = np.zeros(n)
-    column = np.empty(n)
+    unit, column = np.zeros(n), np.empty(n)
     for j in range(n):
-        unit.fill(0.0)
+        unit[:] = 0.0
         unit[j] = 1.0
-        _substitute(lower, unit, column)
-        for i in range(n):
-            inverse[i, j] = column[i]
-    return bool(np.all(np.isfinite(inverse)))
+        if not solve_positive(matrix, unit, column):
+            return False
+        inverse[:, j] = column
+    return True

@@ -111,9 +111,9 @@ class RunFrames:
         try:
             found = self._images.place_of(step.prefix) if place is None else place
             image = None if found is None else self._images.checked(found)
+            return RunFrame(step, image, bits=self._bits)
         except FrameError as error:
             return RunFrame(step, None, failure=str(error))
-        return RunFrame(step, image, bits=self._bits)
 
 
 @dataclass(frozen=True)
@@ -190,7 +190,8 @@ def open_run(folder: Path, camera_path: Path | None = None, *, bits: int | None 
     camera.CameraError, landmarks.LandmarkFileError
         If the calibration or the odometry cannot be read.
     """
-    _demand_folder(folder)
+    if not folder.is_dir():
+        raise DetectError(f"{folder}: no such folder: expected a run folder or a folder of images")
     camera = read_camera(camera_path if camera_path is not None else _only_camera(folder))
     return _image_run(folder, bits).calibrated(camera)
 
@@ -199,14 +200,9 @@ def open_images(
     folder: Path, camera_path: Path | None = None, *, bits: int | None = None
 ) -> ImageRun:
     """Read a run folder as `open_run` does; without a calibration it is no `Run`."""
-    _demand_folder(folder)
-    has_camera = camera_path is not None or any(folder.glob("*.cam"))
-    return open_run(folder, camera_path, bits=bits) if has_camera else _image_run(folder, bits)
-
-
-def _demand_folder(folder: Path) -> None:
-    if not folder.is_dir():
-        raise DetectError(f"{folder}: no such folder: expected a run folder or a folder of images")
+    if folder.is_dir() and camera_path is None and not any(folder.glob("*.cam")):
+        return _image_run(folder, bits)
+    return open_run(folder, camera_path, bits=bits)
 
 
 def _image_run(folder: Path, bits: int | None) -> ImageRun:

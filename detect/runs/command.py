@@ -196,20 +196,19 @@ def _workers(command: DetectorFlags, job: Job) -> Workers:
 
 
 def _print_results(job: Job, summary: RunSummary) -> None:
-    found, places = summary.found, job.places
+    found, places, tilt = summary.found, job.places, summary.tilt
     if "lines" in places:
         print(f"{places['lines']}: {found['lines']} lines in {summary.frames} frames")
-    if "tilt" in places and summary.tilt is not None:
+    if "tilt" in places and tilt is not None:
         frames_tilt = frames_tilt_place(places["tilt"])
         print(f"{frames_tilt}: the tilt of {found['tilts']} frames, each by itself")
-        print(f"{places['tilt']}: {summary.tilt.sentence()}")
+        print(f"{places['tilt']}: {tilt.sentence()}")
     elif "tilt" in places:
         others = _other_frames(job.plan, summary)
         print(f"{places['tilt']}: the tilt of {found['tilts']} frames{others}")
-    if "circles" in places:
-        print(f"{places['circles']}: {found['discs']} discs in {summary.frames} frames")
-    if "markers" in places:
-        print(f"{places['markers']}: {found['markers']} markers in {summary.frames} frames")
+    for kind, what in (("circles", "discs"), ("markers", "markers")):
+        if kind in places:
+            print(f"{places[kind]}: {found[what]} {what} in {summary.frames} frames")
     if summary.rejected:
         causes = ", ".join(f"{cause} {count}" for cause, count in sorted(summary.rejected.items()))
         print(f"rejected: {causes}")

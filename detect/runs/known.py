@@ -97,12 +97,7 @@ class FramesByImage:
     """The frames of a landmark file, by the name of their image; of equal names the last counts.
 
     The file is read once for the offset of each frame, and again there when a frame is requested:
-    its rows are not kept in memory.
-
-    Raises
-    ------
-    landmarks.LandmarkFileError
-        If the file cannot be read or a row is malformed; names file and line.
+    its rows are not kept in memory. If it is malformed there is a `landmarks.LandmarkFileError`.
     """
 
     def __init__(self, path: Path) -> None:
@@ -140,15 +135,11 @@ class MapByImage:
         pose = self._poses.get(image_name(prefix))
         if pose is None:
             return None
-        x, y, theta = pose
-        cosine, sine = np.cos(theta), np.sin(theta)
+        cosine, sine = np.cos(pose[2]), np.sin(pose[2])
         robot_from_map = np.array([[cosine, sine], [-sine, cosine]])
-        xy = (self._discs.xy - (x, y)) @ robot_from_map.T
+        xy = (self._discs.xy - pose[:2]) @ robot_from_map.T
         near = np.flatnonzero(np.hypot(*xy.T) <= _REACH_M)
         spread = robot_from_map @ self._discs.covariance[near] @ robot_from_map.T
-        return [
-            MappedDisc(number, px, py, c[0][0], c[0][1], c[1][1])
-            for number, (px, py), c in zip(
-                self._discs.ids[near].tolist(), xy[near].tolist(), spread.tolist()
-            )
-        ]
+        numbers = np.column_stack([xy[near], spread[:, 0], spread[:, 1, 1]]).tolist()
+        ids = self._discs.ids[near].tolist()
+        return [MappedDisc(number, *values) for number, values in zip(ids, numbers)]

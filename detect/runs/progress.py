@@ -8,12 +8,10 @@ from contextlib import contextmanager
 
 from rich.console import Console
 from rich.progress import (
-    BarColumn,
     MofNCompleteColumn,
     Progress,
     TextColumn,
     TimeElapsedColumn,
-    TimeRemainingColumn,
 )
 
 from detect.interrupts import raise_if_interrupted
@@ -31,11 +29,9 @@ def progress_bar(label: str, total: int | None) -> Iterator[Callable[[], None]]:
     if not sys.stderr.isatty():
         yield raise_if_interrupted
         return
-    columns = (
-        *(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()),
-        *(TextColumn("{task.fields[rate]}"), TimeElapsedColumn(), TimeRemainingColumn()),
-    )
-    progress = Progress(*columns, console=Console(stderr=True))
+    columns = (*Progress.get_default_columns(), MofNCompleteColumn(), TimeElapsedColumn())
+    rate = TextColumn("{task.fields[rate]}")
+    progress = Progress(*columns, rate, console=Console(stderr=True))
     task = progress.add_task(label, total=total, rate="")
 
     def advance() -> None:
@@ -54,8 +50,7 @@ def print_failures(count: int, first: Sequence[str]) -> None:
     """Print which frames could not be processed, as many as fit on a screen."""
     if not count:
         return
-    print(f"{count} frames could not be worked on:", file=sys.stderr)
-    for line in first[:_SHOWN_FAILURES]:
-        print(f"  {line}", file=sys.stderr)
+    shown = [f"  {line}" for line in first[:_SHOWN_FAILURES]]
     if count > _SHOWN_FAILURES:
-        print(f"  and {count - _SHOWN_FAILURES} more", file=sys.stderr)
+        shown.append(f"  and {count - _SHOWN_FAILURES} more")
+    print(f"{count} frames could not be worked on:", *shown, sep="\n", file=sys.stderr)

@@ -105,7 +105,7 @@ def test_the_demos_camera_comes_back(
 
 def test_an_existing_file_is_found_first(tmp_path: Path) -> None:
     from camera.options import Level
-    from detect.mounting_command import perform
+    from detect.mounting import perform
 
     output = tmp_path / "level.cam"
     output.touch()
