@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,7 +20,6 @@ from detect.run import ImageRun
 from detect.runs.plan import FramePlan, Job, RunSummary
 from detect.sources.times import TIMES_HEAD
 from landmarks import format_head
-from storage import OutputExistsError
 
 #: In the head of files whose positions are levelled, or corrected for the tilt.
 LEVEL = "level robot frame"
@@ -203,15 +201,12 @@ def log_place(job: Job) -> Path:
     return job.log or output.with_name(f"{output.name}.log.json")
 
 
-def demand_log_place(place: Path, *, overwrite: bool) -> None:
-    """Refuse to write a log over a file that is none (`OutputExistsError`)."""
-    if overwrite or not os.path.lexists(place):
-        return
-    if not place.is_symlink() and place.is_file():
-        with place.open("rb") as stream:
-            if stream.read(len(_LOG_BEGIN)) == _LOG_BEGIN:
-                return
-    raise OutputExistsError(place)
+def is_log(path: Path) -> bool:
+    """Whether there is a log at a path, which may be replaced: no other file, and no link."""
+    if path.is_symlink() or not path.is_file():
+        return False
+    with path.open("rb") as stream:
+        return stream.read(len(_LOG_BEGIN)) == _LOG_BEGIN
 
 
 def log_text(

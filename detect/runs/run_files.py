@@ -25,7 +25,7 @@ from pathlib import Path
 
 from detect.errors import DetectError
 from detect.runs.journal import Journal, made_by, task_digest
-from detect.runs.outputs import Output, demand_log_place, log_place, log_text, outputs_of
+from detect.runs.outputs import Output, is_log, log_place, log_text, outputs_of
 from detect.runs.plan import FrameRows, FrameTask, Job, RunSummary
 from storage import OutputExistsError
 from storage.parts import PartFile, demand_place, folder_locked, left_part, new_part
@@ -120,11 +120,10 @@ class RunFiles:
         """Refuse to replace what must not be, or cannot be."""
         for path in self._paths:
             demand_place(path, overwrite=self._may_replace(path))
-        demand_log_place(self._log_path, overwrite=self._overwrite)
 
     def _may_replace(self, path: Path) -> bool:
         """Whether an existing file may be replaced: the log always, if it is one."""
-        return self._overwrite or path == self._log_path
+        return self._overwrite or (path == self._log_path and is_log(path))
 
     # -- frames -----------------------------------------------------------------------------
 
@@ -206,8 +205,7 @@ class RunFiles:
 
     def _place(self, parts: Sequence[PartFile]) -> None:
         with folder_locked(self._log_path.parent):
-            for path in self._paths:
-                demand_place(path, overwrite=self._may_replace(path))
+            self._demand_places()
             self._journal.write_complete([part.number for part in parts], overwrite=self._overwrite)
             try:
                 for path, part in zip(self._paths, parts):

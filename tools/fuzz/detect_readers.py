@@ -18,7 +18,7 @@ from camera.calibration.images import read_grey
 from detect.drawing.inputs import read_head
 from detect.errors import DetectError, FrameError
 from detect.runs.journal import Journal
-from detect.runs.outputs import demand_log_place
+from detect.runs.outputs import is_log
 from detect.sources.bag_messages import pixels_of_message
 from detect.sources.gray import (
     bounded_content,
@@ -29,7 +29,6 @@ from detect.sources.gray import (
 from detect.sources.poses import step_between, tick_poses, tum_poses
 from detect.sources.times import read_image_times
 from lut.cache import cached_vertical_table
-from storage import OutputExistsError
 from storage.image_header import claimed_size
 from storage.parts import left_part
 from tools.fuzz.reader import Reader
@@ -152,8 +151,7 @@ def _journal_of(*records: bytes) -> bytes:
 
 
 def _log(path: Path) -> object:
-    demand_log_place(path, overwrite=False)
-    return None
+    return is_log(path)
 
 
 _TABLE_CAMERA = parse_camera(
@@ -289,7 +287,7 @@ DETECT_READERS: tuple[Reader, ...] = (
         "log",
         "detected.log.json",
         _log,
-        (OutputExistsError,),
+        (),
         (b'{\n "program": "redetect",\n "version": "0.1.0"\n}\n',),
         (b"{", b"}", b"\xef\xbb\xbf"),
         needed=False,
