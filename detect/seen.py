@@ -78,11 +78,14 @@ def level_seen(
 
 def level_matrix(levelled_by: ArrayLike) -> FloatArray:
     """(..., 3, 3) rotations exp([pitch, roll, 0]x) that turn measured directions level."""
-    from scipy.spatial.transform import Rotation  # a process that delegates starts without SciPy
-
-    tilt = np.asarray(levelled_by, dtype=np.float64)
-    turns = np.concatenate([tilt, np.zeros_like(tilt[..., :1])], axis=-1)
-    return np.asarray(Rotation.from_rotvec(turns).as_matrix())
+    pitch, roll = np.moveaxis(np.asarray(levelled_by, dtype=np.float64), -1, 0)
+    angle = np.hypot(pitch, roll)[..., None, None]
+    cross = np.zeros((*pitch.shape, 3, 3))
+    cross[..., 0, 2], cross[..., 2, 0] = roll, -roll
+    cross[..., 1, 2], cross[..., 2, 1] = -pitch, pitch
+    # sin(x) / x and (1 - cos(x)) / x^2.
+    first, second = np.sinc(angle / np.pi), 0.5 * np.sinc(0.5 * angle / np.pi) ** 2
+    return np.asarray(np.eye(3) + first * cross + second * cross @ cross)
 
 
 def circle_on_floor(centre_xy: ArrayLike, radius_m: float, points: int = _POINTS) -> FloatArray:

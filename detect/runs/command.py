@@ -124,7 +124,7 @@ def _all(command: All, run: Run) -> Job:
         FramePlan(run.camera, lines=command.lines, circles=circles, levelling=command.tilt),
         places,
         replace(_known_discs(command.ids), lines=_frames(command.line_ids_from)),
-        log=places["lines"].with_suffix(".log.json"),
+        base=places["lines"].with_suffix(""),
     )
 
 

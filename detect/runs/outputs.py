@@ -79,24 +79,13 @@ def outputs_of(job: Job) -> list[Output]:
     if "markers" in places:
         add(places["markers"], "markers", *_markers_text(run, plan), crlf=job.crlf)
     if run.has_times:
-        add(_times_place([output.path for output in outputs]), "times", TIMES_HEAD)
+        add(job.beside(".times"), "times", TIMES_HEAD)
     return outputs
 
 
 def frames_tilt_place(tilt: Path) -> Path:
     """The file of the single frames' tilts beside that of the tilts that discs are levelled by."""
     return tilt.with_name(f"{tilt.stem}.frames.tilt")
-
-
-def _times_place(results: list[Path]) -> Path:
-    """The file of the frames' times beside results.
-
-    It is called like the file of landmarks, with ``.times`` behind; where there are several, like
-    what they have in common: ``detected.circles.times``, but ``detected.times``.
-    """
-    landmarks = [path for path in results if path.suffix in (".circles", ".lines", ".markers")]
-    path = landmarks[0] if landmarks else results[-1]
-    return path.with_name(f"{path.stem if len(landmarks) > 1 else path.name}.times")
 
 
 def _circles_text(job: Job) -> list[str]:
@@ -193,12 +182,6 @@ def _made_with(plan: FramePlan, settings: Any) -> tuple[str, str]:
 
 
 # -- the log --------------------------------------------------------------------------------
-
-
-def log_place(job: Job) -> Path:
-    """Path of the log of a run: beside the first of its results, if none is named."""
-    output = next(iter(job.places.values()))
-    return job.log or output.with_name(f"{output.name}.log.json")
 
 
 def is_log(path: Path) -> bool:

@@ -79,8 +79,9 @@ class Job:
         Prior data on the frames.
     pictures : path or None
         Folder for the plan's pictures.
-    log : path or None
-        By default beside the first of the places.
+    base : path or None
+        What log, journal and times are called but for their endings; by default the first of the
+        places.
     command : str
         What the log calls the run.
     crlf : bool
@@ -98,7 +99,7 @@ class Job:
     places: Mapping[str, Path]
     known: Known = field(default_factory=Known)
     pictures: Path | None = None
-    log: Path | None = None
+    base: Path | None = None
     command: str = ""
     crlf: bool = False
     overwrite: bool = False
@@ -109,6 +110,11 @@ class Job:
     def ships_images(self) -> bool:
         """Whether tasks or their results are as large as images."""
         return self.pictures is not None or self.run.frames.ships_images
+
+    def beside(self, ending: str) -> Path:
+        """A file beside the results that is called like them."""
+        base = self.base or next(iter(self.places.values()))
+        return base.with_name(f"{base.name}{ending}")
 
 
 class FrameTask(NamedTuple):

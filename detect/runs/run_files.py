@@ -25,7 +25,7 @@ from pathlib import Path
 
 from detect.errors import DetectError
 from detect.runs.journal import Journal, made_by, task_digest
-from detect.runs.outputs import Output, is_log, log_place, log_text, outputs_of
+from detect.runs.outputs import Output, is_log, log_text, outputs_of
 from detect.runs.plan import FrameRows, FrameTask, Job, RunSummary
 from storage import OutputExistsError
 from storage.parts import PartFile, demand_place, folder_locked, left_part, new_part
@@ -38,9 +38,8 @@ class RunFiles:
 
     def __init__(self, job: Job) -> None:
         self._job, self._outputs = job, outputs_of(job)
-        self._log_path = log_place(job)
+        self._base, self._log_path = job.beside(""), job.beside(".log.json")
         self._paths = [*(output.path for output in self._outputs), self._log_path]
-        self._base = self._log_path.with_name(self._log_path.name.removesuffix(".log.json"))
         self._made_by = made_by(self._outputs, job.plan)
         self._overwrite, self._resumable = job.overwrite, True
         self._frames = self._taken_over = 0
