@@ -25,12 +25,6 @@ def announcements_are_shown() -> bool:
 
 
 @cache
-def announce_compiling() -> None:
-    """Have it announced when the first kernel is compiled instead of loaded."""
-    on_compilation(say_compiling)
-
-
-@cache
 def say_compiling() -> None:
     """Announce, once, that kernels are compiled."""
     _log.info("compiling kernels, once: about a minute")

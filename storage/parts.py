@@ -14,7 +14,7 @@ import io
 import os
 import stat
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -36,13 +36,6 @@ class OutputExistsError(FileExistsError):
         super().__init__(f"{path}: exists already: give --force to overwrite it")
 
 
-class NotAFileError(OSError):
-    """The path of a result is a device, a pipe or a socket."""
-
-    def __init__(self, path: Path) -> None:
-        super().__init__(f"{path}: is a device, pipe or socket: expected the name of a file")
-
-
 def demand_place(path: Path, *, overwrite: bool) -> None:
     """Refuse a path where no result can be, or where there is one that must not be replaced."""
     if not path.parent.is_dir():
@@ -50,12 +43,12 @@ def demand_place(path: Path, *, overwrite: bool) -> None:
     if path.is_dir():
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     if path.exists() and not path.is_file():
-        raise NotAFileError(path)
+        raise OSError(f"{path}: is a device, pipe or socket: expected the name of a file")
     if not overwrite and os.path.lexists(path):
         raise OutputExistsError(path)
 
 
-class PartFile:
+class PartFile(AbstractContextManager["PartFile"]):
     """A hidden file that this process has locked, and a stream to read and write it.
 
     Its number is 0 unless others were being written. As a context manager it is removed at the end,
@@ -65,9 +58,6 @@ class PartFile:
     def __init__(self, result: Path, place: Path, number: int, handle: int) -> None:
         self._result, self.place, self.number = result, place, number
         self.stream = io.BufferedRandom(_NamedFile(handle, result))
-
-    def __enter__(self) -> PartFile:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.remove()
@@ -124,14 +114,13 @@ def new_part(path: Path, suffix: str = "part", named: Path | None = None) -> Par
         left = left_part(path, suffix, number)
         if left is not None:
             left.remove()
-    named = path if named is None else named
     number = 0
     while True:
         place = _place(path, suffix, number)
-        with _naming(named), suppress(FileExistsError):
+        with _naming(named or path), suppress(FileExistsError):
             handle = os.open(place, _NEW, 0o666)
             if _lock(handle) is not False and _is_at(handle, place):
-                return PartFile(named, place, number, handle)
+                return PartFile(named or path, place, number, handle)
             os.close(handle)  # another process took it for one that was left
         number += 1
 
@@ -146,7 +135,7 @@ def left_part(
     except OSError:
         return None
     if stat.S_ISREG(os.fstat(handle).st_mode) and _lock(handle) and _is_at(handle, place):
-        return PartFile(path if named is None else named, place, number, handle)
+        return PartFile(named or path, place, number, handle)
     os.close(handle)
     return None
 
@@ -169,7 +158,7 @@ def _naming(result: Path) -> Iterator[None]:
     """Let errors name the result: the name of a hidden file would mean nothing to a reader."""
     try:
         yield
-    except (OutputExistsError, NotAFileError):
+    except OutputExistsError:
         raise
     except OSError as error:
         raise type(error)(error.errno, error.strerror, str(result)) from None

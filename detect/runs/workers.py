@@ -23,7 +23,6 @@ from typing import TYPE_CHECKING, ParamSpec, TypeVar, cast
 import cv2
 
 from detect.announcing import (
-    announce_compiling,
     announcements_are_shown,
     on_compilation,
     say_compiling,
@@ -114,7 +113,7 @@ class _InProcess(Executor):
     """Runs each task immediately, before it returns the future."""
 
     def __init__(self) -> None:
-        announce_compiling()
+        on_compilation(say_compiling)
 
     def submit(self, fn: Callable[P, R], /, *args: P.args, **kwargs: P.kwargs) -> Future[R]:
         future: Future[R] = Future()
