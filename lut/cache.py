@@ -17,7 +17,6 @@ import io
 import logging
 import math
 import os
-import stat
 from collections.abc import Callable
 from dataclasses import astuple, fields
 from pathlib import Path
@@ -29,6 +28,7 @@ from camera import Camera
 from lut.outlines import DiscShape, DiscTable, build_disc_table
 from lut.verticals import VerticalTable, build_vertical_table
 from storage import write_whole
+from storage.bounded import read_bounded, writable_by_others
 
 #: Incremented with every change of the tables' content or computation.
 TABLE_VERSION = 13
@@ -40,7 +40,6 @@ _log = logging.getLogger("redetect")
 _DIGEST_BYTES = hashlib.sha256().digest_size
 #: The largest table that is read; that of a 20-megapixel camera has a tenth of it.
 _LARGEST_FILE_BYTES = 1 << 32
-_OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
 
 
 def cache_folder() -> Path:
@@ -174,37 +173,14 @@ def _is_array(array: object, dtype: type[np.generic], shape: tuple[int, ...]) ->
 def _own_content(path: Path) -> bytes | None:
     """The bytes of a file that only the user can have written; None if there is none."""
     try:
-        if (why := _foreign(path.parent.stat())) is not None:
-            _log.warning("cache %s: %s: its tables are not used", path.parent, why)
-            return None
-        # Does not block on a pipe; the checks are of the same open file that is read.
-        handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
-    except OSError:
-        return None
-    try:
-        state = os.fstat(handle)
-        why = _foreign(state)
-        if not stat.S_ISREG(state.st_mode):
-            why = "is no file"
-        elif state.st_size > _LARGEST_FILE_BYTES:
-            why = f"is larger than {_LARGEST_FILE_BYTES} bytes"
-        if why is not None:
-            _log.warning("%s: %s: it is computed again", path, why)
-            return None
-        with os.fdopen(handle, "rb", closefd=False) as stream:
-            return stream.read(state.st_size)
-    except OSError:
-        return None
-    finally:
-        os.close(handle)
-
-
-def _foreign(state: os.stat_result) -> str | None:
-    """Why another user may have written to it; None if none can have."""
-    if state.st_uid != os.geteuid():
-        return f"belongs to user {state.st_uid}, not {os.geteuid()}"
-    if state.st_mode & _OTHERS_WRITE:
-        return f"can be written to by others (mode {stat.S_IMODE(state.st_mode):o})"
+        why = writable_by_others(path.parent.stat())
+        if why is None:
+            return read_bounded(path, _LARGEST_FILE_BYTES, own=True)
+        _log.warning("cache %s: %s: its tables are not used", path.parent, why)
+    except FileNotFoundError:
+        pass
+    except OSError as error:
+        _log.warning("%s: %s: it is computed again", path, error.strerror)
     return None
 
 

@@ -7,7 +7,7 @@ import os
 import stat
 
 
-def read_bounded(path: str | os.PathLike[str], largest_bytes: int) -> bytes:
+def read_bounded(path: str | os.PathLike[str], largest_bytes: int, *, own: bool = False) -> bytes:
     """The content of a file.
 
     Parameters
@@ -16,6 +16,8 @@ def read_bounded(path: str | os.PathLike[str], largest_bytes: int) -> bytes:
         A regular file, or a link to one; pipes and devices are refused, never waited for.
     largest_bytes : int
         A larger file is refused before it is read.
+    own : bool
+        Whether links are refused, and files that another user may have written to.
 
     Raises
     ------
@@ -24,7 +26,8 @@ def read_bounded(path: str | os.PathLike[str], largest_bytes: int) -> bytes:
         says so in words.
     """
     try:
-        handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+        links = os.O_NOFOLLOW if own else 0
+        handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | links)
     except ValueError:
         raise OSError(errno.EINVAL, "there is a NUL in its name") from None
     try:
@@ -35,6 +38,8 @@ def read_bounded(path: str | os.PathLike[str], largest_bytes: int) -> bytes:
             raise OSError(errno.EINVAL, "is a pipe, socket or device: expected a file")
         if state.st_size > largest_bytes:
             raise OSError(errno.EFBIG, f"larger than {largest_bytes} bytes")
+        if own and (why := writable_by_others(state)) is not None:
+            raise PermissionError(errno.EACCES, why)
         # Some file systems return only part of what is asked for in one call.
         content = os.read(handle, state.st_size + 1)
         while more := os.read(handle, state.st_size + 1 - len(content)):
@@ -44,3 +49,12 @@ def read_bounded(path: str | os.PathLike[str], largest_bytes: int) -> bytes:
     if len(content) > state.st_size:
         raise OSError(errno.EBUSY, "grows while it is read")
     return content
+
+
+def writable_by_others(state: os.stat_result) -> str | None:
+    """Why another user may have written to a file or folder; None if none can have."""
+    if state.st_uid != os.geteuid():
+        return f"belongs to user {state.st_uid}, not {os.geteuid()}"
+    if state.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+        return f"can be written to by others (mode {stat.S_IMODE(state.st_mode):o})"
+    return None
