@@ -243,7 +243,8 @@ def _hints(job: Job, summary: RunSummary) -> Iterator[str]:
             "the pixels see anything; nothing is detected in the others"
         )
     hardly_any = summary.frames >= _FEWEST_FRAMES and 3 * found["discs"] < summary.frames
-    if plan.circles is not None and plan.circles.verify and hardly_any:
+    none = not found["discs"] and summary.frames > summary.failed
+    if plan.circles is not None and plan.circles.verify and (hardly_any or none):
         yield from _hints_on_discs(job, plan.circles, summary)
 
 
@@ -251,13 +252,22 @@ def _hints_on_discs(job: Job, settings: CircleSettings, summary: RunSummary) -> 
     if not isinstance(job.run, Run) or job.run.frames.expected is None:
         return
     from detect.discs.radius import find_radius
+    from detect.discs.unfound import why_none
 
     images = list(_some_images(job.run))
-    likely = find_radius(images, job.run.camera, replace(settings, polarity="any"))
     discs = (
         f"{summary.found['discs']} discs of radius {settings.radius_m:g} m in {summary.frames} "
         "frames. "
     )
+    if not summary.found["discs"]:
+        discs += f"{why_none(images, job.run.camera, settings)} "
+    if summary.frames < _FEWEST_FRAMES:
+        yield discs + (
+            "If there are discs in view, try --radius-m auto, which looks for their radius, and "
+            "hold the calibration against the images (`detect draw`)."
+        )
+        return
+    likely = find_radius(images, job.run.camera, replace(settings, polarity="any"))
     if likely is None:
         yield discs + (
             f"At no radius are more found in {len(images)} of the images: is the calibration that "

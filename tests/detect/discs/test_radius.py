@@ -87,5 +87,18 @@ def test_where_there_are_no_discs_it_is_said_what_to_look_at(
     for path in (run / "images").iterdir():
         cv2.imwrite(str(path), np.full((288, 768), 100, np.uint8))
     assert main(["circles", str(run)]) == 0
-    assert "0 discs of radius 0.1 m in 12 frames. At no radius" in capsys.readouterr().err
+    said = " ".join(capsys.readouterr().err.split())
+    assert "0 discs of radius 0.1 m in 12 frames. There is no candidate in 12 of" in said
+    assert "At no radius" in said
     shutil.rmtree(run / "images")
+
+
+def test_what_candidates_for_discs_fail(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for path in sorted((run / "images").iterdir())[3:]:
+        path.unlink()
+    command = ["circles", str(run), "--polarity", "dark", "--radius-m", "0.06"]
+    assert main(command) == 0
+    said = capsys.readouterr().err
+    assert "0 discs of radius 0.06 m in 3 frames. Of " in said
+    assert " are not dark (--polarity any)" in said
+    assert "try --radius-m auto" in said
