@@ -1,15 +1,15 @@
-"""A report as one HTML page."""
+"""A report as one HTML page: no scripts, nothing loaded, figures as data: addresses."""
 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable
-from dataclasses import fields
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jinja2 import Environment, StrictUndefined
-from markupsafe import Markup
 
 from detect import __version__
 from detect.comparison.matching import FLOOR_GATE_M
@@ -34,7 +34,7 @@ from detect.report.figures import (
     whitened_figure,
 )
 from detect.report.inputs import ReportInputs
-from detect.report.parts import PAGE, STYLE, Part, Section
+from detect.report.parts import Part, Section
 from detect.report.pictures import frame_picture, gallery
 from detect.report.statistics import RateCurve, disc_rates, line_rates, whitened
 from detect.settings import CircleSettings
@@ -43,6 +43,9 @@ from detect.tune.table import knee
 _NAMES = {"circles": "Discs", "lines": "Verticals", "markers": "Markers", "tilt": "Tilt"}
 _SETTINGS = {"circles": CircleSettings, "lines": LineSettings, "markers": MarkerSettings}
 _SIGMA = "\N{GREEK SMALL LETTER SIGMA}"
+_TEMPLATE = Path(__file__).with_name("page.html")
+_FORBIDDEN = re.compile(r"[\x00-\x08\x0b-\x1f\x7f\ud800-\udfff]")
+_NO_REFERENCE = "No reference rows: expected {} in the run folder, or a file named by {}."
 _CURVE_POINTS = 41
 _TABLE_POINTS = 5
 
@@ -63,25 +66,14 @@ def report_page(inputs: ReportInputs, worst: int) -> bytes:
     environment = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, finalize=_clean
     )
-    page = environment.from_string(PAGE).render(
-        title=f"Detections of {inputs.run.name}",
-        # The page's own, with quotation marks that are no text.
-        style=Markup(STYLE),
-        sections=sections,
-    )
+    template = environment.from_string(_TEMPLATE.read_text("utf-8"))
+    page = template.render(title=f"Detections of {inputs.run.name}", sections=sections)
     return (page.rstrip("\n") + "\n").encode("utf-8")
 
 
 def _clean(value: Any) -> Any:
     """Text without characters that are not allowed in a page."""
-    if type(value) is not str:
-        return value
-    return "".join(
-        c
-        if (c >= " " or c in "\n\t") and not "\ud800" <= c <= "\udfff" and c != "\x7f"
-        else "\ufffd"
-        for c in value
-    )
+    return _FORBIDDEN.sub("\ufffd", value) if type(value) is str else value
 
 
 def _summary(inputs: ReportInputs) -> list[Part]:
@@ -117,7 +109,7 @@ def _discs(inputs: ReportInputs) -> list[Part]:
     """Rates and errors of discs, whether covariances are right, and discs cut out."""
     result = inputs.discs
     if result is None:
-        return [_no_reference("map.circles", "--reference")]
+        return [Part("note", _NO_REFERENCE.format("map.circles", "--reference"))]
     errors, text = [], []
     if result.on_lookalikes is not None:
         errors.append(("extra on look-alikes", str(result.on_lookalikes)))
@@ -157,7 +149,7 @@ def _lines(inputs: ReportInputs) -> list[Part]:
     """Rates and errors of verticals, and whether standard deviations are right."""
     result = inputs.lines
     if result is None:
-        return [_no_reference("map.lines", "--reference-lines")]
+        return [Part("note", _NO_REFERENCE.format("map.lines", "--reference-lines"))]
     sigma = [row.sigma for match in result.frames for row in match.frame.detected]
     levels = np.quantile(sigma, np.linspace(0.0, 1.0, _CURVE_POINTS)) if sigma else np.zeros(0)
     # Quantiles between rows may round below the greatest.
@@ -176,11 +168,6 @@ def _lines(inputs: ReportInputs) -> list[Part]:
         *_honesty(result, "one for each matched vertical"),
         *([bearings_figure(result.pairs)] if result.matched else []),
     ]
-
-
-def _no_reference(usual: str, flag: str) -> Part:
-    words = f"No reference rows: expected {usual} in the run folder, or a file named by {flag}."
-    return Part("note", words)
 
 
 def _outcome(result: Comparison, gate: str, errors: list[tuple[str, str]]) -> Part:
@@ -340,7 +327,13 @@ def _timing(inputs: ReportInputs) -> Part:
 def _settings(inputs: ReportInputs) -> list[Part]:
     parts: list[Part] = []
     for kind, head in inputs.files.heads.items():
-        usual = _defaults(kind)
+        default = _SETTINGS[kind]() if kind in _SETTINGS else None
+        # As heads write them.
+        usual = (
+            {name: str(value).replace(" ", "") for name, value in vars(default).items()}
+            if default
+            else {}
+        )
         name = inputs.files.detected[kind].name
         parts.append(Part("heading", name))
         if head.settings:
@@ -367,14 +360,6 @@ def _settings(inputs: ReportInputs) -> list[Part]:
         )
     )
     return parts
-
-
-def _defaults(kind: str) -> dict[str, str]:
-    """The default settings, written as heads write them."""
-    if kind not in _SETTINGS:
-        return {}
-    usual: Any = _SETTINGS[kind]()
-    return {f.name: str(getattr(usual, f.name)).replace(" ", "") for f in fields(usual)}
 
 
 def _scaled(value: float | None, factor: float, decimals: int) -> str:

@@ -22,9 +22,7 @@ from landmarks import circle_arrays
 _JPEG_QUALITY = 88
 _MOST, _IN_A_ROW = 18, 6
 _HALF_PX = (48, 32)
-_TIMES = 3
-_SHOWN = 0.5
-_GAP_PX = 4
+_TIMES, _GAP_PX = 2, 4
 #: Outlines are drawn larger than the disc by this factor, so that they do not hide its edge.
 _WIDER = 1.6
 _FATES = {
@@ -45,10 +43,7 @@ def frame_picture(inputs: ReportInputs, prefix: str, words: str) -> Part:
 
 
 def gallery(inputs: ReportInputs, fate: Literal["missed", "extra"]) -> list[Part]:
-    """An image of cut-outs of some of a run's missed or extra discs, evenly over the run.
-
-    There is none if no such disc can be read.
-    """
+    """An image of cut-outs of some missed or extra discs, evenly over the run, if there are any."""
     edges = list(_edges(inputs, fate))
     if not edges:
         return []
@@ -97,17 +92,13 @@ def _edges(inputs: ReportInputs, fate: str) -> Iterator[tuple[str, NDArray[np.fl
 
 
 def _tile(image: NDArray[np.uint8], edge: NDArray[np.float64], colour: Colour) -> NDArray[np.uint8]:
-    """A cut-out with a curve drawn in, enlarged for that; white beyond the image."""
-    width, height = 2 * _HALF_PX[0], 2 * _HALF_PX[1]
-    left, top = np.rint(edge.mean(axis=0)).astype(int) - _HALF_PX
-    to_cut = np.array([[1.0, 0.0, -left], [0.0, 1.0, -top]])
-    cut = cv2.warpAffine(
-        image, to_cut, (width, height), flags=cv2.INTER_NEAREST, borderValue=(255,)
-    )
-    large = cv2.resize(cut, None, fx=_TIMES, fy=_TIMES, interpolation=cv2.INTER_CUBIC)
-    canvas = np.asarray(cv2.cvtColor(large, cv2.COLOR_GRAY2BGR), dtype=np.uint8)
-    draw_curve(canvas, (edge - (left, top) + 0.5) * _TIMES - 0.5, colour, closed=True)
-    small = cv2.resize(canvas, None, fx=_SHOWN, fy=_SHOWN, interpolation=cv2.INTER_AREA)
-    gap = _GAP_PX
-    framed = cv2.copyMakeBorder(small, 0, gap, 0, gap, cv2.BORDER_CONSTANT, value=(255, 255, 255))
-    return np.asarray(framed, dtype=np.uint8)
+    """A cut-out, enlarged, with a curve drawn in and a gap beside it; white beyond the image."""
+    begin = np.rint(edge.mean(axis=0)) - _HALF_PX
+    # Pixels are squares round their centres.
+    shift = 0.5 * (_TIMES - 1) - _TIMES * begin
+    enlarge = np.column_stack([_TIMES * np.eye(2), shift])
+    size = (2 * _TIMES * _HALF_PX[0], 2 * _TIMES * _HALF_PX[1])
+    cut = cv2.warpAffine(image, enlarge, size, flags=cv2.INTER_CUBIC, borderValue=(255,))
+    canvas = np.asarray(cv2.cvtColor(cut, cv2.COLOR_GRAY2BGR), np.uint8)
+    draw_curve(canvas, _TIMES * edge + shift, colour, closed=True)
+    return np.pad(canvas, ((0, _GAP_PX), (0, _GAP_PX), (0, 0)), constant_values=255)
