@@ -44,7 +44,7 @@ _EDGES_M = (-inf, 0.8, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, inf)
 
 
 class Beside(NamedTuple):
-    """What is in view besides the reference rows, where that is known.
+    """What is known to be in view besides the reference rows.
 
     Detected rows on `unlisted` discs are neither right nor wrong, those on `lookalikes` are extra
     and counted apart.
@@ -59,18 +59,12 @@ def beside_reference(
     unlisted: Path | None = None,
     lookalikes: Path | None = None,
 ) -> Beside:
-    """Read what is in view besides the rows of a reference file.
-
-    By default ``unlisted.circles`` and ``lookalikes.circles`` in its folder, if these exist.
-    """
-    found = [
-        None if named is None and not usual.is_file() else tuple(read_frames(named or usual))
-        for named, usual in (
-            (unlisted, Path(reference).parent / "unlisted.circles"),
-            (lookalikes, Path(reference).parent / "lookalikes.circles"),
-        )
-    ]
-    return Beside(found[0] or (), found[1])
+    """Read ``unlisted.circles`` and ``lookalikes.circles`` beside a reference file, or others."""
+    usual = Path(reference).parent / "unlisted.circles"
+    known = tuple(read_frames(unlisted or usual)) if unlisted or usual.is_file() else ()
+    usual = Path(reference).parent / "lookalikes.circles"
+    alike = tuple(read_frames(lookalikes or usual)) if lookalikes or usual.is_file() else None
+    return Beside(known, alike)
 
 
 def compare_runs(
@@ -91,24 +85,18 @@ def compare_runs(
     reference, detected : path, optional
         By default ``map.circles`` and ``detected.circles`` in that folder.
     options : CompareOptions, optional
-        What counts as the same disc, and which rows count.
     sight : Sight, optional
         How rows come back into the images; without it, they are compared on the floor.
     beside : Beside, optional
-        What is in view besides the reference rows; by default as the reference's folder has it.
-
-    Returns
-    -------
-    DiscComparison
-        The figures.
+        What else is in view; by default as the reference's folder has it.
 
     Raises
     ------
     landmarks.LandmarkFileError
         If a file cannot be read.
     CompareError
-        If an image has two frames in a file, or the gate needs a reference row's covariance and
-        that is not positive definite.
+        If an image has two frames in a file, or a covariance that is needed is not positive
+        definite.
     """
     reference = Path(run) / "map.circles" if reference is None else reference
     detected = Path(run) / "detected.circles" if detected is None else detected
@@ -131,18 +119,14 @@ def compare_frames(
     beside: Beside | None = None,
     names: tuple[str, str] = ("reference", "detected"),
 ) -> DiscComparison:
-    """Compare the discs of two sets of frames; errors and reports use their names.
-
-    See `compare_runs`.
-    """
+    """Compare the discs of two sets of frames, called `names` in messages, as `compare_runs`."""
     options, beside = options or CompareOptions(), beside or Beside()
     in_image = sight is not None and not options.on_floor
     if not in_image and options.gate_m is None:
         options = replace(options, gate_m=FLOOR_GATE_M)
     wanted, found = frames_by_image(reference, names[0]), frames_by_image(detected, names[1])
     unlisted = {image_name(frame.step.prefix): frame for frame in beside.unlisted}
-    view_of = None if sight is None else sight.of
-    common = match_runs("circles", wanted, found, options, names, view_of, unlisted)
+    common = match_runs("circles", wanted, found, options, names, sight, unlisted)
     matches = common.frames
     first, second, missed, extra = sides = (
         circle_arrays([row for m in matches for row in m.paired[0]]),

@@ -9,7 +9,7 @@ from rich.console import Console
 
 from camera import read_camera
 from detect.comparison.circles import beside_reference, compare_runs
-from detect.comparison.lines import compare_line_runs
+from detect.comparison.lines import compare_line_frames
 from detect.comparison.report import comparison_tables, format_json
 from detect.comparison.result import Comparison, unmet_demands
 from detect.drawing.inputs import read_head
@@ -17,6 +17,7 @@ from detect.errors import DetectError
 from detect.options import Compare
 from detect.run import camera_in
 from detect.seen import Sight
+from landmarks import read_frames
 from storage import write_whole
 from storage.exit_codes import EXIT_ERROR
 
@@ -36,8 +37,11 @@ def perform(command: Compare) -> int:
             raise DetectError(f"{path}: no such landmark file: {advice}")
     result: Comparison
     if command.lines:
-        result = compare_line_runs(
-            command.run, reference=reference, detected=detected, options=command.options
+        result = compare_line_frames(
+            read_frames(reference),
+            read_frames(detected),
+            command.options,
+            names=(str(reference), str(detected)),
         )
     else:
         result = compare_runs(

@@ -18,14 +18,9 @@ def quantile(values: FloatArray, q: float = 0.5) -> float | None:
 
 
 def normalised_error(offset: FloatArray, covariance: FloatArray) -> NormalisedError:
-    """Mean of squared normalised errors, with the central 95 % of the chi-square distribution.
+    """Mean of squared normalised errors (N, n), with the central 95 % of chi-square.
 
-    Parameters
-    ----------
-    offset : (N, n) float64
-        Errors.
-    covariance : (N, n, n) float64
-        Their covariances; errors whose covariance is not positive definite are left out.
+    Errors whose covariance (N, n, n) is not positive definite are left out.
     """
     usable = is_positive_definite(covariance)
     left_out = int((~usable).sum())

@@ -2,47 +2,20 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from detect.comparison.figures import normalised_error, quantile
-from detect.comparison.matching import (
-    frames_by_image,
-    match_runs,
-    numbers,
-)
+from detect.comparison.matching import frames_by_image, match_runs, numbers
 from detect.comparison.result import CompareOptions, LineComparison, LinePairs
-from landmarks import Frame, read_frames, wrap_angle
+from landmarks import Frame, wrap_angle
 
 FloatArray = NDArray[np.float64]
 
 # Files hold six digits: a smaller sigma is no statement about a bearing.
 _LEAST_SIGMA_RAD = 1e-12
-
-
-def compare_line_runs(
-    run: str | os.PathLike[str],
-    *,
-    reference: str | os.PathLike[str] | None = None,
-    detected: str | os.PathLike[str] | None = None,
-    options: CompareOptions | None = None,
-) -> LineComparison:
-    """Compare a run's detected lines with its reference rows.
-
-    As `detect.comparison.circles.compare_runs`, by default of ``map.lines`` and ``detected.lines``.
-    """
-    reference = Path(run) / "map.lines" if reference is None else reference
-    detected = Path(run) / "detected.lines" if detected is None else detected
-    return compare_line_frames(
-        read_frames(reference),
-        read_frames(detected),
-        options,
-        names=(os.fspath(reference), os.fspath(detected)),
-    )
 
 
 def compare_line_frames(
@@ -52,7 +25,10 @@ def compare_line_frames(
     *,
     names: tuple[str, str] = ("reference", "detected"),
 ) -> LineComparison:
-    """Compare the lines of two sets of frames; errors and reports use their names."""
+    """Compare the lines of two sets of frames, called `names` in messages.
+
+    Errors as of `detect.comparison.circles.compare_runs`.
+    """
     options = options or CompareOptions()
     sides = frames_by_image(reference, names[0]), frames_by_image(detected, names[1])
     common = match_runs("lines", *sides, options, names)

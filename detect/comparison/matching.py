@@ -23,7 +23,7 @@ from detect.comparison.result import (
     FramePair,
     Kind,
 )
-from detect.seen import FrameView, image_positions
+from detect.seen import FrameView, Sight, image_positions
 from detect.sources.image_names import image_name
 from landmarks import (
     Association,
@@ -64,13 +64,12 @@ def match_runs(
     detected: Mapping[str, Frame],
     options: CompareOptions,
     names: tuple[str, str],
-    view_of: Callable[[Frame | None, Frame | None], FrameView] | None = None,
+    sight: Sight | None = None,
     unlisted: Mapping[str, Frame] | None = None,
 ) -> Comparison:
     """Match the rows of two runs, image by image.
 
     Images are in the order of the reference, then those of `detected` alone, if they count.
-    `view_of` gives how the discs of a reference and a detected frame come back into the image.
     """
     images = [name for name in reference if options.all_frames or name in detected]
     if options.all_frames:
@@ -78,7 +77,7 @@ def match_runs(
     matches = []
     for name in images:
         frames = reference.get(name), detected.get(name)
-        view = None if view_of is None else view_of(*frames)
+        view = None if sight is None else sight.of(*frames)
         pair = pair_of(kind, name, *frames, (unlisted or {}).get(name), view)
         matches.append(match_frame(pair, options))
     counts: dict[str, Any] = {
@@ -165,8 +164,7 @@ def pair_discs(
 ) -> Association:
     """Pair discs of one frame one to one: as many as possible, with least squared distances.
 
-    Distances are in the image (in units of the gate) where there is a `view`, unless the options
-    ask for the floor.
+    In the image where there is a view, unless the options ask for the floor.
     """
     first, second = circle_arrays(reference), circle_arrays(detected)
     if view is not None and not options.on_floor:

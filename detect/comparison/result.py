@@ -91,44 +91,26 @@ class CompareOptions(Gates):
 
 
 class FramePair(NamedTuple):
-    """The rows of one image on both sides, all discs or all lines.
-
-    `unlisted` are those that may be detected but need not be. `view` is how discs come back into
-    the image; without it, they are compared on the floor.
-    """
+    """The rows of one image on both sides, all discs or all lines."""
 
     kind: Kind
     name: str
     reference: Sequence[Any]
     detected: Sequence[Any]
-    unlisted: Sequence[Any] = ()
-    view: FrameView | None = None
+    unlisted: Sequence[Any] = ()  # what may be detected but need not be
+    view: FrameView | None = None  # how discs come back into the image; None: compared on the floor
 
 
 class FrameMatch(NamedTuple):
-    """Which rows of one frame belong together.
-
-    Attributes
-    ----------
-    frame : FramePair
-        All its rows.
-    matched : list of (row, row)
-        Pairs of a reference and a detected row; no row is in two of them.
-    joined, missed : list of rows
-        Other reference rows: those that a matched line represents, too, and those that none does.
-    extra, set_aside : list of rows
-        Other detected rows; those set aside fit something that does not count.
-    errors : (M,) float64
-        Of the pairs: distance on the floor (m), or difference in bearing without sign (degrees).
-    """
+    """Which rows of one frame belong together."""
 
     frame: FramePair
-    matched: list[tuple[Any, Any]]
-    joined: list[Any]
+    matched: list[tuple[Any, Any]]  # reference and detected row; no row is in two pairs
+    joined: list[Any]  # reference rows that a matched line represents, too
     missed: list[Any]
     extra: list[Any]
-    set_aside: list[Any]
-    errors: FloatArray
+    set_aside: list[Any]  # detected rows that fit something that does not count
+    errors: FloatArray  # of the pairs: distance on the floor (m), or difference in bearing (deg)
 
     @property
     def largest_error(self) -> float | None:
@@ -158,10 +140,7 @@ class NormalisedError:
 
 @dataclass(frozen=True)
 class DistanceBin:
-    """Discs at a range of forward distances; reference and detected rows each by their own.
-
-    Qualities and errors are medians. Figures are None where there are no rows to compute them from.
-    """
+    """Discs at a range of forward distances; qualities and errors are medians."""
 
     from_m: float | None
     to_m: float | None
@@ -179,30 +158,24 @@ class DistanceBin:
 
 @dataclass(frozen=True)
 class Levelling:
-    """How many frames' rows are levelled, and by what (medians, degrees; None where none are).
-
-    `true` says that rows are level positions that no tilt was applied to.
-    """
+    """How many frames' rows are levelled, and by what (medians)."""
 
     frames: int
     levelled: int
-    true: bool
+    true: bool  # rows are level positions that no tilt was applied to
     pitch_deg: float | None
     roll_deg: float | None
 
 
 @dataclass(frozen=True)
 class FloorDifference:
-    """Detected minus reference positions on the floor: median and 95 % quantile of the distance.
-
-    Also medians along the viewing direction (positive: farther away) and across (to the left).
-    """
+    """Detected minus reference positions: distance (median, 95 %), and medians of directions."""
 
     pairs: int
     median_m: float | None
     most_m: float | None
-    along_m: float | None
-    across_m: float | None
+    along_m: float | None  # the viewing direction, positive farther away
+    across_m: float | None  # positive to the left
 
 
 @dataclass(frozen=True)
@@ -217,10 +190,7 @@ class FloorBin:
 
 @dataclass(frozen=True)
 class CommonLean:
-    """Constant tilt and height of the camera that explain the differences, and the residuals.
-
-    Each figure with its standard deviation; positive pitch and roll as in a ``.tilt`` file.
-    """
+    """Tilt, as in a ``.tilt`` file, and height of the camera that explain the differences."""
 
     pitch_deg: float
     pitch_sigma_deg: float
@@ -234,18 +204,13 @@ class CommonLean:
 
 @dataclass(frozen=True, eq=False)
 class DiscPairs:
-    """N matched discs on the floor (m).
+    """N matched discs on the floor (m)."""
 
-    `offset` and `left` (N, 2) are detected minus reference positions before and after the common
-    lean, `covariance` (N, 2, 2) is what errors are measured in, and `away` (N, 2) has unit vectors
-    along which the camera sees the discs.
-    """
-
-    reference_xy: FloatArray
-    offset: FloatArray
-    left: FloatArray
-    covariance: FloatArray
-    away: FloatArray
+    reference_xy: FloatArray  # (N, 2)
+    offset: FloatArray  # (N, 2) detected minus reference positions
+    left: FloatArray  # (N, 2) the same after the common lean
+    covariance: FloatArray  # (N, 2, 2) what errors are measured in
+    away: FloatArray  # (N, 2) unit vectors along which the camera sees them
 
 
 @dataclass(frozen=True, eq=False)
@@ -261,25 +226,9 @@ class LinePairs:
 class Comparison:
     """How a run's detected rows compare with reference rows.
 
-    Figures are None where there are no rows to compute them from.
-
-    Attributes
-    ----------
-    reference_name, detected_name : str
-        The files.
-    options : CompareOptions
-    reference, detected : int
-        Rows that count.
-    matched, joined, missed, extra, set_aside : int
-        As in `FrameMatch`, of all frames.
-    found : int
-        Reference rows that were matched or joined.
-    recall, precision : float or None
-        Shares of the reference rows that were found, and of the detected rows that were matched.
-    frames : tuple of FrameMatch
-        Each frame that was compared.
-    frames_only_in_reference, frames_only_in_detected : tuple of str
-        Images that only one file has.
+    Figures are None where there are no rows to compute them from. Rows are counted as in
+    `FrameMatch`; `found` ones were matched or joined. Recall and precision are the shares of the
+    reference rows that were found, and of the detected rows that were matched.
     """
 
     reference_name: str
@@ -311,13 +260,9 @@ class Comparison:
 
 @dataclass(frozen=True)
 class DiscComparison(Comparison):
-    """How a run's detected discs compare with reference rows.
+    """How a run's detected discs compare with reference rows; qualities are medians."""
 
-    Qualities are medians. `on_lookalikes` of the extra rows are on something that is known to look
-    like a disc (None where these are not known).
-    """
-
-    on_lookalikes: int | None
+    on_lookalikes: int | None  # extra rows on what is known to look like a disc
     error_median_m: float | None
     error_95_m: float | None
     normalised_error: NormalisedError
@@ -338,16 +283,12 @@ class DiscComparison(Comparison):
 
 @dataclass(frozen=True)
 class LineComparison(Comparison):
-    """How a run's detected lines compare with reference rows.
-
-    Differences in bearing (alpha) and beta are without sign, distances between the pairs' ends, top
-    and bottom alike, in normalised image coordinates.
-    """
+    """How a run's detected lines compare with reference rows: differences without sign."""
 
     bearing_median_deg: float | None
     bearing_95_deg: float | None
     normalised_error: NormalisedError
-    ends_median: float | None
+    ends_median: float | None  # normalised image coordinates, top and bottom alike
     beta_median_deg: float | None
     pairs: LinePairs = field(repr=False)
 
@@ -358,10 +299,7 @@ def unmet_demands(
     min_recall: float | None = None,
     min_precision: float | None = None,
 ) -> tuple[str, ...]:
-    """Say which demands a comparison fails, a sentence for each.
-
-    A figure that there are no rows for fails its demand.
-    """
+    """A sentence for each demand that a comparison fails, as it does without rows to judge by."""
     demands = (
         ("recall", comparison.recall, min_recall),
         ("precision", comparison.precision, min_precision),

@@ -83,12 +83,7 @@ def mp4(
 ) -> Iterator[Callable[[NDArray[np.uint8]], None]]:
     """A video that appears once it is complete; yields what takes its pictures.
 
-    Raises
-    ------
-    DetectError
-        If OpenCV cannot write such videos here, or pictures are not all of one size.
-    storage.OutputExistsError
-        If the file exists and must not be replaced.
+    Raises DetectError if OpenCV cannot write such videos, or pictures are not all of one size.
     """
     writer = cv2.VideoWriter()
     size: tuple[int, int] | None = None

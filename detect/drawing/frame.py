@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,19 +24,18 @@ from detect.drawing.strokes import (
     draw_bar,
     draw_curve,
     draw_text,
+    enlargement,
     with_legend,
 )
-from detect.markers.drawing import mark_marker
-from detect.seen import FrameView, Sight, circle_on_floor, image_positions
+from detect.seen import Sight, circle_on_floor, image_positions
 from detect.settings import CircleSettings
 from landmarks import LineLandmark, MarkerLandmark, circle_arrays
-
-if TYPE_CHECKING:
-    from detect.circles import CircleDetections
 
 FloatArray = NDArray[np.float64]
 
 _POINTS = 33
+#: Size of the ellipses of markers' corners, in standard deviations.
+_SIGMAS = 20.0
 LINE_COLOUR: Colour = (60, 220, 60)
 SIGMA_COLOUR: Colour = (0, 170, 255)
 _EDGE_COLOUR: Colour = (0, 170, 255)
@@ -56,23 +54,11 @@ def draw_rows(
     options: CompareOptions,
     title: str = "",
 ) -> NDArray[np.uint8]:
-    """Draw what files say of a frame into its image (H, W), with a line of words below.
+    """Draw rows of a frame into its image (H, W), and words below it.
 
-    Parameters
-    ----------
-    sight : Sight or None
-        The calibrated camera; without one, only markers are drawn.
-    settings : CircleSettings
-        The radii of the discs' outlines.
-    options : CompareOptions
-        What counts as the same disc or vertical as one of the reference.
-    title : str
-        Beginning of the line below the picture.
-
-    Returns
-    -------
-    (H + h, W, 3) uint8
-        In OpenCV's order blue, green, red; h is the height of the line of words.
+    Without a calibrated camera only markers are drawn. The settings have the radii of the discs'
+    outlines, the options say what fits a reference row. The picture (H + h, W, 3) is in OpenCV's
+    order blue, green, red.
     """
     canvas = canvas_of(image, None if sight is None else sight.camera)
     words = [title] if title else []
@@ -95,22 +81,6 @@ def draw_rows(
         pitch, roll = np.degrees([rows.tilt.pitch, rows.tilt.roll])
         words.append(f"pitch {pitch:.2f} roll {roll:.2f} deg")
     return with_legend(canvas, [("   ".join(words), _WORDS_COLOUR)], canvas.shape[1], 0.38)
-
-
-def draw_circles(
-    image: NDArray[np.uint8],
-    camera: Camera,
-    found: CircleDetections,
-    settings: CircleSettings,
-) -> NDArray[np.uint8]:
-    """Draw the outlines of detected discs and their quality (the report's figure 8).
-
-    Of a grey image (H, W), returns a picture (H, W, 3); `settings` has the radii of the outlines.
-    """
-    canvas = canvas_of(image, camera)
-    for centre, quality in zip(found.floor_xy, found.quality):
-        _outline_disc(canvas, camera.project_floor, centre, settings, f"{quality:.2f}")
-    return canvas
 
 
 def line_curves(camera: Camera, ends: FloatArray) -> FloatArray:
@@ -157,7 +127,8 @@ def _draw_discs(
     view = match.frame.view
     assert view is not None
     project = partial(image_positions, view.camera, levelled_by=view.detected_by)
-    for edge in missed_edges(match, view, settings.radius_m):
+    rings = circle_on_floor(circle_arrays(match.missed).xy, settings.radius_m)
+    for edge in image_positions(view.camera, rings, view.reference_by):
         draw_curve(canvas, edge, MISSED_COLOUR, closed=True)
     apart = apart_px(match)
     drawn = [(row, "", _EDGE_COLOUR) for row in match.set_aside]
@@ -189,21 +160,23 @@ def _draw_lines(
 
 
 def _draw_markers(canvas: NDArray[np.uint8], found: Sequence[MarkerLandmark]) -> None:
+    """Edges, a circle at the top left corner, and ellipses of 20 standard deviations."""
+    times = enlargement(canvas)
+    circle = circle_on_floor((0.0, 0.0), 1.0, _POINTS)
     for row in found:
         corners = np.array([(c.u, c.v) for c in row.corners])
-        covariance = np.array([[(c.cuu, c.cuv), (c.cuv, c.cvv)] for c in row.corners])
-        mark_marker(canvas, row.id, corners, covariance)
+        draw_curve(canvas, corners, LINE_COLOUR, closed=True)
+        for c in row.corners:
+            values, vectors = np.linalg.eigh([[c.cuu, c.cuv], [c.cuv, c.cvv]])
+            ellipse = _SIGMAS * (circle * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
+            draw_curve(canvas, ellipse + np.array([c.u, c.v]), LINE_COLOUR, closed=True)
+        draw_curve(canvas, corners[0] + 3.0 * times * circle, MISSED_COLOUR, closed=True)
+        draw_text(canvas, f"{row.id}", corners.mean(axis=0), _TEXT_COLOUR, 0.45, (-8, 5))
 
 
 def _count(what: str, match: FrameMatch, compared: bool) -> str:
     fate = f" ({len(match.extra)} extra, {len(match.missed)} missed)" if compared else ""
     return f"{len(match.frame.detected)} {what}{fate}"
-
-
-def missed_edges(match: FrameMatch, view: FrameView, radius_m: float) -> FloatArray:
-    """(N, P, 2) pixels of circles round the discs that were missed."""
-    rings = circle_on_floor(circle_arrays(match.missed).xy, radius_m)
-    return image_positions(view.camera, rings, view.reference_by)
 
 
 def _outline_disc(
@@ -212,12 +185,9 @@ def _outline_disc(
     centre_xy: FloatArray,
     settings: CircleSettings,
     text: str,
-    edge_colour: Colour = _EDGE_COLOUR,
+    edge_colour: Colour,
 ) -> None:
-    """Draw a disc's edge and its two outlines, and a word above.
-
-    `project` takes (N, 2) places on the floor (m) to (N, 2) pixels, NaN where they are not seen.
-    """
+    """Draw a disc's edge and its two outlines, and a word above; `project` takes it to pixels."""
     for radius, colour in (
         (settings.inner_radius_m, _OUTLINE_COLOUR),
         (settings.radius_m, edge_colour),

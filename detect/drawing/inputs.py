@@ -39,38 +39,23 @@ SettingsType = TypeVar("SettingsType", CircleSettings, LineSettings)
 class FileHead:
     """The head of a file of rows, as far as it is understood.
 
-    Attributes
-    ----------
-    comments : tuple of str
-        Its lines without the signs of comment.
-    settings : tuple of (str, str)
-        The effective settings: names and values, as they are written.
-    level : bool
-        Whether positions of discs are corrected for the frames' tilts, or true ones in the level
-        robot frame.
-    name : str
-        What messages call the file.
+    Settings are the defaults where it does not give them; a DetectError is raised if one has a
+    value that none can have.
     """
 
-    comments: tuple[str, ...] = ()
-    settings: tuple[tuple[str, str], ...] = ()
-    level: bool = False
-    name: str = ""
+    comments: tuple[str, ...] = ()  # its lines without the signs of comment
+    settings: tuple[tuple[str, str], ...] = ()  # names and values, as they are written
+    level: bool = False  # positions are corrected for the frames' tilts, or true level ones
+    name: str = ""  # what messages call the file
 
     @property
     def circle_settings(self) -> CircleSettings:
-        """The settings of discs, the defaults where the head does not give them.
-
-        Raises
-        ------
-        DetectError
-            If one has a value that none can have.
-        """
+        """The settings of discs."""
         return self._settings(CircleSettings)
 
     @property
     def line_settings(self) -> LineSettings:
-        """The settings of verticals; as `circle_settings`."""
+        """The settings of verticals."""
         return self._settings(LineSettings)
 
     def _settings(self, kind: type[SettingsType]) -> SettingsType:
@@ -99,13 +84,7 @@ def _numbers(name: str, text: str, *, in_pairs: bool) -> tuple[Any, ...]:
 
 
 def read_head(path: Path) -> FileHead:
-    """Read the head of a file of rows.
-
-    Raises
-    ------
-    DetectError
-        If the file cannot be read.
-    """
+    """Read the head of a file of rows; a DetectError if the file cannot be read."""
     try:
         with path.open("rb") as stream:
             start = stream.read(_LONGEST_BYTES)
@@ -133,10 +112,7 @@ def read_head(path: Path) -> FileHead:
 
 @dataclass(frozen=True)
 class SeenRows:
-    """What files have of one image: None where there is no file, or it does not have the image.
-
-    `unlisted` are discs that may be detected but need not be.
-    """
+    """What files have of one image: None where there is no file, or it does not have the image."""
 
     circles: Frame | None = None
     lines: Frame | None = None
@@ -144,15 +120,11 @@ class SeenRows:
     tilt: FrameTilt | None = None
     reference_circles: Frame | None = None
     reference_lines: Frame | None = None
-    unlisted: Frame | None = None
+    unlisted: Frame | None = None  # discs that may be detected but need not be
 
 
 class RunRows:
-    """The files of a run's rows; of these, only the offsets of frames are in memory.
-
-    `detected` has the path of each kind of `KINDS` that there is, `heads` their heads, `reference`
-    the paths of reference rows of these kinds.
-    """
+    """The files of a run's rows, detected and reference by kind; in memory: offsets of frames."""
 
     def __init__(self, detected: dict[str, Path], reference: dict[str, Path]) -> None:
         self.detected = detected
@@ -185,12 +157,8 @@ class RunRows:
 def open_rows(run: ImageRun, options: RowFiles) -> RunRows:
     """Find the files of a run's rows, and index them.
 
-    Raises
-    ------
-    DetectError
-        If one that is named does not exist, or there is none at all.
-    landmarks.LandmarkFileError
-        If one cannot be read or a row is malformed; names file and line.
+    Raises DetectError if one that is named does not exist, or there is none at all, and
+    landmarks.LandmarkFileError if one is malformed.
     """
     detected: dict[str, Path] = {}
     usual = {
@@ -231,29 +199,11 @@ def picture_name(prefix: str) -> str:
 def select_frames(
     frames: Frames, wanted: Sequence[str], every: int
 ) -> tuple[int | None, Iterator[tuple[int, RunFrame]]]:
-    """Parse the selection of frames of a command line.
+    """Their number, if it is known, and the selected frames with their positions in the run.
 
-    Parameters
-    ----------
-    frames : Frames
-        The run's.
-    wanted : sequence of str
-        Names of images, positions, and ranges FROM:TO[:STEP] of positions without the last. What is
-        both a name and a position is a name.
-    every : int
-        Of these, every n-th.
-
-    Returns
-    -------
-    expected : int or None
-        Approximate number of the selected frames, if known.
-    selected : iterator of (int, RunFrame)
-        Their positions in the run and they themselves.
-
-    Raises
-    ------
-    DetectError
-        If a name is no image's, a position is beyond the run, or no frame is left.
+    Every n-th of those that are `wanted` by names of images, positions, or ranges FROM:TO[:STEP] of
+    positions without the last; what is both a name and a position is a name. Raises DetectError if
+    a name is no image's, a position is beyond the run, or no frame is left.
     """
     if every < 1:
         raise DetectError(f"every is {every}: expected 1 or more")

@@ -70,10 +70,9 @@ def draw_text(
     size: float = 0.35,
     shift: tuple[int, int] = (0, 0),
 ) -> None:
-    """Write with the left end of the base line at u, v; nothing if these are not finite.
+    """Write in ASCII from u, v, the left end of the base line, if these are finite.
 
-    `shift` moves the words, by more in wide pictures. What is not ASCII is a question mark, and
-    words stay below the upper border.
+    `shift` moves the words, by more in wide pictures.
     """
     place = np.asarray(at, dtype=np.float64)
     if np.isfinite(place).all():

@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+import io
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from detect.circles import CircleDetections
+from detect.comparison.result import CompareOptions
 from detect.discs.identity import ids_of_map, ids_of_rows
-from detect.drawing.frame import draw_circles
-from detect.drawing.lines import draw_lines, draw_response, draw_tracks
+from detect.drawing.frame import draw_rows
+from detect.drawing.inputs import SeenRows
+from detect.drawing.rejected import draw_candidates, draw_response, draw_tracks
 from detect.errors import FrameError
 from detect.lines import LineDetections
-from detect.markers.drawing import draw_markers
 from detect.runs.frame import (
     COSTS_THE_FRAME,
     FrameDetections,
@@ -33,6 +36,8 @@ from detect.runs.plan import (
     rows_of_failure,
     time_row,
 )
+from detect.seen import Sight
+from detect.settings import CircleSettings
 from detect.verticals.detections import carry_ids
 from detect.verticals.response import line_response
 from landmarks import (
@@ -41,6 +46,8 @@ from landmarks import (
     format_outline_tilt,
     format_record,
     format_tilt,
+    frames_of_rows,
+    parse_rows,
 )
 
 #: Largest number of pixels that are decoded at once.
@@ -66,9 +73,10 @@ def _rows_of(task: FrameTask, found: FrameDetections, plan: FramePlan) -> FrameR
     if found.error is not None:
         return rows_of_failure(task, found.error)
     try:
+        rows = _rows_by_kind(task, found, plan)
         return FrameRows(
             task.frame.step.prefix,
-            _rows_by_kind(task, found, plan),
+            rows,
             {
                 "discs": len(found.discs or ()),
                 "lines": len(found.lines or ()),
@@ -81,7 +89,7 @@ def _rows_of(task: FrameTask, found: FrameDetections, plan: FramePlan) -> FrameR
                     f"{Path(task.frame.step.prefix).name}{ending}",
                     cv2.imencode(".png", picture)[1].tobytes(),
                 )
-                for ending, picture in _drawn(found, plan)
+                for ending, picture in _drawn(rows, found, plan)
             ),
         )
     except COSTS_THE_FRAME as error:
@@ -181,18 +189,27 @@ def _disc_records(found: CircleDetections) -> list[dict[str, object]]:
     ]
 
 
-def _drawn(found: FrameDetections, plan: FramePlan) -> Iterator[tuple[str, NDArray[np.uint8]]]:
+def _drawn(
+    rows: Mapping[str, str], found: FrameDetections, plan: FramePlan
+) -> Iterator[tuple[str, NDArray[np.uint8]]]:
     """The pictures of a plan, by the endings of their names."""
-    image, camera, drawing = found.pixels, plan.camera, plan.drawing
-    if drawing == "markers" and found.markers is not None:
-        yield ".png", draw_markers(image, found.markers)
-    if drawing == "discs" and found.discs is not None and camera and plan.circles:
-        yield ".png", draw_circles(image, camera, found.discs, plan.circles)
-    table = tables_of(plan).verticals
-    if found.lines is not None and camera and plan.lines and table:
-        if drawing == "lines":
-            yield ".png", draw_lines(image, camera, found.lines)
-        if drawing == "tracks":
-            yield ".png", draw_tracks(image, table, found.lines)
-        if plan.draw_response:
-            yield ".response.png", draw_response(line_response(image, table, plan.lines), table)
+    if plan.drawing is None and not plan.draw_response:
+        return
+    image, table = found.pixels, tables_of(plan).verticals
+    kind = "circles" if plan.drawing == "discs" else "markers" if plan.markers else "lines"
+    content = io.BytesIO(rows[kind].encode("utf-8", "surrogateescape"))
+    (frame,) = frames_of_rows(parse_rows(content))
+    if plan.drawing == "tracks" and found.lines is not None and table:
+        yield ".png", draw_tracks(image, table, found.lines)
+    elif plan.drawing is not None:
+        settings = plan.circles or CircleSettings()
+        sight = Sight(plan.camera, settings.radius_m) if plan.camera else None
+        frames: dict[str, Any] = {kind: frame}
+        seen = SeenRows(**frames, tilt=found.tilt)
+        name = Path(frame.step.prefix).name
+        picture = draw_rows(image, sight, seen, settings, CompareOptions(), name)
+        if found.markers is not None:
+            picture = draw_candidates(picture, found.markers)
+        yield ".png", picture
+    if plan.draw_response and found.lines is not None and plan.lines and table:
+        yield ".response.png", draw_response(line_response(image, table, plan.lines), table)

@@ -79,12 +79,10 @@ class Bag(Source):
     ----------
     path : path
         A .bag, .mcap or .db3 file, or the folder of a ROS 2 bag.
-    image_topic : str
-        Which topic of images, if there are several.
+    image_topic, base_frame : str
+        As in `SourceOptions`.
     bits : int or None
         Significant bits of 16-bit images; by default what the first one needs.
-    base_frame : str
-        The frame of the robot's base, on the floor, among the static transforms.
     """
 
     def __init__(

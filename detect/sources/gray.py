@@ -32,7 +32,7 @@ _BYTES_BESIDE = 1 << 23
 def decode_gray(
     content: bytes, name: object, bits: int = 16, size: tuple[int, int] | None = None
 ) -> NDArray[np.uint8]:
-    """Decode the content of an image file to grey values.
+    """Decode the content of an image file to (H, W) uint8 grey values.
 
     Parameters
     ----------
@@ -44,10 +44,6 @@ def decode_gray(
         Significant bits of images that have more than 8 bits.
     size : (int, int) or None
         Width and height that are expected: an image that claims others is not decoded.
-
-    Returns
-    -------
-    (H, W) uint8 array
 
     Raises
     ------
@@ -66,21 +62,14 @@ def decode_gray(
 
 
 def gray_of_pixels(pixels: NDArray[Any], name: object, bits: int = 16) -> NDArray[np.uint8]:
-    """Bring pixels to 8-bit grey values.
+    """Bring pixels to 8-bit grey values, contiguous and writable.
 
     Parameters
     ----------
     pixels : (H, W), (H, W, 1), (H, W, 3) or (H, W, 4) uint8 or uint16 array
         Grey values, or blue, green, red and perhaps opacity; of any byte order and strides.
-    name : object
-        The image's name in messages.
-    bits : int
-        Significant bits of uint16.
-
-    Returns
-    -------
-    (H, W) uint8 array
-        Contiguous and writable; the same array if it is so already.
+    name, bits
+        As of `decode_gray`.
 
     Raises
     ------
@@ -143,13 +132,7 @@ def _decoded(content: bytes) -> NDArray[Any] | None:
 
 
 def bounded_content(path: Path | str, name: object, size: tuple[int, int] | None) -> bytes:
-    """The content of an image file; parameters as in `decode_gray`.
-
-    Raises
-    ------
-    FrameError
-        If it cannot be read, is no file, or has more bytes than such an image can have.
-    """
+    """The content of an image file; a FrameError if it is larger than such an image can be."""
     pixels = MOST_PIXELS if size is None else size[0] * size[1]
     try:
         return read_bounded(path, _BYTES_BESIDE + _BYTES_PER_PIXEL * pixels)
@@ -158,14 +141,7 @@ def bounded_content(path: Path | str, name: object, size: tuple[int, int] | None
 
 
 def demand_bounded(content: bytes, name: object, size: tuple[int, int] | None) -> None:
-    """Refuse an image by its header, before it is decoded; parameters as in `decode_gray`.
-
-    Raises
-    ------
-    FrameError
-        If the file is no JPEG, PNG, PNM, BMP or TIFF, claims another size, or more than
-        `MOST_PIXELS`.
-    """
+    """Refuse an image by its header, with a FrameError: no image, too large, or of another size."""
     claimed = claimed_size(content)
     if claimed is None:
         raise FrameError(f"{name}: cannot be decoded: expected an image")

@@ -18,31 +18,14 @@ class Source(ABC):
     """Images in order, as frames of a run in which the robot does not move.
 
     Iterating again starts over (with a live camera: from then on).
-
-    Attributes
-    ----------
-    name : str
-        Its name in messages.
-    output_base : path
-        Results are called this, with an ending of their own.
-    ships_images : bool
-        Whether it gives contents of images, not files.
-    expected : int or None
-        Approximate number of images; None if unknown.
-    size : (int, int) or None
-        Width and height of the images, where they are known beforehand.
-    times_own : bool
-        Whether images have times by themselves; of others, they can be named.
-    has_times : bool
-        Whether the times of images are known.
     """
 
-    name: str
-    output_base: Path
-    ships_images = True
-    expected: int | None = None
-    size: tuple[int, int] | None = None
-    times_own = True
+    name: str  # in messages
+    output_base: Path  # results are called this, with an ending of their own
+    ships_images = True  # it gives contents of images, not files
+    expected: int | None = None  # approximate number of images, where it is known
+    size: tuple[int, int] | None = None  # width and height, where they are known beforehand
+    times_own = True  # images have times by themselves; of others, they can be named
     has_times = True
     left_out = 0
     why_left_out = "images are left out"

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Generator, Iterator
+from collections.abc import Callable, Generator, Iterator
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -16,71 +15,68 @@ from detect.sources.poses import PosesOverTime, PoseStream, TimedPose, step_betw
 from landmarks import Step, read_steps
 
 
-class _FramesAlong(ABC):
-    """The frames of a source along its odometry."""
+class FramesAlong:
+    """The frames of a source along its odometry, as one of the functions below gives them."""
 
-    def __init__(self, source: Source) -> None:
-        self._source = source
-        self.ships_images = source.ships_images
-        self.expected = source.expected
-        self.left_out = 0
+    def __init__(
+        self,
+        source: Source,
+        framed: Callable[[Iterator[RunFrame]], Generator[RunFrame | None, None, None]],
+        why_left_out: str,
+    ) -> None:
+        self._source, self._framed = source, framed
+        self.ships_images, self.expected = source.ships_images, source.expected
+        self.left_out, self.why_left_out = 0, why_left_out
 
     def __iter__(self) -> Generator[RunFrame, None, None]:
         self.left_out = 0
-        with closing(iter(self._source)) as images:
-            yield from self._framed(images)
+        with closing(iter(self._source)) as images, closing(self._framed(images)) as frames:
+            for frame in frames:
+                if frame is None:
+                    self.left_out += 1
+                else:
+                    yield frame
 
-    @abstractmethod
-    def _framed(self, images: Iterator[RunFrame]) -> Iterator[RunFrame]: ...
 
-
-class FramesAlongPoses(_FramesAlong):
+def frames_along_poses(source: Source, stream: PoseStream) -> FramesAlong:
     """The frames of a source whose robot's poses are known over time.
 
     The pose of an image is that between the two poses before and after it. Images without a pose
     at their time are no part of the run; the first one's step is zero.
     """
 
-    def __init__(self, source: Source, poses: PoseStream) -> None:
-        super().__init__(source)
-        self._poses = poses
-        self.why_left_out = f"images without a pose of {poses.name} at their time: left out"
-
-    def _framed(self, images: Iterator[RunFrame]) -> Iterator[RunFrame]:
-        with closing(self._poses.read()) as stream:
-            poses = PosesOverTime(stream, self._poses.name)
+    def framed(images: Iterator[RunFrame]) -> Generator[RunFrame | None, None, None]:
+        with closing(stream.read()) as read:
+            poses = PosesOverTime(read, stream.name)
             last: TimedPose | None = None
             for image in images:
                 pose = None if image.time_s is None else poses.at(image.time_s)
                 if pose is None:
-                    self.left_out += 1
+                    yield None
                     continue
                 if last is not None:
                     image = replace(image, step=step_between(image.step.prefix, last, pose))
                 yield image
                 last = pose
 
+    why = f"images without a pose of {stream.name} at their time: left out"
+    return FramesAlong(source, framed, why)
 
-class FramesAlongRows(_FramesAlong):
+
+def frames_along_rows(source: Source, path: Path) -> FramesAlong:
     """The frames of a source whose STEP rows are in a file, in the same order.
 
     A row belongs to the image whose name is the last part of its prefix. Images without a row are
     no part of the run; rows without an image are frames that cannot be worked on.
     """
+    names = NameIndex(_encoded(_image_name(step)) for step in read_steps(path))
 
-    why_left_out = "images are not named by a STEP row: left out"
-
-    def __init__(self, source: Source, path: Path) -> None:
-        super().__init__(source)
-        self._path = path
-        self._names = NameIndex(_encoded(_image_name(step)) for step in read_steps(path))
-
-    def _framed(self, images: Iterator[RunFrame]) -> Iterator[RunFrame]:
-        steps = read_steps(self._path)
+    def framed(images: Iterator[RunFrame]) -> Generator[RunFrame | None, None, None]:
+        steps = read_steps(path)
         for image in images:
             prefix = image.step.prefix
-            if self._names.find(_encoded(prefix)) is None:
-                self.left_out += 1
+            if names.find(_encoded(prefix)) is None:
+                yield None
                 continue
             for step in steps:
                 if _image_name(step) == prefix:
@@ -89,11 +85,13 @@ class FramesAlongRows(_FramesAlong):
                 yield RunFrame(step, None)
             else:
                 raise DetectError(
-                    f"{self._path}: the row of {prefix} comes too early: "
+                    f"{path}: the row of {prefix} comes too early: "
                     "expected the STEP rows in the order of the images"
                 )
         for step in steps:
             yield RunFrame(step, None)
+
+    return FramesAlong(source, framed, "images are not named by a STEP row: left out")
 
 
 class FirstFrames:

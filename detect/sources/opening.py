@@ -37,10 +37,6 @@ def open_calibrated(
         The calibration; by default the one beside the images.
     options : SourceOptions, optional
 
-    Returns
-    -------
-    Run
-
     Raises
     ------
     DetectError
@@ -60,26 +56,12 @@ def open_calibrated(
 def open_source(
     name: Path, camera_path: Path | None = None, options: SourceOptions | None = None
 ) -> ImageRun:
-    """Open what holds a run's images, with the calibration that there may be.
-
-    Parameters and errors are those of `open_calibrated`, except for a missing calibration.
-
-    Returns
-    -------
-    ImageRun
-        A `Run` if there is a calibration.
-    """
+    """As `open_calibrated`; a `Run` if there is a calibration."""
     return _open(name, camera_path, options or SourceOptions(), posed=False)
 
 
 def demand_recording(name: Path) -> None:
-    """Refuse a live camera where existing rows are used: its images are not theirs.
-
-    Raises
-    ------
-    DetectError
-        If this names one.
-    """
+    """Raise DetectError for a live camera: existing rows are not of its images."""
     if _LIVE.fullmatch(str(name)):
         raise DetectError(
             f"{name}: shows other images now than those that the rows are from: expected a "
@@ -138,7 +120,7 @@ def _source(name: Path, options: SourceOptions) -> Source:
 
 def _frames(source: Source, options: SourceOptions) -> tuple[Frames, Path | None]:
     """The frames of a source along the odometry that was named, and the file of that."""
-    from detect.sources.odometry import FramesAlongPoses, FramesAlongRows
+    from detect.sources.odometry import frames_along_poses, frames_along_rows
     from detect.sources.poses import PoseStream, tick_poses, tum_poses
 
     named = options.odometry
@@ -158,7 +140,7 @@ def _frames(source: Source, options: SourceOptions) -> tuple[Frames, Path | None
             )
         poses = PoseStream(named, Path(named), lambda: tick_poses(Path(named), *wheels))
     elif named and named != "none":
-        return FramesAlongRows(source, Path(named)), Path(named)
+        return frames_along_rows(source, Path(named)), Path(named)
     else:
         poses = None if named else source.poses(None)
     if poses is None:
@@ -168,7 +150,7 @@ def _frames(source: Source, options: SourceOptions) -> tuple[Frames, Path | None
             f"{source.name}: no times of the images: a trajectory needs them: "
             "name a file of rows 'prefix seconds' by --times"
         )
-    return FramesAlongPoses(source, poses), poses.path
+    return frames_along_poses(source, poses), poses.path
 
 
 def _shortened(run: ImageRun, count: int) -> ImageRun:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import csv
+import io
+import json
 import math
 from dataclasses import asdict, replace
 from typing import Any
@@ -18,7 +21,7 @@ from detect.settings import PUBLISHED, CircleSettings
 from detect.sources.opening import demand_recording, open_calibrated
 from detect.tune.grid import combinations
 from detect.tune.run import Settings, tune_run
-from detect.tune.table import curve_picture, records_csv, records_json, trial_records
+from detect.tune.table import curve_picture, trial_records
 from detect.viewing_options import Tune
 from landmarks import LandmarkFileError, read_tilts
 from storage import OutputExistsError, write_whole
@@ -74,10 +77,15 @@ def perform(options: Tune) -> int:
         "settings": {name: _plain(value) for name, value in asdict(base).items()},
         "varied": varied,
     }
+    table = io.StringIO()
+    writer = csv.DictWriter(table, list(records[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows({**r, "front": int(r["front"]), "knee": int(r["knee"])} for r in records)
+    document = json.dumps({**head, "trials": records}, indent=1, allow_nan=False)
     title = f"{len(grid)} settings on {len(frames)} frames of {run.name}"
     contents = {
-        "table.csv": records_csv(records),
-        "table.json": records_json(head, records),
+        "table.csv": table.getvalue().encode(),
+        "table.json": f"{document}\n".encode(),
         "curve.png": curve_picture(grid, trials, title),
     }
     output.mkdir(parents=True, exist_ok=True)

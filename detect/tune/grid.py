@@ -17,21 +17,9 @@ Combination = dict[str, Any]
 
 
 def parameter_value(kind: type, name: str, text: str) -> Any:
-    """Convert a word to the value of a parameter.
+    """The value that a word stands for, of a field of a dataclass of parameters.
 
-    Parameters
-    ----------
-    kind : type
-        `CircleSettings`, `LineSettings` or another dataclass of parameters.
-    name : str
-        One of its fields.
-    text : str
-        The word.
-
-    Raises
-    ------
-    DetectError
-        If there is no such field, it is no single value, or the word is none of its values.
+    Raises DetectError if there is no such field, it is no single value, or this is none of its.
     """
     known = {field.name for field in fields(kind)}
     if name not in known:

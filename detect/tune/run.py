@@ -8,6 +8,7 @@ from concurrent.futures import Executor
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, replace
 from itertools import chain
+from typing import Any
 
 from detect.comparison.circles import compare_frames
 from detect.comparison.lines import compare_line_frames
@@ -53,24 +54,16 @@ def tune_run(
     tilts: ByPrefix[FrameTilt] | None = None,
     on_progress: Callable[[], None] | None = None,
 ) -> Iterator[Trial]:
-    """Detect with each setting in turn, and compare; yields the trial of each.
+    """Detect in frames of a run with each setting, all of one kind; yields the trial of each.
 
-    Parameters
-    ----------
-    run : Run
-    frames : sequence of (RunFrame, Frame)
-        Which of its frames, with their reference rows.
-    settings : sequence of CircleSettings, or of LineSettings
-        What to try; all of one kind.
-    options : CompareOptions
-    workers : Workers
-        They are started once for all settings, and again where some of them have died.
-    tilts : mapping, optional
-        Tilts by image prefix: positions of discs are corrected for them.
-    on_progress : callable, optional
-        Called once after every frame of every setting.
+    `frames` come with their reference rows; `tilts`, by image prefix, correct positions of discs.
+    `workers` are started once for all settings, and again where some of them have died;
+    `on_progress` is called after every frame of every setting.
     """
-    plans = [_plan(run, each) for each in settings]
+    kind = "circles" if isinstance(settings[0], CircleSettings) else "lines"
+    changes: list[dict[str, Any]] = [{kind: each} for each in settings]
+    plan = FramePlan(run.camera, working_folder=Path.cwd())
+    plans = [replace(plan, **change) for change in changes]
     known = Known(tilts=tilts)
     tasks = [FrameTask(frame, known.of(frame.step.prefix)) for frame, _ in frames]
     reference = [rows for _, rows in frames]
@@ -79,7 +72,6 @@ def tune_run(
         for plan in plans:
             found: list[Frame] = []
             failures: list[str] = []
-            kind = "circles" if plan.circles is not None else "lines"
             with closing(detect_chunks(tasks, plan, same())) as chunks:
                 for _, each in chain.from_iterable(chunks):
                     found += frames_of_rows(
@@ -125,9 +117,3 @@ def _kept(workers: Workers, plan: FramePlan) -> Iterator[Callable[[], Workers]]:
 
     with ExitStack() as started:
         yield of_next_setting
-
-
-def _plan(run: Run, settings: Settings) -> FramePlan:
-    if isinstance(settings, CircleSettings):
-        return FramePlan(run.camera, circles=settings)
-    return FramePlan(run.camera, lines=settings)

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from detect.comparison.circles import compare_runs
-from detect.comparison.lines import compare_line_runs
+from detect.comparison.lines import compare_line_frames
 from detect.comparison.result import CompareOptions, DiscComparison, LineComparison
 from detect.line_settings import LineSettings
 from detect.run import open_run
@@ -120,7 +120,7 @@ def redetected_lines(run: Path, folder: Path) -> LineComparison:
     plan = FramePlan(opened.camera, lines=LineSettings())
     summary = detect_run(Job(opened, plan, {"lines": output, "tilt": folder / "detected.tilt"}))
     assert summary.failures == []
-    return compare_line_runs(run, detected=output)
+    return compare_line_frames(read_frames(run / "map.lines"), read_frames(output))
 
 
 @pytest.mark.long

@@ -17,11 +17,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from camera import Camera, read_camera
-from detect.drawing.lines import draw_lines, draw_response, draw_tracks, track_pixels
+from detect.comparison.result import CompareOptions
+from detect.drawing.frame import draw_rows
+from detect.drawing.inputs import SeenRows
+from detect.drawing.rejected import draw_response, draw_tracks, track_pixels
 from detect.errors import DetectError, FrameError
 from detect.line_settings import DEFAULT, PUBLISHED, REPORT, LineSettings
 from detect.lines import ACCEPTED, JOINED, beyond_doubt, detect_lines
+from detect.seen import Sight
+from detect.settings import CircleSettings
 from detect.verticals.response import line_response, strip_of
+from landmarks import Frame, Step
 from lut.verticals import build_vertical_table
 from tests.detect.line_scene import Edge, edge_columns, mirrored, pinhole, render, tilted
 from tests.detect.verticals.stages import judge_tracks, line_starts, line_tracks
@@ -365,13 +371,16 @@ def test_settings_without_sense_are_refused(name: str, value: object) -> None:
 def test_drawn_lines_lie_on_the_edges() -> None:
     image = np.full((160, 240), 90, np.uint8)
     found = detect_lines(scene(CAMERA), TABLE)
-    picture = draw_lines(image, CAMERA, found)
+    frame = Frame(Step("x", *[0.0] * 9), found.landmarks())
+    picture = draw_rows(
+        image, Sight(CAMERA), SeenRows(lines=frame), CircleSettings(), CompareOptions()
+    )
     green = (picture[..., 1] > 150) & (picture[..., 2] < 120)
     rows = np.arange(40, 120)
     for bearing in truth():
         u = np.rint(edge_columns(CAMERA, bearing, rows.astype(np.float64))).astype(int)
         assert np.mean([green[v, c - 1 : c + 2].any() for v, c in zip(rows, u)]) > 0.9
-    assert picture.shape == (160, 240, 3)
+    assert picture.shape[1:] == (240, 3)
 
 
 def test_drawn_tracks_name_their_fates() -> None:

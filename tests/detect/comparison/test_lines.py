@@ -15,16 +15,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from detect.comparison.lines import compare_line_frames, compare_line_runs
+from detect.comparison.lines import compare_line_frames
 from detect.comparison.report import format_json
 from detect.comparison.result import CompareError, CompareOptions, LineComparison, unmet_demands
 from landmarks import (
     CircleLandmark,
     Frame,
     Landmark,
-    LandmarkFileError,
     LineLandmark,
     Step,
+    read_frames,
     write_frames,
 )
 from tests.detect.comparison.formatting import format_text
@@ -325,21 +325,22 @@ def test_text_shows_the_figures_plainly() -> None:
     assert max(map(len, text.splitlines())) <= 100
 
 
-def test_runs_are_compared_by_their_files(tmp_path: Path) -> None:
-    write_frames(tmp_path / "map.lines", REFERENCE, line_end="\r\n")
-    write_frames(tmp_path / "detected.lines", DETECTED)
-    found = compare_line_runs(tmp_path)
+def test_files_are_compared(tmp_path: Path) -> None:
+    files = tmp_path / "map.lines", tmp_path / "detected.lines"
+    write_frames(files[0], REFERENCE, line_end="\r\n")
+    write_frames(files[1], DETECTED)
+
+    def compared(
+        reference: Path, detected: Path, options: CompareOptions | None = None
+    ) -> LineComparison:
+        return compare_line_frames(read_frames(reference), read_frames(detected), options)
+
+    found = compared(*files)
     assert (found.matched, found.missed, found.extra) == (4, 1, 1)
-    assert found.reference_name == str(tmp_path / "map.lines")
     strict = CompareOptions(tolerance_deg=0.01, sigmas=0)
-    assert compare_line_runs(tmp_path, options=strict).matched == 2
-    swapped = compare_line_runs(
-        tmp_path, reference=tmp_path / "detected.lines", detected=tmp_path / "map.lines"
-    )
+    assert compared(*files, strict).matched == 2
+    swapped = compared(files[1], files[0])
     assert (swapped.reference, swapped.matched) == (5, 4)
-    (tmp_path / "detected.lines").unlink()
-    with pytest.raises(LandmarkFileError, match=r"detected\.lines: no such landmark file"):
-        compare_line_runs(tmp_path)
 
 
 LINES = st.lists(

@@ -7,23 +7,27 @@ import pytest
 from numpy.typing import NDArray
 
 from camera import Camera
-from detect.circles import CircleDetections
-from detect.drawing.frame import draw_circles
+from detect.comparison.result import CompareOptions
+from detect.drawing.frame import draw_rows
+from detect.drawing.inputs import SeenRows
+from detect.seen import Sight
 from detect.settings import CircleSettings
+from landmarks import Frame, Step, circle_landmarks
 from lut import ring
 
 SETTINGS = CircleSettings()
 
 
-def at(*places: tuple[float, float]) -> CircleDetections:
-    count = len(places)
-    return CircleDetections(
-        pixels=np.zeros((count, 2), np.int64),
-        floor_xy=np.array(places, float).reshape(count, 2),
-        covariance=np.tile(1e-4 * np.eye(2), (count, 1, 1)),
-        quality=np.full(count, 0.87),
-        evidence=np.full(count, 9.0),
-    )
+def drawn(
+    image: NDArray[np.uint8], camera: Camera, *places: tuple[float, float]
+) -> NDArray[np.uint8]:
+    """The image with discs of quality 0.87, without the line of words below."""
+    xy = np.array(places, float).reshape(-1, 2)
+    covariance = np.tile(1e-4 * np.eye(2), (len(xy), 1, 1))
+    discs = circle_landmarks(xy, np.full(len(xy), 0.87), covariance, np.full(len(xy), -1))
+    rows = SeenRows(circles=Frame(Step("x", *[0.0] * 9), discs))
+    picture = draw_rows(image, Sight(camera), rows, SETTINGS, CompareOptions())
+    return picture[: image.shape[0]]
 
 
 def changed(canvas: NDArray[np.uint8], image: NDArray[np.uint8]) -> NDArray[np.bool_]:
@@ -38,7 +42,7 @@ def image() -> NDArray[np.uint8]:
 def test_outlines_and_number_are_drawn(image: NDArray[np.uint8], published_camera: Camera) -> None:
     place = (0.2, -1.3)
     before = image.copy()
-    canvas = draw_circles(image, published_camera, at(place), SETTINGS)
+    canvas = drawn(image, published_camera, place)
     assert canvas.shape == (288, 768, 3)
     assert canvas.dtype == np.uint8
     np.testing.assert_array_equal(image, before)
@@ -57,7 +61,7 @@ def test_outlines_and_number_are_drawn(image: NDArray[np.uint8], published_camer
 
 def test_the_rest_is_the_image(image: NDArray[np.uint8], published_camera: Camera) -> None:
     place = (0.2, -1.3)
-    canvas = draw_circles(image, published_camera, at(place), SETTINGS)
+    canvas = drawn(image, published_camera, place)
     v, u = np.nonzero(changed(canvas, image))
     seen = published_camera.project_floor(place + ring(SETTINGS.outer_radius_m, 64))
     left, top = seen.min(axis=0)
@@ -69,17 +73,14 @@ def test_the_rest_is_the_image(image: NDArray[np.uint8], published_camera: Camer
 
 
 def test_without_discs_nothing_is_drawn(image: NDArray[np.uint8], published_camera: Camera) -> None:
-    canvas = draw_circles(image, published_camera, at(), SETTINGS)
+    canvas = drawn(image, published_camera)
     assert not changed(canvas, image).any()
 
 
 def test_each_disc_is_drawn(image: NDArray[np.uint8], published_camera: Camera) -> None:
     places = [(0.2, -1.3), (-0.7, -2.2)]
-    both = changed(draw_circles(image, published_camera, at(*places), SETTINGS), image)
-    single = [
-        changed(draw_circles(image, published_camera, at(place), SETTINGS), image)
-        for place in places
-    ]
+    both = changed(drawn(image, published_camera, *places), image)
+    single = [changed(drawn(image, published_camera, place), image) for place in places]
     np.testing.assert_array_equal(both, single[0] | single[1])
     assert not np.any(single[0] & single[1])
 
@@ -87,9 +88,9 @@ def test_each_disc_is_drawn(image: NDArray[np.uint8], published_camera: Camera) 
 def test_discs_at_the_border_are_cut(image: NDArray[np.uint8], published_camera: Camera) -> None:
     """Of a disc half outside, the half inside is drawn; one behind the camera is not."""
     place = published_camera.floor_from_pixel(np.array([3.0, 200.0]))
-    canvas = draw_circles(image, published_camera, at((place[0], place[1])), SETTINGS)
+    canvas = drawn(image, published_camera, (place[0], place[1]))
     _, u = np.nonzero(changed(canvas, image))
     assert u.min() == 0
     assert 3 < u.max() < 80
-    behind = draw_circles(image, published_camera, at((0.0, 3.0)), SETTINGS)
+    behind = drawn(image, published_camera, (0.0, 3.0))
     assert not changed(behind, image).any()

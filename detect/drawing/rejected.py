@@ -1,4 +1,4 @@
-"""Detected lines, the response and rejected tracks drawn for people."""
+"""What detectors looked at and rejected: tracks and response of lines, candidates for markers."""
 
 from __future__ import annotations
 
@@ -7,19 +7,20 @@ from collections import Counter
 import numpy as np
 from numpy.typing import NDArray
 
-from camera import Camera
-from detect.drawing.frame import LINE_COLOUR, SIGMA_COLOUR, line_curves, sigma_bars
-from detect.drawing.strokes import Colour, canvas_of, draw_bar, draw_curve, draw_text, with_legend
+from detect.drawing.frame import LINE_COLOUR
+from detect.drawing.strokes import Colour, canvas_of, draw_curve, with_legend
 from detect.lines import ACCEPTED, JOINED, LineDetections
+from detect.markers.detect import ACCEPTED as ACCEPTED_MARKER
+from detect.markers.detect import SAME_MARKER, MarkerDetections
 from detect.verticals.tracking import LineTracks
 from lut.verticals import VerticalTable
 
 FloatArray = NDArray[np.float64]
 
-_JOINED_COLOUR: Colour = (255, 190, 0)
+_CANDIDATE_COLOUR: Colour = (255, 150, 40)
 _FATE_COLOURS: dict[str, Colour] = {
     ACCEPTED: LINE_COLOUR,
-    JOINED: _JOINED_COLOUR,
+    JOINED: (255, 190, 0),
     "short": (120, 120, 120),
     "no maximum": (200, 0, 120),
     "little evidence": (200, 120, 60),
@@ -34,35 +35,10 @@ _FATE_COLOURS: dict[str, Colour] = {
 }
 
 
-def draw_lines(
-    image: NDArray[np.uint8], camera: Camera, found: LineDetections
-) -> NDArray[np.uint8]:
-    """Draw lines through the distortion, with bars of their standard deviations on the horizon.
-
-    A bar reaches one standard deviation to each side of where the line crosses the horizon (the
-    report's figure 6). Lines joined from several edges have another colour. Of a grey image (H, W),
-    returns a picture (H, W, 3).
-    """
-    canvas = canvas_of(image, camera)
-    curves, bars = line_curves(camera, found.ends), sigma_bars(camera, found.ends, found.sigma_rad)
-    for curve, bar, members in zip(curves, bars, found.members):
-        draw_curve(canvas, curve, LINE_COLOUR if len(members) == 1 else _JOINED_COLOUR)
-        draw_bar(canvas, bar, SIGMA_COLOUR)
-    text = "no tilt"
-    if found.tilt is not None:
-        pitch, roll = np.degrees([found.tilt.pitch_rad, found.tilt.roll_rad])
-        text = f"pitch {pitch:.2f}  roll {roll:.2f} deg  ({found.tilt.lines} lines)"
-    draw_text(canvas, text, (0, image.shape[0]), SIGMA_COLOUR, 0.4, (4, -5))
-    return canvas
-
-
 def draw_tracks(
     image: NDArray[np.uint8], table: VerticalTable, found: LineDetections
 ) -> NDArray[np.uint8]:
-    """Draw the points of tracks, coloured by their fates, and below how many have each fate.
-
-    Of a grey image (H, W), returns a picture (H + h, W, 3); h is the height of the legend.
-    """
+    """Draw the points of tracks, coloured by their fates, with a legend below."""
     canvas = canvas_of(image)
     for t, fate in enumerate(found.fate):
         points = np.rint(track_pixels(found.tracks, table, t)).astype(np.intp)
@@ -70,6 +46,16 @@ def draw_tracks(
     counts = sorted(Counter(found.fate).items())
     words = [(f"{fate}: {count}", _FATE_COLOURS[fate]) for fate, count in counts]
     return with_legend(canvas, words, 190, 0.38)
+
+
+def draw_candidates(picture: NDArray[np.uint8], found: MarkerDetections) -> NDArray[np.uint8]:
+    """The picture with candidates that are no markers, and below it why any were rejected."""
+    for candidate in found.candidates:
+        if candidate.fate not in (ACCEPTED_MARKER, SAME_MARKER):
+            draw_curve(picture, candidate.outline, _CANDIDATE_COLOUR, closed=True)
+    causes = sorted(found.rejected.items())
+    words = [(f"{cause}: {count}", _CANDIDATE_COLOUR) for cause, count in causes]
+    return with_legend(picture, words, 210, 0.36)
 
 
 def draw_response(response: NDArray[np.float32], table: VerticalTable) -> NDArray[np.uint8]:
