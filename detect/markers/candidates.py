@@ -13,7 +13,6 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import cv2
@@ -67,15 +66,6 @@ class Layer(NamedTuple):
     closed: GreyImage
 
 
-@dataclass(frozen=True)
-class Mask:
-    """Where an image reduced by `scale` is darker than a threshold: 1 there, 0 elsewhere."""
-
-    scale: int
-    threshold: float
-    dark: GreyImage
-
-
 class Region(NamedTuple):
     """A dark region that may be a marker."""
 
@@ -94,28 +84,25 @@ def closing(grey: GreyImage, radius: int) -> GreyImage:
 
 def candidate_regions(
     image: GreyImage, noise: float, dictionary: MarkerDictionary, settings: MarkerSettings
-) -> tuple[list[Region], Counter[str], list[Mask]]:
-    """Regions of an image that may be markers, how many others there are by cause, and all masks.
+) -> tuple[list[Region], Counter[str]]:
+    """Regions of an image that may be markers, and how many others there are by cause.
 
     From fine to coarse layers and high to low thresholds; the smallest specks are not counted. The
     share of white in a dictionary's markers decides how much of a region may be holes.
     """
     layers = _layers(image, settings)
-    white_cells = float(dictionary.patterns.sum(axis=(1, 2)).mean())
-    white = white_cells * dictionary.cell**2
+    white = float(dictionary.patterns.sum(axis=(1, 2)).mean()) * dictionary.cell**2
     regions: list[Region] = []
     rejected: Counter[str] = Counter()
-    masks = []
     for layer in layers:
         widest = math.inf if layer is layers[-1] else _WIDEST_RADII * layer.radius
-        for mask in _masks(layer, noise, settings):
-            masks.append(mask)
-            for found in _marker_regions(mask, widest, white, settings):
+        for dark in _masks(layer, noise, settings):
+            for found in _marker_regions(dark, layer.scale, widest, white, settings):
                 if isinstance(found, str):
                     rejected[found] += 1
                 else:
                     regions.append(found)
-    return regions, rejected, masks
+    return regions, rejected
 
 
 def _layers(image: GreyImage, settings: MarkerSettings) -> list[Layer]:
@@ -145,44 +132,44 @@ def _layers(image: GreyImage, settings: MarkerSettings) -> list[Layer]:
     return layers
 
 
-def _masks(layer: Layer, noise: float, settings: MarkerSettings) -> Iterator[Mask]:
+def _masks(layer: Layer, noise: float, settings: MarkerSettings) -> Iterator[GreyImage]:
     """Where a layer is dark, for each threshold; low ones of the image itself are smoothed."""
     gate = settings.dark_noise * noise / layer.scale
-    smooth = None
+    plain = smooth = layer.grey, layer.closed
+    if layer.scale == 1 and settings.pyramid and min(settings.thresholds) < _SMOOTH_BELOW:
+        window = (5, 5) if noise > _MUCH_NOISE else (3, 3)
+        grey = np.asarray(cv2.GaussianBlur(layer.grey, window, 0), np.uint8)
+        smooth = grey, closing(grey, layer.radius)
     for threshold in settings.thresholds:
-        source, least = layer, gate
-        if layer.scale == 1 and settings.pyramid and threshold < _SMOOTH_BELOW:
-            if smooth is None:
-                window = (5, 5) if noise > _MUCH_NOISE else (3, 3)
-                grey = np.asarray(cv2.GaussianBlur(layer.grey, window, 0), np.uint8)
-                smooth = Layer(1, layer.radius, grey, closing(grey, layer.radius))
-            source, least = smooth, 0.5 * gate
-        dark = dark_pixels(source, threshold, least, settings.darkness)
-        yield Mask(layer.scale, threshold, dark)
+        soft = threshold < _SMOOTH_BELOW and smooth is not plain
+        source, least = (smooth, 0.5 * gate) if soft else (plain, gate)
+        yield dark_pixels(*source, threshold, least, settings.darkness)
 
 
-def dark_pixels(layer: Layer, threshold: float, gate: float, darkness: Darkness) -> GreyImage:
-    """1 where a layer is darker than its closing by the threshold and by `gate` grey levels."""
-    closed = np.arange(256.0)
-    limit = closed * (1.0 - threshold) if darkness == "ratio" else closed - 255.0 * threshold
+def dark_pixels(
+    grey: GreyImage, closed: GreyImage, threshold: float, gate: float, darkness: Darkness
+) -> GreyImage:
+    """1 where an image is darker than its closing by the threshold and by `gate` grey levels."""
+    levels = np.arange(256.0)
+    limit = levels * (1.0 - threshold) if darkness == "ratio" else levels - 255.0 * threshold
     # I1 < limit(I2), for whole grey levels; the limit itself is not dark.
-    table = np.clip(np.ceil(np.minimum(limit, closed - gate)), 0, 255).astype(np.uint8)
-    dark = cv2.compare(layer.grey, cv2.LUT(layer.closed, table), cv2.CMP_LT)
+    table = np.clip(np.ceil(np.minimum(limit, levels - gate)), 0, 255).astype(np.uint8)
+    dark = cv2.compare(grey, cv2.LUT(closed, table), cv2.CMP_LT)
     return np.asarray(dark, np.uint8) & np.uint8(1)
 
 
 def _marker_regions(
-    mask: Mask, widest: float, white: float, settings: MarkerSettings
+    dark: GreyImage, scale: int, widest: float, white: float, settings: MarkerSettings
 ) -> Iterator[Region | str]:
-    """Regions of a mask that may be markers, and for the others why not.
+    """Dark regions of a layer that may be markers, and for the others why not.
 
     `white` is the expected share of white, `widest` the largest side of a region.
     """
-    least_px, most_px = _area_limits(settings, mask.scale)
+    least_px, most_px = _area_limits(settings, scale)
     least_white = settings.least_white * white
     most_white = min(settings.most_white * white, 0.9)
-    contours, hierarchy = cv2.findContours(mask.dark, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
-    height, width = mask.dark.shape
+    contours, hierarchy = cv2.findContours(dark, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+    height, width = dark.shape
     for k, outline in enumerate(contours):
         if hierarchy[0, k, 3] >= 0 or len(outline) < 4 * (_LEAST_SIDE_PX - 1):
             continue
@@ -215,8 +202,8 @@ def _marker_regions(
         if not least_white <= bright / area <= most_white:
             yield WHITE_SHARE
             continue
-        pixels = mask.scale * hull + 0.5 * (mask.scale - 1)
-        yield Region(mask.scale, np.asarray(pixels, np.float64))
+        pixels = scale * hull + 0.5 * (scale - 1)
+        yield Region(scale, np.asarray(pixels, np.float64))
 
 
 def _area_limits(settings: MarkerSettings, scale: int) -> tuple[float, float]:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from camera import Camera
 from detect.markers import identification as identities
-from detect.markers.candidates import Mask, Region, candidate_regions
+from detect.markers.candidates import Region, candidate_regions
 from detect.markers.dictionaries import Templates, templates_of
 from detect.markers.edges import NO_EDGE, RefinedQuadrangle, refine_quadrangle
 from detect.markers.identification import (
@@ -28,7 +28,7 @@ from detect.markers.identification import (
     sampled_cells,
     verified_identity,
 )
-from detect.markers.lens import Lens, Picture, picture_of
+from detect.markers.lens import Picture, picture_of
 from detect.markers.pattern_fit import FIRST_LOOK, Levels, PatternFit, fit_marker
 from detect.markers.quadrangle import (
     NO_QUADRANGLE,
@@ -80,44 +80,19 @@ class Candidate:
 
 @dataclass(frozen=True)
 class MarkerDetections:
-    """The markers found in one image, by ID and place, and the rejected candidates.
-
-    Attributes
-    ----------
-    dictionary : str
-        Name of the dictionary.
-    ids : (N,) int64
-        The markers' numbers.
-    corners : (N, 4, 2) float64
-        Top left, top right, bottom right, bottom left of each marker as printed; pixels (u, v) of
-        the image as it is.
-    covariance : (N, 4, 2, 2) float64
-        Of each corner, pixels squared.
-    quality : (N,) float64
-        1 less the mean absolute difference between the cells' whiteness and the pattern.
-    margin : (N,) float64
-        How much nearer the pattern is than the second best, in cells.
-    explained : (N,) float64
-        Share of the grey values' variance, noise aside, that the fit explains; NaN without
-        ``joint``.
-    candidates : tuple of Candidate
-        All regions that came as far as having corners.
-    rejected : Counter
-        How many regions and candidates were not taken, by cause.
-    masks : tuple of Mask
-        The dark pixels of phase 1, if they were to be kept.
-    """
+    """The N markers found in one image, by ID and place, and the rejected candidates."""
 
     dictionary: str
-    ids: NDArray[np.int64]
+    ids: NDArray[np.int64]  # (N,)
+    #: (N, 4, 2) top left, top right, bottom right, bottom left as printed; pixels of the image.
     corners: FloatArray
-    covariance: FloatArray
-    quality: FloatArray
-    margin: FloatArray
+    covariance: FloatArray  # (N, 4, 2, 2) of each corner, pixels squared
+    quality: FloatArray  # (N,) 1 less the mean difference between cells' whiteness and pattern
+    margin: FloatArray  # (N,) how much nearer the pattern is than the second best, in cells
+    #: (N,) share of the grey values' variance, noise aside, that the fit explains; NaN without one.
     explained: FloatArray
-    candidates: tuple[Candidate, ...]
-    rejected: Counter[str]
-    masks: tuple[Mask, ...]
+    candidates: tuple[Candidate, ...]  # all regions that came as far as having corners
+    rejected: Counter[str]  # how many regions and candidates were not taken, by cause
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -150,8 +125,6 @@ def detect_markers(
     image: NDArray[np.uint8],
     settings: MarkerSettings,
     camera: Camera | None = None,
-    *,
-    keep_masks: bool = False,
 ) -> MarkerDetections:
     """Find the square markers in one image.
 
@@ -160,16 +133,9 @@ def detect_markers(
     image : (H, W) uint8
         Grey image.
     settings : MarkerSettings
-        The settings.
     camera : Camera, optional
         The calibration, whose distortion bends the markers' edges; without one they are taken to
         be straight in the image.
-    keep_masks : bool
-        Whether the result holds the dark pixels of phase 1, for display.
-
-    Returns
-    -------
-    MarkerDetections
 
     Raises
     ------
@@ -184,29 +150,27 @@ def detect_markers(
     """
     templates = templates_of(settings.dictionary, settings.ids)
     picture = picture_of(image, camera)
-    lens = picture.lens
 
     # Phases 1 and 2: dark regions that may be markers.
-    regions, rejected, masks = candidate_regions(
+    regions, rejected = candidate_regions(
         picture.grey, picture.noise, templates.dictionary, settings
     )
 
     # Phase 3: their corners, the edges in the image itself, and which marker it is.
     markers: list[_Marker] = []
     candidates: list[Candidate] = []
-    tried, tries = np.empty((len(regions), 4, 2)), 0
+    tried = np.empty((0, 4, 2))
     for region in regions:
-        rough = _rough_quadrangle(region, lens, settings)
+        rough = _rough_quadrangle(region, picture, settings)
         if isinstance(rough, str):
             rejected[rough] += 1
             continue
         if any(overlap(rough, marker.corners) for marker in markers):
-            candidates.append(Candidate(lens.bend(rough), SAME_MARKER))
+            candidates.append(Candidate(picture.bend(rough), SAME_MARKER))
             continue
-        if count_same(rough, tried[:tries]) >= _TRIES:
+        if count_same(rough, tried) >= _TRIES:
             continue
-        tried[tries] = rough
-        tries += 1
+        tried = np.concatenate([tried, rough[None]])
         side = math.sqrt(signed_area(rough))
         capture_px = _CAPTURE_LAYER_PX * region.scale + _CAPTURE_PX + _CAPTURE_WIDTHS * side
         refined = refine_quadrangle(
@@ -219,12 +183,12 @@ def detect_markers(
         else:
             fate = ACCEPTED
             markers.append(found)
-        candidates.append(Candidate(lens.bend(rough), fate, refined))
+        candidates.append(Candidate(picture.bend(rough), fate, refined))
 
     # Back to the image as it is.
     markers.sort(key=lambda m: (m.id, m.corners[0, 0], m.corners[0, 1]))
-    outlines = [lens.bend(marker.corners) for marker in markers]
-    spreads = [_image_covariance(m, at, lens, settings) for m, at in zip(markers, outlines)]
+    outlines = [picture.bend(marker.corners) for marker in markers]
+    spreads = [_image_covariance(m, at, picture, settings) for m, at in zip(markers, outlines)]
     return MarkerDetections(
         dictionary=settings.dictionary,
         ids=np.array([m.id for m in markers], dtype=np.int64),
@@ -235,13 +199,14 @@ def detect_markers(
         explained=np.array([m.explained for m in markers]),
         candidates=tuple(candidates),
         rejected=+rejected,
-        masks=tuple(masks) if keep_masks else (),
     )
 
 
-def _rough_quadrangle(region: Region, lens: Lens, settings: MarkerSettings) -> FloatArray | str:
+def _rough_quadrangle(
+    region: Region, picture: Picture, settings: MarkerSettings
+) -> FloatArray | str:
     """Rough corners of a region at straight positions, or the cause of there being none."""
-    hull = lens.straighten(region.hull)
+    hull = picture.straighten(region.hull)
     corners = rough_corners(hull, settings.corners)
     if corners is None or not is_convex(corners):
         return NOT_FOUR_CORNERS
@@ -331,7 +296,7 @@ def _marker(
 
 
 def _image_covariance(
-    marker: _Marker, pixels: FloatArray, lens: Lens, settings: MarkerSettings
+    marker: _Marker, pixels: FloatArray, picture: Picture, settings: MarkerSettings
 ) -> FloatArray:
     """(4, 2, 2) covariances of a marker's corners at their pixels in the image."""
     # A pixel's own square is taken for a Gaussian of its variance, 1/12 px^2; where there is little
@@ -339,6 +304,6 @@ def _image_covariance(
     # seems to be.
     optics = max(0.0, marker.blur_px**2 - 1.0 / 12.0)
     staircase_px = _STAIRCASE_PX * max(0.0, 1.0 - optics / _STAIRCASE_VARIANCE)
-    jacobian = np.array([lens.pixel_jacobian(pixel) for pixel in pixels])
+    jacobian = picture.pixel_jacobians(pixels)
     covariance = jacobian @ marker.covariance @ jacobian.transpose(0, 2, 1)
     return np.asarray(covariance + (settings.systematic_px**2 + staircase_px**2) * np.eye(2))

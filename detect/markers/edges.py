@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from detect.markers.lens import Picture, bent, straightened
+from detect.markers.lens import Picture
 from detect.markers.quadrangle import is_convex
 from detect.positive_definite import invert_positive, solve_positive
 
@@ -73,11 +73,24 @@ class RefinedQuadrangle(NamedTuple):
 class _Search(NamedTuple):
     """How edges are searched for."""
 
+    noise: float  # standard deviation, grey levels
     capture: float  # how far they may be from the rough ones, pixels
     border: float  # thickness of the black border, in widths of the marker
     blur: float  # expected standard deviation, pixels
     pixels: int
     close_enough: float
+
+
+class _Band(NamedTuple):
+    """Where an edge is searched for."""
+
+    start: FloatArray  # (2,) straight pixels
+    end: FloatArray
+    seen_start: FloatArray  # (2,) pixels of the image
+    seen_end: FloatArray
+    inwards: float  # how far, pixels
+    reach: float  # how far outwards, pixels
+    stride: int  # of columns (rows) one is used
 
 
 class _Pixels(NamedTuple):
@@ -132,8 +145,12 @@ def refine_quadrangle(
     refined: RefinedQuadrangle | None = None
     corners, reach, blur = rough, capture_px, _FIRST_BLUR_PX
     for pixels, close_enough in _QUICK_PASSES if quick else _PASSES:
-        search = _Search(reach, border, blur, pixels, close_enough)
-        last, refined = refined, _fit_edges(picture, corners, search)
+        search = _Search(max(picture.noise, LEAST_NOISE), reach, border, blur, pixels, close_enough)
+        seen = picture.bend(corners)
+        if not np.all(np.isfinite(seen)):
+            return None
+        last = refined
+        refined = _fit_edges(picture.grey, picture.straight, corners, seen, search)
         # What is not there is NaN.
         moved_far = not np.abs(refined.corners - rough).max() <= _LARGEST_MOVE * capture_px
         if moved_far or not is_convex(refined.corners):
@@ -147,8 +164,14 @@ def refine_quadrangle(
 
 
 @njit(cache=True, error_model="numpy")
-def _fit_edges(picture: Picture, corners: FloatArray, search: _Search) -> RefinedQuadrangle:
-    """Fit the four edges; NaN if one of them is not there."""
+def _fit_edges(
+    grey: NDArray[np.uint8],
+    straight: NDArray[np.float32],
+    corners: FloatArray,
+    seen: FloatArray,
+    search: _Search,
+) -> RefinedQuadrangle:
+    """Fit the four edges between corners, seen at some pixels; NaN if one is not there."""
     found = RefinedQuadrangle(
         np.full((4, 2), np.nan), np.zeros((4, 2, 2)),
         np.empty(4), np.empty(4), np.empty(4), np.empty(4),
@@ -164,8 +187,12 @@ def _fit_edges(picture: Picture, corners: FloatArray, search: _Search) -> Refine
         thickness = search.border * (across[0] * outwards[0] + across[1] * outwards[1])
         reach = min(search.capture, max(1.2, thickness))
         inwards = min(reach, max(1.0, 0.85 * thickness))
-        pixels = _pixels_along(picture, p0, p1, inwards, reach, search.pixels)
-        step = _fit_step(pixels, reach, max(picture.noise, LEAST_NOISE), search)
+        stride = max(
+            1, int(math.hypot(p1[0] - p0[0], p1[1] - p0[1]) * (inwards + reach) / search.pixels)
+        )
+        ends = _Band(p0, p1, seen[k], seen[(k + 1) % 4], inwards, reach, stride)
+        pixels = _pixels_along(grey, straight, ends)
+        step = _fit_step(pixels, reach, search)
         if math.isnan(step.start):
             return found
         found.dark[k], found.light[k] = step.dark, step.light
@@ -188,13 +215,14 @@ def _fit_edges(picture: Picture, corners: FloatArray, search: _Search) -> Refine
 
 
 @njit(cache=True, error_model="numpy")
-def _fit_step(pixels: _Pixels, reach: float, noise: float, search: _Search) -> _Step:
+def _fit_step(pixels: _Pixels, reach: float, search: _Search) -> _Step:
     """Robust least squares of a blurred step; NaN if there is none.
 
     By the Levenberg-Marquardt method, from the best split of the grey values in two.
     """
     if len(pixels.grey) < _LEAST_PIXELS:
         return _NO_STEP
+    noise = search.noise
     offset, turn, dark, light = _best_split(pixels, reach)
     if not light > dark + 0.3 * noise:
         return _NO_STEP
@@ -243,45 +271,35 @@ def _fit_step(pixels: _Pixels, reach: float, noise: float, search: _Search) -> _
 
 
 @njit(cache=True, error_model="numpy")
-def _pixels_along(
-    picture: Picture, p0: FloatArray, p1: FloatArray, inwards: float, reach: float, enough: int
-) -> _Pixels:
-    """Pixels near the line from p0 to p1 but not near its ends; of more than about `enough`, whole
-    columns (rows) are left out.
-    """
-    height, width = picture.grey.shape
-    length = math.hypot(p1[0] - p0[0], p1[1] - p0[1])
-    tx, ty = (p1[0] - p0[0]) / length, (p1[1] - p0[1]) / length
-    stride = max(1, int(length * (inwards + reach) / enough))
-    margin = min(max(1.0, 0.7 * reach), 0.2 * length)
-    a0, b0 = bent(picture.lens, p0[0], p0[1])
-    a1, b1 = bent(picture.lens, p1[0], p1[1])
-    if not math.isfinite(a0 + b0 + a1 + b1):
-        return _Pixels(np.empty(0), np.empty(0), np.empty(0))
-    flat = abs(a1 - a0) >= abs(b1 - b0)
-    most_a, most_b = width, height
-    if not flat:
-        a0, b0, a1, b1, most_a, most_b = b0, a0, b1, a1, most_b, most_a
-    slope = (b1 - b0) / (a1 - a0)
-    # A rough width of the band along the other axis; the test below is exact.
-    pad = 1.5 * reach + 2.0
-    first, last = max(0, int(min(a0, a1) - pad)), min(most_a, int(max(a0, a1) + pad) + 2)
+def _pixels_along(grey: NDArray[np.uint8], straight: NDArray[np.float32], band: _Band) -> _Pixels:
+    """Pixels near a line but not near its ends; of many, only some columns (rows)."""
+    height, width = grey.shape
+    start, end = band.seen_start, band.seen_end
+    line = band.end - band.start
+    length = math.hypot(line[0], line[1])
+    tx, ty = line / length
+    margin = min(max(1.0, 0.7 * band.reach), 0.2 * length)
+    # Along the axis a that the line goes along rather than b; the test below is exact.
+    a, b = (0, 1) if abs(end[0] - start[0]) >= abs(end[1] - start[1]) else (1, 0)
+    most_a, most_b = (width, height) if a == 0 else (height, width)
+    slope = (end[b] - start[b]) / (end[a] - start[a])
+    pad = 1.5 * band.reach + 2.0
+    first = max(0, int(min(start[a], end[a]) - pad))
+    last = min(most_a, int(max(start[a], end[a]) + pad) + 2)
     most = max(0, last - first) * (int(2.0 * pad) + 4)
-    along, across, grey = np.empty(most), np.empty(most), np.empty(most)
+    along, across, values = np.empty(most), np.empty(most), np.empty(most)
     count = 0
-    for a in range(first, last, stride):
-        middle = b0 + slope * (a - a0)
-        for b in range(max(0, int(middle - pad)), min(most_b, int(middle + pad) + 2)):
-            u, v = (a, b) if flat else (b, a)
-            x, y, _, _, _, _ = straightened(picture.lens, float(u), float(v))
-            s = (x - p0[0]) * tx + (y - p0[1]) * ty
-            d = (x - p0[0]) * ty - (y - p0[1]) * tx
-            if margin <= s <= length - margin and -inwards <= d <= reach:
-                along[count] = 2.0 * s / length - 1.0
-                across[count] = d
-                grey[count] = picture.grey[v, u]
+    for i in range(first, last, band.stride):
+        middle = start[b] + slope * (i - start[a])
+        for j in range(max(0, int(middle - pad)), min(most_b, int(middle + pad) + 2)):
+            u, v = (i, j) if a == 0 else (j, i)
+            x, y = straight[v, u, 0] - band.start[0], straight[v, u, 1] - band.start[1]
+            s, d = x * tx + y * ty, x * ty - y * tx
+            if margin <= s <= length - margin and -band.inwards <= d <= band.reach:
+                along[count], across[count] = 2.0 * s / length - 1.0, d
+                values[count] = grey[v, u]
                 count += 1
-    return _Pixels(along[:count], across[:count], grey[:count])
+    return _Pixels(along[:count], across[:count], values[:count])
 
 
 @njit(cache=True, error_model="numpy")

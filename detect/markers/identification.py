@@ -78,7 +78,7 @@ def sampled_cells(picture: Picture, corners: FloatArray, templates: Templates) -
     along = (centres[:, None] + _SPREAD_CELLS * cell * np.array([-1.0, 0.0, 1.0])).ravel()
     x, y = np.meshgrid(along, along)
     straight = cv2.perspectiveTransform(np.stack([x, y], axis=-1), square_homography(corners))
-    u, v = picture.lens.bend(np.asarray(straight, np.float64).reshape(-1, 2)).T
+    u, v = picture.bend(np.asarray(straight, np.float64).reshape(-1, 2)).T
     height, width = picture.grey.shape
     if not np.all((u >= 0.0) & (u <= width - 1.0) & (v >= 0.0) & (v <= height - 1.0)):
         return None

@@ -126,7 +126,7 @@ def fit_marker(
     whole *= variance * _inflation(samples.pixel, left)
     if not (np.all(np.isfinite(whole)) and np.all(np.diag(whole) > 0.0)):
         return None
-    products, squares = cell_sums(samples, pattern, model, left.residual)
+    products, squares = cell_sums(pattern, left)
     with np.errstate(divide="ignore", invalid="ignore"):
         cells = np.where(squares > 0.0, 1.0 - pattern.black + products / squares, 0.5)
         sigma = np.sqrt(variance / squares)
@@ -264,7 +264,7 @@ def _samples(
     """
     along = np.linspace(0.0, 1.0, 5)[:, None, None]
     outline = (1.0 - along) * corners + along * np.roll(corners, -1, axis=0)
-    pixels = picture.lens.bend(outline.reshape(-1, 2))
+    pixels = picture.bend(outline.reshape(-1, 2))
     low, high = pixels.min(axis=0), pixels.max(axis=0)
     last = np.array(picture.grey.shape[::-1]) - 1
     if not (np.all(low >= 0.0) and np.all(high <= last)):
@@ -281,7 +281,7 @@ def _samples(
     hashed = (u * 73856093) ^ (v * 19349663)
     some = hashed % every == 0
     pixel, hashed = np.stack([u[some], v[some]], axis=-1), hashed[some]
-    straight = picture.lens.straighten(pixel.astype(np.float64))
+    straight = picture.straight[pixel[:, 1], pixel[:, 0]].astype(np.float64)
     inverse = _inverse(square_homography(corners))
     projected = straight @ inverse[:, :2].T + inverse[:, 2]
     q = projected[:, 2:]

@@ -15,8 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-
-from detect.markers.quadrangle import project
+from scipy.special import ndtr
 
 FloatArray = NDArray[np.float64]
 
@@ -97,6 +96,9 @@ class Linearised(NamedTuple):
     residual: FloatArray  # (N,)
     weight: FloatArray  # (N,) of robust least squares
     jacobian: FloatArray  # (N, PARAMETERS)
+    place: FloatArray  # (N, 2) on the marker, in widths
+    sigma: FloatArray  # (N, 2) of the blur there
+    contrast: FloatArray  # (N,) of white and black there, grey levels
 
 
 def pattern_of(lines: FloatArray, black: FloatArray) -> Pattern:
@@ -189,7 +191,9 @@ def blurred_blackness(at: MarkerPlace, pattern: Pattern, work: FloatArray) -> Bl
 @njit(cache=True, error_model="numpy", inline="always")
 def _place_on_marker(model: Model, x: float, y: float) -> MarkerPlace:
     inverse = model.inverse
-    mx, my, q = project(inverse, x, y)
+    q = inverse[2, 0] * x + inverse[2, 1] * y + inverse[2, 2]
+    mx = (inverse[0, 0] * x + inverse[0, 1] * y + inverse[0, 2]) / q
+    my = (inverse[1, 0] * x + inverse[1, 1] * y + inverse[1, 2]) / q
     ax = (inverse[0, 0] - mx * inverse[2, 0]) / q
     ay = (inverse[0, 1] - mx * inverse[2, 1]) / q
     bx = (inverse[1, 0] - my * inverse[2, 0]) / q
@@ -211,7 +215,10 @@ def _light(c: FloatArray, x: float, y: float) -> float:
 def linearise(samples: Samples, pattern: Pattern, model: Model, outlier: float) -> Linearised:
     """The model at all pixels; residuals beyond `outlier` lose weight."""
     count = len(samples.grey)
-    left = Linearised(np.zeros(count), np.ones(count), np.zeros((count, PARAMETERS)))
+    left = Linearised(
+        np.zeros(count), np.ones(count), np.zeros((count, PARAMETERS)),
+        np.empty((count, 2)), np.empty((count, 2)), np.empty(count),
+    )  # fmt: skip
     work = np.empty((6, len(pattern.lines)))
     for n in range(count):
         x, y = samples.straight[n, 0], samples.straight[n, 1]
@@ -220,6 +227,8 @@ def linearise(samples: Samples, pattern: Pattern, model: Model, outlier: float) 
         lx, ly = x / samples.size, y / samples.size
         dark = _light(model.black, lx, ly)
         contrast = _light(model.white, lx, ly) - dark
+        left.place[n], left.sigma[n] = (at.x, at.y), (at.sigma_x, at.sigma_y)
+        left.contrast[n] = contrast
         light = 1.0 - d.value
         toned = light + model.tone * light * d.value
         value = dark + contrast * toned
@@ -259,29 +268,13 @@ def linearise(samples: Samples, pattern: Pattern, model: Model, outlier: float) 
     return left
 
 
-@njit(cache=True, error_model="numpy")
-def cell_sums(
-    samples: Samples, pattern: Pattern, model: Model, residual: FloatArray
-) -> tuple[FloatArray, FloatArray]:
+def cell_sums(pattern: Pattern, left: Linearised) -> tuple[FloatArray, FloatArray]:
     """For each cell (L - 1, L - 1) the sums, over all pixels, of the grey levels that a change from
     black to white would add, times residuals and squared.
 
     These do not spare outliers: a cell that is not what it should be must show.
     """
-    n = len(pattern.lines) - 1
-    products, squares = np.zeros((n, n)), np.zeros((n, n))
-    work = np.empty((6, n + 1))
-    for k in range(len(samples.grey)):
-        x, y = samples.straight[k, 0], samples.straight[k, 1]
-        at = _place_on_marker(model, x, y)
-        cx, cy = work[1], work[4]
-        x0, x1 = _cell_profile(at.x, at.sigma_x, pattern.lines, work[0], cx, work[2])
-        y0, y1 = _cell_profile(at.y, at.sigma_y, pattern.lines, work[3], cy, work[5])
-        lx, ly = x / samples.size, y / samples.size
-        contrast = _light(model.white, lx, ly) - _light(model.black, lx, ly)
-        for j in range(y0, y1):
-            for i in range(x0, x1):
-                share = contrast * (cy[j + 1] - cy[j]) * (cx[i + 1] - cx[i])
-                products[j, i] += share * residual[k]
-                squares[j, i] += share * share
-    return products, squares
+    z = (pattern.lines - left.place[..., None]) / left.sigma[..., None]
+    across, down = np.diff(ndtr(np.clip(z, -_REACH, _REACH)), axis=-1).transpose(1, 0, 2)
+    down = down * left.contrast[:, None]
+    return (down * left.residual[:, None]).T @ across, (down**2).T @ across**2

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 
+import cv2
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -82,63 +83,37 @@ def _farthest_points(hull: FloatArray) -> FloatArray:
     return np.asarray(chain[rivals.argmax(axis=1) == np.arange(len(chain))])
 
 
-@njit(cache=True, error_model="numpy")
 def signed_area(corners: FloatArray) -> float:
     """Area of a quadrangle (4, 2); positive if it is clockwise as seen in the image (v down)."""
     a, b = corners[2] - corners[0], corners[3] - corners[1]
     return float(0.5 * (a[0] * b[1] - a[1] * b[0]))
 
 
-@njit(cache=True, error_model="numpy")
-def contains(corners: FloatArray, x: float, y: float) -> bool:
-    """Whether a point is inside a clockwise convex quadrangle (4, 2)."""
-    for k in range(4):
-        a, b = corners[k], corners[(k + 1) % 4]
-        if not (b[0] - a[0]) * (y - a[1]) > (b[1] - a[1]) * (x - a[0]):
-            return False
-    return True
-
-
-@njit(cache=True, error_model="numpy")
 def is_convex(corners: FloatArray) -> bool:
     """Whether a clockwise quadrangle (4, 2) is strictly convex."""
-    for k in range(4):
-        a, b, c = corners[k], corners[(k + 1) % 4], corners[(k + 2) % 4]
-        if not (b[0] - a[0]) * (c[1] - b[1]) > (b[1] - a[1]) * (c[0] - b[0]):
-            return False
-    return True
+    x, y = (np.roll(corners, -1, axis=0) - corners).T
+    return bool(np.all(x * np.roll(y, -1) > y * np.roll(x, -1)))
 
 
-@njit(cache=True, error_model="numpy")
 def overlap(first: FloatArray, second: FloatArray) -> bool:
-    """Whether the middle of either clockwise convex quadrangle (4, 2) is inside the other."""
-    return contains(first, second[:, 0].mean(), second[:, 1].mean()) or contains(
-        second, first[:, 0].mean(), first[:, 1].mean()
+    """Whether the middle of either convex quadrangle (4, 2) is inside the other."""
+    return any(
+        cv2.pointPolygonTest(a.astype(np.float32), b.mean(axis=0).tolist(), False) > 0.0
+        for a, b in ((first, second), (second, first))
     )
 
 
-@njit(cache=True, error_model="numpy")
 def count_same(first: FloatArray, others: FloatArray) -> int:
     """How many of (N, 4, 2) quadrangles have the same corners as one, in any order."""
-    total = 0
-    for other in others:
-        farthest = 0.0
-        for corner in first:
-            nearest = math.inf
-            for k in range(4):
-                apart = max(abs(corner[0] - other[k, 0]), abs(corner[1] - other[k, 1]))
-                nearest = min(nearest, apart)
-            farthest = max(farthest, nearest)
-        if farthest <= _SAME_PX + _SAME_WIDTHS * math.sqrt(abs(signed_area(other))):
-            total += 1
-    return total
+    apart = np.abs(first[:, None] - others[:, None]).max(axis=-1)
+    a, b = (others[:, 2] - others[:, 0]).T, (others[:, 3] - others[:, 1]).T
+    widths = np.sqrt(0.5 * np.abs(a[0] * b[1] - a[1] * b[0]))
+    return int(np.sum(apart.min(axis=-1).max(axis=-1) <= _SAME_PX + _SAME_WIDTHS * widths))
 
 
 def square_homography(corners: FloatArray) -> FloatArray:
-    """(3, 3) homography that takes the unit square to four corners (4, 2); its last entry is 1.
+    """(3, 3) homography from the unit square to four corners (4, 2); its last entry is 1.
 
-    References
-    ----------
     Heckbert, "Fundamentals of Texture Mapping and Image Warping", 1989, section 2.2.3.
     """
     p0, p1, p2, p3 = corners
@@ -163,14 +138,3 @@ def corners_by_homography(homography: FloatArray) -> FloatArray:
     result[:, 0, :3] = result[:, 1, 3:6] = shares
     result[:, :, 6:] = -corners_of(homography)[:, :, None] * shares[:, None, :2]
     return result.reshape(8, 8)
-
-
-@njit(cache=True, error_model="numpy", inline="always")
-def project(h: FloatArray, x: float, y: float) -> tuple[float, float, float]:
-    """Where a homography (3, 3) takes (x, y), and its denominator there."""
-    w = h[2, 0] * x + h[2, 1] * y + h[2, 2]
-    return (
-        (h[0, 0] * x + h[0, 1] * y + h[0, 2]) / w,
-        (h[1, 0] * x + h[1, 1] * y + h[1, 2]) / w,
-        w,
-    )

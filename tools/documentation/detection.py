@@ -102,18 +102,19 @@ def draw_tables(figure: Any, run: Path) -> None:
 
 def draw_markers(figure: Any, run: Path, frame: int) -> None:
     """The three phases: dark regions, corners and edges, identities."""
+    from detect.markers.candidates import closing, dark_pixels
     from detect.markers.detect import detect_markers
     from detect.markers.settings import MarkerSettings
 
     camera, image = _frame(run, frame)
-    found = detect_markers(image, MarkerSettings(), camera, keep_masks=True)
+    found = detect_markers(image, MarkerSettings(), camera)
     panels = figure.subplots(1, 3)
     middles = found.corners.mean(axis=1)
     low, high = middles.min(axis=0) - 70, middles.max(axis=0) + 70
     for axes, title in zip(
         panels,
         (
-            "1. dark against the closing (one of the masks)",
+            "1. dark against the closing (one of the thresholds)",
             f"2. corners of {len(found.candidates)} candidates",
             f"3. {len(found)} markers, fitted and identified",
         ),
@@ -122,8 +123,8 @@ def draw_markers(figure: Any, run: Path, frame: int) -> None:
         _image(axes, image, title)
         axes.set_xlim(max(low[0], 0), min(high[0], camera.width))
         axes.set_ylim(min(high[1], camera.height), max(low[1], 0))
-    mask = max((m for m in found.masks if m.dark.shape == image.shape), key=lambda m: m.threshold)
-    panels[0].imshow(np.where(mask.dark > 0, 1.0, np.nan), cmap="autumn", vmin=0, vmax=1, alpha=0.6)
+    dark = dark_pixels(image, closing(image, 12), 0.5, 0.0, "ratio")
+    panels[0].imshow(np.where(dark > 0, 1.0, np.nan), cmap="autumn", vmin=0, vmax=1, alpha=0.6)
     for candidate in found.candidates:
         _polygon(panels[1], candidate.outline, "#3498db")
     for number, corners in zip(found.ids, found.corners, strict=True):

@@ -14,11 +14,11 @@ from scipy.stats import multivariate_normal, norm
 
 from camera import Camera
 from detect.markers import pattern_model as model
-from detect.markers.candidates import Layer, closing, dark_pixels, pixel_area
+from detect.markers.candidates import closing, dark_pixels, pixel_area
 from detect.markers.detect import detect_markers
 from detect.markers.dictionaries import templates_of
 from detect.markers.edges import robust_sigma
-from detect.markers.lens import NO_LENS, bent, lens_of
+from detect.markers.lens import picture_of
 from detect.markers.quadrangle import (
     corners_by_homography,
     corners_of,
@@ -63,14 +63,15 @@ def test_dark_pixels_by_definition() -> None:
     rng = np.random.default_rng(1)
     grey = rng.integers(0, 256, (40, 50)).astype(np.uint8)
     closed = np.maximum(grey, rng.integers(0, 256, grey.shape)).astype(np.uint8)
-    layer = Layer(1, 5, grey, closed)
     first, second = grey.astype(float), closed.astype(float)
     ratio = np.where(second > 0.0, 1.0 - first / np.maximum(second, 1.0), 0.0) > 0.3
-    np.testing.assert_array_equal(dark_pixels(layer, 0.3, 0.0, "ratio") == 1, ratio)
+    np.testing.assert_array_equal(dark_pixels(grey, closed, 0.3, 0.0, "ratio") == 1, ratio)
     difference = (second - first) / 255.0 > 0.2
-    np.testing.assert_array_equal(dark_pixels(layer, 0.2, 0.0, "difference") == 1, difference)
+    np.testing.assert_array_equal(
+        dark_pixels(grey, closed, 0.2, 0.0, "difference") == 1, difference
+    )
     gated = ratio & (second - first > 20.0)
-    np.testing.assert_array_equal(dark_pixels(layer, 0.3, 20.0, "ratio") == 1, gated)
+    np.testing.assert_array_equal(dark_pixels(grey, closed, 0.3, 20.0, "ratio") == 1, gated)
 
 
 @given(st.integers(0, 2**32 - 1))
@@ -170,23 +171,25 @@ def test_pictures_of_a_pixel_show_no_marker(
 
 def test_the_lens_is_the_cameras_distortion(published_camera: Camera) -> None:
     image = np.zeros((published_camera.height, published_camera.width), np.uint8)
-    lens = lens_of(published_camera, image)
+    lens = picture_of(image, published_camera)
     rng = np.random.default_rng(3)
     size = np.array([published_camera.width, published_camera.height])
     pixels = rng.random((200, 2)) * (size - 1)
     scale = np.array([published_camera.scale_x, published_camera.scale_y])
     offset = np.array([published_camera.offset_x, published_camera.offset_y])
     expected = published_camera.undistort(pixels) * scale + offset
-    np.testing.assert_allclose(lens.straighten(pixels), expected, atol=0.005)
-    for pixel in pixels[:20]:
-        straight = lens.straighten(pixel[None])
-        again = np.array(bent(lens, straight[0, 0], straight[0, 1]))
-        np.testing.assert_allclose(again, pixel, atol=1e-5)
-        jacobian = lens.pixel_jacobian(pixel)
-        moved = lens.bend(straight + np.array([[1e-4, 0.0], [0.0, 1e-4]]))
-        np.testing.assert_allclose(jacobian, (moved - pixel).T / 1e-4, atol=1e-3)
-    assert lens_of(None, image) is NO_LENS
-    np.testing.assert_allclose(NO_LENS.straighten(pixels), pixels, atol=1e-9)
+    straight = lens.straighten(pixels)
+    np.testing.assert_allclose(straight, expected, atol=1e-9)
+    np.testing.assert_allclose(lens.bend(straight), pixels, atol=1e-5)
+    u, v = pixels.astype(int).T
+    at = lens.straighten(np.stack([u, v], axis=-1).astype(float))
+    np.testing.assert_allclose(lens.straight[v, u], at, atol=1e-3)
+    jacobians = lens.pixel_jacobians(pixels)
+    moved = [lens.bend(straight + step) - pixels for step in 1e-4 * np.eye(2)]
+    np.testing.assert_allclose(jacobians, np.stack(moved, axis=-1) / 1e-4, atol=2e-3)
+    plain = picture_of(image, None)
+    np.testing.assert_array_equal(plain.straighten(pixels), pixels)
+    np.testing.assert_array_equal(plain.straight[7, 5], [5.0, 7.0])
 
 
 @given(
