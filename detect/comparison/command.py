@@ -8,8 +8,7 @@ from pathlib import Path
 from rich.console import Console
 
 from camera import read_camera
-from detect.comparison.circles import beside_reference, compare_runs
-from detect.comparison.lines import compare_line_frames
+from detect.comparison.compare import beside_reference, compare_line_frames, compare_runs
 from detect.comparison.report import comparison_tables, format_json
 from detect.comparison.result import Comparison, unmet_demands
 from detect.drawing.inputs import read_head

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
 from dataclasses import asdict, astuple, fields
+from typing import NamedTuple
 
 from rich import box
 from rich.console import Group
@@ -25,6 +25,14 @@ from detect.comparison.result import (
 _WORST_FRAMES = 10
 
 
+class FigureTable(NamedTuple):
+    """Figures as words in rows, for a terminal or a page."""
+
+    caption: str
+    head: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+
+
 def comparison_tables(comparison: Comparison) -> Group:
     """Format a comparison for a rich console, which omits colour if there is no terminal.
 
@@ -39,9 +47,10 @@ def comparison_tables(comparison: Comparison) -> Group:
     if comparison.reference or comparison.detected:
         tables.append("")
         if isinstance(comparison, DiscComparison):
-            tables.append(_over_distance(comparison))
-            tables += [] if comparison.lean is None else [_floor_differences(comparison)]
-        tables.append(_worst_frames(comparison))
+            tables.append(_rich_table(_over_distance(comparison)))
+            if comparison.lean is not None:
+                tables.append(_rich_table(floor_table(comparison)))
+        tables.append(_rich_table(worst_frames_table(comparison, _WORST_FRAMES)))
     return Group(*tables)
 
 
@@ -193,13 +202,13 @@ def _normalised_error(error: NormalisedError, covariance: str, unusable: str) ->
     return text + covariance + left_out
 
 
-def _over_distance(c: DiscComparison) -> Table:
+def _over_distance(c: DiscComparison) -> FigureTable:
     # Of a width that a terminal of 80 columns has.
-    headings = (
+    head = (
         "metres", "ref.", "missed", "recall", "det.", "extra", "prec.",
         "error m", "ref. quality", "det. quality", "diff.",
     )  # fmt: skip
-    table = _titled_table("By forward distance (position error and quality: medians)", headings)
+    rows = []
     for part in c.bins:
         if part.reference or part.detected:
             figures = (
@@ -208,31 +217,39 @@ def _over_distance(c: DiscComparison) -> Table:
             )  # fmt: skip
             recall, precision, *medians = (number(value, 3) for value in figures)
             counts = [str(n) for n in (part.reference, part.missed, part.detected, part.extra)]
-            row = (*counts[:2], recall, *counts[2:], precision, *medians)
-            table.add_row(range_text(part), *row)
-    return table
+            rows.append((range_text(part), *counts[:2], recall, *counts[2:], precision, *medians))
+    caption = "By forward distance (position error and quality: medians)"
+    return FigureTable(caption, head, tuple(rows))
 
 
-def _floor_differences(c: DiscComparison) -> Table:
-    headings = ("median", "95 %", "along", "across")
-    table = _titled_table(
+def floor_table(c: DiscComparison) -> FigureTable:
+    """Differences on the floor by forward distance, before and after the common lean."""
+    rows = []
+    for part in c.floor:
+        if part.before.pairs and part.after is not None:
+            figures = [*astuple(part.before)[1:], *astuple(part.after)[1:]]
+            shown = (number(value, 3) for value in figures)
+            rows.append((range_text(part), str(part.before.pairs), *shown))
+    caption = (
         "On the floor, m: detected minus reference; the same after the common lean\n"
-        "(along: farther away, across: to the left; medians)",
-        ("metres", "pairs", *headings, "after", *headings[1:]),
+        "(along: farther away, across: to the left; medians)"
     )
-    for part, figures in floor_figures(c):
-        shown = [number(value, 3) for value in figures]
-        table.add_row(range_text(part), str(part.before.pairs), *shown)
-    return table
+    head = ("median", "95 %", "along", "across")
+    return FigureTable(caption, ("metres", "pairs", *head, "after", *head[1:]), tuple(rows))
 
 
-def floor_figures(c: DiscComparison) -> list[tuple[FloorBin, list[float | None]]]:
-    """The four figures before and the four after the lean of each bin that has pairs (m)."""
-    return [
-        (part, [*astuple(part.before)[1:], *astuple(part.after)[1:]])
-        for part in c.floor
-        if part.before.pairs and part.after is not None
-    ]
+def worst_frames_table(c: Comparison, most: int) -> FigureTable:
+    """The frames with most missed and extra rows."""
+    rows = tuple(
+        (
+            match.frame.name,
+            *(str(len(getattr(match, count))) for count in _counts(c)),
+            number(match.largest_error, 3),
+        )
+        for match in c.worst_frames(most)
+    )
+    head = ("image", *_counts(c), f"largest error {_unit(c)}")
+    return FigureTable("Worst frames", head, rows)
 
 
 def range_text(part: DistanceBin | FloorBin) -> str:
@@ -242,21 +259,12 @@ def range_text(part: DistanceBin | FloorBin) -> str:
     return f">= {part.from_m:g}" if part.to_m is None else f"{part.from_m:g}-{part.to_m:g}"
 
 
-def _worst_frames(c: Comparison) -> Table:
-    headings = ("image", *_counts(c), f"largest error {_unit(c)}")
-    table = _titled_table("Worst frames", headings)
-    table.columns[0].justify, table.columns[0].overflow = "left", "fold"
-    for match in c.worst_frames(_WORST_FRAMES):
-        numbers = [str(len(getattr(match, count))) for count in _counts(c)]
-        error = number(match.largest_error, 3)
-        table.add_row(Text(printable(match.frame.name)), *numbers, error)
-    return table
-
-
-def _titled_table(title: str, headings: Iterable[str] = ()) -> Table:
-    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=0)
-    for heading in headings:
-        table.add_column(heading, justify="right")
+def _rich_table(figures: FigureTable) -> Table:
+    table = Table(title=figures.caption, title_justify="left", box=box.SIMPLE_HEAD, padding=0)
+    for k, heading in enumerate(figures.head):
+        table.add_column(heading, justify="right" if k else "left", overflow="fold")
+    for row in figures.rows:
+        table.add_row(*(Text(printable(word)) for word in row))
     return table
 
 

@@ -8,8 +8,13 @@ from pathlib import Path
 
 from detect.errors import DetectError
 from detect.exports.options import Export
-from detect.exports.rows import table_rows
-from detect.exports.writers import demand_pyarrow, write_csv, write_mcap, write_parquet
+from detect.exports.writers import (
+    demand_pyarrow,
+    table_rows,
+    write_csv,
+    write_mcap,
+    write_parquet,
+)
 from detect.sources.times import read_image_times
 from landmarks.columns import TableName
 from storage import OutputExistsError, write_whole

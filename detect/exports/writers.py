@@ -14,16 +14,17 @@ import codecs
 import csv
 import shutil
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from itertools import groupby, islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
 
 import numpy as np
 
 from detect.errors import DetectError
-from detect.exports.rows import TableRow
-from landmarks.columns import FRAME_COLUMNS, TABLES, Column, TableName, Value
+from landmarks import FrameTilt, Landmark, Step, read_rows
+from landmarks.columns import FRAME_COLUMNS, TABLES, TableName, Value, table_of, values_of
+from landmarks.tilts import numbered_tilts
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
@@ -41,6 +42,51 @@ _TYPES = {
 }
 
 
+class TableRow(NamedTuple):
+    """A row of a table: the number of its frame, the frame's prefix and time, and what follows."""
+
+    table: TableName
+    frame: int
+    image: str
+    time_s: float | None
+    values: tuple[Value, ...]
+
+    @property
+    def all_values(self) -> tuple[Value, ...]:
+        """The values of all columns."""
+        return (self.frame, self.image, self.time_s, *self.values)
+
+
+def table_rows(
+    path: Path, times: Mapping[str, float] | None, rate_hz: float | None
+) -> Iterator[TableRow]:
+    """The rows of a landmark or tilt file.
+
+    The times of frames are `times`, by their prefix, or follow from the frame rate, if known.
+    """
+    image, time_s = "", None
+    for frame, record in _records(path):
+        if isinstance(record, Step | FrameTilt):
+            image = record.prefix
+            if times is not None:
+                time_s = times.get(image)
+            elif rate_hz is not None:
+                time_s = frame / rate_hz
+        yield TableRow(table_of(record), frame, image, time_s, values_of(record))
+
+
+def _records(path: Path) -> Iterator[tuple[int, Step | Landmark | FrameTilt]]:
+    """The records of a file with the numbers of their frames."""
+    if path.suffix == ".tilt":
+        yield from numbered_tilts(path)
+        return
+    frame = -1
+    for row in read_rows(path):
+        if isinstance(row.record, Step | Landmark):
+            frame += isinstance(row.record, Step)
+            yield frame, row.record
+
+
 def write_csv(stream: BinaryIO, table: TableName, rows: Iterable[TableRow]) -> int:
     """Write a table; rows of other tables are passed over. Returns how many rows were written."""
     text = codecs.getwriter("utf-8")(stream, "surrogateescape")
@@ -49,13 +95,12 @@ def write_csv(stream: BinaryIO, table: TableName, rows: Iterable[TableRow]) -> i
     count = 0
     for row in rows:
         if row.table == table:
-            writer.writerow(_csv_value(value) for value in row.all_values)
+            writer.writerow(
+                " ".join(map(str, value)) if isinstance(value, tuple) else value
+                for value in row.all_values
+            )
             count += 1
     return count
-
-
-def _csv_value(value: Value) -> Value:
-    return " ".join(map(str, value)) if isinstance(value, tuple) else value
 
 
 def demand_pyarrow() -> None:
@@ -107,7 +152,10 @@ def message_definitions(table: TableName) -> dict[str, str]:
     row, frame = _message_types(table)
     columns = TABLES[table][len(FRAME_COLUMNS) :]
     return {
-        row: "".join(_field(column) for column in columns),
+        row: "".join(
+            f"{_TYPES[c.kind]} {c.name}  # {f'{c.unit}: ' if c.unit else ''}{c.meaning}\n"
+            for c in columns
+        ),
         frame: (
             f"std_msgs/Header header  # time of the image; frame_id {FRAME_ID}\n"
             f"int64 frame  # {FRAME_COLUMNS[0].meaning}\n"
@@ -125,11 +173,7 @@ def topic_of(table: TableName) -> str:
 def write_mcap(
     stream: BinaryIO, tables: list[TableName], rows: Iterable[TableRow], source: str
 ) -> int:
-    """Write rows as messages; returns how many.
-
-    Rows must have times, and those of a frame be consecutive; `source` is the file's name in
-    messages of errors.
-    """
+    """Write rows, those of a frame consecutive, as messages; returns how many."""
     store = _typestore()
     from rosbags.rosbag2 import StoragePlugin, Writer
 
@@ -188,11 +232,6 @@ def _ros_value(value: Value) -> Any:
     if isinstance(value, str):
         return value.encode("utf-8", "surrogateescape").decode("utf-8", "replace")
     return value
-
-
-def _field(column: Column) -> str:
-    unit = f"{column.unit}: " if column.unit else ""
-    return f"{_TYPES[column.kind]} {column.name}  # {unit}{column.meaning}\n"
 
 
 def _typestore() -> Typestore:

@@ -25,7 +25,6 @@ from detect.markers.pattern_model import (
     TONE,
     WHITE,
     Linearised,
-    Model,
     Pattern,
     Samples,
     cell_sums,
@@ -116,7 +115,7 @@ def fit_marker(
     solution = _solved(samples, pattern, corners - centre, levels, noise, reach_px, effort.steps)
     if solution is None:
         return None
-    p, model, left, inverse = solution
+    p, left, inverse = solution
 
     energy = left.weight * left.residual**2
     variance = max(energy.sum() / max(left.weight.sum() - PARAMETERS, 1.0), noise**2)
@@ -143,8 +142,8 @@ def fit_marker(
         border=cells[outside],
         misfit=math.sqrt(variance - noise**2) / contrast,
         explained=1.0 - max(0.0, unexplained) / total,
-        blur_px=math.sqrt(0.5 * (model.blur[0] + model.blur[2])),
-        blur_cells=_blur_along_axes(homography, model.blur) / templates.dictionary.cell,
+        blur_px=math.sqrt(0.5 * (p[BLUR][0] + p[BLUR][2])),
+        blur_cells=_blur_along_axes(homography, p[BLUR]) / templates.dictionary.cell,
     )
 
 
@@ -156,8 +155,8 @@ def _solved(
     noise: float,
     reach_px: float,
     steps: int,
-) -> tuple[FloatArray, Model, Linearised, FloatArray] | None:
-    """Parameters, model, residuals and inverse normal matrix of the best fit, if there is one.
+) -> tuple[FloatArray, Linearised, FloatArray] | None:
+    """Parameters, residuals and inverse normal matrix of the best fit, if there is one.
 
     Weak prior knowledge: light changes little over a marker, the blur is round and about what was
     guessed, the tone curve nearly straight.
@@ -175,9 +174,7 @@ def _solved(
     outlier, moved = math.inf, math.inf
     for step in range(steps + 1):
         homography = _homography_of(p)
-        model = Model(_inverse(homography), homography[2, :2], p[WHITE], p[BLACK], p[BLUR],
-                      float(p[TONE]))  # fmt: skip
-        left = linearise(samples, pattern, model, outlier)
+        left = linearise(samples, pattern, p, _inverse(homography), outlier)
         scale = robust_sigma(left.residual, noise)
         outlier = OUTLIER * scale
         sigma[WHITE] = sigma[BLACK] = light * max(abs(p[WHITE.start] - p[BLACK.start]), scale)
@@ -195,7 +192,7 @@ def _solved(
             return None
         p[TONE] = min(max(p[TONE], -_LARGEST_TONE), _LARGEST_TONE)
         p[BLUR] = _confined(p[BLUR], min(1.0 + 3.0 * blur_guess, _LARGEST_VARIANCE))
-    return p, model, left, inverse
+    return p, left, inverse
 
 
 def _inverse(matrix: FloatArray) -> FloatArray:

@@ -7,8 +7,7 @@ import time
 from dataclasses import dataclass
 from itertools import islice
 
-from detect.comparison.circles import beside_reference, compare_frames
-from detect.comparison.lines import compare_line_frames
+from detect.comparison.compare import beside_reference, compare_frames, compare_line_frames
 from detect.comparison.result import CompareOptions, DiscComparison, Gates, LineComparison
 from detect.drawing.inputs import RunRows, SeenRows, open_rows
 from detect.errors import DetectError, FrameError

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +13,11 @@ from jinja2 import Environment, StrictUndefined
 from detect import __version__
 from detect.comparison.matching import FLOOR_GATE_M
 from detect.comparison.report import (
-    floor_figures,
+    floor_table,
     lean_text,
     levelling_text,
     number,
-    range_text,
+    worst_frames_table,
 )
 from detect.comparison.result import Comparison, DiscComparison, LineComparison
 from detect.drawing.inputs import picture_name
@@ -140,7 +139,7 @@ def _discs(inputs: ReportInputs) -> list[Part]:
     if result.lean is not None:
         what += ", after the common lean"
         words = f"One lean for all frames: {lean_text(result.lean)}.".replace("+-", "±")
-        parts += [Part("text", words), _floor(result)]
+        parts += [Part("text", words), Part("table", *floor_table(result))]
     parts += _honesty(result, what)
     return [*parts, *gallery(inputs, "missed"), *gallery(inputs, "extra")]
 
@@ -203,21 +202,6 @@ def _rates(curve: RateCurve, axis: str, name: str) -> list[Part]:
     return [table] if count < 2 else [rates_figure(curve, axis), table]
 
 
-def _floor(result: DiscComparison) -> Part:
-    rows = tuple(
-        (range_text(part), str(part.before.pairs), *(_scaled(value, 1e3, 0) for value in figures))
-        for part, figures in floor_figures(result)
-    )
-    return Part(
-        "table",
-        "Differences on the floor in mm by forward distance of the reference row in m, as the "
-        "rows are and after the common lean; along (farther) and across (left) are medians",
-        ("metres", "pairs", "median", "95 %", "along", "across",
-         "after: median", "95 %", "along", "across"),
-        rows,
-    )  # fmt: skip
-
-
 def _honesty(result: DiscComparison | LineComparison, what: str) -> list[Part]:
     """Whether the stated covariances are right."""
     residuals = whitened(result)
@@ -244,24 +228,12 @@ def _frames(inputs: ReportInputs, worst: int) -> Section:
     named = {picture_name(prefix): prefix for prefix in inputs.names}
     parts: list[Part] = []
     shown: dict[str, str] = {}
-    results: tuple[tuple[str, str, Comparison | None, Callable[[float | None], str]], ...] = (
-        ("discs", "mm", inputs.discs, lambda error: _scaled(error, 1e3, 1)),
-        ("verticals", "deg", inputs.lines, lambda error: number(error, 3)),
-    )
-    for kind, unit, result, text in results:
+    for kind, result in (("discs", inputs.discs), ("verticals", inputs.lines)):
         if result is None:
             continue
         matches = result.worst_frames(worst)
-        rows = tuple(
-            (
-                m.frame.name,
-                *(str(len(rows)) for rows in (m.matched, m.missed, m.extra)),
-                text(m.largest_error),
-            )
-            for m in matches
-        )
-        head = ("frame", "matched", "missed", "extra", f"largest error / {unit}")
-        parts.append(Part("table", f"Frames with most missed and extra {kind}", head, rows))
+        table = worst_frames_table(result, worst)
+        parts.append(Part("table", f"{table.caption}: {kind}", table.head, table.rows))
         for rank, match in enumerate(matches, 1):
             prefix, place = named[picture_name(match.frame.name)], f"number {rank} of {kind}"
             shown[prefix] = f"{shown[prefix]}, {place}" if prefix in shown else place

@@ -7,13 +7,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from detect.comparison.compare import LEAST_SIGMA_RAD
 from detect.comparison.matching import match_frame
 from detect.comparison.result import DiscComparison, LineComparison
 from landmarks import is_positive_definite
 
 FloatArray = NDArray[np.float64]
-
-_LEAST_SIGMA_RAD = 1e-12
 
 
 class RateCurve(NamedTuple):
@@ -66,7 +65,7 @@ def whitened(comparison: DiscComparison | LineComparison) -> FloatArray:
     lean; one for each line with a positive sigma.
     """
     if isinstance(comparison, LineComparison):
-        usable = comparison.pairs.sigma_rad >= _LEAST_SIGMA_RAD
+        usable = comparison.pairs.sigma_rad >= LEAST_SIGMA_RAD
         return comparison.pairs.error_rad[usable] / comparison.pairs.sigma_rad[usable]
     pairs = comparison.pairs
     usable = is_positive_definite(pairs.covariance) & np.isfinite(pairs.left).all(axis=1)

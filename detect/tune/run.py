@@ -10,8 +10,7 @@ from dataclasses import dataclass, replace
 from itertools import chain
 from typing import Any
 
-from detect.comparison.circles import compare_frames
-from detect.comparison.lines import compare_line_frames
+from detect.comparison.compare import compare_frames, compare_line_frames
 from detect.comparison.result import CompareOptions, DiscComparison, LineComparison
 from detect.line_settings import LineSettings
 from detect.run import Run, RunFrame

@@ -9,8 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from detect.comparison.circles import compare_runs
-from detect.comparison.lines import compare_line_frames
+from detect.comparison.compare import compare_line_frames, compare_runs
 from detect.comparison.result import CompareOptions, DiscComparison, LineComparison
 from detect.line_settings import LineSettings
 from detect.run import open_run

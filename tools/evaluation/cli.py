@@ -439,7 +439,7 @@ def _rendered_lines(command: RenderedLines) -> int:
 
 
 def _tilt(command: Tilt) -> int:
-    from detect.comparison.circles import compare_runs
+    from detect.comparison.compare import compare_runs
     from detect.comparison.result import CompareOptions
     from landmarks import read_tilts
 

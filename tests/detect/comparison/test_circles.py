@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from detect.comparison.circles import Beside, compare_frames, compare_runs
+from detect.comparison.compare import Beside, compare_frames, compare_runs
 from detect.comparison.report import format_json
 from detect.comparison.result import CompareError, CompareOptions, DiscComparison, unmet_demands
 from detect.sources.image_names import image_name

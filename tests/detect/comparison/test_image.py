@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from camera import Camera
 from detect.circles import CircleDetections
 from detect.cli import main
-from detect.comparison.circles import compare_frames
+from detect.comparison.compare import compare_frames
 from detect.comparison.report import format_json
 from detect.comparison.result import CompareOptions, DiscComparison
 from detect.levelling import levelled

@@ -15,7 +15,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from detect.comparison.lines import compare_line_frames
+from detect.comparison.compare import compare_line_frames
 from detect.comparison.report import format_json
 from detect.comparison.result import CompareError, CompareOptions, LineComparison, unmet_demands
 from landmarks import (

@@ -211,13 +211,10 @@ def test_a_blurred_corner_is_the_bivariate_normal_distribution(
 def test_the_blurred_patterns_derivatives(rho: float) -> None:
     templates = templates_of("6x6_250", (7,))
     pattern = model.pattern_of(templates.lines, templates.blackness(0))
-    work = np.empty((6, len(templates.lines)))
 
     def value(at: FloatArray) -> FloatArray:
-        x, y, sigma_x, sigma_y, correlation = at.tolist()
-        place = model.MarkerPlace(x, y, 0.0, 0.0, 0.0, 0.0, sigma_x, sigma_y, correlation)
-        numbers = model.blurred_blackness(place, pattern, work)
-        return np.array(list(numbers))
+        numbers = model.blurred_blackness(model.Places(*at[:, None]), pattern)
+        return np.concatenate(numbers)
 
     rng = np.random.default_rng(4)
     for _ in range(50):

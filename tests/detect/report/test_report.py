@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 
 from detect.cli import main
-from detect.comparison.circles import Beside, compare_frames, compare_runs
-from detect.comparison.lines import compare_line_frames
+from detect.comparison.compare import Beside, compare_frames, compare_line_frames, compare_runs
 from detect.comparison.result import CompareOptions, DiscComparison, LineComparison
 from detect.drawing.inputs import read_head
 from detect.line_settings import PUBLISHED as PUBLISHED_LINES

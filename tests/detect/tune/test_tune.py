@@ -18,7 +18,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from detect.cli import main
-from detect.comparison.circles import compare_runs
+from detect.comparison.compare import compare_runs
 from detect.comparison.result import CompareOptions
 from detect.errors import DetectError
 from detect.line_settings import LineSettings

@@ -1,4 +1,4 @@
-"""Compares detected discs with reference rows of the same run.
+"""Compares detected discs, or lines, with reference rows of the same run.
 
 Whether the same disc is seen is one question; where on the floor each side puts it is a second one:
 its differences, and the tilt and height of the camera that would explain them.
@@ -24,6 +24,7 @@ from detect.comparison.matching import (
     apart_px,
     frames_by_image,
     match_runs,
+    numbers,
     pair_discs,
 )
 from detect.comparison.result import (
@@ -32,15 +33,19 @@ from detect.comparison.result import (
     DistanceBin,
     FrameMatch,
     Levelling,
+    LineComparison,
+    LinePairs,
 )
 from detect.seen import Sight
 from detect.sources.image_names import image_name
-from landmarks import CircleArrays, Frame, circle_arrays, read_frames
+from landmarks import CircleArrays, Frame, circle_arrays, read_frames, wrap_angle
 
 FloatArray = NDArray[np.float64]
 
 # The forward distances for which the data set's own qualities are known.
 _EDGES_M = (-inf, 0.8, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, inf)
+# Files hold six digits: a smaller sigma is no statement about a bearing.
+LEAST_SIGMA_RAD = 1e-12
 
 
 class Beside(NamedTuple):
@@ -171,6 +176,44 @@ def compare_frames(
         floor=floor_bins(pairs, lean, ranges),
         lean=lean,
         pairs=pairs,
+    )
+
+
+def compare_line_frames(
+    reference: Iterable[Frame],
+    detected: Iterable[Frame],
+    options: CompareOptions | None = None,
+    *,
+    names: tuple[str, str] = ("reference", "detected"),
+) -> LineComparison:
+    """Compare the lines of two sets of frames, called `names` in messages.
+
+    Errors as of `compare_runs`.
+    """
+    options = options or CompareOptions()
+    sides = frames_by_image(reference, names[0]), frames_by_image(detected, names[1])
+    common = match_runs("lines", *sides, options, names)
+    first, second = ([row for m in common.frames for row in m.paired[side]] for side in (0, 1))
+
+    def difference(name: str) -> FloatArray:
+        return numbers(second, name) - numbers(first, name)
+
+    bearing_rad, sigma_rad = numbers(first, "alpha"), numbers(second, "sigma")
+    error_rad = wrap_angle(difference("alpha"))
+    error_deg = np.degrees(np.abs(error_rad))
+    variance = np.where(sigma_rad >= LEAST_SIGMA_RAD, sigma_rad**2, 0.0)
+    ends = [
+        np.hypot(difference(x), difference(y))
+        for x, y in (("xtop", "ytop"), ("xbottom", "ybottom"))
+    ]
+    return LineComparison(
+        **vars(common),
+        bearing_median_deg=quantile(error_deg),
+        bearing_95_deg=quantile(error_deg, 0.95),
+        normalised_error=normalised_error(error_rad[:, None], variance[:, None, None]),
+        ends_median=quantile(np.concatenate(ends)),
+        beta_median_deg=quantile(np.degrees(np.abs(difference("beta")))),
+        pairs=LinePairs(bearing_rad, error_rad, sigma_rad),
     )
 
 
