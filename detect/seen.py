@@ -5,7 +5,7 @@ Plain numpy: comparing files takes no compiler.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,7 +22,7 @@ _POINTS = 64
 def image_positions(
     camera: Camera, floor_xy: ArrayLike, levelled_by: Tilt | None = None, raised_m: float = 0.0
 ) -> FloatArray:
-    """Where the camera saw places on the floor; exact inverse of detection and levelling.
+    """(..., 2) pixels where the camera saw places on the floor; NaN where not seen.
 
     Parameters
     ----------
@@ -34,11 +34,6 @@ def image_positions(
         Pitch and roll (rad) that turned the positions level (`landmarks.Frame.levelled_by`).
     raised_m : float
         How much higher the camera is than calibrated, metres.
-
-    Returns
-    -------
-    (..., 2) float64
-        Pixels; NaN where not seen.
     """
     xy = np.asarray(floor_xy, dtype=np.float64)
     points = np.concatenate([xy, np.zeros_like(xy[..., :1])], axis=-1)
@@ -95,50 +90,37 @@ def circle_on_floor(centre_xy: ArrayLike, radius_m: float, points: int = _POINTS
     return np.asarray(np.asarray(centre_xy, dtype=np.float64)[..., None, :] + ring)
 
 
-@dataclass(frozen=True, eq=False)
-class FrameView:
-    """How reference and detected rows of one frame come back into its image.
-
-    `reference_by` and `detected_by` are the tilts by which the rows of either side were levelled.
-    """
+@dataclass(frozen=True)
+class Sight:
+    """How rows of discs come back into the images, for each side by the tilt that levelled it."""
 
     camera: Camera
-    radius_m: float
+    radius_m: float = 0.10  # of the discs
+    #: Reference rows are level though they do not say by which tilt: by that of the detected rows.
+    reference_level: bool = False
     reference_by: Tilt | None = None
     detected_by: Tilt | None = None
 
-    def gates(self, reference_xy: FloatArray, least_px: float) -> FloatArray:
-        """(N, 2) half the width and height of discs' images, `least_px` at least, pixels."""
-        ring = circle_on_floor(reference_xy.reshape(-1, 2), self.radius_m, 16)
-        edge = image_positions(self.camera, ring, self.reference_by)
-        seen = np.isfinite(edge)
-        low = np.where(seen, edge, np.inf).min(axis=1, initial=np.inf)
-        high = np.where(seen, edge, -np.inf).max(axis=1, initial=-np.inf)
-        return np.asarray(np.maximum(0.5 * (high - low), least_px))
-
-
-@dataclass(frozen=True)
-class Sight:
-    """How rows come back into the images.
-
-    Attributes
-    ----------
-    camera : Camera
-    radius_m : float
-        Of the discs.
-    reference_level : bool
-        Reference rows are level though they do not say by which tilt: they are seen through that
-        of the detected rows.
-    """
-
-    camera: Camera
-    radius_m: float = 0.10
-    reference_level: bool = False
-
-    def of(self, reference: Frame | None, detected: Frame | None) -> FrameView:
-        """The view of a frame with these rows."""
+    def of(self, reference: Frame | None, detected: Frame | None) -> Sight:
+        """The same for a frame with these rows."""
         detected_by = None if detected is None else detected.levelled_by
         reference_by = None if reference is None else reference.levelled_by
         if self.reference_level and reference_by is None:
             reference_by = detected_by
-        return FrameView(self.camera, self.radius_m, reference_by, detected_by)
+        return replace(self, reference_by=reference_by, detected_by=detected_by)
+
+    def reference_px(self, xy: FloatArray) -> FloatArray:
+        """(..., 2) pixels where positions (..., 2) of reference rows were seen."""
+        return image_positions(self.camera, xy, self.reference_by)
+
+    def detected_px(self, xy: FloatArray) -> FloatArray:
+        """(..., 2) pixels where positions (..., 2) of detected rows were seen."""
+        return image_positions(self.camera, xy, self.detected_by)
+
+    def gates(self, reference_xy: FloatArray, least_px: float) -> FloatArray:
+        """(N, 2) half the width and height of discs' images, `least_px` at least, pixels."""
+        edge = self.reference_px(circle_on_floor(reference_xy.reshape(-1, 2), self.radius_m, 16))
+        seen = np.isfinite(edge)
+        low = np.where(seen, edge, np.inf).min(axis=1, initial=np.inf)
+        high = np.where(seen, edge, -np.inf).max(axis=1, initial=-np.inf)
+        return np.asarray(np.maximum(0.5 * (high - low), least_px))

@@ -17,10 +17,10 @@ from detect.comparison.matching import numbers
 from detect.drawing.frame import ends_of, line_curves, sigma_bars
 from detect.drawing.inputs import SeenRows, open_rows, select_frames
 from detect.errors import EXIT_FRAMES_FAILED, DetectError, FrameError
-from detect.run import Run, read_image
+from detect.run import read_image
 from detect.runs.progress import print_failures, progress_bar
 from detect.seen import circle_on_floor, image_positions
-from detect.sources.opening import demand_recording, open_source
+from detect.sources.opening import demand_recording, open_calibrated
 from detect.viewing_options import View
 from landmarks import Step, circle_arrays
 from landmarks.map_file import read_map, read_path
@@ -39,12 +39,7 @@ def perform(options: View) -> int:
     """Carry the command out; returns the exit code."""
     rr = _rerun()
     demand_recording(options.run)
-    run = open_source(options.run, options.camera, options.source)
-    if not isinstance(run, Run):
-        raise DetectError(
-            f"{options.run}: no calibration: expected a .cam file in it, or one named by --camera; "
-            "`camera calibrate` makes one"
-        )
+    run = open_calibrated(options.run, options.camera, options.source)
     source = open_rows(run, options.files)
     if options.output is not None and options.output.exists() and not options.force:
         raise OutputExistsError(options.output)

@@ -23,7 +23,7 @@ from detect.comparison.result import (
     FramePair,
     Kind,
 )
-from detect.seen import FrameView, Sight, image_positions
+from detect.seen import Sight
 from detect.sources.image_names import image_name
 from landmarks import (
     Association,
@@ -107,7 +107,7 @@ def pair_of(
     reference: Frame | None,
     detected: Frame | None,
     unlisted: Frame | None = None,
-    view: FrameView | None = None,
+    view: Sight | None = None,
 ) -> FramePair:
     """The discs or the lines of two frames of one image; a frame that is None has no rows."""
 
@@ -160,7 +160,7 @@ def pair_discs(
     reference: Sequence[CircleLandmark],
     detected: Sequence[CircleLandmark],
     options: CompareOptions,
-    view: FrameView | None = None,
+    view: Sight | None = None,
 ) -> Association:
     """Pair discs of one frame one to one: as many as possible, with least squared distances.
 
@@ -168,8 +168,7 @@ def pair_discs(
     """
     first, second = circle_arrays(reference), circle_arrays(detected)
     if view is not None and not options.on_floor:
-        seen = image_positions(view.camera, first.xy, view.reference_by)
-        again = image_positions(view.camera, second.xy, view.detected_by)
+        seen, again = view.reference_px(first.xy), view.detected_px(second.xy)
         gate = view.gates(first.xy, options.least_px)
         apart = (again[None] - seen[:, None]) / gate[:, None]
         cost = np.where(np.isfinite(apart).all(axis=-1), (apart**2).sum(axis=-1), np.inf)
@@ -201,9 +200,7 @@ def apart_px(match: FrameMatch) -> FloatArray:
     view = match.frame.view
     assert view is not None
     first, second = (circle_arrays(rows).xy for rows in match.paired)
-    seen = image_positions(view.camera, first, view.reference_by)
-    again = image_positions(view.camera, second, view.detected_by)
-    return np.asarray(np.linalg.norm(again - seen, axis=1))
+    return np.asarray(np.linalg.norm(view.detected_px(second) - view.reference_px(first), axis=1))
 
 
 def numbers(rows: Sequence[Any], name: str) -> FloatArray:

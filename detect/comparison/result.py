@@ -13,7 +13,7 @@ from detect.flags import MaybeFloat
 from storage.bounds import ABOVE_0, NOT_NEGATIVE, demand
 
 if TYPE_CHECKING:
-    from detect.seen import FrameView
+    from detect.seen import Sight
 
 FloatArray = NDArray[np.float64]
 Kind = Literal["circles", "lines"]
@@ -98,7 +98,7 @@ class FramePair(NamedTuple):
     reference: Sequence[Any]
     detected: Sequence[Any]
     unlisted: Sequence[Any] = ()  # what may be detected but need not be
-    view: FrameView | None = None  # how discs come back into the image; None: compared on the floor
+    view: Sight | None = None  # how discs come back into the image; None: compared on the floor
 
 
 class FrameMatch(NamedTuple):

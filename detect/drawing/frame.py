@@ -9,7 +9,6 @@ missing are drawn as well, and rows that fit none have another colour.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +26,7 @@ from detect.drawing.strokes import (
     enlargement,
     with_legend,
 )
-from detect.seen import Sight, circle_on_floor, image_positions
+from detect.seen import Sight, circle_on_floor
 from detect.settings import CircleSettings
 from landmarks import LineLandmark, MarkerLandmark, circle_arrays
 
@@ -126,9 +125,8 @@ def _draw_discs(
 ) -> None:
     view = match.frame.view
     assert view is not None
-    project = partial(image_positions, view.camera, levelled_by=view.detected_by)
     rings = circle_on_floor(circle_arrays(match.missed).xy, settings.radius_m)
-    for edge in image_positions(view.camera, rings, view.reference_by):
+    for edge in view.reference_px(rings):
         draw_curve(canvas, edge, MISSED_COLOUR, closed=True)
     apart = apart_px(match)
     drawn = [(row, "", _EDGE_COLOUR) for row in match.set_aside]
@@ -136,7 +134,9 @@ def _draw_discs(
     drawn += [(row, f" {px:.1f}px", _EDGE_COLOUR) for row, px in zip(match.paired[1], apart)]
     for row, text, colour in drawn:
         centre = np.array([row.px, row.py])
-        _outline_disc(canvas, project, centre, settings, f"{row.quality:.2f}{text}", colour)
+        _outline_disc(
+            canvas, view.detected_px, centre, settings, f"{row.quality:.2f}{text}", colour
+        )
 
 
 def _draw_lines(

@@ -16,7 +16,7 @@ from detect.errors import FrameError
 from detect.report.inputs import ReportInputs
 from detect.report.parts import Part, image_part
 from detect.run import Run, RunFrame, read_image
-from detect.seen import circle_on_floor, image_positions
+from detect.seen import circle_on_floor
 from landmarks import circle_arrays
 
 _JPEG_QUALITY = 88
@@ -82,11 +82,11 @@ def _edges(inputs: ReportInputs, fate: str) -> Iterator[tuple[str, NDArray[np.fl
         view = match.frame.view
         if view is None:
             continue
-        rows, by = match.missed, view.reference_by
+        rows, seen_at = match.missed, view.reference_px
         if fate == "extra":
-            rows, by = match.extra, view.detected_by
+            rows, seen_at = match.extra, view.detected_px
         rings = circle_on_floor(circle_arrays(rows).xy, _WIDER * view.radius_m)
-        for edge in image_positions(view.camera, rings, by):
+        for edge in seen_at(rings):
             if np.isfinite(edge).all():
                 yield picture_name(match.frame.name), edge
 
