@@ -53,6 +53,7 @@ _ROUNDS, _STEPS = 2, 8
 #: it per pixel, both in contrasts.
 _BLUR_SIGMA, _ALONG_SIGMA, _ACROSS_SIGMA = 0.5, 0.3, 0.004
 #: Standard deviation of what a step leaves over, in its contrast: expected, and largest.
+_NO_OUTLIER = 1e9
 _FIRST_REST, _LARGEST_REST = 0.2, 0.6
 #: Places across an edge, and turns of it (in reaches), at which a fit may begin.
 _SPLITS, _TURNS = 14, (0.0, -0.3, 0.3, -0.6, 0.6)
@@ -230,7 +231,7 @@ def _fit_step(pixels: _Pixels, reach: float, search: _Search) -> _Step:
     p = expected.copy()
     p[0], p[1] = offset, turn
     change = np.empty(_PARAMETERS)
-    scale, outlier = _FIRST_REST * (light - dark), math.inf
+    scale, outlier = _FIRST_REST * (light - dark), _NO_OUTLIER
     sigma = np.full(_PARAMETERS, math.inf)
     sigma[4] = _BLUR_SIGMA
     for _ in range(_ROUNDS):
@@ -337,45 +338,33 @@ def _linearise(
     pixels: _Pixels, p: FloatArray, expected: FloatArray, prior: FloatArray, outlier: float
 ) -> _Linearised:
     """Normal equations about p with the weights of prior knowledge, and the robust cost."""
-    matrix, right = np.diag(prior), prior * (expected - p)
-    residual = np.empty(len(pixels.grey))
-    jacobian = np.empty(_PARAMETERS)
-    blur = math.exp(p[4])
-    cost = np.sum(prior * (expected - p) ** 2)
-    weights, squares = 0.0, 0.0
-    for n in range(len(residual)):
-        along = pixels.along[n]
-        out = pixels.across[n] - p[0] - p[1] * along
-        z = out / blur
-        share = 0.5 * (1.0 + math.erf(z * math.sqrt(0.5)))
-        density = math.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi)
-        dark = p[2] + p[7] * along
-        step = p[3] + p[5] * along + p[6] * out - dark
-        r = pixels.grey[n] - dark - step * share
-        residual[n] = r
-        slope = -step * density / blur - p[6] * share
-        jacobian[0] = slope
-        jacobian[1] = slope * along
-        jacobian[2] = 1.0 - share
-        jacobian[3] = share
-        jacobian[4] = -step * density * z
-        jacobian[5] = share * along
-        jacobian[6] = share * out
-        jacobian[7] = (1.0 - share) * along
-        weight = 1.0
-        if abs(r) > outlier:
-            weight = (outlier / r) ** 2
-            cost += outlier**2 * (1.0 - math.log(weight))
-        else:
-            cost += r * r
-        for i in range(_PARAMETERS):
-            factor = weight * jacobian[i]
-            right[i] += factor * r
-            for j in range(i + 1):
-                matrix[i, j] += factor * jacobian[j]
-        weights += weight
-        squares += weight * r * r
-    return _Linearised(matrix, right, cost, weights, squares, residual)
+    along, blur = pixels.along, math.exp(p[4])
+    out = pixels.across - p[0] - p[1] * along
+    z = out / blur
+    share = np.empty_like(z)
+    for n in range(len(z)):
+        share[n] = 0.5 * (1.0 + math.erf(z[n] * math.sqrt(0.5)))
+    density = np.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi)
+    dark = p[2] + p[7] * along
+    step = p[3] + p[5] * along + p[6] * out - dark
+    residual = pixels.grey - dark - step * share
+    weight = np.where(np.abs(residual) > outlier, (outlier / residual) ** 2, 1.0)
+    slope = -step * density / blur - p[6] * share
+    jacobian = np.stack((
+        slope, slope * along, 1.0 - share, share, -step * density * z,
+        share * along, share * out, (1.0 - share) * along,
+    ))  # fmt: skip
+    weighted = weight * jacobian
+    squares = np.sum(weight * residual**2)
+    off = expected - p
+    return _Linearised(
+        np.diag(prior) + weighted @ jacobian.T,
+        prior * off + weighted @ residual,
+        np.sum(prior * off**2) + squares - outlier**2 * np.sum(np.log(weight)),
+        np.sum(weight),
+        squares,
+        residual,
+    )
 
 
 @njit(cache=True, error_model="numpy")
@@ -387,19 +376,11 @@ def robust_sigma(residual: FloatArray, least: float) -> float:
 @njit(cache=True, error_model="numpy")
 def _support(pixels: _Pixels, p: FloatArray) -> float:
     """Share of the segments of an edge whose own step is at least half the fitted one."""
-    total, n = np.zeros((_SEGMENTS, 2)), np.zeros((_SEGMENTS, 2))
-    for k in range(len(pixels.grey)):
-        along = pixels.along[k]
-        out = pixels.across[k] - p[0] - p[1] * along
-        if abs(out) > 0.5:
-            segment = min(int((along + 1.0) * 0.5 * _SEGMENTS), _SEGMENTS - 1)
-            side = int(out > 0.0)
-            total[segment, side] += pixels.grey[k]
-            n[segment, side] += 1.0
-    there, known = 0.0, 0.0
-    for k in range(_SEGMENTS):
-        if n[k, 0] > 0.0 and n[k, 1] > 0.0:
-            known += 1.0
-            if total[k, 1] / n[k, 1] - total[k, 0] / n[k, 0] > 0.5 * (p[3] - p[2]):
-                there += 1.0
-    return there / known if known > 0.0 else 0.0
+    out = pixels.across - p[0] - p[1] * pixels.along
+    near = np.abs(out) > 0.5
+    segment = ((pixels.along[near] + 1.0) * 0.5 * _SEGMENTS).astype(np.int64)
+    place, places = 2 * np.minimum(segment, _SEGMENTS - 1) + (out[near] > 0.0), 2 * _SEGMENTS
+    means = np.bincount(place, pixels.grey[near], places) / np.bincount(place, None, places)
+    steps = means[1::2] - means[::2]
+    known = steps[np.isfinite(steps)]
+    return float(np.mean(known > 0.5 * (p[3] - p[2]))) if len(known) > 0 else 0.0
