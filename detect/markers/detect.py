@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from camera import Camera
 from detect.markers import identification as identities
-from detect.markers.candidates import Region, candidate_regions
+from detect.markers.candidates import candidate_regions
 from detect.markers.dictionaries import Templates, templates_of
 from detect.markers.edges import NO_EDGE, RefinedQuadrangle, refine_quadrangle
 from detect.markers.identification import (
@@ -34,8 +34,8 @@ from detect.markers.quadrangle import (
     NO_QUADRANGLE,
     NOT_FOUR_CORNERS,
     count_same,
+    covered,
     is_convex,
-    overlap,
     rough_corners,
     signed_area,
 )
@@ -160,13 +160,16 @@ def detect_markers(
     markers: list[_Marker] = []
     candidates: list[Candidate] = []
     tried = np.empty((0, 4, 2))
-    for region in regions:
-        rough = _rough_quadrangle(region, picture, settings)
+    hulls = picture.straighten(np.concatenate([np.empty((0, 2)), *(r.hull for r in regions)]))
+    ends = np.cumsum([len(region.hull) for region in regions])
+    for region, hull in zip(regions, np.split(hulls, ends)):
+        rough = _rough_quadrangle(hull, settings)
         if isinstance(rough, str):
             rejected[rough] += 1
             continue
-        if any(overlap(rough, marker.corners) for marker in markers):
-            candidates.append(Candidate(picture.bend(rough), SAME_MARKER))
+        outline = picture.bend(rough)
+        if markers and covered(rough, np.array([marker.corners for marker in markers])):
+            candidates.append(Candidate(outline, SAME_MARKER))
             continue
         if count_same(rough, tried) >= _TRIES:
             continue
@@ -174,7 +177,7 @@ def detect_markers(
         side = math.sqrt(signed_area(rough))
         capture_px = _CAPTURE_LAYER_PX * region.scale + _CAPTURE_PX + _CAPTURE_WIDTHS * side
         refined = refine_quadrangle(
-            picture, rough, capture_px=capture_px, border=templates.border, quick=settings.joint
+            picture, rough, outline, templates.border, capture_px, quick=settings.joint
         )
         found = NO_EDGE if refined is None else _identified(picture, refined, templates, settings)
         if isinstance(found, str):
@@ -183,7 +186,7 @@ def detect_markers(
         else:
             fate = ACCEPTED
             markers.append(found)
-        candidates.append(Candidate(picture.bend(rough), fate, refined))
+        candidates.append(Candidate(outline, fate, refined))
 
     # Back to the image as it is.
     markers.sort(key=lambda m: (m.id, m.corners[0, 0], m.corners[0, 1]))
@@ -202,11 +205,8 @@ def detect_markers(
     )
 
 
-def _rough_quadrangle(
-    region: Region, picture: Picture, settings: MarkerSettings
-) -> FloatArray | str:
-    """Rough corners of a region at straight positions, or the cause of there being none."""
-    hull = picture.straighten(region.hull)
+def _rough_quadrangle(hull: FloatArray, settings: MarkerSettings) -> FloatArray | str:
+    """Rough corners of a region by its straight hull, or the cause of there being none."""
     corners = rough_corners(hull, settings.corners)
     if corners is None or not is_convex(corners):
         return NOT_FOUR_CORNERS
@@ -262,9 +262,8 @@ def _identified(
     best: RefinedQuadrangle | PatternFit = fit
     if side >= _LEAST_BENT_PX and fit.blur_px <= _SHARP_BLURS * templates.border * side:
         capture_px = _CAPTURE_PX + 2.0 * fit.blur_px
-        again = refine_quadrangle(
-            picture, fit.corners, capture_px=capture_px, border=templates.border
-        )
+        outline = picture.bend(fit.corners)
+        again = refine_quadrangle(picture, fit.corners, outline, templates.border, capture_px)
         if again is not None and _contradicts(again, fit):
             best = again
     return _marker(identity, best, templates, fit.explained, fit.blur_px)

@@ -132,25 +132,26 @@ _NO_STEP = _Step(*(math.nan,) * 8)
 def refine_quadrangle(
     picture: Picture,
     rough: FloatArray,
-    *,
-    capture_px: float,
+    outline: FloatArray,
     border: float,
+    capture_px: float,
+    *,
     quick: bool = False,
 ) -> RefinedQuadrangle | None:
     """Fit the edges of a quadrangle (4, 2), clockwise at straight pixels, to the image.
 
-    Edges are within `capture_px` of the rough ones; the black border is `border` widths of the
-    marker thick. With `quick` they are good enough to begin the fit of the whole marker with. None
-    if an edge is not there, or the edges make no convex quadrangle near the rough one.
+    `outline` are its corners in the image, `border` widths of the marker the black border's
+    thickness. Edges are within `capture_px` of the rough ones; with `quick` they are good enough to
+    begin the fit of the whole marker with. None if an edge is not there, or the edges make no
+    convex quadrangle near the rough one.
     """
     refined: RefinedQuadrangle | None = None
+    if not np.all(np.isfinite(outline)):
+        return None
     corners, reach, blur = rough, capture_px, _FIRST_BLUR_PX
     for pixels, close_enough in _QUICK_PASSES if quick else _PASSES:
         search = _Search(max(picture.noise, LEAST_NOISE), reach, border, blur, pixels, close_enough)
-        seen = picture.bend(corners)
-        if not np.all(np.isfinite(seen)):
-            return None
-        last = refined
+        seen, last = outline + (corners - rough), refined
         refined = _fit_edges(picture.grey, picture.straight, corners, seen, search)
         # What is not there is NaN.
         moved_far = not np.abs(refined.corners - rough).max() <= _LARGEST_MOVE * capture_px
@@ -350,10 +351,10 @@ def _linearise(
     residual = pixels.grey - dark - step * share
     weight = np.where(np.abs(residual) > outlier, (outlier / residual) ** 2, 1.0)
     slope = -step * density / blur - p[6] * share
-    jacobian = np.stack((
-        slope, slope * along, 1.0 - share, share, -step * density * z,
-        share * along, share * out, (1.0 - share) * along,
-    ))  # fmt: skip
+    jacobian = np.empty((_PARAMETERS, len(z)))
+    jacobian[0], jacobian[1] = slope, slope * along
+    jacobian[2], jacobian[3], jacobian[4] = 1.0 - share, share, -step * density * z
+    jacobian[5], jacobian[6], jacobian[7] = share * along, share * out, (1.0 - share) * along
     weighted = weight * jacobian
     squares = np.sum(weight * residual**2)
     off = expected - p

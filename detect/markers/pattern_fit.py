@@ -297,4 +297,6 @@ def _samples(
     centre = corners.mean(axis=0)
     size = max(1.0, float(np.hypot(*(corners - centre).T).max()))
     grey = picture.grey[pixel[:, 1], pixel[:, 0]].astype(np.float64)
-    return Samples(pixel, straight - centre, grey, size)
+    u, v = (straight - centre).T / size
+    light = np.stack([np.ones(len(u)), u, v, u * u, u * v, v * v], axis=-1)
+    return Samples(pixel, straight - centre, grey, light)

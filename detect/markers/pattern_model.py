@@ -53,7 +53,7 @@ class Samples(NamedTuple):
     pixel: NDArray[np.int64]  # (N, 2) u, v
     straight: FloatArray  # (N, 2) without distortion, from the marker's middle, pixels
     grey: FloatArray  # (N,)
-    size: float  # distance of the farthest corner from the middle, pixels
+    light: FloatArray  # (N, 6) 1, x, y, x^2, xy, y^2 in sizes of the marker
 
 
 class Places(NamedTuple):
@@ -193,7 +193,8 @@ def linearise(
     """
     u, v = samples.straight.T
     q = inverse[2, 0] * u + inverse[2, 1] * v + inverse[2, 2]
-    x, y, _ = (samples.straight @ inverse[:, :2].T + inverse[:, 2]).T / q
+    x = (inverse[0, 0] * u + inverse[0, 1] * v + inverse[0, 2]) / q
+    y = (inverse[1, 0] * u + inverse[1, 1] * v + inverse[1, 2]) / q
     x_u, x_v = (inverse[0, 0] - x * inverse[2, 0]) / q, (inverse[0, 1] - x * inverse[2, 1]) / q
     y_u, y_v = (inverse[1, 0] - y * inverse[2, 0]) / q, (inverse[1, 1] - y * inverse[2, 1]) / q
     uu, uv, vv = p[BLUR]
@@ -203,8 +204,7 @@ def linearise(
     at = Places(x, y, sx, sy, rho)
     d = blurred_blackness(at, pattern)
 
-    lu, lv = u / samples.size, v / samples.size
-    terms = np.stack([np.ones(len(u)), lu, lv, lu * lu, lu * lv, lv * lv], axis=-1)
+    terms = samples.light
     dark = terms @ p[BLACK]
     contrast = terms @ p[WHITE] - dark
     light = 1.0 - d.value
@@ -222,17 +222,21 @@ def linearise(
     fx = slope * (d.by_sigma_x - d.by_correlation * rho / sx) / (2.0 * sx)
     fy = slope * (d.by_sigma_y - d.by_correlation * rho / sy) / (2.0 * sy)
     fxy = slope * d.by_correlation / (sx * sy)
-    w = p[6] * x + p[7] * y + 1.0
     # The pattern moves with the homography: against its own gradient.
-    moved = (gu * u + gv * v) / w
-    jacobian = np.column_stack([
-        -gu * x / w, -gu * y / w, -gu / w, -gv * x / w, -gv * y / w, -gv / w, moved * x, moved * y,
-        toned[:, None] * terms, (1.0 - toned)[:, None] * terms,
+    gu, gv = gu / (p[6] * x + p[7] * y + 1.0), gv / (p[6] * x + p[7] * y + 1.0)
+    moved = gu * u + gv * v
+    jacobian = np.empty((len(u), PARAMETERS))
+    jacobian[:, HOMOGRAPHY] = np.stack(
+        [-gu * x, -gu * y, -gu, -gv * x, -gv * y, -gv, moved * x, moved * y], axis=-1
+    )
+    jacobian[:, WHITE] = toned[:, None] * terms
+    jacobian[:, BLACK] = terms - jacobian[:, WHITE]
+    jacobian[:, BLUR] = np.stack([
         fx * x_u**2 + fy * y_u**2 + fxy * x_u * y_u,
         2.0 * (fx * x_u * x_v + fy * y_u * y_v) + fxy * (x_u * y_v + x_v * y_u),
         fx * x_v**2 + fy * y_v**2 + fxy * x_v * y_v,
-        contrast * light * d.value,
-    ])  # fmt: skip
+    ], axis=-1)  # fmt: skip
+    jacobian[:, TONE] = contrast * light * d.value
     # A clipped grey value says no more than that the light was at least (at most) that.
     clipped = (grey > 254.5) & (seen > 255.0 - _CLIP_ZONE) | (grey < 0.5) & (seen < _CLIP_ZONE)
     residual[clipped], weight[clipped], jacobian[clipped] = 0.0, 1.0, 0.0

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import math
 
-import cv2
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -30,6 +29,7 @@ _CORNER_SPACING_RAD = math.radians(25.0)
 _CHAIN_POINTS = 160
 #: Quadrangles whose corners are all this near (pixels, and in widths) are one and the same.
 _SAME_PX, _SAME_WIDTHS = 1.0, 0.08
+_NEXT = np.array([1, 2, 3, 0])
 _SQUARE = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 1.0], [1.0, 1.0, 1.0], [0.0, 1.0, 1.0]])
 
 
@@ -83,32 +83,52 @@ def _farthest_points(hull: FloatArray) -> FloatArray:
     return np.asarray(chain[rivals.argmax(axis=1) == np.arange(len(chain))])
 
 
+@njit(cache=True, error_model="numpy")
 def signed_area(corners: FloatArray) -> float:
     """Area of a quadrangle (4, 2); positive if it is clockwise as seen in the image (v down)."""
     a, b = corners[2] - corners[0], corners[3] - corners[1]
     return float(0.5 * (a[0] * b[1] - a[1] * b[0]))
 
 
+@njit(cache=True, error_model="numpy")
 def is_convex(corners: FloatArray) -> bool:
     """Whether a clockwise quadrangle (4, 2) is strictly convex."""
-    x, y = (np.roll(corners, -1, axis=0) - corners).T
-    return bool(np.all(x * np.roll(y, -1) > y * np.roll(x, -1)))
+    for k in range(4):
+        a, b, c = corners[k], corners[(k + 1) % 4], corners[(k + 2) % 4]
+        if not (b[0] - a[0]) * (c[1] - b[1]) > (b[1] - a[1]) * (c[0] - b[0]):
+            return False
+    return True
 
 
-def overlap(first: FloatArray, second: FloatArray) -> bool:
-    """Whether the middle of either convex quadrangle (4, 2) is inside the other."""
-    return any(
-        cv2.pointPolygonTest(a.astype(np.float32), b.mean(axis=0).tolist(), False) > 0.0
-        for a, b in ((first, second), (second, first))
-    )
+def covered(quadrangle: FloatArray, others: FloatArray) -> bool:
+    """Whether the middle of a clockwise convex quadrangle (4, 2), or of one of others, is in both.
+
+    Others (N, 4, 2) are clockwise and convex, too.
+    """
+
+    def inside(corners: FloatArray, point: FloatArray) -> NDArray[np.bool_]:
+        side, to = corners[..., _NEXT, :] - corners, point[..., None, :] - corners
+        return np.asarray(np.all(side[..., 0] * to[..., 1] > side[..., 1] * to[..., 0], axis=-1))
+
+    middles = others.mean(axis=1)
+    return bool(np.any(inside(others, quadrangle.mean(axis=0)) | inside(quadrangle, middles)))
 
 
+@njit(cache=True, error_model="numpy")
 def count_same(first: FloatArray, others: FloatArray) -> int:
     """How many of (N, 4, 2) quadrangles have the same corners as one, in any order."""
-    apart = np.abs(first[:, None] - others[:, None]).max(axis=-1)
-    a, b = (others[:, 2] - others[:, 0]).T, (others[:, 3] - others[:, 1]).T
-    widths = np.sqrt(0.5 * np.abs(a[0] * b[1] - a[1] * b[0]))
-    return int(np.sum(apart.min(axis=-1).max(axis=-1) <= _SAME_PX + _SAME_WIDTHS * widths))
+    total = 0
+    for other in others:
+        farthest = 0.0
+        for corner in first:
+            nearest = math.inf
+            for k in range(4):
+                apart = max(abs(corner[0] - other[k, 0]), abs(corner[1] - other[k, 1]))
+                nearest = min(nearest, apart)
+            farthest = max(farthest, nearest)
+        if farthest <= _SAME_PX + _SAME_WIDTHS * math.sqrt(abs(signed_area(other))):
+            total += 1
+    return total
 
 
 def square_homography(corners: FloatArray) -> FloatArray:
