@@ -41,7 +41,7 @@ def comparison_tables(comparison: Comparison) -> Group:
     summary = Table(box=None, show_header=False, pad_edge=False)
     summary.add_column(style="bold", no_wrap=True)
     summary.add_column(overflow="fold")
-    for name, value in _summary(comparison).items():
+    for name, value in summary_rows(comparison).items():
         summary.add_row(name, Text(value))
     tables: list[Table | str] = [summary]
     if comparison.reference or comparison.detected:
@@ -85,8 +85,8 @@ def _counts(c: Comparison) -> tuple[str, ...]:
     return ("matched", *joined, "missed", "extra")
 
 
-def _summary(c: Comparison) -> dict[str, str]:
-    """What was found first, then how it was compared and how large the errors are."""
+def summary_rows(c: Comparison) -> dict[str, str]:
+    """Names and words: what was found first, then how it was compared and how large errors are."""
     only, counted = c.options.only_identified, "counted" if c.options.all_frames else "not counted"
     on_lookalikes = c.on_lookalikes if isinstance(c, DiscComparison) else None
     joined = f", {c.joined} of them by a row that represents several" if c.joined else ""
@@ -130,7 +130,7 @@ def _summary(c: Comparison) -> dict[str, str]:
 def _disc_rows(c: DiscComparison) -> dict[str, str]:
     rows = {}
     if any(s.levelled or s.true for s in (c.reference_levelling, c.detected_levelling)):
-        rows["levelled"] = levelling_text(c)
+        rows["levelled"] = _levelling_text(c)
     if c.in_image:
         same = f"in the image, within half the disc's image or {c.options.least_px:g} px"
         apart = _median_and_most(c.image_median_px, c.image_95_px, 2, "px")
@@ -146,7 +146,7 @@ def _disc_rows(c: DiscComparison) -> dict[str, str]:
         c.normalised_error, source, "not positive definite"
     )
     if c.lean is not None:
-        rows["common lean"] = lean_text(c.lean)
+        rows["common lean"] = _lean_text(c.lean)
     for side, matched, fate, alone in (
         ("reference", c.reference_quality_matched, "missed", c.reference_quality_missed),
         ("detected", c.detected_quality_matched, "extra", c.detected_quality_extra),
@@ -156,7 +156,7 @@ def _disc_rows(c: DiscComparison) -> dict[str, str]:
     return rows
 
 
-def levelling_text(c: DiscComparison) -> str:
+def _levelling_text(c: DiscComparison) -> str:
     """One sentence on which side's rows are levelled."""
     reference = _levelled_side("reference", c.reference_levelling)
     detected = _levelled_side("detected", c.detected_levelling)
@@ -176,7 +176,7 @@ def _levelled_side(name: str, side: Levelling) -> str:
     )
 
 
-def lean_text(lean: CommonLean) -> str:
+def _lean_text(lean: CommonLean) -> str:
     """Tilt and height that would explain the differences on the floor, and the residuals."""
     left = _median_and_most(lean.left.median_m, lean.left.most_m, 4, "m")
     return (

@@ -29,7 +29,7 @@ from detect.markers.identification import (
     verified_identity,
 )
 from detect.markers.lens import Picture, picture_of
-from detect.markers.pattern_fit import FIRST_LOOK, Levels, PatternFit, fit_marker
+from detect.markers.pattern_fit import FIRST_LOOK, PatternFit, fit_marker
 from detect.markers.quadrangle import (
     NO_QUADRANGLE,
     NOT_FOUR_CORNERS,
@@ -242,9 +242,8 @@ def _identified(
     likely = likely_patterns(cells, templates, blur_cells)
     if not likely:
         return identities.NO_PATTERN
-    levels = Levels(float(np.median(refined.dark)), float(np.median(refined.light)), blur_px)
     looks = [
-        (fit_marker(picture, refined.corners, templates, template, levels, FIRST_LOOK), template)
+        (fit_marker(picture, refined, templates, template, FIRST_LOOK), template)
         for template in likely
     ]
     possible = [(look, template) for look, template in looks if look is not None]
@@ -253,7 +252,8 @@ def _identified(
     first, template = max(possible, key=lambda look: look[0].explained)
     if first.explained < settings.least_explained - _FIRST_LOOK_SLACK:
         return identities.UNEXPLAINED
-    fit = fit_marker(picture, first.corners, templates, template, levels)
+    start = refined._replace(corners=first.corners)
+    fit = fit_marker(picture, start, templates, template)
     if fit is None:
         return identities.NOT_FITTED
     identity = verified_identity(fit, template, templates, settings)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from detect.markers.dictionaries import Templates
-from detect.markers.edges import LEAST_NOISE, OUTLIER, robust_sigma
+from detect.markers.edges import LEAST_NOISE, OUTLIER, RefinedQuadrangle, robust_sigma
 from detect.markers.lens import Picture
 from detect.markers.pattern_model import (
     BLACK,
@@ -67,14 +67,6 @@ class Effort(NamedTuple):
 FIRST_LOOK, WHOLE_FIT = Effort(450, 5), Effort(3000, 12)
 
 
-class Levels(NamedTuple):
-    """What a fit begins with: grey levels of black and white, standard deviation of the blur."""
-
-    black: float
-    white: float
-    blur_px: float
-
-
 class PatternFit(NamedTuple):
     """A marker fitted to the grey values."""
 
@@ -91,20 +83,20 @@ class PatternFit(NamedTuple):
 
 def fit_marker(
     picture: Picture,
-    corners: FloatArray,
+    start: RefinedQuadrangle,
     templates: Templates,
     template: int,
-    levels: Levels,
     effort: Effort = WHOLE_FIT,
 ) -> PatternFit | None:
-    """Fit a marker of a known pattern by the Gauss-Newton method; None if there is none nearby.
+    """Fit a marker of a known pattern by the Gauss-Newton method, beginning with its edges.
 
-    Corners (4, 2) to begin with are straight pixels, clockwise as seen in the image.
+    None if there is no such marker nearby.
     """
+    corners, blur_px = start.corners, float(np.median(start.blur))
     middles = 0.5 * (corners + np.roll(corners, -1, axis=0))
     cell_px = templates.dictionary.cell * float(np.hypot(*(middles[:2] - middles[2:]).T).min())
     pattern = pattern_of(templates.lines, templates.blackness(template))
-    near = _SEAM_BLURS * levels.blur_px + _SEAM_PX
+    near = _SEAM_BLURS * blur_px + _SEAM_PX
     reach = min(near, max(_LEAST_SEAM_PX, cell_px))
     samples = _samples(picture, corners, pattern.lines, reach, near, effort.pixels)
     if samples is None or len(samples.grey) < PARAMETERS + _SPARE_PIXELS:
@@ -112,7 +104,8 @@ def fit_marker(
     noise = max(picture.noise, LEAST_NOISE)
     reach_px = max(_REACH_PX, _REACH_CELLS * cell_px)
     centre = corners.mean(axis=0)
-    solution = _solved(samples, pattern, corners - centre, levels, noise, reach_px, effort.steps)
+    start = start._replace(corners=corners - centre)
+    solution = _solved(samples, pattern, start, noise, reach_px, effort.steps)
     if solution is None:
         return None
     p, left, inverse = solution
@@ -150,8 +143,7 @@ def fit_marker(
 def _solved(
     samples: Samples,
     pattern: Pattern,
-    corners: FloatArray,
-    levels: Levels,
+    start: RefinedQuadrangle,
     noise: float,
     reach_px: float,
     steps: int,
@@ -161,12 +153,13 @@ def _solved(
     Weak prior knowledge: light changes little over a marker, the blur is round and about what was
     guessed, the tone curve nearly straight.
     """
-    blur_guess = min(max(levels.blur_px**2, _LEAST_VARIANCE), _LARGEST_VARIANCE)
+    corners, blur_px = start.corners, float(np.median(start.blur))
+    blur_guess = min(max(blur_px**2, _LEAST_VARIANCE), _LARGEST_VARIANCE)
     p = np.zeros(PARAMETERS)
     p[BLUR] = blur_guess, 0.0, blur_guess
     expected = p.copy()
     p[HOMOGRAPHY] = square_homography(corners).flat[:8]
-    p[WHITE.start], p[BLACK.start] = levels.white, levels.black
+    p[WHITE.start], p[BLACK.start] = np.median(start.light), np.median(start.dark)
     sigma = np.full(PARAMETERS, np.inf)
     sigma[BLUR] = blur_guess + 0.1, 0.5 * blur_guess + 0.05, blur_guess + 0.1
     sigma[TONE] = _TONE_SIGMA

@@ -11,12 +11,10 @@ import numpy as np
 from jinja2 import Environment, StrictUndefined
 
 from detect import __version__
-from detect.comparison.matching import FLOOR_GATE_M
 from detect.comparison.report import (
     floor_table,
-    lean_text,
-    levelling_text,
     number,
+    summary_rows,
     worst_frames_table,
 )
 from detect.comparison.result import Comparison, DiscComparison, LineComparison
@@ -109,25 +107,7 @@ def _discs(inputs: ReportInputs) -> list[Part]:
     result = inputs.discs
     if result is None:
         return [Part("note", _NO_REFERENCE.format("map.circles", "--reference"))]
-    errors, text = [], []
-    if result.on_lookalikes is not None:
-        errors.append(("extra on look-alikes", str(result.on_lookalikes)))
-    if result.in_image:
-        apart = f"{number(result.image_median_px, 2)} px"
-        errors.append(("median difference in the image", apart))
-        words = levelling_text(result)
-        words = (
-            f"{words[:1].upper()}{words[1:]}. A detected row fits a reference row if they are at "
-            f"most half the disc's image apart ({result.options.least_px:g} px for those that are "
-            "smaller)."
-        )
-        text.append(Part("text", words))
-    errors += [
-        ("median difference on the floor", f"{_scaled(result.error_median_m, 1e3, 1)} mm"),
-        ("95 %", f"{_scaled(result.error_95_m, 1e3, 1)} mm"),
-    ]
-    where = "in the image" if result.in_image else "on the floor"
-    parts = [_outcome(result, where, errors), *text]
+    parts = [_summary_of(result)]
     if result.reference or result.detected:
         parts.append(distance_figure(result.bins))
     quality = [row.quality for match in result.frames for row in match.frame.detected]
@@ -138,8 +118,7 @@ def _discs(inputs: ReportInputs) -> list[Part]:
     what = "two components for each matched disc"
     if result.lean is not None:
         what += ", after the common lean"
-        words = f"One lean for all frames: {lean_text(result.lean)}.".replace("+-", "±")
-        parts += [Part("text", words), Part("table", *floor_table(result))]
+        parts.append(Part("table", *floor_table(result)))
     parts += _honesty(result, what)
     return [*parts, *gallery(inputs, "missed"), *gallery(inputs, "extra")]
 
@@ -153,33 +132,20 @@ def _lines(inputs: ReportInputs) -> list[Part]:
     levels = np.quantile(sigma, np.linspace(0.0, 1.0, _CURVE_POINTS)) if sigma else np.zeros(0)
     # Quantiles between rows may round below the greatest.
     curve = line_rates(result, np.nextafter(np.unique(levels), np.inf))
-    options = inputs.options
-    errors = [
-        ("found with another", str(result.joined)),
-        ("median error", f"{number(result.bearing_median_deg, 3)}°"),
-        ("95 %", f"{number(result.bearing_95_deg, 3)}°"),
-    ]
     return [
-        _outcome(
-            result, f"within {options.tolerance_deg:g}° or {options.sigmas:g} {_SIGMA}", errors
-        ),
+        _summary_of(result),
         *_rates(curve, f"largest {_SIGMA} of the bearing / deg", f"{_SIGMA} / deg"),
         *_honesty(result, "one for each matched vertical"),
         *([bearings_figure(result.pairs)] if result.matched else []),
     ]
 
 
-def _outcome(result: Comparison, gate: str, errors: list[tuple[str, str]]) -> Part:
-    rows = (
-        ("reference rows", str(result.reference)),
-        ("detected rows", str(result.detected)),
-        (f"matched {gate}", str(result.matched)),
-        ("missed", str(result.missed)),
-        ("extra", str(result.extra)),
-        ("recall", number(result.recall, 4)),
-        ("precision", number(result.precision, 4)),
+def _summary_of(result: Comparison) -> Part:
+    """What `detect compare` says."""
+    rows = tuple(summary_rows(result).items())
+    return Part(
+        "table", "Detected rows against reference rows", ("what", "value"), rows, left=(0, 1)
     )
-    return Part("figures", rows=(*rows, *errors))
 
 
 def _rates(curve: RateCurve, axis: str, name: str) -> list[Part]:
@@ -207,16 +173,11 @@ def _honesty(result: DiscComparison | LineComparison, what: str) -> list[Part]:
     residuals = whitened(result)
     if not len(residuals):
         return [Part("note", "No matched rows with a usable covariance: nothing to whiten.")]
-    lean = result.lean if isinstance(result, DiscComparison) else None
-    error = result.normalised_error if lean is None else lean.normalised_error
     rows = [("mean", f"{residuals.mean():.3f}"), ("deviation", f"{residuals.std():.3f}")]
     for k in (1, 2, 3):
         normal = math.erf(k / math.sqrt(2.0))
         share = np.mean(np.abs(residuals) <= k)
         rows.append((f"within {k} {_SIGMA} (normal: {normal:.3f})", f"{share:.3f}"))
-    rows.append(("squared, per degree of freedom", number(error.per_dof, 3)))
-    if error.band is not None:
-        rows.append(("95 % band of that", f"{error.band[0]:.3f} to {error.band[1]:.3f}"))
     return [whitened_figure(residuals, what), Part("figures", rows=tuple(rows))]
 
 
@@ -319,21 +280,5 @@ def _settings(inputs: ReportInputs) -> list[Part]:
             parts.append(Part("table", caption, ("setting", "value", "default"), rows, bold=bold))
         words = [line for line in head.comments if line and not line.startswith("settings ")]
         parts += [Part("note", line) for line in words] or [Part("note", "No head in the file.")]
-    options = inputs.options
-    same = f"within {FLOOR_GATE_M if options.gate_m is None else options.gate_m:g} m on the floor"
-    if inputs.sight is not None and not options.on_floor:
-        same = f"within half its image or {options.least_px:g} px"
-    parts.append(
-        Part(
-            "note",
-            f"The same disc: {same}. The same vertical: within {options.tolerance_deg:g}° or "
-            f"{options.sigmas:g} standard deviations. "
-            f"Page written by detect report, version {__version__}.",
-        )
-    )
+    parts.append(Part("note", f"Page written by detect report, version {__version__}."))
     return parts
-
-
-def _scaled(value: float | None, factor: float, decimals: int) -> str:
-    """A figure in another unit, or a dash where there is none."""
-    return number(None if value is None else factor * value, decimals)

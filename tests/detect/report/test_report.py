@@ -239,7 +239,8 @@ def test_page_states_what_comparing_does(judged_run: Path, tmp_path: Path) -> No
     assert (expected.matched, expected.missed, expected.extra) == (2, 1, 1)
     assert f"recall {expected.recall:.4f}" in words
     assert f"precision {expected.precision:.4f}" in words
-    assert "reference rows 3 detected rows 3 matched in the image 2 missed 1 extra 1" in words
+    assert "found 2 of 3 reference rows missed 1 of 3 reference rows" in words
+    assert "clutter 1 of 3 detected rows" in words
     assert "s.0001 0 1 1 -" in words
     assert "radius_m 0.1" in words
     first = (tmp_path / "r.html").read_bytes()
