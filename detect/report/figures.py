@@ -14,7 +14,7 @@ from detect.drawing.inputs import SeenRows
 from detect.report.parts import Part, image_part
 from detect.report.plot import BAND, DATA, MARK, REFERENCE, SECOND, figure_file
 from detect.report.statistics import RateCurve, binned
-from detect.tune.table import knee, pareto_front
+from detect.tune.table import draw_rates, knee
 
 if TYPE_CHECKING:
     from io import BytesIO
@@ -56,24 +56,13 @@ def rates_figure(curve: RateCurve, axis: str) -> Part:
         at = curve.threshold
         left.plot(at, curve.recall, color=DATA, lw=1.4, label="recall")
         left.plot(at, curve.precision, color=SECOND, lw=1.4, ls="--", label="precision")
-        right.plot(curve.recall, curve.precision, ".-", color=DATA, lw=1.0, ms=4)
+        draw_rates(right, curve.recall, curve.precision, [f"{t:.3g}" for t in at], most_named=2)
+        right.legend(fontsize=8)
         best = knee(curve.recall, curve.precision)
         if best is not None:
-            label = f"knee: {at[best]:.3g}"
-            left.axvline(at[best], color=MARK, lw=0.9, ls=":", label=label)
-            right.plot(
-                curve.recall[best], curve.precision[best], "o", mfc="none", mec=MARK, mew=1.8,
-                ms=11, label=label,
-            )  # fmt: skip
-            right.legend(fontsize=8)
-        for k in {*pareto_front(curve.recall, curve.precision)[[0, -1]].tolist()} - {best}:
-            right.annotate(
-                f"{at[k]:.3g}", (curve.recall[k], curve.precision[k]), fontsize=7,
-                xytext=(4, 4), textcoords="offset points",
-            )  # fmt: skip
+            left.axvline(at[best], color=MARK, lw=0.9, ls=":", label=f"knee: {at[best]:.3g}")
         _finish(left, axis, "share")
         left.legend(fontsize=8)
-        _finish(right, "recall", "precision")
         for limits in (left.set_ylim, right.set_ylim, right.set_xlim):
             limits(0.0, 1.05)
     words = (

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -11,6 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 from detect.report.plot import DATA, MARK, figure_file
 from detect.tune.grid import Combination
 from detect.tune.run import Trial
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 FloatArray = NDArray[np.float64]
 
@@ -47,42 +50,43 @@ def curve_picture(
     combinations: Sequence[Combination], trials: Sequence[Trial], title: str
 ) -> bytes:
     """Precision over recall as a PNG file: all trials, their front, and the knee."""
-    recall, precision = _rates(trials)
-    front, best = pareto_front(recall, precision), knee(recall, precision)
     with figure_file((6.4, 6.2), "png") as (figure, content):
         axes = figure.subplots()
-        axes.plot(recall, precision, "o", color=DATA, ms=4, label="tried")
-        axes.plot(
-            recall[front], precision[front], "--", color=DATA, lw=1.4,
-            label="none is better in both",
-        )  # fmt: skip
-        if best is not None:
-            axes.plot(
-                recall[best], precision[best], "o", mfc="none", mec=MARK, mew=2.0, ms=13,
-                label=f"knee: {_words(combinations[best])}",
-            )  # fmt: skip
-        for k in front[:: 1 + len(front) // _MOST_NAMED]:
-            axes.annotate(
-                _words(combinations[k]), (recall[k], precision[k]), xytext=(-7, -9),
-                textcoords="offset points", ha="right", fontsize=7,
-            )  # fmt: skip
+        names = [", ".join(f"{name} {value}" for name, value in c.items()) for c in combinations]
+        draw_rates(axes, *_rates(trials), names, _MOST_NAMED)
         axes.margins(0.15)
-        axes.set_xlabel("recall")
-        axes.set_ylabel("precision")
-        axes.grid(alpha=0.25, lw=0.6)
         axes.set_title(title, fontsize=10)
         figure.legend(loc="outside lower center", fontsize=8, ncols=1)
     return content.getvalue()
+
+
+def draw_rates(
+    axes: Axes, recall: FloatArray, precision: FloatArray, names: Sequence[str], most_named: int
+) -> None:
+    """Draw precision over recall (N,): all settings, their front with some names, and the knee."""
+    front, best = pareto_front(recall, precision), knee(recall, precision)
+    axes.plot(recall, precision, "o", color=DATA, ms=4, label="tried")
+    axes.plot(
+        recall[front], precision[front], "--", color=DATA, lw=1.2, label="none is better in both"
+    )
+    if best is not None:
+        axes.plot(
+            recall[best], precision[best], "o", mfc="none", mec=MARK, mew=2.0, ms=12,
+            label=f"knee: {names[best]}",
+        )  # fmt: skip
+    for k in front[:: max(1, -(-(len(front) - 1) // (most_named - 1)))]:
+        axes.annotate(
+            names[k], (recall[k], precision[k]), xytext=(-7, -9), textcoords="offset points",
+            ha="right", fontsize=7,
+        )  # fmt: skip
+    axes.set(xlabel="recall", ylabel="precision")
+    axes.grid(alpha=0.25, lw=0.6)
 
 
 def _rates(trials: Sequence[Trial]) -> tuple[FloatArray, FloatArray]:
     """(N,) recall and precision, NaN where there is none."""
     rates = np.array([(t.recall, t.precision) for t in trials], np.float64).reshape(-1, 2)
     return rates[:, 0], rates[:, 1]
-
-
-def _words(combination: Combination) -> str:
-    return ", ".join(f"{name} {value}" for name, value in combination.items())
 
 
 def _rounded(value: float | None) -> float | None:
