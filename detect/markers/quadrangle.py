@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 
+import cv2
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -132,17 +133,9 @@ def count_same(first: FloatArray, others: FloatArray) -> int:
 
 
 def square_homography(corners: FloatArray) -> FloatArray:
-    """(3, 3) homography from the unit square to four corners (4, 2); its last entry is 1.
-
-    Heckbert, "Fundamentals of Texture Mapping and Image Warping", 1989, section 2.2.3.
-    """
-    p0, p1, p2, p3 = corners
-    a, b, c = p1 - p2, p3 - p2, p0 - p1 + p2 - p3
-    determinant = a[0] * b[1] - b[0] * a[1]
-    g = (c[0] * b[1] - b[0] * c[1]) / determinant
-    h = (a[0] * c[1] - c[0] * a[1]) / determinant
-    columns = [p1 - p0 + g * p1, p3 - p0 + h * p3, p0]
-    return np.vstack([np.stack(columns, axis=-1), [g, h, 1.0]])
+    """(3, 3) homography from the unit square to four corners (4, 2); its last entry is 1."""
+    square = _SQUARE[:, :2].astype(np.float32)
+    return np.asarray(cv2.getPerspectiveTransform(square, corners.astype(np.float32)))
 
 
 def corners_of(homography: FloatArray) -> FloatArray:
