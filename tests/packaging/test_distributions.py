@@ -54,7 +54,7 @@ def test_the_wheel_has_the_rooms_and_nothing_else(source: Path, distributions: P
         f"{room}/{name}"
         for room in ROOMS
         for name in files_below(source / room)
-        if name.endswith((".py", ".npz")) or name == "py.typed"
+        if name.endswith((".py", ".npz", ".html")) or name == "py.typed"
     }
     assert found == expected
     for room in ROOMS:
