@@ -172,8 +172,8 @@ def _solved(
         outlier = OUTLIER * scale
         sigma[WHITE] = sigma[BLACK] = light * max(abs(p[WHITE.start] - p[BLACK.start]), scale)
         prior = (scale / sigma) ** 2
-        weighted = left.jacobian.T * left.weight
-        inverse = _inverse(weighted @ left.jacobian + np.diag(prior))
+        weighted = left.jacobian * left.weight
+        inverse = _inverse(weighted @ left.jacobian.T + np.diag(prior))
         if step == steps or moved < _CLOSE_ENOUGH_PX:
             break
         change = inverse @ (weighted @ left.residual + prior * (expected - p))
@@ -291,5 +291,5 @@ def _samples(
     size = max(1.0, float(np.hypot(*(corners - centre).T).max()))
     grey = picture.grey[pixel[:, 1], pixel[:, 0]].astype(np.float64)
     u, v = (straight - centre).T / size
-    light = np.stack([np.ones(len(u)), u, v, u * u, u * v, v * v], axis=-1)
+    light = np.stack([np.ones(len(u)), u, v, u * u, u * v, v * v])
     return Samples(pixel, straight - centre, grey, light)

@@ -53,7 +53,7 @@ class Samples(NamedTuple):
     pixel: NDArray[np.int64]  # (N, 2) u, v
     straight: FloatArray  # (N, 2) without distortion, from the marker's middle, pixels
     grey: FloatArray  # (N,)
-    light: FloatArray  # (N, 6) 1, x, y, x^2, xy, y^2 in sizes of the marker
+    light: FloatArray  # (6, N) 1, x, y, x^2, xy, y^2 in sizes of the marker
 
 
 class Places(NamedTuple):
@@ -82,7 +82,7 @@ class Linearised(NamedTuple):
 
     residual: FloatArray  # (N,) 0 where clipped grey values say no more than the model
     weight: FloatArray  # (N,) of robust least squares
-    jacobian: FloatArray  # (N, PARAMETERS)
+    jacobian: FloatArray  # (PARAMETERS, N)
     at: Places
     contrast: FloatArray  # (N,) of white and black, grey levels
 
@@ -205,8 +205,8 @@ def linearise(
     d = blurred_blackness(at, pattern)
 
     terms = samples.light
-    dark = terms @ p[BLACK]
-    contrast = terms @ p[WHITE] - dark
+    dark = p[BLACK] @ terms
+    contrast = p[WHITE] @ terms - dark
     light = 1.0 - d.value
     toned = light + p[TONE] * light * d.value
     seen, grey = dark + contrast * toned, samples.grey
@@ -225,21 +225,19 @@ def linearise(
     # The pattern moves with the homography: against its own gradient.
     gu, gv = gu / (p[6] * x + p[7] * y + 1.0), gv / (p[6] * x + p[7] * y + 1.0)
     moved = gu * u + gv * v
-    jacobian = np.empty((len(u), PARAMETERS))
-    jacobian[:, HOMOGRAPHY] = np.stack(
-        [-gu * x, -gu * y, -gu, -gv * x, -gv * y, -gv, moved * x, moved * y], axis=-1
-    )
-    jacobian[:, WHITE] = toned[:, None] * terms
-    jacobian[:, BLACK] = terms - jacobian[:, WHITE]
-    jacobian[:, BLUR] = np.stack([
+    jacobian = np.empty((PARAMETERS, len(u)))
+    jacobian[HOMOGRAPHY] = -gu * x, -gu * y, -gu, -gv * x, -gv * y, -gv, moved * x, moved * y
+    jacobian[WHITE] = toned * terms
+    jacobian[BLACK] = terms - jacobian[WHITE]
+    jacobian[BLUR] = (
         fx * x_u**2 + fy * y_u**2 + fxy * x_u * y_u,
         2.0 * (fx * x_u * x_v + fy * y_u * y_v) + fxy * (x_u * y_v + x_v * y_u),
         fx * x_v**2 + fy * y_v**2 + fxy * x_v * y_v,
-    ], axis=-1)  # fmt: skip
-    jacobian[:, TONE] = contrast * light * d.value
+    )
+    jacobian[TONE] = contrast * light * d.value
     # A clipped grey value says no more than that the light was at least (at most) that.
     clipped = (grey > 254.5) & (seen > 255.0 - _CLIP_ZONE) | (grey < 0.5) & (seen < _CLIP_ZONE)
-    residual[clipped], weight[clipped], jacobian[clipped] = 0.0, 1.0, 0.0
+    residual[clipped], weight[clipped], jacobian[:, clipped] = 0.0, 1.0, 0.0
     return Linearised(residual, weight, jacobian, at, contrast)
 
 
