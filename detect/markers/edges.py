@@ -349,7 +349,10 @@ def _linearise(
     dark = p[2] + p[7] * along
     step = p[3] + p[5] * along + p[6] * out - dark
     residual = pixels.grey - dark - step * share
-    weight = np.where(np.abs(residual) > outlier, (outlier / residual) ** 2, 1.0)
+    weight, log_weights = np.ones_like(z), 0.0
+    for k in np.flatnonzero(np.abs(residual) > outlier):
+        weight[k] = (outlier / residual[k]) ** 2
+        log_weights += math.log(weight[k])
     slope = -step * density / blur - p[6] * share
     jacobian = np.empty((_PARAMETERS, len(z)))
     jacobian[0], jacobian[1] = slope, slope * along
@@ -361,7 +364,7 @@ def _linearise(
     return _Linearised(
         np.diag(prior) + weighted @ jacobian.T,
         prior * off + weighted @ residual,
-        np.sum(prior * off**2) + squares - outlier**2 * np.sum(np.log(weight)),
+        np.sum(prior * off**2) + squares - outlier**2 * log_weights,
         np.sum(weight),
         squares,
         residual,
