@@ -49,7 +49,7 @@ LEAST_SIGMA_RAD = 1e-12
 
 
 class Beside(NamedTuple):
-    """What is known to be in view besides the reference rows.
+    """What else than the reference rows is in view.
 
     Detected rows on `unlisted` discs are neither right nor wrong, those on `lookalikes` are extra
     and counted apart.

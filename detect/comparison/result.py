@@ -262,7 +262,7 @@ class Comparison:
 class DiscComparison(Comparison):
     """How a run's detected discs compare with reference rows; qualities are medians."""
 
-    on_lookalikes: int | None  # extra rows on what is known to look like a disc
+    on_lookalikes: int | None  # extra rows on what resembles a disc
     error_median_m: float | None
     error_95_m: float | None
     normalised_error: NormalisedError

@@ -1,4 +1,4 @@
-"""What detectors looked at and rejected: tracks and response of lines, candidates for markers."""
+"""What detectors rejected: tracks and response of lines, candidates for markers."""
 
 from __future__ import annotations
 

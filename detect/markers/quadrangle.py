@@ -76,7 +76,7 @@ def _farthest_points(hull: FloatArray) -> FloatArray:
     along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(closed, axis=0).T))])
     at = np.union1d(np.linspace(0.0, along[-1], _CHAIN_POINTS, endpoint=False), along[:-1])
     chain = np.stack([np.interp(at, along, closed[:, k]) for k in range(2)], axis=-1)
-    # So many points that their mean is the barycentre of the outline.
+    # With this many points, their mean is the barycentre of the outline.
     x, y = (chain - chain.mean(axis=0)).T
     angle = np.arctan2(y, x)
     apart = np.abs(np.remainder(angle[:, None] - angle + np.pi, 2.0 * np.pi) - np.pi)

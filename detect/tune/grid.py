@@ -17,7 +17,7 @@ Combination = dict[str, Any]
 
 
 def parameter_value(kind: type, name: str, text: str) -> Any:
-    """The value that a word stands for, of a field of a dataclass of parameters.
+    """Convert a word to the value of a field of a dataclass of parameters.
 
     Raises DetectError if there is no such field, it is no single value, or this is none of its.
     """
