@@ -61,7 +61,7 @@ def tune_run(
     """
     kind = "circles" if isinstance(settings[0], CircleSettings) else "lines"
     changes: list[dict[str, Any]] = [{kind: each} for each in settings]
-    plan = FramePlan(run.camera, working_folder=Path.cwd())
+    plan = FramePlan(run.camera)
     plans = [replace(plan, **change) for change in changes]
     known = Known(tilts=tilts)
     tasks = [FrameTask(frame, known.of(frame.step.prefix)) for frame, _ in frames]
