@@ -46,7 +46,7 @@ PUBLISHED_PIXEL_VARIANCE = 2.0
 _LEAST_NOISE = 1.0
 _SIGNS: dict[Polarity, int] = {"any": 0, "light": 1, "dark": -1}
 #: Rows of an image from which its noise is estimated.
-_NOISE_ROWS = 32
+_NOISE_ROWS = 16
 #: Least gradient of an edge that votes, and least step of a rim, grey levels (per pixel).
 _EDGE, _LEAST_STEP = 4.0, 8.0
 #: Of the least quality, part of the directions of what is fitted must have this share.
@@ -230,8 +230,6 @@ def _disc_search(settings: CircleSettings) -> DiscSearch:
         refine=settings.refine,
         least_evidence=settings.evidence,
         optics_px=settings.blur_px,
-        pixel_variance=settings.systematic_px**2,
-        tilt_variance=math.radians(settings.tilt_sigma_deg) ** 2,
     )
 
 

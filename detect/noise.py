@@ -47,28 +47,32 @@ def estimate_noise(image: NDArray[np.uint8], most_rows: int | None = None) -> fl
 def _median_response(image: NDArray[np.uint8], rows: NDArray[np.int64]) -> float:
     """Median of the absolute responses in some rows, by their histogram."""
     width = image.shape[1]
-    bend = np.empty(width, np.int32)
-    counted = np.zeros(_MOST_RESPONSE + 1, np.int64)
-    others = np.zeros(_MOST_RESPONSE + 1, np.int64)
+    bend, response = np.empty(width, np.int32), np.empty(width, np.int32)
+    # Of the pixels that count, and then of the others.
+    histogram = np.zeros(2 * (_MOST_RESPONSE + 1), np.int32)
     for v in rows:
         above, here, below = image[v - 1], image[v], image[v + 1]
         for u in range(width):
             bend[u] = np.int32(above[u]) + np.int32(below[u]) - 2 * np.int32(here[u])
         for u in range(1, width - 1):
-            response = abs(bend[u - 1] - 2 * bend[u] + bend[u + 1])
-            if _DARK < here[u] < _LIGHT:
-                counted[response] += 1
-            else:
-                others[response] += 1
-    count = np.sum(counted)
+            counts = (here[u] > _DARK) & (here[u] < _LIGHT)
+            response[u] = abs(bend[u - 1] - 2 * bend[u] + bend[u + 1])
+            response[u] += 0 if counts else _MOST_RESPONSE + 1
+        for u in range(1, width - 1):
+            histogram[response[u]] += 1
+    count = 0
+    for k in range(_MOST_RESPONSE + 1):
+        count += histogram[k]
     if count < _LEAST_COUNTABLE:
-        counted += others
-        count = np.sum(counted)
+        for k in range(_MOST_RESPONSE + 1):
+            histogram[k] += histogram[k + _MOST_RESPONSE + 1]
+            count += histogram[k + _MOST_RESPONSE + 1]
     # The two in the middle, or twice the one.
-    seen, total = 0, 0.0
-    for response in range(len(counted)):
-        for rank in ((count - 1) // 2, count // 2):
-            if seen <= rank < seen + counted[response]:
-                total += 0.5 * response
-        seen += counted[response]
+    total = 0.0
+    for rank in ((count - 1) // 2, count // 2):
+        k, seen = 0, histogram[0]
+        while seen <= rank:
+            k += 1
+            seen += histogram[k]
+        total += 0.5 * k
     return total

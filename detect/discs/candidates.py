@@ -73,30 +73,51 @@ def suppress_neighbours(
     (N,) bool
     """
     order = np.argsort(-score, kind="stable")
-    return np.asarray(_apart(np.ascontiguousarray(floor_xy, np.float64), order, separation))
+    kept = np.zeros(len(score), np.bool_)
+    kept[apart(np.ascontiguousarray(floor_xy, np.float64), order, separation)] = True
+    return kept
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _apart(floor_xy: FloatArray, order: NDArray[np.int64], separation: float) -> NDArray[np.bool_]:
-    """Which of some positions are not nearer than this to one that comes before and is kept."""
-    kept = np.zeros(len(order), np.bool_)
-    x, y, count = np.empty(len(order)), np.empty(len(order)), 0
+def apart(floor_xy: FloatArray, order: NDArray[np.int64], separation: float) -> NDArray[np.int64]:
+    """Those of some positions, in this order, that are not nearer than this to one kept before."""
+    kept, count = np.empty(len(order), np.int64), 0
+    x, y = np.empty(len(order)), np.empty(len(order))
     for i in order:
         alone = True
         for k in range(count):
             dx, dy = x[k] - floor_xy[i, 0], y[k] - floor_xy[i, 1]
             alone &= dx * dx + dy * dy >= separation * separation
         if alone:
-            kept[i] = True
-            x[count], y[count] = floor_xy[i, 0], floor_xy[i, 1]
+            kept[count], x[count], y[count] = i, floor_xy[i, 0], floor_xy[i, 1]
             count += 1
-    return kept
+    return kept[:count]
 
 
+@njit(cache=True, error_model="numpy", nogil=True)
+def best_apart(floor_xy: FloatArray, score: FloatArray, separation: float) -> NDArray[np.int64]:
+    """Those of some positions that have no better one nearer than this, the best first.
+
+    Those of a score of minus infinity are left out; of equal ones the first is the best.
+    """
+    # NumPy's sorting takes seconds to compile.
+    order, count = np.empty(len(score), np.int64), 0
+    for i in range(len(score)):
+        if score[i] > -np.inf:
+            k = count
+            while k > 0 and score[order[k - 1]] < score[i]:
+                order[k] = order[k - 1]
+                k -= 1
+            order[k] = i
+            count += 1
+    return apart(floor_xy, order[:count], separation)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
 def strong_and_alone(
     centres: Centres, floor_xy: NDArray[np.float32], weakest: float, separation: float
 ) -> NDArray[np.int64]:
-    """Which centres have at least the contrast `weakest`, and no better one nearby.
+    """Which centres have at least the contrast `weakest`, and no better one nearby: the best first.
 
     Parameters
     ----------
@@ -111,11 +132,15 @@ def strong_and_alone(
     Returns
     -------
     (M,) int64
-        Indices, ascending.
+        Indices.
     """
-    index = np.flatnonzero(np.abs(centres.contrast) >= weakest)
-    u, v = centres.pixels[index].T
-    return index[suppress_neighbours(floor_xy[v, u], centres.quality[index], separation)]
+    count = len(centres.quality)
+    place, score = np.empty((count, 2)), np.empty(count)
+    for i in range(count):
+        u, v = centres.pixels[i, 0], centres.pixels[i, 1]
+        place[i, 0], place[i, 1] = floor_xy[v, u, 0], floor_xy[v, u, 1]
+        score[i] = centres.quality[i] if abs(centres.contrast[i]) >= weakest else -np.inf
+    return best_apart(place, score, separation)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

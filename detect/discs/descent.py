@@ -51,7 +51,7 @@ _LEAST_RADIUS, _MOST_RADIUS = 0.4, 2.0
 #: Longest step of the position, in nominal radii.
 _LONGEST_STEP = 0.3
 #: A step that promises less than this, in variances of the noise, is the last,
-_CONVERGED = 0.3
+_CONVERGED = 1.0
 #: and one that is shorter than this share of the blur's width, and changes that by less than this
 #: share: what is left is less than the square of it.
 _SHORT = 0.05
@@ -73,7 +73,7 @@ WORK = np.dtype(
         ("factor", *_SQUARE),
         # The unknowns, and the background without a disc.
         ("values", np.float64, UNKNOWNS),
-        ("bare", np.float64, BACKGROUND),
+        ("bare", np.float64, UNKNOWNS),
         ("sector_sums", np.float32, (SECTORS + 1, 8)),
     ]
 )

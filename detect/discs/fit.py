@@ -115,7 +115,7 @@ def fit_disc(
     """
     patch, radius = work.patch, candidate.radius
     _clear(result)
-    gathered = gather(image, floor_xy, candidate, settings, effort.look, patch)
+    gathered = gather(image, floor_xy, candidate, settings, start, effort.look, patch)
     most_blur = MOST_BLUR
     if gathered.shape != EDGE:
         most_blur = min(_MOST_GROWTH * candidate.blur + _MOST_GROWTH_PX, MOST_BLUR)

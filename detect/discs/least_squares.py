@@ -180,7 +180,7 @@ def correlated_area(patch: Any, n: int) -> float:
     """
     product = square = pairs = F32(0.0)
     for i in range(1, n):
-        linked = patch.linked[i]
+        linked = F32(1.0) if patch.pixel[i] == patch.pixel[i - 1] + np.uint32(1) else F32(0.0)
         here, before = patch.residual[i], patch.residual[i - 1]
         product += linked * here * before
         square += linked * (here * here + before * before)

@@ -1,9 +1,9 @@
 """The pixels to which a disc is fitted, with the floor that they see and their grey values.
 
-Pixels count if they are within some radii of the candidate, or within some pixels or deviations of
-the blur of the disc's edge. A first look takes some of them, evenly spread. A fit takes all; of
-large discs all of those at the edge, which locate it, and some of the others, which give the grey
-levels. How far a pixel is from the edge is known to first order, with the floor's steps at the
+Pixels count if they are within some radii of the disc where a fit starts, or within some pixels or
+deviations of the blur of its edge. A first look takes some of them, evenly spread. A fit takes all;
+of large discs all of those at the edge, which locate it, and some of the others, which give the
+grey levels. How far a pixel is from the edge is known to first order, with the floor's steps at the
 candidate: ``|r - R| r / |J^T p|`` pixels for a place p on the floor, r = ``|p|``, and the steps J.
 """
 
@@ -27,6 +27,7 @@ from detect.discs.model import (
     ROWS,
     SADDLE,
     SADDLE_XY,
+    Disc,
 )
 
 #: Most pixels of a patch.
@@ -43,8 +44,6 @@ PATCH = np.dtype(
         ("pixel", np.uint32, CAPACITY),
         # Its weight in the explained variance, in pixels: 0 too far from the disc to count.
         ("weight", *_VALUES),
-        # 1 where it is the right neighbour of the pixel before it, else 0.
-        ("linked", *_VALUES),
         # Place on the floor relative to the candidate, in nominal radii, and how far that moves by
         # one step along the first axis and along the second: u and v, or the steeper one and the
         # other.
@@ -56,8 +55,8 @@ PATCH = np.dtype(
         # Of the fit, grey levels.
         ("residual", *_VALUES),
         ("sector", np.int32, CAPACITY),
-        # Working space: weights of one row of the image.
-        ("row", *_VALUES),
+        # Working space, of one row of the image: weights, and places on the floor.
+        *((name, *_VALUES) for name in ("row", "row_x", "row_y")),
     ]
 )  # fmt: skip
 
@@ -72,7 +71,7 @@ _LEAST_HALF_AXIS = 4.0
 _NEAR_RADII = 1.45
 _NEAR_PX = 2.0
 #: What is called the edge: this many deviations of the blur on either side.
-_EDGE_BLURS = 2.8
+_EDGE_BLURS = 2.0
 #: About how many pixels a look takes; of windows larger than the other a fit takes some.
 _LOOK_PIXELS = 160
 _DENSE_WINDOW = 2048
@@ -134,7 +133,7 @@ class View(NamedTuple):
     v_per_radius: float
     """How many pixels one radius can be at most; 0 where no floor is seen."""
     steps: tuple[float, float, float, float]
-    """By how much the floor moves from pixel to pixel: x, y by u, and by v; nominal radii."""
+    """By how much the floor moves from pixel to pixel: x, y by u, and by v; radii."""
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
@@ -160,9 +159,14 @@ def floor_steps(
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def view_of(floor_xy: NDArray[np.float32], candidate: Candidate, ratio: float) -> View:
-    """How a candidate is seen, with the blur's ratio of `FitSettings`."""
-    per_radius = 1.0 / candidate.radius
+def view_of(
+    floor_xy: NDArray[np.float32], candidate: Candidate, relative: float, ratio: float
+) -> View:
+    """How a candidate of a radius relative to the nominal one is seen.
+
+    `ratio` is that of the blur in `FitSettings`.
+    """
+    per_radius = 1.0 / (candidate.radius * relative)
     xu, yu, xv, yv = floor_steps(floor_xy, candidate.u, candidate.v)
     xu, yu, xv, yv = xu * per_radius, yu * per_radius, xv * per_radius, yv * per_radius
     area = abs(xu * yv - xv * yu)
@@ -203,6 +207,7 @@ def gather(
     floor_xy: NDArray[np.float32],
     candidate: Candidate,
     settings: FitSettings,
+    start: Disc,
     look: bool,
     patch: Any,
 ) -> Gathered:
@@ -215,15 +220,17 @@ def gather(
         Floor position of each pixel, metres.
     candidate : Candidate
     settings : FitSettings
+    start : Disc
+        Where the fit starts.
     look : bool
         Take about 160 pixels, rather than all that matter.
     patch : PATCH
         The result.
     """
-    view = view_of(floor_xy, candidate, settings.blur_ratio)
+    view = view_of(floor_xy, candidate, start.radius, settings.blur_ratio)
     if view.u_per_radius == 0.0:
         return Gathered(view.shape, 0, 0)
-    count = _choose(floor_xy, candidate, settings, view, look, patch)
+    count = _choose(floor_xy, candidate, settings, start, view, look, patch)
     _describe(image, floor_xy, candidate, view.shape, count, patch)
     return Gathered(view.shape, padded(count), count)
 
@@ -233,6 +240,7 @@ def _choose(
     floor_xy: NDArray[np.float32],
     candidate: Candidate,
     settings: FitSettings,
+    start: Disc,
     view: View,
     look: bool,
     patch: Any,
@@ -256,42 +264,57 @@ def _choose(
     stands_for = F32(every * row_step)
     at_edge = stands_for if look else F32(1.0)
     shift = max(1, int(_SHIFT * every + 0.5))
-    floor = floor_xy.reshape(-1)
-    pixel, weight, row = patch.pixel, patch.weight, patch.row
-    length = last_u - first_u + 1
+    floor = floor_xy.reshape(-1, 2)
+    pixel, weight, row, row_x, row_y = (
+        patch.pixel,
+        patch.weight,
+        patch.row,
+        patch.row_x,
+        patch.row_y,
+    )
+    # Places relative to the start, in its radii.
+    x0 = F32(floor_xy[v0, u0, 0] + candidate.radius * start.x)
+    y0 = F32(floor_xy[v0, u0, 1] + candidate.radius * start.y)
+    per_radius = F32(1.0 / (candidate.radius * start.radius))
     count = 0
     for v in range(v0 - (v0 - first_v) // row_step * row_step, last_v + 1, row_step):
+        turn = (u0 - first_u + shift * (v - v0)) % every
+        begin, step, between = v * width + first_u, 1, every - 1
+        if look:
+            begin, step, turn, between = begin + turn, every, 0, 0
+        length = (v * width + last_u - begin) // step + 1
         if count + length > CAPACITY:
             break
-        begin = v * width + first_u
-        _weigh(
-            floor[2 * begin :], length, floor_xy[v0, u0], candidate, settings, view, stands_for,
-            at_edge, row,
-        )  # fmt: skip
-        turn = (u0 - first_u + shift * (v - v0)) % every
+        if look:
+            for k in range(length):
+                row_x[k] = (floor[begin + step * k, 0] - x0) * per_radius
+                row_y[k] = (floor[begin + step * k, 1] - y0) * per_radius
+        else:
+            places = floor[begin:]
+            for k in range(np.uint64(length)):
+                row_x[k] = (places[k, 0] - x0) * per_radius
+                row_y[k] = (places[k, 1] - y0) * per_radius
+        _weigh(length, candidate, settings, view, stands_for, at_edge, patch)
         for k in range(length):
             if row[k] >= F32(0.0) and (turn == 0 or row[k] == F32(1.0)):
-                pixel[count] = begin + k
+                pixel[count] = begin + step * k
                 weight[count] = row[k]
                 count += 1
-            turn = turn - 1 if turn > 0 else every - 1
+            turn = turn - 1 if turn > 0 else between
     return count
 
 
 @njit(cache=True, error_model="numpy", forceinline=True, fastmath=FASTMATH)
 def _weigh(
-    floor: NDArray[np.float32],
     length: int,
-    middle: NDArray[np.float32],
     candidate: Candidate,
     settings: FitSettings,
     view: View,
     stands_for: float,
     at_edge: float,
-    row: NDArray[np.float32],
+    patch: Any,
 ) -> None:
     """Weights of the pixels of a row: -1 beyond reach, 0 too far from the disc."""
-    x0, y0, per_radius = F32(middle[0]), F32(middle[1]), F32(1.0 / candidate.radius)
     xu, yu, xv, yv = (
         F32(view.steps[0]), F32(view.steps[1]), F32(view.steps[2]), F32(view.steps[3]),
     )  # fmt: skip
@@ -305,8 +328,7 @@ def _weigh(
     reach_radii, near_radii = F32(settings.reach_radii), F32(_NEAR_RADII)
     near_px = F32(_NEAR_PX**2)
     for k in range(length):
-        x = (floor[2 * k] - x0) * per_radius
-        y = (floor[2 * k + 1] - y0) * per_radius
+        x, y = patch.row_x[k], patch.row_y[k]
         r_2 = x * x + y * y
         r = math.sqrt(r_2)
         # Distance from the edge, and the floor's steps across it, times the distance.
@@ -325,7 +347,7 @@ def _weigh(
         edge = off_2 < edge_u * gu + edge_v * gv
         weight = F32(0.0) if within else F32(-1.0)
         weight = stands_for if near else weight
-        row[k] = at_edge if near & edge else weight
+        patch.row[k] = at_edge if near & edge else weight
 
 
 @njit(cache=True, error_model="numpy", forceinline=True, fastmath=FASTMATH)
@@ -351,24 +373,20 @@ def _describe(
     before = math.hypot(floor[at, 0] - floor[at - first, 0], floor[at, 1] - floor[at - first, 1])
     patch.growth = F32(2.0) * (after - before) / (after + before + F32(1e-9))
     for i in range(count):
-        at = np.int64(pixel[i])
-        x, y = floor[at, 0], floor[at, 1]
-        patch.x[i] = (x - x0) * per_radius
-        patch.y[i] = (y - y0) * per_radius
-        patch.x1[i] = (floor[at + first, 0] - floor[at - first, 0]) * per_two
-        patch.y1[i] = (floor[at + first, 1] - floor[at - first, 1]) * per_two
-        patch.x2[i] = (floor[at + second, 0] - floor[at - second, 0]) * per_two
-        patch.y2[i] = (floor[at + second, 1] - floor[at - second, 1]) * per_two
+        at, one, two = np.uint64(pixel[i]), np.uint64(first), np.uint64(second)
+        patch.x[i] = (floor[at, 0] - x0) * per_radius
+        patch.y[i] = (floor[at, 1] - y0) * per_radius
+        patch.x1[i] = (floor[at + one, 0] - floor[at - one, 0]) * per_two
+        patch.y1[i] = (floor[at + one, 1] - floor[at - one, 1]) * per_two
+        patch.x2[i] = (floor[at + two, 0] - floor[at - two, 0]) * per_two
+        patch.y2[i] = (floor[at + two, 1] - floor[at - two, 1]) * per_two
         design[GREY, i] = F32(grey[at]) - middle
     nowhere, zero = F32(1e3), F32(0.0)
     for i in range(count, padded(count)):
         patch.x[i] = patch.y[i] = nowhere
-        patch.linked[i] = zero
         patch.x1[i] = patch.y2[i] = F32(1.0)
         patch.y1[i] = patch.x2[i] = patch.weight[i] = design[GREY, i] = zero
-    patch.linked[0] = zero
-    for i in range(1, count):
-        patch.linked[i] = F32(1.0) if pixel[i] == pixel[i - 1] + np.uint32(1) else zero
+        pixel[i] = pixel[count - 1]
     for i in range(padded(count)):
         x = patch.x[i] if patch.x[i] < nowhere else zero
         y = patch.y[i] if patch.x[i] < nowhere else zero

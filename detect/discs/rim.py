@@ -62,6 +62,7 @@ _ARRIVED = 1e-4
 #: With this share of the points on it, no other circle has more.
 _CERTAINLY_BEST = 0.9
 
+_1 = np.uint64(1)
 _ANGLES = 2.0 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
 _COS, _SIN = np.cos(_ANGLES), np.sin(_ANGLES)
 #: Weights of a parabola's beginning, middle and end at the steps.
@@ -122,8 +123,7 @@ def profiles(
     pixels_per_radius : (DIRECTIONS,) float64
         Length of a radius in the image in each direction, pixels.
     """
-    grey = np.full((DIRECTIONS, STEPS), np.nan)
-    scale = np.ones(DIRECTIONS)
+    grey, scale = np.empty((DIRECTIONS, STEPS)), np.empty(DIRECTIONS)
     u0, v0 = project_floor_point(camera_numbers, x, y)
     half = 0.5 * FARTHEST
     right, bottom = image.shape[1] - 1.0, image.shape[0] - 1.0
@@ -136,11 +136,14 @@ def profiles(
         for m in range(STEPS):
             u = _BEGIN[m] * u0 + _MIDDLE[m] * u1 + _END[m] * u2
             v = _BEGIN[m] * v0 + _MIDDLE[m] * v1 + _END[m] * v2
+            grey[k, m] = math.nan
             if 0.0 <= u < right and 0.0 <= v < bottom:
-                i, j = np.int32(u), np.int32(v)
+                # Unsigned: an index that is none of those counted from the end.
+                i, j = np.uint64(u), np.uint64(v)
                 a, b = np.float32(u - i), np.float32(v - j)
-                upper = image[j, i] + a * (np.float32(image[j, i + 1]) - image[j, i])
-                lower = image[j + 1, i] + a * (np.float32(image[j + 1, i + 1]) - image[j + 1, i])
+                upper = image[j, i] + a * (np.float32(image[j, i + _1]) - image[j, i])
+                lower = np.float32(image[j + _1, i])
+                lower += a * (np.float32(image[j + _1, i + _1]) - lower)
                 grey[k, m] = upper + b * (lower - upper)
     return grey, scale
 
@@ -165,12 +168,12 @@ def rim_points(
     step : (DIRECTIONS,) float64
         The step there, grey levels.
     """
-    distance = np.full(DIRECTIONS, np.nan)
-    step = np.zeros(DIRECTIONS)
+    distance, step = np.empty(DIRECTIONS), np.zeros(DIRECTIONS)
     per_step = (FARTHEST - NEAREST) / (STEPS - 1)
     sign = 1.0 if contrast > 0.0 else -1.0
     change = np.empty(STEPS)
     for k in range(DIRECTIONS):
+        distance[k] = math.nan
         # The step is taken over two pixels, and at least over a sixth of the radius.
         reach = max(2, round(1.0 / (pixels_per_radius[k] * per_step)))
         reach = min(reach, STEPS // 4)
@@ -368,17 +371,18 @@ def follow_rim(
     """
     grey, scale = profiles(image, camera_numbers, x, y, radius)
     distance, step = rim_points(grey, scale, contrast)
-    tolerance = TOLERANCE_RADII + TOLERANCE_PX / scale
-    at_x = np.zeros(DIRECTIONS)
-    at_y = np.zeros(DIRECTIONS)
-    weight = np.zeros(DIRECTIONS)
+    at_x, at_y = np.zeros(DIRECTIONS), np.zeros(DIRECTIONS)
+    weight, tolerance = np.zeros(DIRECTIONS), np.zeros(DIRECTIONS)
+    log_px = 0.0
     for k in range(DIRECTIONS):
+        log_px += math.log(scale[k]) / DIRECTIONS
+        tolerance[k] = TOLERANCE_RADII + TOLERANCE_PX / scale[k]
         if distance[k] == distance[k]:
             at_x[k], at_y[k] = distance[k] * _COS[k], distance[k] * _SIN[k]
             weight[k] = (scale[k] / POINT_SIGMA_PX) ** 2
     chosen = np.zeros(DIRECTIONS)
     best, best_count = best_circle(at_x, at_y, weight, tolerance, chosen)
-    radius_px = math.exp(np.mean(np.log(scale)))
+    radius_px = math.exp(log_px)
     nothing = Rim(0.0, 0.0, 0, 0.0, 0.0, 0.0, x, y, radius, 0.0, 0.0, 0.0, radius_px)
     if best_count < LEAST_POINTS:
         return nothing
@@ -431,14 +435,14 @@ def _placed(
     Where a stretch ends, the edge of what hides the rest of the rim pulls at the rim's own. Points
     far off the others by their median deviation are left out.
     """
-    trusted = chosen.copy()
-    count = 0
+    trusted, count = np.zeros(DIRECTIONS), 0
     for k in range(DIRECTIONS):
-        if chosen[(k - 1) % DIRECTIONS] == 0.0 or chosen[(k + 1) % DIRECTIONS] == 0.0:
-            trusted[k] = 0.0
+        if chosen[(k - 1) % DIRECTIONS] > 0.0 and chosen[(k + 1) % DIRECTIONS] > 0.0:
+            trusted[k] = chosen[k]
         count += trusted[k] > 0.0
     if count < LEAST_TRUSTED:
-        trusted[:] = chosen
+        for k in range(DIRECTIONS):
+            trusted[k] = chosen[k]
     off = np.empty(DIRECTIONS)
     for _ in range(_PLACING_STEPS):
         circle = fit_circle(x, y, trusted, circle)
@@ -467,22 +471,29 @@ def _by_jackknife(
     Neighbouring points err together where something touches the rim: what the centre owes to one
     stretch says how far off all of them may be (B. Efron, The Jackknife, 1982).
     """
-    without = np.empty((_STRETCHES, 2))
-    n = 0
+    others, n = np.empty((_STRETCHES, 2)), 0
+    some = np.empty(DIRECTIONS)
     each = DIRECTIONS // _STRETCHES
-    for k in range(_STRETCHES):
-        some = weight.copy()
-        some[each * k : each * (k + 1)] = 0.0
-        if np.sum(some) == np.sum(weight) or np.sum(some) == 0.0:
+    mean_x = mean_y = 0.0
+    for stretch in range(_STRETCHES):
+        left_out = left = 0
+        for k in range(DIRECTIONS):
+            some[k] = 0.0 if k // each == stretch else weight[k]
+            left_out += some[k] != weight[k]
+            left += some[k] > 0.0
+        if left_out == 0 or left == 0:
             continue
         other = fit_circle(x, y, some, fit_circle(x, y, some, circle))
-        without[n, 0], without[n, 1] = other.x, other.y
-        n += 1
+        others[n, 0], others[n, 1] = other.x, other.y
+        mean_x, mean_y, n = mean_x + other.x, mean_y + other.y, n + 1
     if n < 2:
         return 1.0, 0.0, 1.0
-    dx, dy = without[:n, 0] - np.mean(without[:n, 0]), without[:n, 1] - np.mean(without[:n, 1])
+    xx = xy = yy = 0.0
+    for i in range(n):
+        dx, dy = others[i, 0] - mean_x / n, others[i, 1] - mean_y / n
+        xx, xy, yy = xx + dx * dx, xy + dx * dy, yy + dy * dy
     share = (n - 1.0) / n
-    return share * np.sum(dx * dx), share * np.sum(dx * dy), share * np.sum(dy * dy)
+    return share * xx, share * xy, share * yy
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

@@ -9,19 +9,18 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from detect.discs import fit
-from detect.discs.candidates import middles, strong_and_alone, suppress_neighbours
+from camera.kernels import project_floor_point
+from detect.discs.candidates import best_apart, middles, strong_and_alone
 from detect.discs.descent import Hope
 from detect.discs.evidence_kernels import (
     CLEAR_EVIDENCE,
     LEAST_MIDDLE_STEP,
-    LEAST_RIM,
     LEAST_RIM_PX,
     RADIUS_RANGE,
     evidence_of,
     evidence_with_rim,
 )
-from detect.discs.fit import RESULT, X, Y, fit_disc, fitted_positions, working_space
+from detect.discs.fit import RESULT, fit_disc, working_space
 from detect.discs.model import Disc
 from detect.discs.patch import FULL, LOOK, Candidate, FitSettings, floor_steps
 from detect.discs.quality import Centres
@@ -84,10 +83,6 @@ class DiscSearch(NamedTuple):
     """Neighbours are suppressed at the fitted positions; else at the candidates'."""
     least_evidence: float
     optics_px: float
-    pixel_variance: float
-    """Of the systematic error, pixels squared."""
-    tilt_variance: float
-    """Of pitch and of roll, radians squared."""
 
 
 class Scene(NamedTuple):
@@ -128,108 +123,211 @@ def search_discs(scene: Scene, centres: Centres, weakest: float) -> FoundDiscs:
     weakest : float
         Least contrast, grey levels.
     """
-    search = scene.search
+    return FoundDiscs(*_search(scene, centres, weakest, working_space()))
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _search(scene: Scene, centres: Centres, weakest: float, space: NDArray[Any]) -> Any:
+    """`search_discs`: the fields of what it returns."""
+    image, floor_xy, search, settings = scene.image, scene.floor_xy, scene.search, scene.settings
+    work = space[0]
     # Each disc has several best centres: of those in the middle of it one is enough.
     near = 0.5 * search.separation
-    keep = strong_and_alone(centres, scene.floor_xy, weakest, near)
-    starts = middles(centres, keep, scene.floor_xy, weakest, near)
-    quality, contrast, work = centres.quality[keep], centres.contrast[keep], working_space()[0]
-    order = np.argsort(-quality, kind="stable")
-    looks, promise = _look_at_all(scene, starts, quality, contrast, order, work)
-    order = np.flatnonzero(promise > -np.inf)
-    looked_xy = np.column_stack([looks[X], looks[Y]])
-    order = _apart(order, looked_xy, promise, _SAME_DISC * search.separation)
-    results, evidence, score = _fit_all(scene, starts, quality, contrast, looks, order, work)
-    found = np.flatnonzero(score > -np.inf)
-    places = np.column_stack([results[X], results[Y]])
-    if not search.refine:
-        places = scene.floor_xy[starts[:, 1], starts[:, 0]].astype(np.float64)
-    found = _apart(found, places, score, search.separation)
+    keep = strong_and_alone(centres, floor_xy, weakest, near)
+    starts = middles(centres, keep, floor_xy, weakest, near)
+    count = len(keep)
+    results: Any = np.zeros(count, RESULT)
+    place = np.zeros((count, 2))
+    evidence, score = np.full(count, -np.inf), np.full(count, -np.inf)
+    first_blur = max(settings.blur_px, 0.6 * search.optics_px)
+    for k in range(count):
+        result, u, v = results[k], starts[k, 0], starts[k, 1]
+        quality, contrast = centres.quality[keep[k]], centres.contrast[keep[k]]
+        if _at_clear_disc(search, place[:k], evidence, floor_xy[v, u]) or (
+            search.verify and not worth_a_look(scene, u, v, quality, contrast)
+        ):
+            continue
+        candidate = Candidate(u, v, search.radius, first_blur)
+        start = Disc(0.0, 0.0, 1.0, math.log(first_blur))
+        hope = _hope(search, quality)
+        if fit_disc(image, floor_xy, candidate, settings, start, LOOK, hope, work, result):
+            place[k, 0], place[k, 1] = result.x, result.y
+            promise = _evidence(result, search)
+            if not search.verify:
+                evidence[k] = max(promise, _NO_EVIDENCE)
+            elif promise >= hope.least_evidence:
+                evidence[k] = promise
+    for k in best_apart(place, evidence, _SAME_DISC * search.separation):
+        result, u, v = results[k], starts[k, 0], starts[k, 1]
+        quality, contrast = centres.quality[keep[k]], centres.contrast[keep[k]]
+        x, y = floor_xy[v, u, 0], floor_xy[v, u, 1]
+        u, v = nearest_pixel(floor_xy, u, v, result.x, result.y)
+        # A look gives the blur but roughly: too small a patch would be gathered again.
+        blur = max(result.blur, first_blur)
+        is_disc = False
+        for _ in range(1 + _MOST_REFITS):
+            candidate = Candidate(u, v, search.radius, blur)
+            start = Disc(
+                (result.x - floor_xy[v, u, 0]) / search.radius,
+                (result.y - floor_xy[v, u, 1]) / search.radius,
+                result.radius / search.radius,
+                math.log(result.blur),
+            )
+            hope = _hope(search, quality)
+            is_disc = fit_disc(
+                image, floor_xy, candidate, settings, start, FULL, hope, work, result
+            )
+            evidence[k] = _evidence(result, search) if is_disc else -np.inf
+            if is_disc and search.verify:
+                evidence[k] = _with_rim(scene, quality, evidence[k], result)
+                is_disc = evidence[k] >= search.least_evidence
+            if not is_disc or result.blur <= _AT_BOUND * result.blur_bound:
+                break
+            # Too blurred for its patch: once more, in a wider one.
+            blur = result.blur_bound
+        # A fit that wandered off, or turned the disc's contrast round, is about something else.
+        off = math.hypot(result.x - x, result.y - y)
+        if is_disc and off < search.radius and result.contrast * contrast > 0.0:
+            score[k] = max(evidence[k], _NO_EVIDENCE + quality)
+        place[k, 0], place[k, 1] = (result.x, result.y) if search.refine else (x, y)
+    best = best_apart(place, score, search.separation)
     if search.verify:
-        found = found[_likely_sign(contrast[found] > 0.0, evidence[found], search.least_evidence)]
-    return FoundDiscs(keep[found], *fitted_positions(results[found]), evidence[found])
+        best = of_likely_sign(best, results.contrast, evidence, search.least_evidence)
+    # In scan order, as the centres are: by insertion, for these are few.
+    for i in range(1, len(best)):
+        k, j = best[i], i
+        while j > 0 and keep[best[j - 1]] > keep[k]:
+            best[j] = best[j - 1]
+            j -= 1
+        best[j] = k
+    found, covariance = np.empty(len(best), np.int64), np.empty((len(best), 2, 2))
+    found_xy, log_odds = np.empty((len(best), 2)), np.empty(len(best))
+    for i in range(len(best)):
+        result = results[best[i]]
+        found[i], log_odds[i] = keep[best[i]], evidence[best[i]]
+        found_xy[i, 0], found_xy[i, 1] = result.x, result.y
+        covariance[i, 0, 0], covariance[i, 1, 1] = result.cov_xx, result.cov_yy
+        covariance[i, 0, 1] = covariance[i, 1, 0] = result.cov_xy
+    return found, found_xy, covariance, log_odds
 
 
-def _apart(
-    index: NDArray[np.int64], place: NDArray[np.float64], score: NDArray[np.float64], near: float
-) -> NDArray[np.int64]:
-    """Those of some discs that have no better one nearby; all of them if nothing is near."""
-    if near > 0.0:
-        index = index[suppress_neighbours(place[index], score[index], near)]
-    return index
+@njit(cache=True, error_model="numpy", nogil=True)
+def _at_clear_disc(
+    search: DiscSearch, looked_at: NDArray[np.float64], evidence: NDArray[np.float64],
+    place: NDArray[np.float32],
+) -> bool:  # fmt: skip
+    """Whether a place is within a disc that a look showed clearly."""
+    near = _WITHIN * search.separation
+    for k in range(len(looked_at)):
+        if search.verify and evidence[k] >= search.least_evidence + _CLEAR:
+            dx, dy = looked_at[k, 0] - place[0], looked_at[k, 1] - place[1]
+            if dx * dx + dy * dy < near * near:
+                return True
+    return False
 
 
-def _likely_sign(
-    light: NDArray[np.bool_], evidence: NDArray[np.float64], least_evidence: float
-) -> NDArray[np.bool_]:
-    """Which discs are not both doubtful and the only dark ones among light ones, or vice versa.
+@njit(cache=True, error_model="numpy", nogil=True)
+def of_likely_sign(
+    found: NDArray[np.int64], contrast: NDArray[np.float64], evidence: NDArray[np.float64],
+    least_evidence: float,
+) -> NDArray[np.int64]:  # fmt: skip
+    """Those discs that are not both doubtful and of a sign that hardly any others have.
 
     Discs of one place are mostly alike. With m of n clear discs of a sign, the odds of that sign
     are (m + 1) : (n - m + 1) by Laplace's rule of succession; where they speak against a doubtful
     disc, they are weighed with its evidence. Few clear discs say too little.
     """
-    clear = evidence >= least_evidence + CLEAR_EVIDENCE
-    if np.count_nonzero(clear) < _LEAST_CLEAR:
-        return np.ones(len(light), np.bool_)
-    odds = (np.count_nonzero(light & clear) + 1) / (np.count_nonzero(~light & clear) + 1)
-    log_odds = np.where(light, 1.0, -1.0) * math.log(odds)
-    return np.asarray(evidence + np.minimum(log_odds, 0.0) >= least_evidence)
+    light = dark = 0
+    for k in found:
+        if evidence[k] >= least_evidence + CLEAR_EVIDENCE:
+            light += contrast[k] > 0.0
+            dark += contrast[k] < 0.0
+    if light + dark < _LEAST_CLEAR:
+        return found
+    log_odds = math.log((light + 1.0) / (dark + 1.0))
+    kept, count = np.empty(len(found), np.int64), 0
+    for k in found:
+        for_it = log_odds if contrast[k] > 0.0 else -log_odds
+        if evidence[k] + min(for_it, 0.0) >= least_evidence:
+            kept[count] = k
+            count += 1
+    return kept[:count]
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _evidence(result: Any, search: DiscSearch) -> float:
     return evidence_of(
-        result[fit.EXPLAINED],
-        result[fit.RADIUS] / search.radius,
-        result[fit.OUTLINE_DEVIATION],
-        result[fit.SECTORS_GOOD],
-        result[fit.MIDDLE_STEP],
-        result[fit.RELATIVE_BLUR],
+        result.explained,
+        result.radius / search.radius,
+        result.outline_deviation,
+        result.sectors_good,
+        result.middle_step,
+        result.relative_blur,
         search.optics_px,
     )
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _slack(quality: float) -> float:
-    """How much less than the required evidence a first look may promise."""
-    return _FIRST_LOOK_SLACK + _SLACK_PER_QUALITY * max(quality - _ORDINARY_QUALITY, 0.0)
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def _rim_of(scene: Scene, result: Any) -> Rim:
-    return follow_rim(
-        scene.image, scene.camera_numbers, result[fit.X], result[fit.Y], scene.search.radius,
-        result[fit.CONTRAST],
-    )  # fmt: skip
+def _hope(search: DiscSearch, quality: float) -> Hope:
+    """When a fit is given up: it may promise less where the quality is high."""
+    if not search.verify:
+        return Hope(-math.inf, -math.inf, search.optics_px)
+    slack = _FIRST_LOOK_SLACK + _SLACK_PER_QUALITY * max(quality - _ORDINARY_QUALITY, 0.0)
+    return Hope(_LEAST_SHARE, search.least_evidence - slack, search.optics_px)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _with_rim(scene: Scene, quality: float, log_odds: float, result: Any) -> float:
-    """The evidence of a doubtful fit with its rim, which also places a partly hidden disc."""
+    """The evidence of a fit with its rim, where it is doubtful; the rim may place the disc.
+
+    It places a partly hidden disc, and one that the fit explains in part if it states the smaller
+    covariance: a shadow's edge, a sun patch or a sheet of paper pull at the fit of a whole disc,
+    and much less at the points of the rim beside them.
+    """
     search = scene.search
-    relative = result[fit.RADIUS] / search.radius
+    is_clear = log_odds >= search.least_evidence + CLEAR_EVIDENCE
+    relative = result.radius / search.radius
     possible = (
-        RADIUS_RANGE[0] < relative < RADIUS_RANGE[1] and result[fit.MIDDLE_STEP] > LEAST_MIDDLE_STEP
+        RADIUS_RANGE[0] < relative < RADIUS_RANGE[1] and result.middle_step > LEAST_MIDDLE_STEP
     )
-    if not possible:
+    if (is_clear and result.explained >= _WELL_EXPLAINED) or not possible:
         return log_odds
-    rim = _rim_of(scene, result)
-    if rim.radius_px < LEAST_RIM_PX:
+    if _radius_px(scene, result.x, result.y) < LEAST_RIM_PX:
         return log_odds
+    rim = follow_rim(
+        scene.image, scene.camera_numbers, result.x, result.y, search.radius, result.contrast
+    )
     together = evidence_with_rim(
-        log_odds, result[fit.EXPLAINED], result[fit.CONTRAST], quality, rim, search.radius
+        log_odds, result.explained, result.contrast, quality, rim, search.radius
     )
-    by_fit = log_odds
-    if log_odds >= search.least_evidence and together < _REFUTED:
+    by_fit, by_rim = log_odds, search.least_evidence + together - _RESCUED
+    if not is_clear and log_odds >= search.least_evidence and together < _REFUTED:
         by_fit = -math.inf
-    by_rim = search.least_evidence + together - _RESCUED
-    if log_odds >= search.least_evidence + _BY_FIT or result[fit.OUTLINE_DEVIATION] > _MOST_UNEVEN:
-        return by_fit
-    if by_rim < search.least_evidence and log_odds >= search.least_evidence:
+    if (
+        log_odds >= search.least_evidence + _BY_FIT
+        or result.outline_deviation > _MOST_UNEVEN
+        or by_rim < search.least_evidence <= log_odds
+    ):
+        surer = rim.cov_xx + rim.cov_yy < result.cov_xx + result.cov_yy
+        partly = result.explained < _WELL_EXPLAINED and rim.agreeing >= _HALF_RIM
+        if partly and surer and _places_well(rim):
+            _place_by_rim(result, rim)
         return by_fit
     if _places_well(rim):
         _place_by_rim(result, rim)
     return by_rim
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _radius_px(scene: Scene, x: float, y: float) -> float:
+    """The geometric mean of a disc's radius over all directions: (a + b) / 2 of an ellipse."""
+    radius = scene.search.radius
+    u, v = project_floor_point(scene.camera_numbers, x, y)
+    u1, v1 = project_floor_point(scene.camera_numbers, x + radius, y)
+    u2, v2 = project_floor_point(scene.camera_numbers, x, y + radius)
+    u1, v1, u2, v2 = u1 - u, v1 - v, u2 - u, v2 - v
+    squares = u1 * u1 + v1 * v1 + u2 * u2 + v2 * v2
+    return 0.5 * math.sqrt(squares + 2.0 * abs(u1 * v2 - u2 * v1))
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -243,25 +341,8 @@ def _places_well(rim: Rim) -> bool:
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _place_by_rim(result: Any, rim: Rim) -> None:
-    result[fit.X], result[fit.Y] = rim.x, rim.y
-    result[fit.COV_XX], result[fit.COV_XY] = rim.cov_xx, rim.cov_xy
-    result[fit.COV_YY] = rim.cov_yy
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def _place_by_the_surer(scene: Scene, result: Any) -> None:
-    """Place a disc that the fit explains in part by its rim, if that states the smaller covariance.
-
-    A shadow's edge, a sun patch or a sheet of paper pull at the fit of a whole disc, and much less
-    at the points of the rim beside them.
-    """
-    if result[fit.EXPLAINED] >= _WELL_EXPLAINED:
-        return
-    rim = _rim_of(scene, result)
-    by_fit = result[fit.COV_XX] + result[fit.COV_YY]
-    enough = rim.agreeing >= _HALF_RIM and rim.radius_px >= LEAST_RIM_PX
-    if enough and _places_well(rim) and rim.cov_xx + rim.cov_yy < by_fit:
-        _place_by_rim(result, rim)
+    result.x, result.y = rim.x, rim.y
+    result.cov_xx, result.cov_xy, result.cov_yy = rim.cov_xx, rim.cov_xy, rim.cov_yy
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
@@ -349,160 +430,11 @@ def share_of_steps(
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def worth_a_look(
-    image: NDArray[np.uint8],
-    floor_xy: NDArray[np.float32],
-    u: int,
-    v: int,
-    quality: float,
-    contrast: float,
-    inner: float,
-    outer: float,
-) -> bool:
-    """Whether a candidate's quality is clear, or the grey value steps on most sides.
-
-    Parameters are those of `share_of_steps`.
-    """
+def worth_a_look(scene: Scene, u: int, v: int, quality: float, contrast: float) -> bool:
+    """Whether a candidate's quality is clear, or the grey value steps on most sides."""
     if quality >= CLEAR_QUALITY:
         return True
-    steps = share_of_steps(image, floor_xy, u, v, inner, outer, contrast)
+    steps = share_of_steps(
+        scene.image, scene.floor_xy, u, v, scene.search.inner, scene.search.outer, contrast
+    )
     return bool(steps >= _LEAST_STEPS)
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def _near_clear(clear: NDArray[np.float64], count: int, x: float, y: float, near: float) -> bool:
-    """Whether a place is nearer than this to one of the first discs that showed clearly."""
-    for k in range(count):
-        dx, dy = clear[k, 0] - x, clear[k, 1] - y
-        if dx * dx + dy * dy < near * near:
-            return True
-    return False
-
-
-@njit(cache=True, error_model="numpy", forceinline=True)
-def _hope(search: DiscSearch, quality: float) -> Hope:
-    """When a fit is given up."""
-    if search.verify:
-        return Hope(_LEAST_SHARE, search.least_evidence - _slack(quality), search.optics_px)
-    return Hope(-math.inf, -math.inf, search.optics_px)
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def _promising(scene: Scene, quality: float, log_odds: float, result: Any) -> bool:
-    """Whether a look is worth a fit."""
-    search = scene.search
-    if log_odds >= search.least_evidence - _FIRST_LOOK_SLACK:
-        return True
-    if log_odds < search.least_evidence - _slack(quality):
-        return False
-    # Whether enough of a rim is in view round a poor first look to be worth a fit.
-    rim = _rim_of(scene, result)
-    return bool(rim.agreeing >= LEAST_RIM or rim.radius_px < LEAST_RIM_PX)
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def _look_at_all(
-    scene: Scene, pixels: NDArray[np.int64], quality: NDArray[np.float64],
-    contrast: NDArray[np.float32], order: NDArray[np.int64], work: Any,
-) -> tuple[Any, NDArray[np.float64]]:  # fmt: skip
-    """Look at the candidates in some order: (N,) RESULT, and what they promise.
-
-    What lies within a disc that showed clearly is left out. The promise is the evidence;
-    minus infinity for what is not worth a fit.
-    """
-    search, floor_xy = scene.search, scene.floor_xy
-    looks = np.zeros(len(pixels), RESULT)
-    promise = np.full(len(pixels), -np.inf)
-    clear = np.empty((len(pixels), 2))
-    clear_count = 0
-    blur = _first_blur(scene)
-    for i in order:
-        u, v = pixels[i, 0], pixels[i, 1]
-        x, y = float(floor_xy[v, u, 0]), float(floor_xy[v, u, 1])
-        if _near_clear(clear, clear_count, x, y, _WITHIN * search.separation):
-            continue
-        if search.verify and not worth_a_look(
-            scene.image, floor_xy, u, v, quality[i], float(contrast[i]), search.inner, search.outer
-        ):
-            continue
-        candidate = Candidate(u, v, search.radius, blur)
-        start = Disc(0.0, 0.0, 1.0, math.log(blur))
-        fitted = fit_disc(
-            scene.image, scene.floor_xy, candidate, scene.settings, start, LOOK,
-            _hope(search, quality[i]), work, looks[i],
-        )  # fmt: skip
-        log_odds = _evidence(looks[i], search) if fitted else -math.inf
-        if not search.verify:
-            if fitted:
-                promise[i] = max(log_odds, _NO_EVIDENCE)
-        elif _promising(scene, quality[i], log_odds, looks[i]):
-            promise[i] = log_odds
-            if log_odds >= search.least_evidence + _CLEAR:
-                clear[clear_count, 0], clear[clear_count, 1] = looks[i][fit.X], looks[i][fit.Y]
-                clear_count += 1
-    return looks, promise
-
-
-@njit(cache=True, error_model="numpy", forceinline=True)
-def _first_blur(scene: Scene) -> float:
-    return max(scene.settings.blur_px, 0.6 * scene.search.optics_px)
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def _fit_after_look(
-    scene: Scene, pixel: NDArray[np.int64], quality: float, look: Any, work: Any, result: Any
-) -> tuple[bool, float]:
-    """Fit in full where a look came to: whether it is a disc, and the evidence."""
-    search, floor_xy = scene.search, scene.floor_xy
-    u, v = nearest_pixel(floor_xy, pixel[0], pixel[1], look[fit.X], look[fit.Y])
-    # A look gives the blur but roughly: too small a patch would be gathered again.
-    blur = max(look[fit.BLUR], _first_blur(scene))
-    x, y, radius, log_blur = look[fit.X], look[fit.Y], look[fit.RADIUS], math.log(look[fit.BLUR])
-    enough, log_odds = False, -math.inf
-    for _ in range(1 + _MOST_REFITS):
-        start = Disc(
-            (x - floor_xy[v, u, 0]) / search.radius,
-            (y - floor_xy[v, u, 1]) / search.radius,
-            radius / search.radius,
-            log_blur,
-        )
-        candidate = Candidate(u, v, search.radius, blur)
-        fitted = fit_disc(
-            scene.image, scene.floor_xy, candidate, scene.settings, start, FULL,
-            _hope(search, quality), work, result,
-        )  # fmt: skip
-        log_odds = _evidence(result, search) if fitted else -math.inf
-        if search.verify and fitted and log_odds < search.least_evidence + CLEAR_EVIDENCE:
-            log_odds = _with_rim(scene, quality, log_odds, result)
-        enough = fitted and (not search.verify or log_odds >= search.least_evidence)
-        if not (enough and result[fit.BLUR] > _AT_BOUND * result[fit.BLUR_BOUND]):
-            if enough and search.verify:
-                _place_by_the_surer(scene, result)
-            break
-        # Too blurred for its patch: once more, in a wider one.
-        blur = result[fit.BLUR_BOUND]
-        x, y, radius = result[fit.X], result[fit.Y], result[fit.RADIUS]
-        log_blur = math.log(result[fit.BLUR])
-    return enough, log_odds
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def _fit_all(
-    scene: Scene, pixels: NDArray[np.int64], quality: NDArray[np.float64],
-    contrast: NDArray[np.float32], looks: Any, order: NDArray[np.int64], work: Any,
-) -> tuple[Any, NDArray[np.float64], NDArray[np.float64]]:  # fmt: skip
-    """Fit what the looks left: (N,) RESULT, the evidence, and a score for those that are discs."""
-    search = scene.search
-    results = np.zeros(len(pixels), RESULT)
-    evidence, score = np.full(len(pixels), -np.inf), np.full(len(pixels), -np.inf)
-    for i in order:
-        result = results[i]
-        enough, log_odds = _fit_after_look(scene, pixels[i], quality[i], looks[i], work, result)
-        evidence[i] = log_odds
-        candidate = scene.floor_xy[pixels[i, 1], pixels[i, 0]]
-        # A fit that wandered off, or turned the disc's contrast round, is about something else.
-        off = math.hypot(result[fit.X] - candidate[0], result[fit.Y] - candidate[1])
-        same_sign = result[fit.CONTRAST] * contrast[i] > 0.0
-        if enough and off < search.radius and same_sign:
-            score[i] = log_odds if log_odds > -math.inf else _NO_EVIDENCE + quality[i]
-    return results, evidence, score

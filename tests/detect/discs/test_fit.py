@@ -118,7 +118,7 @@ def test_larger_discs_than_a_patch_are_fitted(published_camera: Camera, table: D
     assert fit.radius_m[0] == pytest.approx(0.25, rel=2e-3)
 
 
-def test_strongest_alone_in_scan_order(table: DiscTable) -> None:
+def test_strongest_alone_the_best_first(table: DiscTable) -> None:
     pixels = np.array([[300, 200], [304, 200], [500, 200], [600, 200]])
     quality = np.array([0.7, 0.9, 0.8, 0.95])
     contrast = np.array([30.0, -30.0, 30.0, 5.0], np.float32)
@@ -126,7 +126,7 @@ def test_strongest_alone_in_scan_order(table: DiscTable) -> None:
     keep = strong_and_alone(centres, table.floor_xy, 10.0, 0.07)
     np.testing.assert_array_equal(keep, [1, 2])
     keep = strong_and_alone(centres, table.floor_xy, 10.0, 0.0)
-    np.testing.assert_array_equal(keep, [0, 1, 2])
+    np.testing.assert_array_equal(keep, [1, 2, 0])
 
 
 def test_nearest_pixel_sees_the_place(published_camera: Camera, table: DiscTable) -> None:
@@ -199,7 +199,7 @@ def test_fits_are_the_least_squares_of_the_reference(
     assert fit.fitted[0]
     settings = fit_settings(noise, 0.5)
     candidate = Candidate(int(u), int(v), 0.1, settings.blur_px)
-    flat = view_of(table.floor_xy, candidate, 0.5).shape != EDGE
+    flat = view_of(table.floor_xy, candidate, 1.0, 0.5).shape != EDGE
     assert flat == (place[1] < -3.0)
     rows, columns = np.divmod(
         pixels_within_reach(table.floor_xy, candidate, settings), image.shape[1]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from camera import Camera
 from detect.circles import disc_shape
 from detect.discs.fit import fit_settings
-from detect.discs.model import GREY, ONE, PLANE_X, PLANE_Y
+from detect.discs.model import GREY, ONE, PLANE_X, PLANE_Y, Disc
 from detect.discs.patch import EDGE, PATCH, WHOLE, Candidate, FitSettings, Gathered, gather, padded
 from detect.discs.search import share_of_steps
 from detect.settings import CircleSettings
@@ -21,6 +21,7 @@ from tests.detect.painted_floor import PaintedFloor
 from tests.reference.discs import pixels_within_reach
 
 RADIUS = 0.1
+NOMINAL = Disc(0.0, 0.0, 1.0, 0.0)
 
 
 @pytest.fixture(scope="module")
@@ -31,19 +32,24 @@ def table(published_camera: Camera) -> DiscTable:
 @njit(error_model="numpy")
 def _gather(
     image: NDArray[np.uint8], floor_xy: NDArray[np.float32], candidate: Candidate,
-    settings: FitSettings, look: bool, patch: Any,
+    settings: FitSettings, start: Disc, look: bool, patch: Any,
 ) -> Gathered:  # fmt: skip
-    return gather(image, floor_xy, candidate, settings, look, patch[0])
+    return gather(image, floor_xy, candidate, settings, start, look, patch[0])
 
 
 def gathered(
-    table: DiscTable, image: NDArray[np.uint8], candidate: Candidate, look: bool = False
+    table: DiscTable,
+    image: NDArray[np.uint8],
+    candidate: Candidate,
+    look: bool = False,
+    start: Disc = NOMINAL,
 ) -> tuple[Gathered, dict[str, Any]]:
     """`gather` into a patch that was used before."""
     patch = np.zeros(1, PATCH)
     for name in ("x", "y", "design", "weight", "row"):
         patch[name] = 7.0
-    found = _gather(image, table.floor_xy, candidate, fit_settings(1.0, 0.5), look, patch)
+    settings = fit_settings(1.0, 0.5)
+    found = _gather(image, table.floor_xy, candidate, settings, start, look, patch)
     return found, {name: patch[name][0] for name in PATCH.names or ()}
 
 
@@ -65,13 +71,24 @@ def test_patches_are_the_pixels_within_reach(table: DiscTable, u: int, v: int) -
     np.testing.assert_allclose(design[[PLANE_X, PLANE_Y], :n].T, place, atol=2e-5)
     np.testing.assert_array_equal(design[GREY, :n], image[rows, columns].astype(int) - image[v, u])
     np.testing.assert_array_equal(design[ONE, :n], 1.0)
-    np.testing.assert_array_equal(patch["linked"][1:n], np.diff(index) == 1)
     # What fills up the patch is nowhere.
     assert n <= found.n == padded(n) < n + WHOLE
     assert found.n % WHOLE == 0
     np.testing.assert_array_equal(design[[*range(5), GREY], n : found.n], 0.0)
     np.testing.assert_array_equal(patch["weight"][n : found.n], 0.0)
     assert np.all(patch["x"][n : found.n] > 100.0)
+
+
+def test_patches_lie_about_the_start_of_the_fit(table: DiscTable) -> None:
+    image = np.zeros(table.floor_xy.shape[:2], np.uint8)
+    start = Disc(0.1, -0.2, 1.2, 0.0)
+    found, patch = gathered(table, image, Candidate(400, 200, RADIUS, 0.8), start=start)
+    place = table.floor_xy.reshape(-1, 2)[patch["pixel"][: found.fitted].astype(int)]
+    off = place - table.floor_xy[200, 400] - RADIUS * np.array([start.x, start.y])
+    r = np.linalg.norm(off, axis=-1) / (RADIUS * start.radius)
+    at_edge = patch["weight"][: found.fitted] == 1
+    assert r[at_edge].max() < 1.5
+    assert r.max() == pytest.approx(1.7, abs=0.05)
 
 
 @pytest.mark.parametrize("v", [200, 115])

@@ -35,7 +35,7 @@ def fitted(kind: str) -> tuple[NDArray[Any], int]:
     ahead, behind = (edge_share(at, *DISC[:2], DISC.radius + d, *BLUR) for d in (1e-4, -1e-4))
     design[BY_RADIUS, :n] = (ahead - behind) / 2e-4
     patch["weight"][:n] = np.hypot(at.x, at.y) < 1.45
-    patch["linked"][:n] = u > u.min()
+    patch["pixel"][:n] = 1000 * (v + 24) + u + 34
     patch["residual"][:n] = {
         "noise": rng.normal(0.0, 3.0, n),
         "none": np.zeros(n),

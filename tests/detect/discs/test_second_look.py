@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from camera import Camera
 from detect.circles import CircleDetections, detect_circles, disc_shape
-from detect.discs.search import _likely_sign
+from detect.discs.search import of_likely_sign
 from detect.settings import CircleSettings
 from lut import DiscTable, build_disc_table
 from tests.detect.painted_floor import FLOOR, LIGHT, PaintedFloor
@@ -103,6 +103,7 @@ def test_a_doubtful_disc_of_the_other_sign_among_many_clear_ones_is_dropped(
     light[-2:] = True
     evidence = np.full(clear + 2, 12.0)
     evidence[-1] = 2.5
-    likely = _likely_sign(light, evidence, 1.1)
-    assert likely[clear]
-    assert likely[clear + 1] == kept
+    contrast = np.where(light, 50.0, -50.0)
+    likely = of_likely_sign(np.arange(clear + 2), contrast, evidence, 1.1)
+    assert clear in likely
+    assert (clear + 1 in likely) == kept

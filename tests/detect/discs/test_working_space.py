@@ -29,7 +29,7 @@ def test_what_is_left_in_the_memory_of_fits_does_not_matter(
     for number in (0.0, left):
         for name in ("products", "best", "damped", "factor", "values", "bare", "sector_sums"):
             work[name] = number
-        for name in ("weight", "linked", "x", "y", "x1", "y2", "growth", "design", "residual"):
+        for name in ("weight", "row", "x", "y", "x1", "y2", "growth", "design", "residual"):
             work["patch"][name] = number
         # Such as would be neighbours.
         work["patch"]["pixel"] = work["patch"]["sector"] = np.arange(CAPACITY) if number else 0
