@@ -31,7 +31,7 @@ from detect.verticals.judgement import (
 )
 from detect.verticals.refinement import LineFits
 from detect.verticals.response import FloatArray, Strip
-from detect.verticals.tilt import level_matrix
+from detect.verticals.tilt import level_matrix, strongest_first
 from detect.verticals.tracking import LineTracks
 
 
@@ -61,63 +61,100 @@ class Lines(NamedTuple):
     bounds: NDArray[np.int64]
 
 
-def lines_of_tracks(
-    strip: Strip, tracks: LineTracks, judged: Judgement, settings: LineSettings
-) -> Lines:
-    """Lines of accepted tracks; the fate of tracks that are left out or joined is changed."""
-    fits, evidence, tilt = judged.fits, judged.evidence, judged.tilt
-    accepted = np.flatnonzero(judged.fate == ACCEPTED)
-    strongest_first = accepted[np.argsort(-evidence[accepted], kind="stable")]
-    pitch, roll = (tilt.pitch_rad, tilt.roll_rad) if tilt is not None else (0.0, 0.0)
-    level = settings.alpha == "level"
-    turn = 1.0 if level else -1.0
-    building = math.radians(settings.building_deg) if level and tilt is not None else math.inf
-    alpha, noise = np.empty((2, len(evidence)))
-    _bearings(
-        fits, strongest_first, level_matrix(turn * pitch, turn * roll), (pitch, roll), building,
-        alpha, noise,
-    )  # fmt: skip
-    limits = _Limits(
-        float(settings.same_edge_px),
-        float(settings.join_px),
-        float(settings.join_share),
-        float(settings.shoulder_px),
-        float(settings.shoulder_share),
-    )
-    _leave_out(strongest_first, alpha, tracks.polarity, judged.fits, evidence, limits, judged.fate)
-    kept = strongest_first[judged.fate[strongest_first] == ACCEPTED]
-    pixel = fits.pixel_rad[kept]
-    group = chain_neighbours(alpha[kept], settings.join_px * pixel)
-    # Leftmost first; stable: the strongest of each line stays its first.
-    order = np.argsort(group, kind="stable")
-    members, pixel = kept[order], pixel[order]
-    count = np.bincount(group)
-    bounds = np.zeros(len(count) + 1, np.int64)
-    np.cumsum(count, out=bounds[1:])
-    first = bounds[:-1]
-    judged.fate[members] = JOINED
-    judged.fate[members[first]] = ACCEPTED
-    equal = settings.joined == "equal"
-    weight = np.ones(len(members)) if equal else evidence[members]
-    deviation = np.hypot(noise[members], settings.sigma_px * pixel)
-    joined, sigma = join_mixtures(alpha[members], deviation, weight, first)
-    ends, beta = _ends_of_lines(strip, tracks, fits, members)
-    if equal:
-        ends = np.add.reduceat(ends, first) / count[:, None]
-        beta = np.add.reduceat(beta, first) / count
-    else:
-        ends, beta = ends[first], beta[first]
-    return Lines(ends, joined, beta, sigma, noise[members[first]], members, bounds)
-
-
-class _Limits(NamedTuple):
-    """Limits for leaving out tracks; see `detect.line_settings.LineSettings`."""
+class JoiningRules(NamedTuple):
+    """How lines are joined; see `detect.line_settings.LineSettings`."""
 
     same_edge_px: float
     join_px: float
     join_share: float
     shoulder_px: float
     shoulder_share: float
+    sigma_px: float
+    building_rad: float
+    level: bool
+    equal: bool
+
+    @classmethod
+    def of(cls, settings: LineSettings) -> JoiningRules:
+        """Those of some settings."""
+        return cls(
+            float(settings.same_edge_px),
+            float(settings.join_px),
+            float(settings.join_share),
+            float(settings.shoulder_px),
+            float(settings.shoulder_share),
+            float(settings.sigma_px),
+            math.radians(settings.building_deg),
+            settings.alpha == "level",
+            settings.joined == "equal",
+        )
+
+
+def lines_of_tracks(
+    strip: Strip, tracks: LineTracks, judged: Judgement, rules: JoiningRules
+) -> Lines:
+    """Lines of accepted tracks; the fate of tracks that are left out or joined is changed."""
+    tilt = (judged.tilt.pitch_rad, judged.tilt.roll_rad) if judged.tilt is not None else (0.0, 0.0)
+    if judged.tilt is None or not rules.level:
+        rules = rules._replace(building_rad=math.inf)
+    return _join(strip, tracks, judged.fits, judged.evidence, judged.fate, tilt, rules)
+
+
+@njit(cache=True, error_model="numpy")
+def _join(
+    strip: Strip, tracks: LineTracks, fits: LineFits, evidence: FloatArray,
+    fate: NDArray[np.int8], tilt: tuple[float, float], rules: JoiningRules,
+) -> Lines:  # fmt: skip
+    count = 0
+    strength, chosen = np.empty(len(fate)), np.empty(len(fate), np.int64)
+    for t in range(len(fate)):
+        if fate[t] == ACCEPTED:
+            strength[count], chosen[count] = evidence[t], t
+            count += 1
+    tried = chosen[strongest_first(strength[:count])]
+    alpha, noise = _bearings(fits, tried, tilt, rules)
+    _leave_out(tried, alpha, tracks.polarity, fits, evidence, rules, fate)
+    bearing, reach, count = np.empty(len(tried)), np.empty(len(tried)), 0
+    for t in tried:
+        if fate[t] == ACCEPTED:
+            bearing[count], reach[count] = alpha[t], rules.join_px * fits.pixel_rad[t]
+            chosen[count] = t
+            count += 1
+    group = chain_neighbours(bearing[:count], reach[:count])
+    # The strongest of each line stays its first.
+    bounds = np.zeros(count + 1, np.int64)
+    members, lines, n = np.empty(count, np.int64), 0, 0
+    while n < count:
+        for k in range(count):
+            if group[k] == lines:
+                members[n] = chosen[k]
+                fate[members[n]] = JOINED
+                n += 1
+        fate[members[bounds[lines]]] = ACCEPTED
+        lines += 1
+        bounds[lines] = n
+    bounds = bounds[: lines + 1]
+    deviation, weight = np.empty(count), np.ones(count)
+    for n in range(count):
+        t = members[n]
+        bearing[n] = alpha[t]
+        deviation[n] = math.hypot(noise[t], rules.sigma_px * fits.pixel_rad[t])
+        if not rules.equal:
+            weight[n] = evidence[t]
+    joined, sigma = join_mixtures(bearing, deviation, weight, bounds)
+    ends, beta, own_noise = np.zeros((lines, 4)), np.zeros(lines), np.empty(lines)
+    for n in range(lines):
+        first = bounds[n]
+        own_noise[n] = noise[members[first]]
+        after = bounds[n + 1] if rules.equal else first + 1
+        for k in range(first, after):
+            t, share = members[k], 1.0 / (after - first)
+            beta[n] += share * _inclination(fits.line[t])
+            for end in range(2):
+                right, down = _end_of_line(strip, tracks, fits, t, end)
+                ends[n, 2 * end] += share * right
+                ends[n, 2 * end + 1] += share * down
+    return Lines(ends, joined, beta, sigma, own_noise, members, bounds)
 
 
 @njit(cache=True, error_model="numpy")
@@ -127,19 +164,21 @@ def _wrapped(angle: float) -> float:
 
 @njit(cache=True, error_model="numpy")
 def _bearings(
-    fits: LineFits, tracks: NDArray[np.int64], rotation: FloatArray, tilt: tuple[float, float],
-    building: float, alpha: FloatArray, noise: FloatArray,
-) -> None:  # fmt: skip
-    """Levelled bearings of tracks, and their standard deviations due to noise.
+    fits: LineFits, tracks: NDArray[np.int64], tilt: tuple[float, float], rules: JoiningRules
+) -> tuple[FloatArray, FloatArray]:
+    """Levelled bearings of some tracks, and their standard deviations due to noise.
 
     The measured lean b is replaced by its best estimate, given that it should be that of a vertical
-    under the tilt up to the standard deviation `building`, and a, which is correlated with it,
+    under the tilt up to the standard deviation `building_rad`, and a, which is correlated with it,
     follows.
     """
+    alpha, noise = np.empty(len(fits.line)), np.empty(len(fits.line))
+    turn = 1.0 if rules.level else -1.0
+    rotation = level_matrix(turn * tilt[0], turn * tilt[1])
     for t in tracks:
         sine, cosine = math.sin(fits.reference_rad[t]), math.cos(fits.reference_rad[t])
         a, b, covariance = fits.line[t, 0], fits.line[t, 1], fits.covariance[t]
-        gain = covariance[0, 1] / (covariance[1, 1] + building * building)
+        gain = covariance[0, 1] / (covariance[1, 1] + rules.building_rad**2)
         a -= gain * (b - (tilt[0] * sine - tilt[1] * cosine))
         # Of the plane's two level directions (n_y, -n_x) is the one ahead of the camera.
         n_x, n_y = cosine - a * sine, sine + a * cosine
@@ -147,12 +186,13 @@ def _bearings(
         y = rotation[1, 0] * n_x + rotation[1, 1] * n_y - rotation[1, 2] * b
         alpha[t] = math.atan2(y, x)
         noise[t] = math.sqrt(covariance[0, 0] - gain * covariance[0, 1])
+    return alpha, noise
 
 
 @njit(cache=True, error_model="numpy")
 def _leave_out(
     tracks: NDArray[np.int64], alpha: FloatArray, polarity: FloatArray, fits: LineFits,
-    evidence: FloatArray, limits: _Limits, fate: NDArray[np.int8],
+    evidence: FloatArray, rules: JoiningRules, fate: NDArray[np.int8],
 ) -> None:  # fmt: skip
     """Leave out tracks, from the strongest on, on the same edge as a stronger one or beside it."""
     pixel, contrast = fits.pixel_rad, fits.contrast
@@ -162,15 +202,16 @@ def _leave_out(
             if fate[s] != ACCEPTED:
                 continue
             near_px = abs(_wrapped(alpha[t] - alpha[s])) / pixel[t]
-            if polarity[t] == polarity[s] and near_px < limits.same_edge_px:
+            if polarity[t] == polarity[s] and near_px < rules.same_edge_px:
                 fate[t] = SAME_EDGE
                 break
-            faint = evidence[t] < limits.join_share * evidence[s]
-            fainter = contrast[t] < limits.shoulder_share * contrast[s]
-            if (near_px < limits.join_px and faint) or (near_px < limits.shoulder_px and fainter):
+            faint = evidence[t] < rules.join_share * evidence[s]
+            fainter = contrast[t] < rules.shoulder_share * contrast[s]
+            if (near_px < rules.join_px and faint) or (near_px < rules.shoulder_px and fainter):
                 fate[t] = BESIDE_A_STRONGER_EDGE
 
 
+@njit(cache=True, error_model="numpy")
 def chain_neighbours(alpha: FloatArray, distance: FloatArray) -> NDArray[np.int64]:
     """Number the groups of bearings whose neighbours are close.
 
@@ -186,25 +227,17 @@ def chain_neighbours(alpha: FloatArray, distance: FloatArray) -> NDArray[np.int6
     (N,) int64
         The group of each, counted from 0 at the largest bearing (leftmost in the image).
     """
-    group = np.zeros(len(alpha), np.int64)
-    _number_groups(alpha, distance, np.argsort(-alpha, kind="stable"), group)
+    group, order = np.zeros(len(alpha), np.int64), strongest_first(alpha)
+    for k in range(1, len(order)):
+        left, right = order[k - 1], order[k]
+        apart = alpha[left] - alpha[right] >= min(distance[left], distance[right])
+        group[right] = group[left] + (1 if apart else 0)
     return group
 
 
 @njit(cache=True, error_model="numpy")
-def _number_groups(
-    alpha: FloatArray, distance: FloatArray, order: NDArray[np.int64], group: NDArray[np.int64]
-) -> None:
-    number = 0
-    for k in range(1, len(order)):
-        left, right = order[k - 1], order[k]
-        number += alpha[left] - alpha[right] >= min(distance[left], distance[right])
-        group[right] = number
-
-
-@njit(cache=True, error_model="numpy")
 def join_mixtures(
-    alpha: FloatArray, sigma: FloatArray, weight: FloatArray, first: NDArray[np.int64]
+    alpha: FloatArray, sigma: FloatArray, weight: FloatArray, bounds: NDArray[np.int64]
 ) -> tuple[FloatArray, FloatArray]:
     """Means and standard deviations of mixtures of Gaussians of bearings.
 
@@ -215,17 +248,17 @@ def join_mixtures(
         means of one are within half a turn.
     weight : (M,) float64
         Their weights, not negative, of any sum.
-    first : (N,) int64
-        The first component of each mixture.
+    bounds : (N + 1,) int64
+        Components of mixture n are ``bounds[n] : bounds[n + 1]``.
 
     Returns
     -------
     alpha, sigma : (N,) float64
         Of the mixtures (rad).
     """
-    mean, deviation = np.empty(len(first)), np.empty(len(first))
-    for n in range(len(first)):
-        begin, end = first[n], first[n + 1] if n + 1 < len(first) else len(alpha)
+    mean, deviation = np.empty(len(bounds) - 1), np.empty(len(bounds) - 1)
+    for n in range(len(mean)):
+        begin, end = bounds[n], bounds[n + 1]
         total = off = square = 0.0
         for k in range(begin, end):
             total += weight[k]
@@ -239,68 +272,39 @@ def join_mixtures(
 
 
 @njit(cache=True, error_model="numpy")
-def _ends_of_lines(
-    strip: Strip, tracks: LineTracks, fits: LineFits, chosen: NDArray[np.int64]
-) -> tuple[FloatArray, FloatArray]:
-    """Where lines cross the first and the last row of their tracks, and how they are inclined.
+def _inclination(line: FloatArray) -> float:
+    """Inclination of the normal of a line's plane (rad)."""
+    a, b = line
+    return -math.asin(b / math.sqrt(1.0 + a * a + b * b))
 
-    Returns
-    -------
-    ends : (N, 4) float64
-        xtop, ytop, xbottom, ybottom: undistorted normalised coordinates.
-    beta : (N,) float64
-        Inclinations of the normals of their planes (rad).
-    """
-    bearing, elevation, robot_from_camera = strip.bearing, strip.rise, strip.robot_from_camera
-    bounds, row, column = tracks.bounds, tracks.row, tracks.column
-    reference, line = fits.reference_rad, fits.line
-    width = len(bearing)
-    ends = np.empty((len(chosen), 4))
-    beta = np.empty(len(chosen))
-    for n in range(len(chosen)):
-        t = chosen[n]
-        phi = reference[t]
-        a = line[t, 0]
-        b = line[t, 1]
-        beta[n] = -math.asin(b / math.sqrt(1.0 + a * a + b * b))
-        for end in range(2):
-            i = bounds[t] if end == 0 else bounds[t + 1] - 1
-            v = row[i]
-            near = column[i]
-            x = 0.0
-            z = 0.0
-            rise = 0.0
-            for _ in range(3):
-                j = min(max(int(near), 0), width - 2)
-                f = near - j
-                moved = (1.0 - f) * elevation[j, v] + f * elevation[j + 1, v]
-                # At the verticals' own ends the neighbouring column may end a row earlier.
-                if math.isfinite(moved):
-                    rise = moved
-                # Z depends on X in second order only: one repetition settles it.
-                x = a + b * rise
-                z = rise * math.sqrt(1.0 + x * x)
-                x = a + b * z
-                moved = j + (phi + math.atan(x) - bearing[j]) / (bearing[j + 1] - bearing[j])
-                if math.isfinite(moved):
-                    near = min(max(moved, 0.0), width - 1.0)
-            left = math.cos(phi) * x + math.sin(phi)
-            back = math.sin(phi) * x - math.cos(phi)
-            right = (
-                left * robot_from_camera[0, 0]
-                + back * robot_from_camera[1, 0]
-                + z * robot_from_camera[2, 0]
-            )
-            down = (
-                left * robot_from_camera[0, 1]
-                + back * robot_from_camera[1, 1]
-                + z * robot_from_camera[2, 1]
-            )
-            forward = (
-                left * robot_from_camera[0, 2]
-                + back * robot_from_camera[1, 2]
-                + z * robot_from_camera[2, 2]
-            )
-            ends[n, 2 * end] = right / forward
-            ends[n, 2 * end + 1] = down / forward
-    return ends, beta
+
+@njit(cache=True, error_model="numpy")
+def _end_of_line(
+    strip: Strip, tracks: LineTracks, fits: LineFits, t: int, end: int
+) -> tuple[float, float]:
+    """Undistorted normalised coordinates of where a line crosses the first or last row it has."""
+    bearing, elevation, rotation = strip.bearing, strip.rise, strip.robot_from_camera
+    phi, a, b = fits.reference_rad[t], fits.line[t, 0], fits.line[t, 1]
+    last = len(bearing) - 1
+    i = tracks.bounds[t + end] - end
+    v, near = tracks.row[i], tracks.column[i]
+    x = z = rise = 0.0
+    for _ in range(3):
+        j = min(max(int(near), 0), last - 1)
+        f = near - j
+        moved = (1.0 - f) * elevation[j, v] + f * elevation[j + 1, v]
+        # At the verticals' own ends the neighbouring column may end a row earlier.
+        if math.isfinite(moved):
+            rise = moved
+        # Z depends on X in second order only: one repetition settles it.
+        x = a + b * rise
+        z = rise * math.sqrt(1.0 + x * x)
+        x = a + b * z
+        moved = j + (phi + math.atan(x) - bearing[j]) / (bearing[j + 1] - bearing[j])
+        if math.isfinite(moved):
+            near = min(max(moved, 0.0), float(last))
+    left, back = math.cos(phi) * x + math.sin(phi), math.sin(phi) * x - math.cos(phi)
+    right = left * rotation[0, 0] + back * rotation[1, 0] + z * rotation[2, 0]
+    down = left * rotation[0, 1] + back * rotation[1, 1] + z * rotation[2, 1]
+    forward = left * rotation[0, 2] + back * rotation[1, 2] + z * rotation[2, 2]
+    return right / forward, down / forward

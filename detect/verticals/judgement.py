@@ -20,7 +20,14 @@ from detect.line_settings import LineSettings
 from detect.verticals.refinement import LineFits, StepFilters, fit_lines
 from detect.verticals.response import FloatArray, Strip
 from detect.verticals.starts import Maxima, StartBand
-from detect.verticals.tilt import TiltEstimate, Verticals, agreed_tilt, gather
+from detect.verticals.tilt import (
+    TiltEstimate,
+    TiltSearch,
+    Verticals,
+    agree_on_tilt,
+    gather,
+    strongest_first,
+)
 from detect.verticals.tracking import LineTracks
 
 #: Fates of tracks: a line of its own, joined to another one, or the reason for its rejection.
@@ -92,106 +99,6 @@ class Judgement(NamedTuple):
     edge: NDArray[np.int64]
 
 
-def fit_and_judge(
-    image: NDArray[np.uint8], strip: Strip, tracks: LineTracks, filters: StepFilters,
-    settings: LineSettings,
-) -> Judgement:  # fmt: skip
-    """Fit lines to tracks, select them one by one, and estimate the tilt on which most agree."""
-    least_points = settings.least_points(strip.row_aspect)
-    fits = fit_lines(
-        image, strip, tracks, filters, least_points, settings.least_evidence / strip.row_aspect
-    )
-    evidence, fate = _judge_each(strip, tracks, fits, settings)
-    accepted = np.flatnonzero(fate == ACCEPTED)
-    votes = np.minimum(0.1 * evidence[accepted], settings.weight_limit)
-    lines = weigh_verticals(fits, votes, accepted, Leaning.of(settings))
-    place = fits.reference_rad[accepted] + np.arctan(fits.line[accepted, 0])
-    near = settings.same_edge_px * fits.pixel_rad[accepted]
-    edge = gather(place, near, evidence[accepted], tracks.polarity[accepted])
-    lines = share_edges(lines, edge)
-    tilt, agrees = agreed_tilt(lines, settings)
-    fate[accepted[~agrees]] = NOT_VERTICAL
-    return Judgement(fits, evidence, fate, tilt, lines, edge)
-
-
-class _Limits(NamedTuple):
-    """Limits for tracks by themselves; see `detect.line_settings.LineSettings`."""
-
-    least_points: int
-    least_evidence: float
-    largest_shift_px: float
-    largest_scatter_px: float
-    largest_horizon_gap_px: float
-    largest_noise_px: float
-
-
-def _judge_each(
-    strip: Strip, tracks: LineTracks, fits: LineFits, settings: LineSettings
-) -> tuple[FloatArray, NDArray[np.int8]]:
-    """Evidence of each track, and whether it can be a vertical, by itself."""
-    limits = _Limits(
-        settings.least_points(strip.row_aspect),
-        float(settings.least_evidence),
-        float(settings.largest_shift_px),
-        float(settings.largest_scatter_px),
-        float(settings.largest_horizon_gap_px),
-        float(settings.largest_noise_px),
-    )
-    evidence, fate = np.empty(len(tracks.polarity)), np.empty(len(tracks.polarity), np.int8)
-    _judge(strip, tracks, fits, limits, evidence, fate)
-    accepted = np.flatnonzero(fate == ACCEPTED)
-    if len(accepted) > 0:
-        # How sharp an edge can be depends on the image's focus and motion.
-        sharpness, contrast = fits.sharpness[accepted], fits.contrast[accepted]
-        soft = sharpness < settings.least_sharpness * _quantile(sharpness, 0.25)
-        soft &= contrast < _quantile(contrast, 0.5)
-        soft &= evidence[accepted] < settings.soft_evidence
-        fate[accepted[soft]] = SOFT
-    return evidence, fate
-
-
-@njit(cache=True, error_model="numpy")
-def _judge(
-    strip: Strip, tracks: LineTracks, fits: LineFits, limits: _Limits, evidence: FloatArray,
-    fate: NDArray[np.int8],
-) -> None:  # fmt: skip
-    score = tracks.score
-    for t in range(len(fate)):
-        begin, end = tracks.bounds[t], tracks.bounds[t + 1]
-        total = 0.0
-        for i in range(begin, end):
-            total += score[i]
-        evidence[t] = total * strip.row_aspect * fits.sharpness[t] ** 2
-        horizon = strip.anchor_row[min(int(np.rint(tracks.column[begin])), len(strip.bearing) - 1)]
-        gap = max(horizon - tracks.row[end - 1], tracks.row[begin] - horizon) * strip.row_aspect
-        noise_px = math.sqrt(fits.covariance[t, 0, 0]) / fits.pixel_rad[t]
-        if end - begin < limits.least_points:
-            fate[t] = SHORT
-        elif not evidence[t] >= limits.least_evidence:
-            fate[t] = LITTLE_EVIDENCE
-        elif not math.isfinite(fits.line[t, 0]):
-            fate[t] = NO_MAXIMUM
-        elif not fits.shift_px[t] <= limits.largest_shift_px:
-            fate[t] = OFF_THE_TRACK
-        elif not fits.scatter_px[t] <= limits.largest_scatter_px:
-            fate[t] = NOT_STRAIGHT
-        elif not gap <= limits.largest_horizon_gap_px:
-            fate[t] = OFF_THE_HORIZON
-        elif not noise_px <= limits.largest_noise_px:
-            fate[t] = UNCERTAIN
-        else:
-            fate[t] = ACCEPTED
-
-
-def _quantile(values: FloatArray, share: float) -> float:
-    """Quantile, interpolated linearly, without the overhead of `numpy.quantile`."""
-    place = share * (len(values) - 1)
-    below = int(place)
-    ordered = np.sort(values)
-    lower, upper = ordered[below], ordered[min(below + 1, len(values) - 1)]
-    return float(lower + (place - below) * (upper - lower))
-
-
 class Leaning(NamedTuple):
     """How far verticals lean; see `detect.line_settings.LineSettings`."""
 
@@ -202,10 +109,27 @@ class Leaning(NamedTuple):
     largest_lean_sigmas: float
     largest_lean_px: float
 
+
+class Criteria(NamedTuple):
+    """What makes tracks verticals; see `detect.line_settings.LineSettings`."""
+
+    least_points: int
+    least_evidence: float
+    largest_shift_px: float
+    largest_scatter_px: float
+    largest_horizon_gap_px: float
+    largest_noise_px: float
+    least_sharpness: float
+    soft_evidence: float
+    weight_limit: float
+    same_edge_px: float
+    leaning: Leaning
+    search: TiltSearch
+
     @classmethod
-    def of(cls, settings: LineSettings) -> Leaning:
-        """Those of some settings."""
-        return cls(
+    def of(cls, settings: LineSettings, row_aspect: float) -> Criteria:
+        """Those of some settings, for rows of some height in widths of a pixel."""
+        leaning = Leaning(
             math.radians(settings.building_deg),
             float(settings.bend_px),
             float(settings.lean_noise),
@@ -213,73 +137,228 @@ class Leaning(NamedTuple):
             float(settings.largest_lean_sigmas),
             float(settings.largest_lean_px),
         )
+        return cls(
+            settings.least_points(row_aspect),
+            float(settings.least_evidence),
+            float(settings.largest_shift_px),
+            float(settings.largest_scatter_px),
+            float(settings.largest_horizon_gap_px),
+            float(settings.largest_noise_px),
+            float(settings.least_sharpness),
+            float(settings.soft_evidence),
+            float(settings.weight_limit),
+            float(settings.same_edge_px),
+            leaning,
+            TiltSearch.of(settings),
+        )
 
 
-def weigh_verticals(
-    fits: LineFits, weight: FloatArray, accepted: NDArray[np.intp], leaning: Leaning
-) -> Verticals:
-    """The tilt's constraints by accepted lines, with some votes each."""
-    count = len(accepted)
-    lines = Verticals(np.empty((count, 3)), np.empty(count), np.empty(count), weight)
-    _weigh(fits, accepted, leaning, lines)
-    return lines
+def fit_and_judge(
+    image: NDArray[np.uint8], strip: Strip, tracks: LineTracks, filters: StepFilters,
+    criteria: Criteria,
+) -> Judgement:  # fmt: skip
+    """Fit lines to tracks, select them one by one, and estimate the tilt on which most agree."""
+    least_score = criteria.least_evidence / strip.row_aspect
+    fits = fit_lines(image, strip, tracks, filters, criteria.least_points, least_score)
+    evidence, fate, tilt, lines, edge = _judge(strip, tracks, fits, criteria)
+    return Judgement(fits, evidence, fate, tilt if tilt.lines > 0 else None, lines, edge)
 
 
 @njit(cache=True, error_model="numpy")
-def _weigh(fits: LineFits, accepted: NDArray[np.int64], leaning: Leaning, lines: Verticals) -> None:
-    for k in range(len(accepted)):
+def _judge(
+    strip: Strip, tracks: LineTracks, fits: LineFits, criteria: Criteria
+) -> tuple[FloatArray, NDArray[np.int8], TiltEstimate, Verticals, NDArray[np.int64]]:
+    """What `Judgement` says of tracks with some fits; a tilt of 0 lines where too few agree."""
+    count = len(tracks.polarity)
+    evidence, fate = np.empty(count), np.empty(count, np.int8)
+    _judge_each(strip, tracks, fits, criteria, evidence, fate)
+    accepted = _accepted(fate)
+    _reject_soft(fits, evidence, accepted, criteria, fate)
+    accepted = _accepted(fate)
+    count = len(accepted)
+    votes, place, near = np.empty(count), np.empty(count), np.empty(count)
+    own_evidence, polarity = np.empty(count), np.empty(count)
+    for k in range(count):
+        t = accepted[k]
+        votes[k] = min(0.1 * evidence[t], criteria.weight_limit)
+        place[k] = fits.reference_rad[t] + math.atan(fits.line[t, 0])
+        near[k] = criteria.same_edge_px * fits.pixel_rad[t]
+        own_evidence[k], polarity[k] = evidence[t], tracks.polarity[t]
+    lines = _weigh(fits, accepted, votes, criteria.leaning)
+    edge = gather(place, near, own_evidence, polarity)
+    share_edges(lines, edge)
+    tilt, agrees = agree_on_tilt(lines, criteria.search)
+    for k in range(count):
+        if not agrees[k]:
+            fate[accepted[k]] = NOT_VERTICAL
+    return evidence, fate, tilt, lines, edge
+
+
+@njit(cache=True, error_model="numpy")
+def _judge_each(
+    strip: Strip, tracks: LineTracks, fits: LineFits, criteria: Criteria, evidence: FloatArray,
+    fate: NDArray[np.int8],
+) -> None:  # fmt: skip
+    """Evidence of each track, and whether it can be a vertical, by itself."""
+    score = tracks.score
+    for t in range(len(fate)):
+        begin, end = tracks.bounds[t], tracks.bounds[t + 1]
+        total = 0.0
+        for i in range(begin, end):
+            total += score[i]
+        evidence[t] = total * strip.row_aspect * fits.sharpness[t] ** 2
+        horizon = strip.anchor_row[min(int(np.rint(tracks.column[begin])), len(strip.bearing) - 1)]
+        gap = max(horizon - tracks.row[end - 1], tracks.row[begin] - horizon) * strip.row_aspect
+        noise_px = math.sqrt(fits.covariance[t, 0, 0]) / fits.pixel_rad[t]
+        if end - begin < criteria.least_points:
+            fate[t] = SHORT
+        elif not evidence[t] >= criteria.least_evidence:
+            fate[t] = LITTLE_EVIDENCE
+        elif not math.isfinite(fits.line[t, 0]):
+            fate[t] = NO_MAXIMUM
+        elif not fits.shift_px[t] <= criteria.largest_shift_px:
+            fate[t] = OFF_THE_TRACK
+        elif not fits.scatter_px[t] <= criteria.largest_scatter_px:
+            fate[t] = NOT_STRAIGHT
+        elif not gap <= criteria.largest_horizon_gap_px:
+            fate[t] = OFF_THE_HORIZON
+        elif not noise_px <= criteria.largest_noise_px:
+            fate[t] = UNCERTAIN
+        else:
+            fate[t] = ACCEPTED
+
+
+@njit(cache=True, error_model="numpy")
+def _accepted(fate: NDArray[np.int8]) -> NDArray[np.int64]:
+    accepted, count = np.empty(len(fate), np.int64), 0
+    for t in range(len(fate)):
+        if fate[t] == ACCEPTED:
+            accepted[count] = t
+            count += 1
+    return accepted[:count]
+
+
+@njit(cache=True, error_model="numpy")
+def _reject_soft(
+    fits: LineFits, evidence: FloatArray, accepted: NDArray[np.int64], criteria: Criteria,
+    fate: NDArray[np.int8],
+) -> None:  # fmt: skip
+    """Reject lines that are soft and faint among the accepted ones."""
+    if len(accepted) == 0:
+        return
+    # How sharp an edge can be depends on the image's focus and motion.
+    least_sharpness = criteria.least_sharpness * _quantile(fits.sharpness, accepted, 0.25)
+    faint = _quantile(fits.contrast, accepted, 0.5)
+    for t in accepted:
+        soft = fits.sharpness[t] < least_sharpness and fits.contrast[t] < faint
+        if soft and evidence[t] < criteria.soft_evidence:
+            fate[t] = SOFT
+
+
+@njit(cache=True, error_model="numpy")
+def _quantile(values: FloatArray, chosen: NDArray[np.int64], share: float) -> float:
+    """Quantile of some values, interpolated linearly."""
+    own = np.empty(len(chosen))
+    for k in range(len(chosen)):
+        own[k] = values[chosen[k]]
+    order = strongest_first(own)
+    place = (1.0 - share) * (len(own) - 1)
+    upper = int(place)
+    high, low = own[order[upper]], own[order[min(upper + 1, len(own) - 1)]]
+    return float(high - (place - upper) * (high - low))
+
+
+@njit(cache=True, error_model="numpy")
+def _weigh(
+    fits: LineFits, accepted: NDArray[np.int64], votes: FloatArray, leaning: Leaning
+) -> Verticals:
+    """The tilt's constraints by accepted lines, with some votes each."""
+    count = len(accepted)
+    normal, variance, tolerance = np.empty((count, 3)), np.empty(count), np.empty(count)
+    for k in range(count):
         t = accepted[k]
         sine, cosine = math.sin(fits.reference_rad[t]), math.cos(fits.reference_rad[t])
         a, b = fits.line[t, 0], fits.line[t, 1]
         length = math.sqrt(1.0 + a * a + b * b)
-        lines.normal[k, 0] = (cosine - a * sine) / length
-        lines.normal[k, 1] = (sine + a * cosine) / length
-        lines.normal[k, 2] = -b / length
+        normal[k, 0] = (cosine - a * sine) / length
+        normal[k, 1] = (sine + a * cosine) / length
+        normal[k, 2] = -b / length
         # One pixel from end to end: 12 = (length / standard deviation of its points)^2.
         per_length = fits.pixel_rad[t] / math.sqrt(12.0 * fits.spread[t])
         noise = fits.covariance[t, 1, 1]
-        lines.variance[k] = (
+        variance[k] = (
             leaning.building_rad**2
             + leaning.lean_noise * noise
             + (leaning.bend_px * per_length) ** 2
         )
-        lines.tolerance[k] = math.sqrt(
+        tolerance[k] = math.sqrt(
             leaning.largest_lean_rad**2
             + leaning.largest_lean_sigmas**2 * noise
             + (leaning.largest_lean_px * per_length) ** 2
         )
+    return Verticals(normal, variance, tolerance, votes)
 
 
-def share_edges(lines: Verticals, edge: NDArray[np.int64]) -> Verticals:
+@njit(cache=True, error_model="numpy")
+def share_edges(lines: Verticals, edge: NDArray[np.int64]) -> None:
     """Let the lines of one edge say together as much about the tilt as one."""
-    members = np.bincount(edge)[edge]
-    return lines._replace(variance=lines.variance * members, weight=lines.weight / members)
+    members = np.zeros(len(edge), np.int64)
+    for k in range(len(edge)):
+        members[edge[k]] += 1
+    for k in range(len(edge)):
+        lines.variance[k] *= members[edge[k]]
+        lines.weight[k] /= members[edge[k]]
 
 
 def tilt_of_chains(
     image: NDArray[np.uint8], strip: Strip, maxima: Maxima, band: StartBand,
-    settings: LineSettings, no_steps: StepFilters,
+    criteria: Criteria, no_steps: StepFilters,
 ) -> TiltEstimate | None:  # fmt: skip
     """The tilt that most chains of the band's maxima agree with; None where too few do."""
-    members = np.flatnonzero(np.bincount(maxima.chain)[maxima.chain] >= _CHAIN_LEAST)
-    if len(members) == 0:
-        return None
-    # Stable: from the top row of each chain to its bottom row.
-    members = members[np.argsort(maxima.chain[members], kind="stable")]
-    chain = maxima.chain[members]
-    bounds = np.flatnonzero(np.concatenate([[True], chain[1:] != chain[:-1], [True]]))
-    tracks = LineTracks(
-        np.ones(len(bounds) - 1),
-        bounds,
-        band.row[maxima.level[members], maxima.column[members]],
-        maxima.place[members],
-        np.abs(maxima.value[members]),
-    )
+    tracks = _tracks_of_chains(maxima, band.row)
     fits = fit_lines(image, strip, tracks, no_steps, _CHAIN_LEAST, 0.0)
-    straight = np.flatnonzero(fits.scatter_px <= _CHAIN_SCATTER_PX)
-    leaning = Leaning.of(settings)._replace(
+    leaning = criteria.leaning._replace(
         bend_px=_CHAIN_BEND_PX, lean_noise=1.0, largest_lean_px=_CHAIN_LEAN_PX
     )
-    # All chains count the same.
-    votes = np.full(len(straight), float(settings.weight_limit))
-    return agreed_tilt(weigh_verticals(fits, votes, straight, leaning), settings)[0]
+    tilt = _tilt_of_straight(fits, leaning, criteria.search, criteria.weight_limit)
+    return tilt if tilt.lines > 0 else None
+
+
+@njit(cache=True, error_model="numpy")
+def _tracks_of_chains(maxima: Maxima, rows: NDArray[np.int32]) -> LineTracks:
+    """The long chains; those of a band on which tracks start on some (K, W) rows."""
+    level, column, value, chain = maxima.level, maxima.column, maxima.value, maxima.chain
+    length = np.zeros(len(chain), np.int64)
+    for i in range(len(chain)):
+        length[chain[i]] += 1
+    # A chain has the number of its first maximum.
+    begin, bounds = np.empty(len(chain), np.int64), np.zeros(len(chain) + 1, np.int64)
+    count = points = 0
+    for i in range(len(chain)):
+        if length[i] >= _CHAIN_LEAST:
+            begin[i] = points
+            points += length[i]
+            count += 1
+            bounds[count] = points
+    row, place = np.empty(points, np.int32), np.empty(points)
+    score = np.empty(points, np.float32)
+    for i in range(len(chain)):
+        if length[chain[i]] >= _CHAIN_LEAST:
+            k = begin[chain[i]]
+            begin[chain[i]] += 1
+            row[k], place[k], score[k] = rows[level[i], column[i]], maxima.place[i], abs(value[i])
+    return LineTracks(np.ones(count), bounds[: count + 1], row, place, score)
+
+
+@njit(cache=True, error_model="numpy")
+def _tilt_of_straight(
+    fits: LineFits, leaning: Leaning, search: TiltSearch, vote: float
+) -> TiltEstimate:
+    """The tilt that most straight lines agree with, all of which count the same."""
+    straight, count = np.empty(len(fits.scatter_px), np.int64), 0
+    for t in range(len(fits.scatter_px)):
+        if fits.scatter_px[t] <= _CHAIN_SCATTER_PX:
+            straight[count] = t
+            count += 1
+    lines = _weigh(fits, straight[:count], np.full(count, vote), leaning)
+    return agree_on_tilt(lines, search)[0]

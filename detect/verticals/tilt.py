@@ -117,6 +117,27 @@ class Verticals(NamedTuple):
     weight: FloatArray
 
 
+class TiltSearch(NamedTuple):
+    """How a tilt is sought; see `detect.line_settings.LineSettings`."""
+
+    largest_rad: float
+    prior_rad: float
+    stray_share: float
+    proposers: int
+    least_lines: int
+
+    @classmethod
+    def of(cls, settings: LineSettings) -> TiltSearch:
+        """That of some settings."""
+        return cls(
+            math.radians(settings.largest_tilt_deg),
+            math.radians(settings.tilt_prior_deg),
+            float(settings.stray_share),
+            settings.proposers,
+            settings.least_lines,
+        )
+
+
 def consensus(
     lines: Verticals, settings: LineSettings = DEFAULT
 ) -> tuple[TiltEstimate | None, NDArray[np.bool_]]:
@@ -136,40 +157,24 @@ def consensus(
     consistent : (N,) bool
         Lines that are vertical under that tilt; without an estimate, under no tilt.
     """
-    tilt, consistent = agreed_tilt(lines, settings)
-    if tilt is None:
+    search = TiltSearch.of(settings)
+    tilt, consistent = agree_on_tilt(lines, search)
+    if tilt.lines == 0:
         return None, consistent
-    return with_error(tilt, lines, np.arange(len(lines.weight)), settings), consistent
-
-
-def agreed_tilt(
-    lines: Verticals, settings: LineSettings
-) -> tuple[TiltEstimate | None, NDArray[np.bool_]]:
-    """`consensus` with the covariance of least squares."""
-    limit, prior = math.radians(settings.largest_tilt_deg), math.radians(settings.tilt_prior_deg)
-    proposers = np.argsort(-lines.weight, kind="stable")[: settings.proposers]
-    agrees, covariance = np.empty(len(lines.weight), np.bool_), np.empty((2, 2))
-    pitch, roll, count, votes = _agree_on_tilt(lines, proposers, limit, prior, covariance, agrees)
-    if count < settings.least_lines or abs(pitch) > limit or abs(roll) > limit:
-        return None, np.abs(lines.normal[:, 2]) <= lines.tolerance
-    return TiltEstimate(pitch, roll, covariance, count, votes), agrees
+    return with_error(tilt, lines, np.arange(len(lines.weight)), search), consistent
 
 
 def with_error(
-    tilt: TiltEstimate, lines: Verticals, edge: NDArray[np.int64], settings: LineSettings
+    tilt: TiltEstimate, lines: Verticals, edge: NDArray[np.int64], search: TiltSearch
 ) -> TiltEstimate:
     """The tilt with its mean square error as covariance, unless settings leave that out.
 
     `edge` is one of the lines for each, the same for all of an edge.
     """
-    if settings.stray_share == 0.0:
+    if search.stray_share == 0.0:
         return tilt
-    bearing = np.arctan2(lines.normal[:, 1], lines.normal[:, 0])
-    together = gather(bearing, np.full(len(bearing), TOGETHER_RAD), lines.weight)
-    prior = math.radians(settings.tilt_prior_deg)
     place = tilt.pitch_rad, tilt.roll_rad
-    error = _error_of_tilt(lines, edge, together, place, prior, float(settings.stray_share), _GRID)
-    return tilt._replace(covariance=error)
+    return tilt._replace(covariance=_error_of_tilt(lines, edge, place, search, _GRID))
 
 
 @njit(cache=True, error_model="numpy")
@@ -186,30 +191,40 @@ def lean_deviation(covariance: FloatArray, sine: FloatArray, cosine: FloatArray)
 
 
 @njit(cache=True, error_model="numpy")
-def _agree_on_tilt(
-    lines: Verticals, proposers: NDArray[np.int64], limit: float, prior: float,
-    covariance: FloatArray, agrees: NDArray[np.bool_],
-) -> tuple[float, float, int, float]:  # fmt: skip
-    """Pitch and roll, how many lines agree, and their share of the votes.
+def strongest_first(strength: FloatArray) -> NDArray[np.int64]:
+    """Places of some values, the largest first; of equal ones the first."""
+    order = np.empty(len(strength), np.int64)
+    for i in range(len(strength)):
+        k = i
+        while k > 0 and strength[order[k - 1]] < strength[i]:
+            order[k] = order[k - 1]
+            k -= 1
+        order[k] = i
+    return order
 
-    `covariance` gets that of the tilt, if lines err one by one, `agrees` which lines are vertical.
-    """
-    pitch, roll = _vote_for_tilt(lines, proposers, limit, prior)
-    pitch, roll = _refine_tilt(lines, pitch, roll, prior, covariance, agrees)
+
+@njit(cache=True, error_model="numpy")
+def agree_on_tilt(lines: Verticals, search: TiltSearch) -> tuple[TiltEstimate, NDArray[np.bool_]]:
+    """`consensus` with the covariance of least squares; of 0 lines where too few agree."""
+    agrees, covariance = np.empty(len(lines.weight), np.bool_), np.empty((2, 2))
+    pitch, roll = _vote_for_tilt(lines, search)
+    pitch, roll = _refine_tilt(lines, pitch, roll, search.prior_rad, covariance, agrees)
     count, votes, total = 0, 0.0, 0.0
     for i in range(len(agrees)):
         total += lines.weight[i]
         if agrees[i]:
             count += 1
             votes += lines.weight[i]
-    return pitch, roll, count, votes / total
+    largest = max(abs(pitch), abs(roll))
+    if count < search.least_lines or largest > search.largest_rad:
+        count = 0
+        for i in range(len(agrees)):
+            agrees[i] = abs(lines.normal[i, 2]) <= lines.tolerance[i]
+    return TiltEstimate(pitch, roll, covariance, count, votes / total), agrees
 
 
-# Sums in any order become vectors; inlined, their order is that of the kernel that has them.
-@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"}, forceinline=True)
-def _vote_for_tilt(
-    lines: Verticals, proposers: NDArray[np.int64], limit: float, prior: float
-) -> tuple[float, float]:
+@njit(cache=True, error_model="numpy")
+def _vote_for_tilt(lines: Verticals, search: TiltSearch) -> tuple[float, float]:
     """Pitch and roll that the largest weight of lines agrees with; of equal ones the first.
 
     Each pair of proposers gives the tilt that makes both vertical; a line votes for it with its
@@ -217,32 +232,36 @@ def _vote_for_tilt(
     tried as well.
     """
     normal, weight = lines.normal, lines.weight
-    x, y, z = np.empty(len(weight)), np.empty(len(weight)), np.empty(len(weight))
+    proposers = strongest_first(weight)[: search.proposers]
+    most = 1 + len(proposers) * (len(proposers) - 1) // 2
+    pitch, roll, votes = np.empty(most), np.empty(most), np.empty(most)
+    pitch[0] = roll[0] = 0.0
+    count = 1
+    for i in range(len(proposers)):
+        for k in range(i + 1, len(proposers)):
+            m, n = proposers[i], proposers[k]
+            # n_z + pitch n_y - roll n_x = 0 for both.
+            determinant = normal[m, 0] * normal[n, 1] - normal[m, 1] * normal[n, 0]
+            if determinant == 0.0:
+                continue
+            p = (normal[m, 2] * normal[n, 0] - normal[m, 0] * normal[n, 2]) / determinant
+            r = (normal[m, 2] * normal[n, 1] - normal[m, 1] * normal[n, 2]) / determinant
+            if abs(p) <= search.largest_rad and abs(r) <= search.largest_rad:
+                pitch[count], roll[count] = p, r
+                count += 1
+    for k in range(count):
+        votes[k] = -0.5 * (pitch[k] * pitch[k] + roll[k] * roll[k]) / search.prior_rad**2
     for i in range(len(weight)):
         share = 1.0 / lines.tolerance[i]
-        x[i], y[i], z[i] = share * normal[i, 0], share * normal[i, 1], share * normal[i, 2]
-    best_pitch = best_roll = 0.0
-    best = -math.inf
-    for i in range(-1, len(proposers)):
-        for k in range(i + 1, len(proposers) if i >= 0 else 1):
-            pitch = roll = 0.0
-            if i >= 0:
-                m, n = proposers[i], proposers[k]
-                # n_z + pitch n_y - roll n_x = 0 for both.
-                determinant = normal[m, 0] * normal[n, 1] - normal[m, 1] * normal[n, 0]
-                if determinant == 0.0:
-                    continue
-                pitch = (normal[m, 2] * normal[n, 0] - normal[m, 0] * normal[n, 2]) / determinant
-                roll = (normal[m, 2] * normal[n, 1] - normal[m, 1] * normal[n, 2]) / determinant
-                if not (abs(pitch) <= limit and abs(roll) <= limit):
-                    continue
-            votes = -0.5 * (pitch * pitch + roll * roll) / (prior * prior)
-            for line in range(len(weight)):
-                off = z[line] + pitch * y[line] - roll * x[line]
-                votes += weight[line] * max(1.0 - off * off, 0.0)
-            if votes > best:
-                best, best_pitch, best_roll = votes, pitch, roll
-    return best_pitch, best_roll
+        x, y, z = share * normal[i, 0], share * normal[i, 1], share * normal[i, 2]
+        for k in range(count):
+            off = z + pitch[k] * y - roll[k] * x
+            votes[k] += weight[i] * max(1.0 - off * off, 0.0)
+    best = 0
+    for k in range(count):
+        if votes[k] > votes[best]:
+            best = k
+    return pitch[best], roll[best]
 
 
 @njit(cache=True, error_model="numpy")
@@ -303,36 +322,25 @@ def level_matrix(pitch: float, roll: float) -> FloatArray:
     return rotation
 
 
+@njit(cache=True, error_model="numpy")
 def gather(
-    place: FloatArray, reach: FloatArray, strength: FloatArray,
-    kind: FloatArray | None = None,
-) -> NDArray[np.int64]:  # fmt: skip
+    place: FloatArray, reach: FloatArray, strength: FloatArray, kind: FloatArray
+) -> NDArray[np.int64]:
     """Groups of lines of one kind near the strongest of those that are in no group yet.
 
     Parameters
     ----------
-    place, reach, strength : (N,) float64
-        Where each is, how near others belong to it, how strong it is.
-    kind : (N,) float64, optional
-        Only equal ones are gathered.
+    place, reach, strength, kind : (N,) float64
+        Where each is, how near others belong to it, how strong it is; only lines of equal kind are
+        gathered.
 
     Returns
     -------
     (N,) int64
         The first line of the group of each.
     """
-    order = np.argsort(-strength, kind="stable")
-    group = np.full(len(place), -1, np.int64)
-    _gather(place, reach, np.zeros(len(place)) if kind is None else kind, order, group)
-    return group
-
-
-@njit(cache=True, error_model="numpy")
-def _gather(
-    place: FloatArray, reach: FloatArray, kind: FloatArray, order: NDArray[np.int64],
-    group: NDArray[np.int64],
-) -> None:  # fmt: skip
-    for strongest in order:
+    group = np.full(len(place), -1)
+    for strongest in strongest_first(strength):
         if group[strongest] >= 0:
             continue
         first = -1
@@ -342,6 +350,7 @@ def _gather(
                 if first < 0:
                     first = k
                 group[k] = first
+    return group
 
 
 @njit(cache=True, error_model="numpy")
@@ -351,28 +360,34 @@ def merge_lines(lines: Verticals, group: NDArray[np.int64]) -> FloatArray:
     Lines are weighed by how well they are measured beside the middle scatter; the variances are
     without scatter.
     """
-    normal, variance = lines.normal, lines.variance
-    share, total = np.empty(len(group)), np.zeros(len(group))
+    merged, total = np.zeros((len(group), 4)), np.zeros(len(group))
     for k in range(len(group)):
-        share[k] = 1.0 / (variance[k] + SCATTER_RAD[1] ** 2)
-        total[group[k]] += share[k]
-    place = np.cumsum(total > 0.0) - 1
-    merged = np.zeros((len(np.flatnonzero(total)), 4))
-    for k in range(len(group)):
-        own = share[k] / total[group[k]]
-        to = merged[place[group[k]]]
+        share, to = 1.0 / (lines.variance[k] + SCATTER_RAD[1] ** 2), merged[group[k]]
+        total[group[k]] += share
         for i in range(3):
-            to[i] += own * normal[k, i]
-        to[3] += own * own * variance[k]
-    return merged
+            to[i] += share * lines.normal[k, i]
+        to[3] += share * share * lines.variance[k]
+    groups = 0
+    for k in range(len(group)):
+        if total[k] > 0.0:
+            for i in range(3):
+                merged[groups, i] = merged[k, i] / total[k]
+            merged[groups, 3] = merged[k, 3] / (total[k] * total[k])
+            groups += 1
+    return merged[:groups]
 
 
 @njit(cache=True, error_model="numpy")
 def _error_of_tilt(
-    lines: Verticals, edge: NDArray[np.int64], together: NDArray[np.int64],
-    tilt: tuple[float, float], prior: float, stray_share: float, grid: FloatArray,
+    lines: Verticals, edge: NDArray[np.int64], tilt: tuple[float, float], search: TiltSearch,
+    grid: FloatArray,
 ) -> FloatArray:  # fmt: skip
     """(2, 2) mean square error of a tilt, over what its lines and those that disagree say."""
+    prior, stray_share, count = search.prior_rad, search.stray_share, len(edge)
+    bearing = np.empty(count)
+    for k in range(count):
+        bearing[k] = math.atan2(lines.normal[k, 1], lines.normal[k, 0])
+    together = gather(bearing, np.full(count, TOGETHER_RAD), lines.weight, np.zeros(count))
     edges, groups = merge_lines(lines, edge), merge_lines(lines, together)
     xx, xy, yy = _stretch(groups, tilt, prior)
     n = grid.shape[1]
@@ -382,23 +397,21 @@ def _error_of_tilt(
         roll[i] = tilt[1] + xy * grid[0, i] + yy * grid[1, i]
         squared = pitch[i] * pitch[i] + roll[i] * roll[i]
         before[i] = grid[2, i] * math.exp(-0.5 * squared / (prior * prior))
-    error = np.zeros((2, 2))
-    total = 0.0
+    pp = pr = rr = total = 0.0
     for m in range(len(SCATTER_RAD)):
-        density[:] = before
-        _multiply_likelihood(density, pitch, roll, edges, SCATTER_RAD[m], stray_share)
-        share = SCATTER_SHARE[m] * density.sum()
+        share = SCATTER_SHARE[m]
+        share *= _posterior(before, pitch, roll, edges, SCATTER_RAD[m], stray_share, density)
         total += share
-        density[:] = before
-        _multiply_likelihood(density, pitch, roll, groups, SCATTER_RAD[m], stray_share)
-        share /= density.sum()
+        share /= _posterior(before, pitch, roll, groups, SCATTER_RAD[m], stray_share, density)
         for i in range(n):
-            p, r = pitch[i] - tilt[0], roll[i] - tilt[1]
-            error[0, 0] += share * density[i] * p * p
-            error[0, 1] += share * density[i] * p * r
-            error[1, 1] += share * density[i] * r * r
-    error[1, 0] = error[0, 1]
-    return error / total
+            p, r, weight = pitch[i] - tilt[0], roll[i] - tilt[1], share * density[i]
+            pp += weight * p * p
+            pr += weight * p * r
+            rr += weight * r * r
+    error = np.empty((2, 2))
+    error[0, 0], error[1, 1] = pp / total, rr / total
+    error[0, 1] = error[1, 0] = pr / total
+    return error
 
 
 @njit(cache=True, error_model="numpy")
@@ -425,19 +438,26 @@ def _stretch(
 
 
 @njit(cache=True, error_model="numpy")
-def _multiply_likelihood(
-    density: FloatArray, pitch: FloatArray, roll: FloatArray, lines: FloatArray, scatter: float,
-    stray_share: float,
-) -> None:  # fmt: skip
-    """Multiply densities of tilts by the likelihood of the lines."""
-    of_stray = stray_share / (math.pi * STRAY_RAD)
+def _posterior(
+    before: FloatArray, pitch: FloatArray, roll: FloatArray, lines: FloatArray, scatter: float,
+    stray_share: float, density: FloatArray,
+) -> float:  # fmt: skip
+    """Densities of tilts by the prior and by lines of some scatter; returns their sum."""
+    for i in range(len(before)):
+        density[i] = before[i]
+    of_stray = stray_share / (math.pi * STRAY_RAD) * SCATTER_RAD[1]
+    per_stray = 1.0 / STRAY_RAD**2
     for k in range(len(lines)):
-        three_variances = 3.0 * (lines[k, 3] + scatter * scatter)
-        of_vertical = (1.0 - stray_share) * 2.0 / (math.pi * math.sqrt(three_variances))
+        per_variance = 1.0 / (3.0 * (lines[k, 3] + scatter * scatter))
+        # In units in which products of a hundred stay in range.
+        of_vertical = (1.0 - stray_share) * 2.0 / math.pi * math.sqrt(per_variance) * SCATTER_RAD[1]
         x, y, z = lines[k, 0], lines[k, 1], lines[k, 2]
         for i in range(len(density)):
             off = z + pitch[i] * y - roll[i] * x
-            student = 1.0 / (1.0 + off * off / three_variances)
-            cauchy = of_stray / (1.0 + off * off / STRAY_RAD**2)
-            # In units in which products of a hundred stay in range.
-            density[i] *= (of_vertical * student * student + cauchy) * SCATTER_RAD[1]
+            student, cauchy = 1.0 + off * off * per_variance, 1.0 + off * off * per_stray
+            student *= student
+            density[i] *= (of_vertical * cauchy + of_stray * student) / (student * cauchy)
+    total = 0.0
+    for i in range(len(density)):
+        total += density[i]
+    return total

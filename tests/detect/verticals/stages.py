@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from detect.line_settings import LineSettings
 from detect.verticals import starts
-from detect.verticals.judgement import Judgement, fit_and_judge
+from detect.verticals.judgement import Criteria, Judgement, fit_and_judge
 from detect.verticals.refinement import step_filters
 from detect.verticals.response import StripResponse, line_filter, strip_of, strip_response
 from detect.verticals.starts import LineStarts, StartBand, band_response, find_maxima, start_band
@@ -61,7 +61,9 @@ def judge_tracks(
     steps: int | None = None,
 ) -> Judgement:
     """Lines through tracks, refined in all or some steps, their fates, and the tilt."""
-    judged = fit_and_judge(image, strip_of(table), tracks, step_filters(settings, steps), settings)
+    criteria = Criteria.of(settings, table.row_aspect)
+    judged = fit_and_judge(image, strip_of(table), tracks, step_filters(settings, steps), criteria)
     if judged.tilt is None:
         return judged
-    return judged._replace(tilt=with_error(judged.tilt, judged.verticals, judged.edge, settings))
+    tilt = with_error(judged.tilt, judged.verticals, judged.edge, criteria.search)
+    return judged._replace(tilt=tilt)

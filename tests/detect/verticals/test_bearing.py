@@ -104,7 +104,7 @@ def test_plane_normals_do_not_depend_on_where_the_ends_are(published_camera: Cam
 def joined(alpha: np.ndarray, sigma: np.ndarray, weight: np.ndarray) -> tuple[float, float]:
     """Mean and deviation of a mixture, behind another one."""
     two = [np.concatenate([values[:1], values]) for values in (alpha, sigma, weight)]
-    means, deviations = join_mixtures(two[0], two[1], two[2], np.array([0, 1]))
+    means, deviations = join_mixtures(two[0], two[1], two[2], np.array([0, 1, len(two[0])]))
     assert (means[0], deviations[0]) == pytest.approx((two[0][0], two[1][0]))
     return float(means[1]), float(deviations[1])
 

@@ -8,7 +8,7 @@ import pytest
 from camera import Camera
 from detect.line_settings import DEFAULT
 from detect.lines import detect_lines
-from detect.verticals.judgement import tilt_of_chains
+from detect.verticals.judgement import Criteria, tilt_of_chains
 from detect.verticals.refinement import step_filters
 from detect.verticals.response import strip_of
 from detect.verticals.starts import find_maxima
@@ -34,7 +34,8 @@ def told_by_the_band(image: np.ndarray) -> TiltEstimate | None:
     response, band = start_response(image, TABLE, DEFAULT)
     maxima = find_maxima(response, DEFAULT.threshold)
     no_steps = step_filters(DEFAULT, 0)
-    return tilt_of_chains(image, strip_of(TABLE), maxima, band, DEFAULT, no_steps)
+    criteria = Criteria.of(DEFAULT, TABLE.row_aspect)
+    return tilt_of_chains(image, strip_of(TABLE), maxima, band, criteria, no_steps)
 
 
 @pytest.mark.parametrize("tilt_deg", [(0.0, 0.0), (2.3, 0.5), (-1.5, 2.0), (3.5, -3.0)])

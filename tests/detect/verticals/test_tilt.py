@@ -15,8 +15,9 @@ from detect.lines import detect_lines
 from detect.verticals.judgement import share_edges
 from detect.verticals.tilt import (
     TiltEstimate,
+    TiltSearch,
     Verticals,
-    agreed_tilt,
+    agree_on_tilt,
     consensus,
     gather,
     level_matrix,
@@ -151,7 +152,7 @@ def edges_at(
 ) -> np.ndarray:
     """Edges of lines at bearings in a camera of a thousand pixels per radian."""
     near = np.full(len(place), 1e-3 * DEFAULT.same_edge_px)
-    return gather(place, near, evidence, polarity)
+    return gather(place, near, evidence, np.ones(len(place)) if polarity is None else polarity)
 
 
 def test_lines_of_one_edge_tell_as_much_as_one() -> None:
@@ -168,9 +169,9 @@ def test_lines_of_one_edge_tell_as_much_as_one() -> None:
         normal = np.stack([np.cos(bearing), np.sin(bearing), -lean_], axis=-1)[which]
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
         lines = Verticals(normal, variance, np.full(count, 0.015), weight)
-        lines = share_edges(lines, edges_at(place, evidence))
-        tilt, _ = agreed_tilt(lines, DEFAULT)
-        assert tilt is not None
+        share_edges(lines, edges_at(place, evidence))
+        tilt, _ = agree_on_tilt(lines, TiltSearch.of(DEFAULT))
+        assert tilt.lines > 0
         assert lines.weight.sum() == pytest.approx(16.0)
         return np.array([tilt.pitch_rad, tilt.roll_rad]), tilt.covariance
 
@@ -189,10 +190,10 @@ def test_edges_of_other_polarity_or_farther_away_are_not_the_same() -> None:
         np.array([10.0, 12.0, 30.0, 9.0, 8.0]),
         np.array([1.0, 1.0, -1.0, 1.0, 1.0]),
     )
-    shared = share_edges(lines, edge)
+    share_edges(lines, edge)
     np.testing.assert_array_equal(edge, [0, 0, 2, 3, 3])
-    np.testing.assert_allclose(shared.variance, [2e-6, 2e-6, 1e-6, 2e-6, 2e-6])
-    np.testing.assert_allclose(shared.weight, [1.5, 1.5, 3.0, 1.5, 1.5])
+    np.testing.assert_allclose(lines.variance, [2e-6, 2e-6, 1e-6, 2e-6, 2e-6])
+    np.testing.assert_allclose(lines.weight, [1.5, 1.5, 3.0, 1.5, 1.5])
 
 
 @pytest.mark.parametrize("narrow", [True, False])

@@ -14,6 +14,7 @@ from detect.verticals.tilt import (
     STRAY_RAD,
     TOGETHER_RAD,
     TiltEstimate,
+    TiltSearch,
     Verticals,
     consensus,
     gather,
@@ -37,7 +38,8 @@ def stated_error(
     """The covariance of a tilt that has a prior of 0.035 rad."""
     settings = replace(DEFAULT, tilt_prior_deg=float(np.degrees(0.035)), stray_share=share)
     lines = Verticals(normal, variance, np.ones(len(weight)), weight)
-    return with_error(TiltEstimate(*tilt, np.eye(2), len(weight)), lines, edge, settings).covariance
+    estimate = TiltEstimate(*tilt, np.eye(2), len(weight))
+    return with_error(estimate, lines, edge, TiltSearch.of(settings)).covariance
 
 
 def building(
@@ -142,7 +144,7 @@ def test_lines_are_gathered_round_the_strongest() -> None:
     bearing = np.array([0.0, 0.5, 0.1, 0.2, 0.9]) * TOGETHER_RAD * 2.0
     weight = np.array([1.0, 4.0, 3.0, 2.0, 5.0])
 
-    group = gather(bearing, np.full(5, TOGETHER_RAD), weight)
+    group = gather(bearing, np.full(5, TOGETHER_RAD), weight, np.zeros(5))
 
     np.testing.assert_array_equal(group, [0, 1, 0, 0, 1])
 
