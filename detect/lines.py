@@ -176,12 +176,13 @@ def beyond_doubt(tilt: TiltEstimate | None, least_lines: int, strip: Strip) -> b
     """Whether a tilt of `least_lines` lines or more is good enough to follow all edges along it."""
     if tilt is None or tilt.lines < least_lines or tilt.votes < _FIRST_VOTES:
         return False
-    return bool(lean_deviation(tilt.covariance, strip.sine, strip.cosine) <= _FIRST_LEAN_RAD)
+    (pp, pr), (_, rr) = tilt.covariance.tolist()
+    return bool(lean_deviation(pp, pr, rr, strip.sine, strip.cosine) <= _FIRST_LEAN_RAD)
 
 
 def _lag_px(tilt: TiltEstimate, guide: TiltEstimate, strip: Strip, settings: LineSettings) -> float:
     """How far tracks along `guide` were from edges of a tilt, where that is most, pixels."""
-    change = np.array([tilt.pitch_rad - guide.pitch_rad, tilt.roll_rad - guide.roll_rad])
-    lean = lean_deviation(np.outer(change, change), strip.sine, strip.cosine)
+    pitch, roll = tilt.pitch_rad - guide.pitch_rad, tilt.roll_rad - guide.roll_rad
+    lean = lean_deviation(pitch * pitch, pitch * roll, roll * roll, strip.sine, strip.cosine)
     # A track follows a wrong lean at the distance where its correction per row equals it.
     return float(lean * strip.row_aspect / settings.guided_pull)

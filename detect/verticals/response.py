@@ -118,8 +118,8 @@ class StripResponse(NamedTuple):
         Means, covariances and mean squares across the verticals evaluated last: few, so that they
         stay in the cache. That of number c has place c modulo S.
     taken : (S, 3) int32
-        Number of the vertical in each place, -1 for none; the first row for which there are
-        moments, and the one after the last.
+        Number of the vertical in each place; the first row for which there are moments, and the one
+        after the last.
     """
 
     pixels: NDArray[np.uint8]
@@ -193,7 +193,7 @@ def strip_response(image: NDArray[np.uint8], strip: Strip, window: LineFilter) -
         value=np.empty((width, height), np.float32),
         known=np.zeros((width, 2), np.int32),
         moments=np.empty((_PLACES, 3, height), np.float32),
-        taken=np.full((_PLACES, 3), -1, np.int32),
+        taken=np.zeros((_PLACES, 3), np.int32),
     )
 
 

@@ -239,6 +239,7 @@ def _respond(
         response[c] = value if row[c] >= 0 else np.float32(0.0)
 
 
+@njit(cache=True, error_model="numpy")
 def find_maxima(response: SingleArray, threshold: float) -> Maxima:
     """Maxima of the response along rows parallel to the horizon, and their chains.
 
@@ -249,22 +250,11 @@ def find_maxima(response: SingleArray, threshold: float) -> Maxima:
     threshold : float
         Least absolute response.
     """
-    size = response.size
-    found = Maxima(
-        np.empty(size, np.int32), np.empty(size, np.int32), np.empty(size, np.float32),
-        np.empty(size), np.empty(size, np.int64),
-    )  # fmt: skip
-    count = _find_maxima(response, np.float32(threshold), found)
-    return Maxima(
-        found.level[:count], found.column[:count], found.value[:count],
-        found.place[:count], found.chain[:count],
-    )  # fmt: skip
-
-
-@njit(cache=True, error_model="numpy")
-def _find_maxima(response: SingleArray, threshold: np.float32, found: Maxima) -> int:
     levels, width = response.shape
-    continued = np.zeros(response.size, np.bool_)
+    size = response.size
+    level, column = np.empty(size, np.int32), np.empty(size, np.int32)
+    value, places, chain = np.empty(size, np.float32), np.empty(size), np.empty(size, np.int64)
+    continued = np.zeros(size, np.bool_)
     n = above = begin = 0
     for k in range(levels):
         # Maxima of the row above are those from `above` to before `begin`.
@@ -279,30 +269,47 @@ def _find_maxima(response: SingleArray, threshold: np.float32, found: Maxima) ->
             if here < 0.0 and not (left > here and right >= here):
                 continue
             place = c + 0.5 * float(left - right) / float(left - here - here + right)
-            found.level[n], found.column[n], found.value[n], found.place[n] = k, c, here, place
-            found.chain[n] = n
+            level[n], column[n], value[n], places[n], chain[n] = k, c, here, place, n
             # Each goes on the chain of the nearest one above that none has continued yet.
-            while above < begin and found.place[above] <= place - 2.0 * _APART:
+            while above < begin and places[above] <= place - 2.0 * _APART:
                 above += 1
             nearest, link = _APART, -1
             other = above
-            while other < begin and found.place[other] < place + _APART:
-                apart = abs(found.place[other] - place)
-                if found.value[other] * here > 0.0 and apart < nearest and not continued[other]:
+            while other < begin and places[other] < place + _APART:
+                apart = abs(places[other] - place)
+                if value[other] * here > 0.0 and apart < nearest and not continued[other]:
                     nearest, link = apart, other
                 other += 1
             if link >= 0:
-                found.chain[n] = found.chain[link]
+                chain[n] = chain[link]
                 continued[link] = True
             n += 1
-    return n
+    return Maxima(level[:n], column[:n], value[:n], places[:n], chain[:n])
 
 
 def line_starts(maxima: Maxima, band: StartBand) -> LineStarts:
     """Maxima on chains, or all of them where lines need not cross several rows of the band."""
-    strength = np.abs(maxima.value)
-    order = np.argsort(-strength, kind="stable")
-    if band.chained:
-        order = order[np.bincount(maxima.chain)[maxima.chain[order]] > 1]
-    column = maxima.column[order]
-    return LineStarts(band.row[maxima.level[order], column], column, maxima.value[order])
+    row, column, value = _starts(maxima, band.row, 2 if band.chained else 1)
+    order = np.argsort(-np.abs(value), kind="stable")
+    return LineStarts(row[order], column[order], value[order])
+
+
+@njit(cache=True, error_model="numpy")
+def _starts(maxima: Maxima, rows: NDArray[np.int32], least: int) -> LineStarts:
+    """Maxima on chains of some length, in the order of the maxima."""
+    size = len(maxima.chain)
+    length = np.zeros(size, np.int64)
+    for i in range(size):
+        length[maxima.chain[i]] += 1
+    row, column, value = (
+        np.empty(size, np.int32),
+        np.empty(size, np.int32),
+        np.empty(size, np.float32),
+    )
+    n = 0
+    for i in range(size):
+        if length[maxima.chain[i]] >= least:
+            column[n], value[n] = maxima.column[i], maxima.value[i]
+            row[n] = rows[maxima.level[i], column[n]]
+            n += 1
+    return LineStarts(row[:n], column[:n], value[:n])

@@ -178,9 +178,11 @@ def with_error(
 
 
 @njit(cache=True, error_model="numpy")
-def lean_deviation(covariance: FloatArray, sine: FloatArray, cosine: FloatArray) -> float:
-    """Largest standard deviation of the lean of verticals at some bearings due to the tilt's."""
-    pp, pr, rr = covariance[0, 0], covariance[0, 1], covariance[1, 1]
+def lean_deviation(pp: float, pr: float, rr: float, sine: FloatArray, cosine: FloatArray) -> float:
+    """Largest standard deviation of the lean of verticals at some bearings.
+
+    It is due to a tilt with some variances and covariance of pitch and roll.
+    """
     largest = 0.0
     for s, c in zip(sine, cosine):
         variance = s * s * pp - 2.0 * s * c * pr + c * c * rr

@@ -76,8 +76,8 @@ class Following(NamedTuple):
 
     Attributes
     ----------
-    columns_per_rise : (W,) float64
-        By how many columns an edge is expected to move for a rise of 1.
+    pitch, roll : float
+        The tilt that they are expected to show (rad).
     pull : float
         Part of a point's offset by which the expected position of the next one moves; more for the
         first points, whose mean it is. 1 follows any curve, small values only verticals.
@@ -92,7 +92,8 @@ class Following(NamedTuple):
         with at least this number of points and this sum of scores.
     """
 
-    columns_per_rise: FloatArray
+    pitch: float
+    roll: float
     pull: float
     reach: float
     threshold: float
@@ -125,12 +126,11 @@ def follow_edges(
     enough : int
         Stop once there are this many tracks that may be lines.
     """
-    count = len(starts.row)
-    width, height = strip.rise.shape
     guided = tilt_rad is not None
     pitch, roll = tilt_rad or (0.0, 0.0)
     following = Following(
-        columns_per_rise=(pitch * strip.sine - roll * strip.cosine) * strip.columns_per_rad,
+        pitch,
+        roll,
         pull=float(settings.guided_pull) if guided else 1.0,
         reach=float(settings.guided_reach_px) if guided else 1.0,
         threshold=float(settings.threshold),
@@ -140,36 +140,31 @@ def follow_edges(
         least_points=settings.least_points(strip.row_aspect),
         least_score=float(settings.least_evidence / strip.row_aspect),
     )
-    found = LineTracks(
-        np.empty(count), np.zeros(count + 1, np.int64), np.empty(count * height, np.int32),
-        np.empty(count * height), np.empty(count * height, np.float32),
-    )  # fmt: skip
-    lowest, highest = (starts.row.min(), starts.row.max()) if count else (0, -1)
-    followed = np.zeros((2, highest - lowest + 1, width), np.bool_)
-    tracks = _follow_edges(response, strip.rise, starts, following, followed, lowest, found)
-    points = found.bounds[tracks]
-    return LineTracks(
-        found.polarity[:tracks],
-        found.bounds[: tracks + 1],
-        found.row[:points].copy(),
-        found.column[:points].copy(),
-        found.score[:points].copy(),
-    )
+    return _follow_edges(response, strip, starts, following)
 
 
 @njit(cache=True, error_model="numpy")
 def _follow_edges(
-    response: StripResponse, rise: SingleArray, starts: LineStarts, following: Following,
-    followed: NDArray[np.bool_], lowest: int, found: LineTracks,
-) -> int:  # fmt: skip
-    """Follow edges; return the number of tracks.
-
-    `followed`, (2, R, W), marks columns by polarity, on the rows from `lowest` on that have starts.
-    """
+    response: StripResponse, strip: Strip, starts: LineStarts, following: Following
+) -> LineTracks:
+    rise = strip.rise
     width, height = rise.shape
+    # By how many columns an edge is expected to move for a rise of 1.
+    columns_per_rise = np.empty(width)
+    for c in range(width):
+        lean = following.pitch * strip.sine[c] - following.roll * strip.cosine[c]
+        columns_per_rise[c] = lean * strip.columns_per_rad[c]
+    count = len(starts.row)
+    lowest, highest = height, -1
+    for v in starts.row:
+        lowest, highest = min(lowest, v), max(highest, v)
+    # Columns that were followed, by polarity, on the rows that have starts.
+    followed = np.zeros((2, max(highest - lowest + 1, 0), width), np.bool_)
+    polarity, bounds = np.empty(count), np.zeros(count + 1, np.int64)
+    found_row, found_column = np.empty(count * height, np.int32), np.empty(count * height)
+    found_score = np.empty(count * height, np.float32)
     # Numba counts references to arrays in tuples wherever they are taken out of these.
     start_row, start_column, start_value = starts.row, starts.column, starts.value
-    found_row, found_column, found_score = found.row, found.column, found.score
     # Of the edge that is followed, by row; no score where there is no point.
     column, score = np.empty(height), np.zeros(height, np.float32)
     tracks = n = counting = 0
@@ -186,7 +181,7 @@ def _follow_edges(
         for direction in (-1, 1):
             # Upward from the start, then downward from the point that was found there.
             begin = v, column[v], direction
-            end = _follow(response, rise, following, sign, begin, column, score)
+            end = _follow(response, rise, columns_per_rise, following, sign, begin, column, score)
             top, bottom = min(top, end), max(bottom, end)
             if score[v] == 0.0:
                 break
@@ -202,12 +197,18 @@ def _follow_edges(
                     for k in range(max(0, j - 1), min(width, j + 2)):
                         marks[row - lowest, k] = True
         if n > first:
-            found.polarity[tracks] = sign
+            polarity[tracks] = sign
             tracks += 1
-            found.bounds[tracks] = n
+            bounds[tracks] = n
             if n - first >= following.least_points and total >= following.least_score:
                 counting += 1
-    return tracks
+    return LineTracks(
+        polarity[:tracks],
+        bounds[: tracks + 1],
+        found_row[:n].copy(),
+        found_column[:n].copy(),
+        found_score[:n].copy(),
+    )
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
@@ -230,15 +231,16 @@ def _is_known(known: NDArray[np.int32], c: int, v: int) -> bool:
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _follow(
-    response: StripResponse, rise: SingleArray, following: Following, sign: np.float32,
-    start: tuple[int, float, int], column: FloatArray, score: SingleArray,
+    response: StripResponse, rise: SingleArray, columns_per_rise: FloatArray,
+    following: Following, sign: np.float32, start: tuple[int, float, int], column: FloatArray,
+    score: SingleArray,
 ) -> int:  # fmt: skip
     """Follow an edge from a row and column on in a direction; return the last row.
 
     Nothing is found if there is no point in the first row.
     """
     # Numba counts references to arrays in tuples wherever they are taken out of these.
-    value, known, columns_per_rise = response.value, response.known, following.columns_per_rise
+    value, known = response.value, response.known
     pull, reach, threshold = following.pull, following.reach, following.threshold
     border, max_gap = following.border, following.max_gap
     width, height = rise.shape
