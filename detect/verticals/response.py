@@ -33,6 +33,8 @@ SingleArray = NDArray[np.float32]
 
 #: Grey values about 0 keep small variances exact in single precision.
 MIDDLE_GREY = np.float32(128.0)
+#: Rows of a vertical that are evaluated together.
+BLOCK = 8
 #: Verticals whose moments are kept: more than a track needs side by side.
 _PLACES = 16
 #: Weights are padded with zeros to a multiple of this: whole vectors.
@@ -112,14 +114,14 @@ class StripResponse(NamedTuple):
         The filter.
     value : (W, H) float32
         Responses, in [-1, 1]; positive where the image is brighter on the right.
-    known : (W, 2) int32
-        First of the rows in which each vertical has them, and the one after the last.
+    known : (W, B) bool
+        Blocks of rows in which each vertical has them.
     moments : (S, 3, H) float32
         Means, covariances and mean squares across the verticals evaluated last: few, so that they
         stay in the cache. That of number c has place c modulo S.
-    taken : (S, 3) int32
-        Number of the vertical in each place; the first row for which there are moments, and the one
-        after the last.
+    owner : (S, B) int32
+        One more than the number of the vertical whose moments are in each block of rows; 0 for
+        none.
     """
 
     pixels: NDArray[np.uint8]
@@ -128,9 +130,9 @@ class StripResponse(NamedTuple):
     last_row: NDArray[np.int32]
     window: LineFilter
     value: NDArray[np.float32]
-    known: NDArray[np.int32]
+    known: NDArray[np.bool_]
     moments: NDArray[np.float32]
-    taken: NDArray[np.int32]
+    owner: NDArray[np.int32]
 
 
 def weights_across(sigma_px: float, spacing_px: float = 1.0) -> FloatArray:
@@ -184,6 +186,7 @@ def strip_of(table: VerticalTable) -> Strip:
 def strip_response(image: NDArray[np.uint8], strip: Strip, window: LineFilter) -> StripResponse:
     """The response of an image, of which nothing is evaluated yet."""
     width, height = strip.column.shape
+    blocks = -(-height // BLOCK)
     return StripResponse(
         image.reshape(-1),
         strip.column,
@@ -191,9 +194,10 @@ def strip_response(image: NDArray[np.uint8], strip: Strip, window: LineFilter) -
         strip.last_row,
         window,
         value=np.empty((width, height), np.float32),
-        known=np.zeros((width, 2), np.int32),
-        moments=np.empty((_PLACES, 3, height), np.float32),
-        taken=np.zeros((_PLACES, 3), np.int32),
+        known=np.zeros((width, blocks), np.bool_),
+        # Behind the filter's weights are zeros: what they are multiplied by must be finite.
+        moments=np.zeros((_PLACES, 3, height), np.float32),
+        owner=np.zeros((_PLACES, blocks), np.int32),
     )
 
 
@@ -223,64 +227,42 @@ def line_response(
 
 @njit(cache=True, error_model="numpy")
 def _extend_all(response: StripResponse) -> None:
-    width, height = response.value.shape
-    extend(response, (0, width), (0, height))
+    width, blocks = response.known.shape
+    for c in range(width):
+        for block in range(blocks):
+            extend(response, c, block)
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def extend(response: StripResponse, verticals: tuple[int, int], rows: tuple[int, int]) -> None:
-    """Evaluate verticals in some rows, as far as these are not known, and in all rows between.
-
-    Parameters
-    ----------
-    response : StripResponse
-        Changed.
-    verticals, rows : (int, int)
-        The first, and the one after the last.
-    """
-    pixels, window, column = response.pixels, response.window, response.column
-    value, known, moments = response.value, response.known, response.moments
-    across, along, sums = window.across, window.along, window.along_sums
-    width, half_length = len(known), window.half_length
+def extend(response: StripResponse, c: int, block: int) -> None:
+    """Evaluate vertical c in the rows of a block."""
+    pixels, window, column = response.pixels, response.window, response.column[c]
+    value, moments, owner = response.value[c], response.moments[c % _PLACES], response.owner
+    width, half_length = len(response.known), window.half_length
+    begin, end = block * BLOCK, min((block + 1) * BLOCK, len(column))
+    top, bottom = response.first_row[c], response.last_row[c] + 1
+    first, after = max(begin - half_length, top), min(end + half_length, bottom)
+    for other in range(first // BLOCK, (after + BLOCK - 1) // BLOCK):
+        if owner[c % _PLACES, other] != c + 1:
+            owner[c % _PLACES, other] = c + 1
+            rows = other * BLOCK, min((other + 1) * BLOCK, len(column))
+            _take_moments(pixels, width, column, window.across, window.reach, rows, moments)
+    _correlate_along(
+        moments,
+        window.along,
+        window.along_sums,
+        half_length,
+        window.regulariser,
+        (max(begin, top), min(end, bottom)),
+        (top, bottom),
+        value,
+    )
+    # A window that leaves the image has no response, nor has a vertical that is not seen.
     leftmost, rightmost = np.float32(window.reach), np.float32(width - 1 - window.reach)
-    for c in range(verticals[0], verticals[1]):
-        begin, end = rows
-        if known[c, 0] == known[c, 1]:
-            known[c, 0], known[c, 1] = begin, end
-        elif begin < known[c, 0]:
-            end = known[c, 0]
-            known[c, 0] = begin
-        elif end > known[c, 1]:
-            begin = known[c, 1]
-            known[c, 1] = end
-        else:
-            continue
-        top, bottom = response.first_row[c], response.last_row[c] + 1
-        own_column, own_value = column[c], value[c]
-        own_moments, taken = moments[c % _PLACES], response.taken[c % _PLACES]
-        first = max(begin - half_length, top)
-        after = min(end - half_length + len(along) - 1, bottom)
-        if taken[0] != c or first > taken[2] or after < taken[1]:
-            taken[0], taken[1], taken[2] = c, first, first
-        for span in ((first, min(after, taken[1])), (max(first, taken[2]), after)):
-            _take_moments(pixels, width, own_column, across, window.reach, span, own_moments)
-        taken[1], taken[2] = min(taken[1], first), max(taken[2], after)
-        span = max(begin, top), min(end, bottom)
-        _correlate_along(
-            own_moments,
-            along,
-            sums,
-            half_length,
-            window.regulariser,
-            span,
-            (top, bottom),
-            own_value,
-        )
-        # A window that leaves the image has no response, nor has a vertical that is not seen.
-        for v in range(begin, end):
-            x = own_column[v]
-            if not (x >= leftmost and x < rightmost):
-                own_value[v] = np.float32(0.0)
+    for v in range(begin, end):
+        if not (column[v] >= leftmost and column[v] < rightmost):
+            value[v] = np.float32(0.0)
+    response.known[c, block] = True
 
 
 # Kernels with loops take arrays one by one: Numba counts references to arrays in tuples.

@@ -16,11 +16,9 @@ from numba import njit
 from numpy.typing import NDArray
 
 from detect.line_settings import LineSettings
-from detect.verticals.response import FloatArray, SingleArray, Strip, StripResponse, extend
+from detect.verticals.response import BLOCK, FloatArray, SingleArray, Strip, StripResponse, extend
 from detect.verticals.starts import LineStarts
 
-#: Rows that are filtered ahead of a track.
-_AHEAD = 8
 #: More edges than any image has.
 ALL_EDGES = 2**31
 
@@ -225,11 +223,6 @@ def _place(column: int, part: float) -> tuple[int, float]:
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _is_known(known: NDArray[np.int32], c: int, v: int) -> bool:
-    return bool(known[c, 0] <= v and v < known[c, 1])
-
-
-@njit(cache=True, error_model="numpy", forceinline=True)
 def _follow(
     response: StripResponse, rise: SingleArray, columns_per_rise: FloatArray,
     following: Following, sign: np.float32, start: tuple[int, float, int], column: FloatArray,
@@ -262,14 +255,10 @@ def _follow(
             break
         near = j
         while True:
-            if not (
-                _is_known(known, near - 1, v)
-                and _is_known(known, near, v)
-                and _is_known(known, near + 1, v)
-            ):
-                first = v if direction > 0 else max(v - _AHEAD + 1, 0)
-                after = min(v + _AHEAD, height) if direction > 0 else v + 1
-                extend(response, (near - 1, near + 2), (first, after))
+            block = v // BLOCK
+            for c in range(near - 1, near + 2):
+                if not known[c, block]:
+                    extend(response, c, block)
             left, here, right = (
                 sign * value[near - 1, v], sign * value[near, v], sign * value[near + 1, v]
             )  # fmt: skip
