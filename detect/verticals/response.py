@@ -116,9 +116,10 @@ class StripResponse(NamedTuple):
         Responses, in [-1, 1]; positive where the image is brighter on the right.
     known : (W, B) bool
         Blocks of rows in which each vertical has them.
-    moments : (S, 3, H) float32
-        Means, covariances and mean squares across the verticals evaluated last: few, so that they
-        stay in the cache. That of number c has place c modulo S.
+    moments : (S, 4, H) float32
+        Means, covariances and mean squares across the verticals evaluated last, and 1 where these
+        are defined, else 0. They are few, so that they stay in the cache: that of number c has
+        place c modulo S.
     owner : (S, B) int32
         One more than the number of the vertical whose moments are in each block of rows; 0 for
         none.
@@ -196,7 +197,7 @@ def strip_response(image: NDArray[np.uint8], strip: Strip, window: LineFilter) -
         value=np.empty((width, height), np.float32),
         known=np.zeros((width, blocks), np.bool_),
         # Behind the filter's weights are zeros: what they are multiplied by must be finite.
-        moments=np.zeros((_PLACES, 3, height), np.float32),
+        moments=np.zeros((_PLACES, 4, height), np.float32),
         owner=np.zeros((_PLACES, blocks), np.int32),
     )
 
@@ -237,35 +238,22 @@ def _extend_all(response: StripResponse) -> None:
 def extend(response: StripResponse, c: int, block: int) -> None:
     """Evaluate vertical c in the rows of a block."""
     pixels, window, column = response.pixels, response.window, response.column[c]
-    value, moments, owner = response.value[c], response.moments[c % _PLACES], response.owner
+    moments, owner = response.moments[c % _PLACES], response.owner[c % _PLACES]
     width, half_length = len(response.known), window.half_length
     begin, end = block * BLOCK, min((block + 1) * BLOCK, len(column))
     top, bottom = response.first_row[c], response.last_row[c] + 1
     first, after = max(begin - half_length, top), min(end + half_length, bottom)
     for other in range(first // BLOCK, (after + BLOCK - 1) // BLOCK):
-        if owner[c % _PLACES, other] != c + 1:
-            owner[c % _PLACES, other] = c + 1
+        if owner[other] != c + 1:
+            owner[other] = c + 1
             rows = other * BLOCK, min((other + 1) * BLOCK, len(column))
             _take_moments(pixels, width, column, window.across, window.reach, rows, moments)
-    _correlate_along(
-        moments,
-        window.along,
-        window.along_sums,
-        half_length,
-        window.regulariser,
-        (max(begin, top), min(end, bottom)),
-        (top, bottom),
-        value,
-    )
-    # A window that leaves the image has no response, nor has a vertical that is not seen.
-    leftmost, rightmost = np.float32(window.reach), np.float32(width - 1 - window.reach)
-    for v in range(begin, end):
-        if not (column[v] >= leftmost and column[v] < rightmost):
-            value[v] = np.float32(0.0)
+    _correlate_along(moments, window, (begin, end), (top, bottom), response.value[c])
     response.known[c, block] = True
 
 
-# Kernels with loops take arrays one by one: Numba counts references to arrays in tuples.
+# Kernels with loops take arrays one by one: Numba counts references to arrays in tuples. Unsigned
+# indices are not checked for being negative.
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
@@ -273,44 +261,45 @@ def _take_moments(
     pixels: NDArray[np.uint8], width: int, column: NDArray[np.float32],
     weights: NDArray[np.float32], reach: int, rows: tuple[int, int], moments: NDArray[np.float32],
 ) -> None:  # fmt: skip
-    """(3, H) moments across a vertical from the first of two rows to before the second."""
-    taps = weights.shape[1]
+    """(4, H) moments across a vertical from the first of two rows to before the second."""
+    means, covs, squares, inside = moments[0], moments[1], moments[2], moments[3]
     leftmost, rightmost = np.float32(reach), np.float32(width - 1 - reach)
-    for v in range(rows[0], rows[1]):
+    for v in range(np.uint64(rows[0]), np.uint64(rows[1])):
         x = column[v]
-        mean = cov = square = np.float32(0.0)
+        mean = cov = square = one = np.float32(0.0)
         # Where the window leaves the image, the vertical counts as of middle grey.
         if x >= leftmost and x < rightmost:
-            j = int(x)
-            begin = v * width + j - reach
-            # At the end of the image only pixels of weight 0 are missing.
-            window = pixels[begin : begin + taps]
-            mean, cov, square = _moments_across(window, weights, x - np.float32(j))
-        moments[0, v] = mean
-        moments[1, v] = cov
-        moments[2, v] = square
+            j = np.uint64(x)
+            begin = v * np.uint64(width) + j - np.uint64(reach)
+            mean, cov, square = _moments_across(pixels, begin, weights, x - np.float32(j))
+            one = np.float32(1.0)
+        means[v], covs[v], squares[v], inside[v] = mean, cov, square, one
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"}, forceinline=True)
 def _correlate_along(
-    moments: NDArray[np.float32], along: NDArray[np.float32], sums: NDArray[np.float32],
-    half_length: int, noise: np.float32, rows: tuple[int, int], seen: tuple[int, int],
+    moments: NDArray[np.float32], window: LineFilter, rows: tuple[int, int], seen: tuple[int, int],
     value: NDArray[np.float32],
 ) -> None:  # fmt: skip
     """Responses in some rows from the moments in the rows round them on which it is seen."""
-    means, covs, squares = moments[0], moments[1], moments[2]
+    means, covs, squares, inside = moments[0], moments[1], moments[2], moments[3]
+    along, sums, half_length = window.along, window.along_sums, window.half_length
     for v in range(rows[0], rows[1]):
-        begin = v - half_length
-        first, after = max(begin, seen[0]), min(begin + len(along), seen[1])
-        weights = along[first - begin : after - begin]
-        mean, cov, square = _weighted_sums(
-            weights, means[first:after], covs[first:after], squares[first:after]
-        )
-        scale = np.float32(1.0) / (sums[after - begin] - sums[first - begin])
-        mean *= scale
-        cov *= scale
-        # Rounding can make a vanishing variance negative.
-        value[v] = cov * abs(cov) / (abs(square * scale - mean * mean) + noise)
+        response = np.float32(0.0)
+        # A window that leaves the image has no response, nor has a vertical that is not seen.
+        if inside[v] > 0.0:
+            begin = v - half_length
+            first, after = max(begin, seen[0]), min(begin + len(along), seen[1])
+            mean, cov, square = _weighted_sums(
+                along[first - begin : after - begin], means, covs, squares, np.uint64(first)
+            )
+            scale = np.float32(1.0) / (sums[after - begin] - sums[first - begin])
+            mean *= scale
+            cov *= scale
+            # Rounding can make a vanishing variance negative.
+            variance = abs(square * scale - mean * mean)
+            response = cov * abs(cov) / (variance + window.regulariser)
+        value[v] = response
 
 
 # Sums in any order become vectors; inlined, their order is that of the kernel that has them.
@@ -318,12 +307,13 @@ def _correlate_along(
 
 @njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"}, forceinline=True)
 def _moments_across(
-    pixels: NDArray[np.uint8], weights: NDArray[np.float32], part: np.float32
+    pixels: NDArray[np.uint8], begin: np.uint64, weights: NDArray[np.float32], part: np.float32
 ) -> tuple[np.float32, np.float32, np.float32]:
     """Mean, covariance and mean square in a window `part` of a pixel right of its first one."""
     mean = cov = square = np.float32(0.0)
-    for k in range(len(pixels)):
-        grey = np.float32(pixels[k]) - MIDDLE_GREY
+    # At the end of the image only pixels of weight 0 are missing.
+    for k in range(np.uint64(min(weights.shape[1], len(pixels) - np.int64(begin)))):
+        grey = np.float32(pixels[begin + k]) - MIDDLE_GREY
         weighted = (weights[0, k] + part * weights[1, k]) * grey
         mean += weighted
         square += weighted * grey
@@ -334,11 +324,12 @@ def _moments_across(
 @njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"}, forceinline=True)
 def _weighted_sums(
     weights: NDArray[np.float32], one: NDArray[np.float32], two: NDArray[np.float32],
-    three: NDArray[np.float32],
+    three: NDArray[np.float32], begin: np.uint64,
 ) -> tuple[np.float32, np.float32, np.float32]:  # fmt: skip
+    """Sums of three arrays from some place on."""
     first = second = third = np.float32(0.0)
-    for k in range(len(weights)):
-        first += weights[k] * one[k]
-        second += weights[k] * two[k]
-        third += weights[k] * three[k]
+    for k in range(np.uint64(len(weights))):
+        first += weights[k] * one[begin + k]
+        second += weights[k] * two[begin + k]
+        third += weights[k] * three[begin + k]
     return first, second, third
