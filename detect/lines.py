@@ -72,7 +72,6 @@ class _Prepared(NamedTuple):
     strip: Strip
     window: LineFilter
     band: StartBand
-    no_steps: StepFilters
     first_steps: StepFilters
     all_steps: StepFilters
     criteria: Criteria
@@ -85,7 +84,6 @@ def _prepared(table: VerticalTable, settings: LineSettings) -> _Prepared:
         strip_of(table),
         line_filter(settings),
         start_band(table, settings),
-        step_filters(settings, 0),
         step_filters(settings, _FIRST_STEPS),
         step_filters(settings),
         Criteria.of(settings, table.row_aspect),
@@ -150,7 +148,7 @@ def _tracks_of_verticals(
     if settings.guided and settings.first_edges > 0:
         # The band is useless in images that are full of maxima everywhere.
         if band.chained and band.height_px >= _BAND_PX and len(starts.row) <= image.shape[1]:
-            guide = tilt_of_chains(image, strip, maxima, band, criteria, tools.no_steps)
+            guide = tilt_of_chains(strip, maxima, band, criteria)
         if beyond_doubt(guide, _CHAINS, strip):
             passes = 2
         else:

@@ -17,7 +17,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from detect.line_settings import LineSettings
-from detect.verticals.refinement import LineFits, StepFilters, fit_lines
+from detect.verticals.refinement import LineFits, StepFilters, fit_lines, fit_points, no_fits
 from detect.verticals.response import FloatArray, Strip
 from detect.verticals.starts import Maxima, StartBand
 from detect.verticals.tilt import (
@@ -158,22 +158,26 @@ def fit_and_judge(
     criteria: Criteria,
 ) -> Judgement:  # fmt: skip
     """Fit lines to tracks, select them one by one, and estimate the tilt on which most agree."""
-    least_score = criteria.least_evidence / strip.row_aspect
-    fits = fit_lines(image, strip, tracks, filters, criteria.least_points, least_score)
-    evidence, fate, tilt, lines, edge = _judge(strip, tracks, fits, criteria)
+    fits, evidence, fate, tilt, lines, edge = _fit_and_judge(
+        image, strip, tracks, filters, criteria
+    )
     return Judgement(fits, evidence, fate, tilt if tilt.lines > 0 else None, lines, edge)
 
 
 @njit(cache=True, error_model="numpy")
-def _judge(
-    strip: Strip, tracks: LineTracks, fits: LineFits, criteria: Criteria
-) -> tuple[FloatArray, NDArray[np.int8], TiltEstimate, Verticals, NDArray[np.int64]]:
-    """What `Judgement` says of tracks with some fits; a tilt of 0 lines where too few agree."""
+def _fit_and_judge(
+    image: NDArray[np.uint8], strip: Strip, tracks: LineTracks, filters: StepFilters,
+    criteria: Criteria,
+) -> tuple[
+    LineFits, FloatArray, NDArray[np.int8], TiltEstimate, Verticals, NDArray[np.int64]
+]:  # fmt: skip
+    """The parts of a `Judgement`; a tilt of 0 lines where too few agree."""
+    least_score = criteria.least_evidence / strip.row_aspect
+    fits = fit_lines(image, strip, tracks, filters, criteria.least_points, least_score)
     count = len(tracks.polarity)
     evidence, fate = np.empty(count), np.empty(count, np.int8)
     _judge_each(strip, tracks, fits, criteria, evidence, fate)
-    accepted = _accepted(fate)
-    _reject_soft(fits, evidence, accepted, criteria, fate)
+    _reject_soft(fits, evidence, _accepted(fate), criteria, fate)
     accepted = _accepted(fate)
     count = len(accepted)
     votes, place, near = np.empty(count), np.empty(count), np.empty(count)
@@ -191,7 +195,7 @@ def _judge(
     for k in range(count):
         if not agrees[k]:
             fate[accepted[k]] = NOT_VERTICAL
-    return evidence, fate, tilt, lines, edge
+    return fits, evidence, fate, tilt, lines, edge
 
 
 @njit(cache=True, error_model="numpy")
@@ -311,17 +315,35 @@ def share_edges(lines: Verticals, edge: NDArray[np.int64]) -> None:
 
 
 def tilt_of_chains(
-    image: NDArray[np.uint8], strip: Strip, maxima: Maxima, band: StartBand,
-    criteria: Criteria, no_steps: StepFilters,
-) -> TiltEstimate | None:  # fmt: skip
+    strip: Strip, maxima: Maxima, band: StartBand, criteria: Criteria
+) -> TiltEstimate | None:
     """The tilt that most chains of the band's maxima agree with; None where too few do."""
-    tracks = _tracks_of_chains(maxima, band.row)
-    fits = fit_lines(image, strip, tracks, no_steps, _CHAIN_LEAST, 0.0)
     leaning = criteria.leaning._replace(
         bend_px=_CHAIN_BEND_PX, lean_noise=1.0, largest_lean_px=_CHAIN_LEAN_PX
     )
-    tilt = _tilt_of_straight(fits, leaning, criteria.search, criteria.weight_limit)
+    criteria = criteria._replace(leaning=leaning)
+    tilt = _tilt_of_chains(strip, maxima, band.row, criteria)
     return tilt if tilt.lines > 0 else None
+
+
+@njit(cache=True, error_model="numpy")
+def _tilt_of_chains(
+    strip: Strip, maxima: Maxima, rows: NDArray[np.int32], criteria: Criteria
+) -> TiltEstimate:
+    """That of straight chains, all of which count the same; of 0 lines where too few agree."""
+    tracks = _tracks_of_chains(maxima, rows)
+    fits = no_fits(len(tracks.polarity))
+    straight, count = np.empty(len(tracks.polarity), np.int64), 0
+    chart = np.empty((2, len(tracks.row)))
+    for t in range(len(straight)):
+        fit_points(strip, tracks, t, _CHAIN_LEAST, 0.0, chart, fits)
+        if fits.scatter_px[t] <= _CHAIN_SCATTER_PX:
+            straight[count] = t
+            count += 1
+    votes = np.full(count, criteria.weight_limit)
+    return agree_on_tilt(_weigh(fits, straight[:count], votes, criteria.leaning), criteria.search)[
+        0
+    ]
 
 
 @njit(cache=True, error_model="numpy")
@@ -348,17 +370,3 @@ def _tracks_of_chains(maxima: Maxima, rows: NDArray[np.int32]) -> LineTracks:
             begin[chain[i]] += 1
             row[k], place[k], score[k] = rows[level[i], column[i]], maxima.place[i], abs(value[i])
     return LineTracks(np.ones(count), bounds[: count + 1], row, place, score)
-
-
-@njit(cache=True, error_model="numpy")
-def _tilt_of_straight(
-    fits: LineFits, leaning: Leaning, search: TiltSearch, vote: float
-) -> TiltEstimate:
-    """The tilt that most straight lines agree with, all of which count the same."""
-    straight, count = np.empty(len(fits.scatter_px), np.int64), 0
-    for t in range(len(fits.scatter_px)):
-        if fits.scatter_px[t] <= _CHAIN_SCATTER_PX:
-            straight[count] = t
-            count += 1
-    lines = _weigh(fits, straight[:count], np.full(count, vote), leaning)
-    return agree_on_tilt(lines, search)[0]

@@ -137,31 +137,6 @@ def gaussian_steps(sigma: float, half: int) -> FloatArray:
     return np.asarray(weights - weights.mean(axis=-1, keepdims=True))
 
 
-def fit_lines(
-    image: NDArray[np.uint8], strip: Strip, tracks: LineTracks, filters: StepFilters,
-    least_points: int, least_score: float,
-) -> LineFits:  # fmt: skip
-    """Fit lines to tracks by the eigen-decomposition of their points' scatter, and refine them.
-
-    Parameters
-    ----------
-    image : (H, W) uint8
-        Grey values.
-    strip, tracks, filters
-        The table, the tracks, the steps of the refinement; where there are none the covariance is
-        that of independent points with the scatter that the track shows.
-    least_points, least_score : int, float
-        Tracks of fewer points, or of a smaller sum of scores, have no line.
-    """
-    count = len(tracks.polarity)
-    fits = LineFits(
-        np.empty(count), np.empty(count), np.empty((count, 2)), np.empty((count, 2, 2)),
-        *np.empty((5, count)),
-    )  # fmt: skip
-    _fit_lines(image, strip, tracks, filters, least_points, float(least_score), fits)
-    return fits
-
-
 class Crossings(NamedTuple):
     """Where a line crosses the N rows of its track: columns, NaN for none, and derivatives."""
 
@@ -181,7 +156,7 @@ class NewtonStep(NamedTuple):
     bb: float
 
 
-class _Eigenline(NamedTuple):
+class Eigenline(NamedTuple):
     """A line a + b Z, the variance across it, and mean and variance of the points' Z."""
 
     a: float
@@ -192,58 +167,97 @@ class _Eigenline(NamedTuple):
 
 
 @njit(cache=True, error_model="numpy")
-def _fit_lines(
+def no_fits(count: int) -> LineFits:
+    """Of some tracks none of which has a line yet."""
+    return LineFits(
+        reference_rad=np.empty(count),
+        pixel_rad=np.empty(count),
+        line=np.full((count, 2), np.nan),
+        covariance=np.full((count, 2, 2), np.nan),
+        scatter_px=np.full(count, np.nan),
+        shift_px=np.full(count, np.nan),
+        spread=np.full(count, np.nan),
+        contrast=np.full(count, np.nan),
+        sharpness=np.ones(count),
+    )
+
+
+@njit(cache=True, error_model="numpy")
+def fit_points(
+    strip: Strip, tracks: LineTracks, t: int, least_points: int, least_score: float,
+    chart: FloatArray, fits: LineFits,
+) -> Eigenline:  # fmt: skip
+    """Fit a line to track t by the eigen-decomposition of its points' scatter.
+
+    Parameters
+    ----------
+    strip, tracks
+        The table, the tracks.
+    least_points, least_score : int, float
+        Tracks of fewer points, or of a smaller sum of scores, have no line.
+    chart : (2, N) float64
+        Gets X and Z of the points.
+    fits : LineFits
+        Gets the line; the covariance is that of independent points with the scatter that the track
+        shows.
+    """
+    begin, end = tracks.bounds[t], tracks.bounds[t + 1]
+    n, row, column, score = end - begin, tracks.row, tracks.column, tracks.score
+    middle = total = 0.0
+    for i in range(begin, end):
+        middle += column[i]
+        total += score[i]
+    origin = min(max(int(middle / n + 0.5), 1), len(strip.bearing) - 2)
+    pixel = 1.0 / abs(strip.columns_per_rad[origin])
+    fits.reference_rad[t], fits.pixel_rad[t] = strip.bearing[origin], pixel
+    if n < least_points or total < least_score:
+        return Eigenline(np.nan, np.nan, np.nan, np.nan, np.nan)
+    x, z = chart[0, :n], chart[1, :n]
+    _place_in_chart(strip, row[begin:end], column[begin:end], strip.bearing[origin], x, z)
+    line = _eigenline(x, z)
+    fits.scatter_px[t], fits.spread[t] = math.sqrt(line.scatter) / pixel, line.spread
+    if line.spread > line.scatter:
+        variance = line.scatter / (max(n - 2, 1) * line.spread)
+        fits.line[t, 0], fits.line[t, 1] = line.a, line.b
+        fits.covariance[t, 0, 0] = (line.spread + line.middle**2) * variance
+        fits.covariance[t, 0, 1] = fits.covariance[t, 1, 0] = -line.middle * variance
+        fits.covariance[t, 1, 1] = variance
+        fits.shift_px[t] = 0.0
+    return line
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def fit_lines(
     image: NDArray[np.uint8], strip: Strip, tracks: LineTracks, filters: StepFilters,
-    least_points: int, least_score: float, fits: LineFits,
-) -> None:  # fmt: skip
+    least_points: int, least_score: float,
+) -> LineFits:  # fmt: skip
+    """Fit lines to tracks (`fit_points`), and refine them on the grey values in some steps."""
+    fits = no_fits(len(tracks.polarity))
     scratch = np.empty((5, image.shape[0]))
-    chart_x, chart_z, column, by_a, by_b = (
-        scratch[0], scratch[1], scratch[2], scratch[3], scratch[4]
-    )  # fmt: skip
-    fits.line[:], fits.covariance[:] = np.nan, np.nan
-    fits.scatter_px[:], fits.shift_px[:] = np.nan, np.nan
-    fits.spread[:], fits.contrast[:], fits.sharpness[:] = np.nan, np.nan, 1.0
-    tracked, score = tracks.column, tracks.score
+    chart, column, by_a, by_b = scratch[:2], scratch[2], scratch[3], scratch[4]
     for t in range(len(tracks.polarity)):
+        line = fit_points(strip, tracks, t, least_points, least_score, chart, fits)
+        if len(filters.half) == 0 or np.isnan(fits.line[t, 0]):
+            continue
         begin, end = tracks.bounds[t], tracks.bounds[t + 1]
-        n, sign = end - begin, tracks.polarity[t]
-        middle = total = 0.0
-        for i in range(begin, end):
-            middle += tracked[i]
-            total += score[i]
-        origin = min(max(int(middle / n + 0.5), 1), len(strip.bearing) - 2)
-        pixel = 1.0 / abs(strip.columns_per_rad[origin])
-        fits.reference_rad[t], fits.pixel_rad[t] = strip.bearing[origin], pixel
-        if n < least_points or total < least_score:
+        n, sign, pixel = end - begin, tracks.polarity[t], fits.pixel_rad[t]
+        crossings = Crossings(tracks.row[begin:end], column[:n], by_a[:n], by_b[:n])
+        x, z = chart[0, :n], chart[1, :n]
+        _cross_rows(strip, tracks.column[begin:end], x, z, line, crossings)
+        steps = _climb(image, crossings, filters, sign, line.middle, pixel)
+        # NaN where there is no maximum.
+        fits.line[t, 0] += steps.change_a
+        fits.line[t, 1] += steps.change_b
+        fits.covariance[t, 0, 0], fits.covariance[t, 1, 1] = steps.aa, steps.bb
+        fits.covariance[t, 0, 1] = fits.covariance[t, 1, 0] = steps.ab
+        fits.shift_px[t] = abs(steps.change_a + steps.change_b * line.middle) / pixel
+        if np.isnan(steps.aa):
             continue
-        row, x, z = tracks.row[begin:end], chart_x[:n], chart_z[:n]
-        _place_in_chart(strip, row, tracked[begin:end], fits.reference_rad[t], x, z)
-        line = _eigenline(x, z)
-        fits.scatter_px[t], fits.spread[t] = math.sqrt(line.scatter) / pixel, line.spread
-        if not line.spread > line.scatter:
-            continue
-        a, b = line.a, line.b
-        of_lean = line.scatter / (max(n - 2, 1) * line.spread)
-        aa, ab, bb = (line.spread + line.middle**2) * of_lean, -line.middle * of_lean, of_lean
-        if len(filters.half) == 0:
-            fits.shift_px[t] = 0.0
-        else:
-            crossings = Crossings(row, column[:n], by_a[:n], by_b[:n])
-            _cross_rows(strip, tracked[begin:end], x, z, line, crossings)
-            steps = _climb(image, crossings, filters, sign, line.middle, pixel)
-            a, b, aa, ab, bb = (
-                a + steps.change_a, b + steps.change_b, steps.aa, steps.ab, steps.bb
-            )  # fmt: skip
-            if np.isnan(aa):
-                continue
-            fits.shift_px[t] = abs(steps.change_a + steps.change_b * line.middle) / pixel
-            rows, fine, coarse = _contrasts(image, crossings, filters.heights)
-            fits.contrast[t] = sign * fine / rows if rows > 0 else 0.0
-            sharp = fine / coarse if sign * coarse > 0.0 else 1.0
-            fits.sharpness[t] = min(max(sharp, 0.0), 1.0)
-        fits.line[t, 0], fits.line[t, 1] = a, b
-        fits.covariance[t, 0, 0], fits.covariance[t, 1, 1] = aa, bb
-        fits.covariance[t, 0, 1] = fits.covariance[t, 1, 0] = ab
+        rows, fine, coarse = _contrasts(image, crossings, filters.heights)
+        fits.contrast[t] = sign * fine / rows if rows > 0 else 0.0
+        sharp = fine / coarse if sign * coarse > 0.0 else 1.0
+        fits.sharpness[t] = min(max(sharp, 0.0), 1.0)
+    return fits
 
 
 @njit(cache=True, error_model="numpy")
@@ -265,7 +279,7 @@ def _place_in_chart(
 
 
 @njit(cache=True, error_model="numpy")
-def _eigenline(x: FloatArray, z: FloatArray) -> _Eigenline:
+def _eigenline(x: FloatArray, z: FloatArray) -> Eigenline:
     """The line along the larger eigenvalue's eigenvector of the points' scatter."""
     n = len(x)
     mean_x = mean_z = xx = xz = zz = 0.0
@@ -281,12 +295,12 @@ def _eigenline(x: FloatArray, z: FloatArray) -> _Eigenline:
     half = 0.5 * (xx - zz)
     smaller = max(0.5 * (xx + zz) - math.sqrt(half * half + xz * xz), 0.0)
     b = xz / (zz - smaller)
-    return _Eigenline(mean_x - b * mean_z, b, smaller, mean_z, zz)
+    return Eigenline(mean_x - b * mean_z, b, smaller, mean_z, zz)
 
 
 @njit(cache=True, error_model="numpy")
 def _cross_rows(
-    strip: Strip, tracked: FloatArray, x: FloatArray, z: FloatArray, line: _Eigenline,
+    strip: Strip, tracked: FloatArray, x: FloatArray, z: FloatArray, line: Eigenline,
     crossings: Crossings,
 ) -> None:  # fmt: skip
     """Where a line crosses the rows of its track, whose points are near it."""
@@ -340,6 +354,8 @@ def _climb(
             change = newton.change_a * by_a[i] + newton.change_b * by_b[i]
             column[i] += change
             moved_px = max(moved_px, abs(change))
+    if np.isnan(aa):
+        a = b = np.nan
     return NewtonStep(a, b, aa, ab, bb)
 
 

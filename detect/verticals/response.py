@@ -242,7 +242,8 @@ def extend(response: StripResponse, c: int, block: int) -> None:
     width, half_length = len(response.known), window.half_length
     begin, end = block * BLOCK, min((block + 1) * BLOCK, len(column))
     top, bottom = response.first_row[c], response.last_row[c] + 1
-    first, after = max(begin - half_length, top), min(end + half_length, bottom)
+    first = max(begin - half_length, min(begin, top))
+    after = min(end + half_length, max(end, bottom))
     for other in range(first // BLOCK, (after + BLOCK - 1) // BLOCK):
         if owner[other] != c + 1:
             owner[other] = c + 1

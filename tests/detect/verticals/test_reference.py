@@ -14,16 +14,15 @@ from detect.line_settings import DEFAULT, PUBLISHED, LineSettings
 from detect.sources.gray import decode_gray
 from detect.verticals.refinement import (
     Crossings,
-    fit_lines,
     newton_step,
     step_filters,
 )
-from detect.verticals.response import line_response, strip_of
+from detect.verticals.response import line_response
 from detect.verticals.starts import LineStarts
 from detect.verticals.tracking import LineTracks
 from lut.verticals import build_vertical_table
 from tests.detect.line_scene import Edge, pinhole, render, tilted
-from tests.detect.verticals.stages import line_tracks, start_response
+from tests.detect.verticals.stages import judge_tracks, line_tracks, start_response
 from tests.reference import verticals as reference
 
 DEMO = Path(__file__).parents[3] / "images" / "e"
@@ -104,7 +103,7 @@ def test_lines_through_tracks_are_those_of_the_reference() -> None:
         bounds, score = np.array([0, len(row)]), np.ones(len(row), np.float32)
         tracks = LineTracks(np.ones(1), bounds, row, column, score)
         image = np.zeros((CAMERA.height, CAMERA.width), np.uint8)
-        fits = fit_lines(image, strip_of(table), tracks, step_filters(DEFAULT, 0), 5, 0.0)
+        fits = judge_tracks(image, tracks, table, DEFAULT, steps=0).fits
         bearing = np.interp(column, columns, table.bearing_rad)
         rise = [np.interp(c, columns, table.elevation_tan[v]) for v, c in zip(row, column)]
         expected = reference.eigenline(bearing, np.array(rise), float(fits.reference_rad[0]))
