@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal, NamedTuple, get_type_hints
 
 from detect.errors import DetectError
 from storage.bounds import (
@@ -196,6 +196,58 @@ class LineSettings:
     def least_points(self, row_aspect: float) -> int:
         """Least number of points of a line, given the height of a row in widths of a pixel."""
         return max(self.least_rows, math.ceil(self.least_length_px / row_aspect))
+
+
+class LineNumbers(NamedTuple):
+    """What compiled code reads of settings, for rows of some height; see `LineSettings`."""
+
+    least_points: int
+    threshold: float
+    border_rows: int
+    gap_rows: int
+    guided_pull: float
+    guided_reach_px: float
+    least_evidence: float
+    least_sharpness: float
+    soft_evidence: float
+    largest_horizon_gap_px: float
+    largest_scatter_px: float
+    largest_shift_px: float
+    largest_noise_px: float
+    bend_px: float
+    lean_noise: float
+    largest_lean_deg: float
+    largest_lean_sigmas: float
+    largest_lean_px: float
+    largest_tilt_deg: float
+    tilt_prior_deg: float
+    building_deg: float
+    proposers: int
+    least_lines: int
+    stray_share: float
+    weight_limit: float
+    same_edge_px: float
+    join_px: float
+    join_share: float
+    joined_equally: bool
+    shoulder_px: float
+    shoulder_share: float
+    sigma_px: float
+    level: bool
+
+    @classmethod
+    def of(cls, settings: LineSettings, row_aspect: float = 1.0) -> LineNumbers:
+        """Those of some settings, for rows of some height in widths of a pixel."""
+        given: dict[str, Any] = {
+            "least_points": settings.least_points(row_aspect),
+            "joined_equally": settings.joined == "equal",
+            "level": settings.alpha == "level",
+        }
+        # Compiled code tells 1 from 1.0.
+        for name, kind in get_type_hints(cls).items():
+            if name not in given:
+                given[name] = kind(getattr(settings, name))
+        return cls(**given)
 
 
 #: Reproduces the data set's own rows as far as these are known (docs/verticals.md).

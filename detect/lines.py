@@ -26,13 +26,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from detect.errors import FrameError
-from detect.line_settings import DEFAULT, LineSettings
+from detect.line_settings import DEFAULT, LineNumbers, LineSettings
 from detect.verticals.blur import median_sharpness, widened, width_for
 from detect.verticals.detections import LineDetections
-from detect.verticals.joining import JoiningRules, lines_of_tracks
+from detect.verticals.joining import lines_of_tracks
 from detect.verticals.judgement import (
     FATES,
-    Criteria,
     Judgement,
     fit_and_judge,
     tilt_of_chains,
@@ -74,8 +73,7 @@ class _Prepared(NamedTuple):
     band: StartBand
     first_steps: StepFilters
     all_steps: StepFilters
-    criteria: Criteria
-    joining: JoiningRules
+    numbers: LineNumbers
 
 
 @lru_cache(maxsize=16)
@@ -86,8 +84,7 @@ def _prepared(table: VerticalTable, settings: LineSettings) -> _Prepared:
         start_band(table, settings),
         step_filters(settings, _FIRST_STEPS),
         step_filters(settings),
-        Criteria.of(settings, table.row_aspect),
-        JoiningRules.of(settings),
+        LineNumbers.of(settings, table.row_aspect),
     )
 
 
@@ -127,9 +124,9 @@ def detect_lines(
     if settings.blurred_widths and sharpness < settings.blurred_sharpness:
         return detect_lines(image, table, widened(settings, width_for(sharpness, settings)))
     if judged.tilt is not None:
-        tilt = with_error(judged.tilt, judged.verticals, judged.edge, tools.criteria.search)
+        tilt = with_error(judged.tilt, judged.verticals, judged.edge, tools.numbers)
         judged = judged._replace(tilt=tilt)
-    lines = lines_of_tracks(tools.strip, tracks, judged, tools.joining)
+    lines = lines_of_tracks(tools.strip, tracks, judged, tools.numbers)
     return LineDetections(lines, tracks, judged, sharpness)
 
 
@@ -137,7 +134,7 @@ def _tracks_of_verticals(
     image: NDArray[np.uint8], tools: _Prepared, settings: LineSettings
 ) -> tuple[LineTracks, Judgement]:
     """Tracks along the verticals of the image's tilt where that is found, and their fates."""
-    strip, band, criteria = tools.strip, tools.band, tools.criteria
+    strip, band, numbers = tools.strip, tools.band, tools.numbers
     in_band = band_response(image, band, settings.regulariser)
     maxima = find_maxima(in_band, settings.threshold)
     starts = line_starts(maxima, band)
@@ -148,22 +145,22 @@ def _tracks_of_verticals(
     if settings.guided and settings.first_edges > 0:
         # The band is useless in images that are full of maxima everywhere.
         if band.chained and band.height_px >= _BAND_PX and len(starts.row) <= image.shape[1]:
-            guide = tilt_of_chains(strip, maxima, band, criteria)
+            guide = tilt_of_chains(strip, maxima, band, numbers)
         if beyond_doubt(guide, _CHAINS, strip):
             passes = 2
         else:
-            tracks = follow_edges(response, strip, starts, settings, enough=settings.first_edges)
-            guide = fit_and_judge(image, strip, tracks, tools.first_steps, criteria).tilt
+            tracks = follow_edges(response, strip, starts, numbers, enough=settings.first_edges)
+            guide = fit_and_judge(image, strip, tracks, tools.first_steps, numbers).tilt
             if not beyond_doubt(guide, _FIRST_LINES, strip):
                 guide = None
     if guide is None:
-        tracks = follow_edges(response, strip, starts, settings)
-        judged = fit_and_judge(image, strip, tracks, tools.all_steps, criteria)
+        tracks = follow_edges(response, strip, starts, numbers)
+        judged = fit_and_judge(image, strip, tracks, tools.all_steps, numbers)
         guide = judged.tilt if settings.guided else None
     # Once more if the band's tilt, by which they were followed, was not quite that of the lines.
     while guide is not None and passes > 0:
-        tracks = follow_edges(response, strip, starts, settings, (guide.pitch_rad, guide.roll_rad))
-        judged = fit_and_judge(image, strip, tracks, tools.all_steps, criteria)
+        tracks = follow_edges(response, strip, starts, numbers, (guide.pitch_rad, guide.roll_rad))
+        judged = fit_and_judge(image, strip, tracks, tools.all_steps, numbers)
         if judged.tilt is None or _lag_px(judged.tilt, guide, strip, settings) <= _LAG_PX:
             break
         guide, passes = judged.tilt, passes - 1

@@ -21,7 +21,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from detect.line_settings import LineSettings
+from detect.line_settings import LineNumbers
 from detect.verticals.judgement import (
     ACCEPTED,
     BESIDE_A_STRONGER_EDGE,
@@ -61,49 +61,20 @@ class Lines(NamedTuple):
     bounds: NDArray[np.int64]
 
 
-class JoiningRules(NamedTuple):
-    """How lines are joined; see `detect.line_settings.LineSettings`."""
-
-    same_edge_px: float
-    join_px: float
-    join_share: float
-    shoulder_px: float
-    shoulder_share: float
-    sigma_px: float
-    building_rad: float
-    level: bool
-    equal: bool
-
-    @classmethod
-    def of(cls, settings: LineSettings) -> JoiningRules:
-        """Those of some settings."""
-        return cls(
-            float(settings.same_edge_px),
-            float(settings.join_px),
-            float(settings.join_share),
-            float(settings.shoulder_px),
-            float(settings.shoulder_share),
-            float(settings.sigma_px),
-            math.radians(settings.building_deg),
-            settings.alpha == "level",
-            settings.joined == "equal",
-        )
-
-
 def lines_of_tracks(
-    strip: Strip, tracks: LineTracks, judged: Judgement, rules: JoiningRules
+    strip: Strip, tracks: LineTracks, judged: Judgement, numbers: LineNumbers
 ) -> Lines:
     """Lines of accepted tracks; the fate of tracks that are left out or joined is changed."""
     tilt = (judged.tilt.pitch_rad, judged.tilt.roll_rad) if judged.tilt is not None else (0.0, 0.0)
-    if judged.tilt is None or not rules.level:
-        rules = rules._replace(building_rad=math.inf)
-    return _join(strip, tracks, judged.fits, judged.evidence, judged.fate, tilt, rules)
+    if judged.tilt is None or not numbers.level:
+        numbers = numbers._replace(building_deg=math.inf)
+    return _join(strip, tracks, judged.fits, judged.evidence, judged.fate, tilt, numbers)
 
 
 @njit(cache=True, error_model="numpy")
 def _join(
     strip: Strip, tracks: LineTracks, fits: LineFits, evidence: FloatArray,
-    fate: NDArray[np.int8], tilt: tuple[float, float], rules: JoiningRules,
+    fate: NDArray[np.int8], tilt: tuple[float, float], numbers: LineNumbers,
 ) -> Lines:  # fmt: skip
     count = 0
     strength, chosen = np.empty(len(fate)), np.empty(len(fate), np.int64)
@@ -112,12 +83,12 @@ def _join(
             strength[count], chosen[count] = evidence[t], t
             count += 1
     tried = chosen[strongest_first(strength[:count])]
-    alpha, noise = _bearings(fits, tried, tilt, rules)
-    _leave_out(tried, alpha, tracks.polarity, fits, evidence, rules, fate)
+    alpha, noise = _bearings(fits, tried, tilt, numbers)
+    _leave_out(tried, alpha, tracks.polarity, fits, evidence, numbers, fate)
     bearing, reach, count = np.empty(len(tried)), np.empty(len(tried)), 0
     for t in tried:
         if fate[t] == ACCEPTED:
-            bearing[count], reach[count] = alpha[t], rules.join_px * fits.pixel_rad[t]
+            bearing[count], reach[count] = alpha[t], numbers.join_px * fits.pixel_rad[t]
             chosen[count] = t
             count += 1
     group = chain_neighbours(bearing[:count], reach[:count])
@@ -138,15 +109,15 @@ def _join(
     for n in range(count):
         t = members[n]
         bearing[n] = alpha[t]
-        deviation[n] = math.hypot(noise[t], rules.sigma_px * fits.pixel_rad[t])
-        if not rules.equal:
+        deviation[n] = math.hypot(noise[t], numbers.sigma_px * fits.pixel_rad[t])
+        if not numbers.joined_equally:
             weight[n] = evidence[t]
     joined, sigma = join_mixtures(bearing, deviation, weight, bounds)
     ends, beta, own_noise = np.zeros((lines, 4)), np.zeros(lines), np.empty(lines)
     for n in range(lines):
         first = bounds[n]
         own_noise[n] = noise[members[first]]
-        after = bounds[n + 1] if rules.equal else first + 1
+        after = bounds[n + 1] if numbers.joined_equally else first + 1
         for k in range(first, after):
             t, share = members[k], 1.0 / (after - first)
             beta[n] += share * _inclination(fits.line[t])
@@ -164,21 +135,21 @@ def _wrapped(angle: float) -> float:
 
 @njit(cache=True, error_model="numpy")
 def _bearings(
-    fits: LineFits, tracks: NDArray[np.int64], tilt: tuple[float, float], rules: JoiningRules
+    fits: LineFits, tracks: NDArray[np.int64], tilt: tuple[float, float], numbers: LineNumbers
 ) -> tuple[FloatArray, FloatArray]:
     """Levelled bearings of some tracks, and their standard deviations due to noise.
 
     The measured lean b is replaced by its best estimate, given that it should be that of a vertical
-    under the tilt up to the standard deviation `building_rad`, and a, which is correlated with it,
+    under the tilt up to the standard deviation `building_deg`, and a, which is correlated with it,
     follows.
     """
     alpha, noise = np.empty(len(fits.line)), np.empty(len(fits.line))
-    turn = 1.0 if rules.level else -1.0
+    turn = 1.0 if numbers.level else -1.0
     rotation = level_matrix(turn * tilt[0], turn * tilt[1])
     for t in tracks:
         sine, cosine = math.sin(fits.reference_rad[t]), math.cos(fits.reference_rad[t])
         a, b, covariance = fits.line[t, 0], fits.line[t, 1], fits.covariance[t]
-        gain = covariance[0, 1] / (covariance[1, 1] + rules.building_rad**2)
+        gain = covariance[0, 1] / (covariance[1, 1] + math.radians(numbers.building_deg) ** 2)
         a -= gain * (b - (tilt[0] * sine - tilt[1] * cosine))
         # Of the plane's two level directions (n_y, -n_x) is the one ahead of the camera.
         n_x, n_y = cosine - a * sine, sine + a * cosine
@@ -192,7 +163,7 @@ def _bearings(
 @njit(cache=True, error_model="numpy")
 def _leave_out(
     tracks: NDArray[np.int64], alpha: FloatArray, polarity: FloatArray, fits: LineFits,
-    evidence: FloatArray, rules: JoiningRules, fate: NDArray[np.int8],
+    evidence: FloatArray, numbers: LineNumbers, fate: NDArray[np.int8],
 ) -> None:  # fmt: skip
     """Leave out tracks, from the strongest on, on the same edge as a stronger one or beside it."""
     pixel, contrast = fits.pixel_rad, fits.contrast
@@ -202,12 +173,12 @@ def _leave_out(
             if fate[s] != ACCEPTED:
                 continue
             near_px = abs(_wrapped(alpha[t] - alpha[s])) / pixel[t]
-            if polarity[t] == polarity[s] and near_px < rules.same_edge_px:
+            if polarity[t] == polarity[s] and near_px < numbers.same_edge_px:
                 fate[t] = SAME_EDGE
                 break
-            faint = evidence[t] < rules.join_share * evidence[s]
-            fainter = contrast[t] < rules.shoulder_share * contrast[s]
-            if (near_px < rules.join_px and faint) or (near_px < rules.shoulder_px and fainter):
+            faint = evidence[t] < numbers.join_share * evidence[s]
+            fainter = contrast[t] < numbers.shoulder_share * contrast[s]
+            if (near_px < numbers.join_px and faint) or (near_px < numbers.shoulder_px and fainter):
                 fate[t] = BESIDE_A_STRONGER_EDGE
 
 

@@ -16,13 +16,12 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from detect.line_settings import LineSettings
+from detect.line_settings import LineNumbers
 from detect.verticals.refinement import LineFits, StepFilters, fit_lines, fit_points, no_fits
 from detect.verticals.response import FloatArray, Strip
 from detect.verticals.starts import Maxima, StartBand
 from detect.verticals.tilt import (
     TiltEstimate,
-    TiltSearch,
     Verticals,
     agree_on_tilt,
     gather,
@@ -99,99 +98,43 @@ class Judgement(NamedTuple):
     edge: NDArray[np.int64]
 
 
-class Leaning(NamedTuple):
-    """How far verticals lean; see `detect.line_settings.LineSettings`."""
-
-    building_rad: float
-    bend_px: float
-    lean_noise: float
-    largest_lean_rad: float
-    largest_lean_sigmas: float
-    largest_lean_px: float
-
-
-class Criteria(NamedTuple):
-    """What makes tracks verticals; see `detect.line_settings.LineSettings`."""
-
-    least_points: int
-    least_evidence: float
-    largest_shift_px: float
-    largest_scatter_px: float
-    largest_horizon_gap_px: float
-    largest_noise_px: float
-    least_sharpness: float
-    soft_evidence: float
-    weight_limit: float
-    same_edge_px: float
-    leaning: Leaning
-    search: TiltSearch
-
-    @classmethod
-    def of(cls, settings: LineSettings, row_aspect: float) -> Criteria:
-        """Those of some settings, for rows of some height in widths of a pixel."""
-        leaning = Leaning(
-            math.radians(settings.building_deg),
-            float(settings.bend_px),
-            float(settings.lean_noise),
-            math.radians(settings.largest_lean_deg),
-            float(settings.largest_lean_sigmas),
-            float(settings.largest_lean_px),
-        )
-        return cls(
-            settings.least_points(row_aspect),
-            float(settings.least_evidence),
-            float(settings.largest_shift_px),
-            float(settings.largest_scatter_px),
-            float(settings.largest_horizon_gap_px),
-            float(settings.largest_noise_px),
-            float(settings.least_sharpness),
-            float(settings.soft_evidence),
-            float(settings.weight_limit),
-            float(settings.same_edge_px),
-            leaning,
-            TiltSearch.of(settings),
-        )
-
-
 def fit_and_judge(
     image: NDArray[np.uint8], strip: Strip, tracks: LineTracks, filters: StepFilters,
-    criteria: Criteria,
+    numbers: LineNumbers,
 ) -> Judgement:  # fmt: skip
     """Fit lines to tracks, select them one by one, and estimate the tilt on which most agree."""
-    fits, evidence, fate, tilt, lines, edge = _fit_and_judge(
-        image, strip, tracks, filters, criteria
-    )
+    fits, evidence, fate, tilt, lines, edge = _fit_and_judge(image, strip, tracks, filters, numbers)
     return Judgement(fits, evidence, fate, tilt if tilt.lines > 0 else None, lines, edge)
 
 
 @njit(cache=True, error_model="numpy")
 def _fit_and_judge(
     image: NDArray[np.uint8], strip: Strip, tracks: LineTracks, filters: StepFilters,
-    criteria: Criteria,
+    numbers: LineNumbers,
 ) -> tuple[
     LineFits, FloatArray, NDArray[np.int8], TiltEstimate, Verticals, NDArray[np.int64]
 ]:  # fmt: skip
     """The parts of a `Judgement`; a tilt of 0 lines where too few agree."""
-    least_score = criteria.least_evidence / strip.row_aspect
-    fits = fit_lines(image, strip, tracks, filters, criteria.least_points, least_score)
+    least_score = numbers.least_evidence / strip.row_aspect
+    fits = fit_lines(image, strip, tracks, filters, numbers.least_points, least_score)
     count = len(tracks.polarity)
     evidence, fate = np.empty(count), np.empty(count, np.int8)
-    _judge_each(strip, tracks, fits, criteria, evidence, fate)
-    _reject_soft(fits, evidence, _accepted(fate), criteria, fate)
+    _judge_each(strip, tracks, fits, numbers, evidence, fate)
+    _reject_soft(fits, evidence, _accepted(fate), numbers, fate)
     accepted = _accepted(fate)
     count = len(accepted)
     votes, place, near = np.empty(count), np.empty(count), np.empty(count)
     own_evidence, polarity = np.empty(count), np.empty(count)
     for k in range(count):
         t = accepted[k]
-        votes[k] = min(0.1 * evidence[t], criteria.weight_limit)
+        votes[k] = min(0.1 * evidence[t], numbers.weight_limit)
         place[k] = fits.reference_rad[t] + math.atan(fits.line[t, 0])
-        near[k] = criteria.same_edge_px * fits.pixel_rad[t]
+        near[k] = numbers.same_edge_px * fits.pixel_rad[t]
         own_evidence[k], polarity[k] = evidence[t], tracks.polarity[t]
-    lines = _weigh(fits, accepted, votes, criteria.leaning)
+    lines = _weigh(fits, accepted, votes, numbers)
     edge = gather(place, near, own_evidence, polarity)
     share_edges(lines, edge)
-    tilt, agrees = agree_on_tilt(lines, criteria.search)
+    tilt, agrees = agree_on_tilt(lines, numbers)
     for k in range(count):
         if not agrees[k]:
             fate[accepted[k]] = NOT_VERTICAL
@@ -200,7 +143,7 @@ def _fit_and_judge(
 
 @njit(cache=True, error_model="numpy")
 def _judge_each(
-    strip: Strip, tracks: LineTracks, fits: LineFits, criteria: Criteria, evidence: FloatArray,
+    strip: Strip, tracks: LineTracks, fits: LineFits, numbers: LineNumbers, evidence: FloatArray,
     fate: NDArray[np.int8],
 ) -> None:  # fmt: skip
     """Evidence of each track, and whether it can be a vertical, by itself."""
@@ -214,19 +157,19 @@ def _judge_each(
         horizon = strip.anchor_row[min(int(np.rint(tracks.column[begin])), len(strip.bearing) - 1)]
         gap = max(horizon - tracks.row[end - 1], tracks.row[begin] - horizon) * strip.row_aspect
         noise_px = math.sqrt(fits.covariance[t, 0, 0]) / fits.pixel_rad[t]
-        if end - begin < criteria.least_points:
+        if end - begin < numbers.least_points:
             fate[t] = SHORT
-        elif not evidence[t] >= criteria.least_evidence:
+        elif not evidence[t] >= numbers.least_evidence:
             fate[t] = LITTLE_EVIDENCE
         elif not math.isfinite(fits.line[t, 0]):
             fate[t] = NO_MAXIMUM
-        elif not fits.shift_px[t] <= criteria.largest_shift_px:
+        elif not fits.shift_px[t] <= numbers.largest_shift_px:
             fate[t] = OFF_THE_TRACK
-        elif not fits.scatter_px[t] <= criteria.largest_scatter_px:
+        elif not fits.scatter_px[t] <= numbers.largest_scatter_px:
             fate[t] = NOT_STRAIGHT
-        elif not gap <= criteria.largest_horizon_gap_px:
+        elif not gap <= numbers.largest_horizon_gap_px:
             fate[t] = OFF_THE_HORIZON
-        elif not noise_px <= criteria.largest_noise_px:
+        elif not noise_px <= numbers.largest_noise_px:
             fate[t] = UNCERTAIN
         else:
             fate[t] = ACCEPTED
@@ -244,18 +187,18 @@ def _accepted(fate: NDArray[np.int8]) -> NDArray[np.int64]:
 
 @njit(cache=True, error_model="numpy")
 def _reject_soft(
-    fits: LineFits, evidence: FloatArray, accepted: NDArray[np.int64], criteria: Criteria,
+    fits: LineFits, evidence: FloatArray, accepted: NDArray[np.int64], numbers: LineNumbers,
     fate: NDArray[np.int8],
 ) -> None:  # fmt: skip
     """Reject lines that are soft and faint among the accepted ones."""
     if len(accepted) == 0:
         return
     # How sharp an edge can be depends on the image's focus and motion.
-    least_sharpness = criteria.least_sharpness * _quantile(fits.sharpness, accepted, 0.25)
+    least_sharpness = numbers.least_sharpness * _quantile(fits.sharpness, accepted, 0.25)
     faint = _quantile(fits.contrast, accepted, 0.5)
     for t in accepted:
         soft = fits.sharpness[t] < least_sharpness and fits.contrast[t] < faint
-        if soft and evidence[t] < criteria.soft_evidence:
+        if soft and evidence[t] < numbers.soft_evidence:
             fate[t] = SOFT
 
 
@@ -274,7 +217,7 @@ def _quantile(values: FloatArray, chosen: NDArray[np.int64], share: float) -> fl
 
 @njit(cache=True, error_model="numpy")
 def _weigh(
-    fits: LineFits, accepted: NDArray[np.int64], votes: FloatArray, leaning: Leaning
+    fits: LineFits, accepted: NDArray[np.int64], votes: FloatArray, numbers: LineNumbers
 ) -> Verticals:
     """The tilt's constraints by accepted lines, with some votes each."""
     count = len(accepted)
@@ -291,14 +234,14 @@ def _weigh(
         per_length = fits.pixel_rad[t] / math.sqrt(12.0 * fits.spread[t])
         noise = fits.covariance[t, 1, 1]
         variance[k] = (
-            leaning.building_rad**2
-            + leaning.lean_noise * noise
-            + (leaning.bend_px * per_length) ** 2
+            math.radians(numbers.building_deg) ** 2
+            + numbers.lean_noise * noise
+            + (numbers.bend_px * per_length) ** 2
         )
         tolerance[k] = math.sqrt(
-            leaning.largest_lean_rad**2
-            + leaning.largest_lean_sigmas**2 * noise
-            + (leaning.largest_lean_px * per_length) ** 2
+            math.radians(numbers.largest_lean_deg) ** 2
+            + numbers.largest_lean_sigmas**2 * noise
+            + (numbers.largest_lean_px * per_length) ** 2
         )
     return Verticals(normal, variance, tolerance, votes)
 
@@ -315,20 +258,19 @@ def share_edges(lines: Verticals, edge: NDArray[np.int64]) -> None:
 
 
 def tilt_of_chains(
-    strip: Strip, maxima: Maxima, band: StartBand, criteria: Criteria
+    strip: Strip, maxima: Maxima, band: StartBand, numbers: LineNumbers
 ) -> TiltEstimate | None:
     """The tilt that most chains of the band's maxima agree with; None where too few do."""
-    leaning = criteria.leaning._replace(
+    numbers = numbers._replace(
         bend_px=_CHAIN_BEND_PX, lean_noise=1.0, largest_lean_px=_CHAIN_LEAN_PX
     )
-    criteria = criteria._replace(leaning=leaning)
-    tilt = _tilt_of_chains(strip, maxima, band.row, criteria)
+    tilt = _tilt_of_chains(strip, maxima, band.row, numbers)
     return tilt if tilt.lines > 0 else None
 
 
 @njit(cache=True, error_model="numpy")
 def _tilt_of_chains(
-    strip: Strip, maxima: Maxima, rows: NDArray[np.int32], criteria: Criteria
+    strip: Strip, maxima: Maxima, rows: NDArray[np.int32], numbers: LineNumbers
 ) -> TiltEstimate:
     """That of straight chains, all of which count the same; of 0 lines where too few agree."""
     tracks = _tracks_of_chains(maxima, rows)
@@ -340,10 +282,8 @@ def _tilt_of_chains(
         if fits.scatter_px[t] <= _CHAIN_SCATTER_PX:
             straight[count] = t
             count += 1
-    votes = np.full(count, criteria.weight_limit)
-    return agree_on_tilt(_weigh(fits, straight[:count], votes, criteria.leaning), criteria.search)[
-        0
-    ]
+    votes = np.full(count, numbers.weight_limit)
+    return agree_on_tilt(_weigh(fits, straight[:count], votes, numbers), numbers)[0]
 
 
 @njit(cache=True, error_model="numpy")

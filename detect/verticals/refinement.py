@@ -233,8 +233,9 @@ def fit_lines(
 ) -> LineFits:  # fmt: skip
     """Fit lines to tracks (`fit_points`), and refine them on the grey values in some steps."""
     fits = no_fits(len(tracks.polarity))
-    scratch = np.empty((5, image.shape[0]))
-    chart, column, by_a, by_b = scratch[:2], scratch[2], scratch[3], scratch[4]
+    height = image.shape[0]
+    chart, column = np.empty((2, height)), np.empty(height)
+    by_a, by_b = np.empty(height), np.empty(height)
     for t in range(len(tracks.polarity)):
         line = fit_points(strip, tracks, t, least_points, least_score, chart, fits)
         if len(filters.half) == 0 or np.isnan(fits.line[t, 0]):

@@ -37,7 +37,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from detect.line_settings import DEFAULT, LineSettings
+from detect.line_settings import DEFAULT, LineNumbers, LineSettings
 
 FloatArray = NDArray[np.float64]
 
@@ -117,27 +117,6 @@ class Verticals(NamedTuple):
     weight: FloatArray
 
 
-class TiltSearch(NamedTuple):
-    """How a tilt is sought; see `detect.line_settings.LineSettings`."""
-
-    largest_rad: float
-    prior_rad: float
-    stray_share: float
-    proposers: int
-    least_lines: int
-
-    @classmethod
-    def of(cls, settings: LineSettings) -> TiltSearch:
-        """That of some settings."""
-        return cls(
-            math.radians(settings.largest_tilt_deg),
-            math.radians(settings.tilt_prior_deg),
-            float(settings.stray_share),
-            settings.proposers,
-            settings.least_lines,
-        )
-
-
 def consensus(
     lines: Verticals, settings: LineSettings = DEFAULT
 ) -> tuple[TiltEstimate | None, NDArray[np.bool_]]:
@@ -157,24 +136,24 @@ def consensus(
     consistent : (N,) bool
         Lines that are vertical under that tilt; without an estimate, under no tilt.
     """
-    search = TiltSearch.of(settings)
-    tilt, consistent = agree_on_tilt(lines, search)
+    numbers = LineNumbers.of(settings)
+    tilt, consistent = agree_on_tilt(lines, numbers)
     if tilt.lines == 0:
         return None, consistent
-    return with_error(tilt, lines, np.arange(len(lines.weight)), search), consistent
+    return with_error(tilt, lines, np.arange(len(lines.weight)), numbers), consistent
 
 
 def with_error(
-    tilt: TiltEstimate, lines: Verticals, edge: NDArray[np.int64], search: TiltSearch
+    tilt: TiltEstimate, lines: Verticals, edge: NDArray[np.int64], numbers: LineNumbers
 ) -> TiltEstimate:
     """The tilt with its mean square error as covariance, unless settings leave that out.
 
     `edge` is one of the lines for each, the same for all of an edge.
     """
-    if search.stray_share == 0.0:
+    if numbers.stray_share == 0.0:
         return tilt
     place = tilt.pitch_rad, tilt.roll_rad
-    return tilt._replace(covariance=_error_of_tilt(lines, edge, place, search, _GRID))
+    return tilt._replace(covariance=_error_of_tilt(lines, edge, place, numbers, _GRID))
 
 
 @njit(cache=True, error_model="numpy")
@@ -206,11 +185,12 @@ def strongest_first(strength: FloatArray) -> NDArray[np.int64]:
 
 
 @njit(cache=True, error_model="numpy")
-def agree_on_tilt(lines: Verticals, search: TiltSearch) -> tuple[TiltEstimate, NDArray[np.bool_]]:
+def agree_on_tilt(lines: Verticals, numbers: LineNumbers) -> tuple[TiltEstimate, NDArray[np.bool_]]:
     """`consensus` with the covariance of least squares; of 0 lines where too few agree."""
     agrees, covariance = np.empty(len(lines.weight), np.bool_), np.empty((2, 2))
-    pitch, roll = _vote_for_tilt(lines, search)
-    pitch, roll = _refine_tilt(lines, pitch, roll, search.prior_rad, covariance, agrees)
+    pitch, roll = _vote_for_tilt(lines, numbers)
+    prior = math.radians(numbers.tilt_prior_deg)
+    pitch, roll = _refine_tilt(lines, pitch, roll, prior, covariance, agrees)
     count, votes, total = 0, 0.0, 0.0
     for i in range(len(agrees)):
         total += lines.weight[i]
@@ -218,7 +198,7 @@ def agree_on_tilt(lines: Verticals, search: TiltSearch) -> tuple[TiltEstimate, N
             count += 1
             votes += lines.weight[i]
     largest = max(abs(pitch), abs(roll))
-    if count < search.least_lines or largest > search.largest_rad:
+    if count < numbers.least_lines or largest > math.radians(numbers.largest_tilt_deg):
         count = 0
         for i in range(len(agrees)):
             agrees[i] = abs(lines.normal[i, 2]) <= lines.tolerance[i]
@@ -226,7 +206,7 @@ def agree_on_tilt(lines: Verticals, search: TiltSearch) -> tuple[TiltEstimate, N
 
 
 @njit(cache=True, error_model="numpy")
-def _vote_for_tilt(lines: Verticals, search: TiltSearch) -> tuple[float, float]:
+def _vote_for_tilt(lines: Verticals, numbers: LineNumbers) -> tuple[float, float]:
     """Pitch and roll that the largest weight of lines agrees with; of equal ones the first.
 
     Each pair of proposers gives the tilt that makes both vertical; a line votes for it with its
@@ -234,7 +214,8 @@ def _vote_for_tilt(lines: Verticals, search: TiltSearch) -> tuple[float, float]:
     tried as well.
     """
     normal, weight = lines.normal, lines.weight
-    proposers = strongest_first(weight)[: search.proposers]
+    limit, prior = math.radians(numbers.largest_tilt_deg), math.radians(numbers.tilt_prior_deg)
+    proposers = strongest_first(weight)[: numbers.proposers]
     most = 1 + len(proposers) * (len(proposers) - 1) // 2
     pitch, roll, votes = np.empty(most), np.empty(most), np.empty(most)
     pitch[0] = roll[0] = 0.0
@@ -248,11 +229,11 @@ def _vote_for_tilt(lines: Verticals, search: TiltSearch) -> tuple[float, float]:
                 continue
             p = (normal[m, 2] * normal[n, 0] - normal[m, 0] * normal[n, 2]) / determinant
             r = (normal[m, 2] * normal[n, 1] - normal[m, 1] * normal[n, 2]) / determinant
-            if abs(p) <= search.largest_rad and abs(r) <= search.largest_rad:
+            if abs(p) <= limit and abs(r) <= limit:
                 pitch[count], roll[count] = p, r
                 count += 1
     for k in range(count):
-        votes[k] = -0.5 * (pitch[k] * pitch[k] + roll[k] * roll[k]) / search.prior_rad**2
+        votes[k] = -0.5 * (pitch[k] * pitch[k] + roll[k] * roll[k]) / (prior * prior)
     for i in range(len(weight)):
         share = 1.0 / lines.tolerance[i]
         x, y, z = share * normal[i, 0], share * normal[i, 1], share * normal[i, 2]
@@ -381,11 +362,11 @@ def merge_lines(lines: Verticals, group: NDArray[np.int64]) -> FloatArray:
 
 @njit(cache=True, error_model="numpy")
 def _error_of_tilt(
-    lines: Verticals, edge: NDArray[np.int64], tilt: tuple[float, float], search: TiltSearch,
+    lines: Verticals, edge: NDArray[np.int64], tilt: tuple[float, float], numbers: LineNumbers,
     grid: FloatArray,
 ) -> FloatArray:  # fmt: skip
     """(2, 2) mean square error of a tilt, over what its lines and those that disagree say."""
-    prior, stray_share, count = search.prior_rad, search.stray_share, len(edge)
+    count, stray_share, prior = len(edge), numbers.stray_share, math.radians(numbers.tilt_prior_deg)
     bearing = np.empty(count)
     for k in range(count):
         bearing[k] = math.atan2(lines.normal[k, 1], lines.normal[k, 0])

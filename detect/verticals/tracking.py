@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from detect.line_settings import LineSettings
+from detect.line_settings import LineNumbers
 from detect.verticals.response import BLOCK, FloatArray, SingleArray, Strip, StripResponse, extend
 from detect.verticals.starts import LineStarts
 
@@ -69,41 +69,8 @@ class LineTracks(NamedTuple):
         return np.add.reduceat(self.score, self.bounds[:-1], dtype=np.float64)
 
 
-class Following(NamedTuple):
-    """How edges are followed.
-
-    Attributes
-    ----------
-    pitch, roll : float
-        The tilt that they are expected to show (rad).
-    pull : float
-        Part of a point's offset by which the expected position of the next one moves; more for the
-        first points, whose mean it is. 1 follows any curve, small values only verticals.
-    reach : float
-        Largest offset of a point from its expected position, columns.
-    threshold, max_gap, border
-        Least absolute response of a point; rows without one that are bridged; rows at the image's
-        border that are left out.
-    enough : int
-        No more edges are followed once there are this many tracks
-    least_points, least_score : int, float
-        with at least this number of points and this sum of scores.
-    """
-
-    pitch: float
-    roll: float
-    pull: float
-    reach: float
-    threshold: float
-    max_gap: int
-    border: int
-    enough: int
-    least_points: int
-    least_score: float
-
-
 def follow_edges(
-    response: StripResponse, strip: Strip, starts: LineStarts, settings: LineSettings,
+    response: StripResponse, strip: Strip, starts: LineStarts, numbers: LineNumbers,
     tilt_rad: tuple[float, float] | None = None, enough: int = ALL_EDGES,
 ) -> LineTracks:  # fmt: skip
     """Follow edges up and down from starts; a start on an edge already followed is left out.
@@ -116,7 +83,7 @@ def follow_edges(
         The table.
     starts : LineStarts
         Where to start, in this order.
-    settings : LineSettings
+    numbers : LineNumbers
         Threshold, gaps, border, and how a track is guided.
     tilt_rad : (float, float), optional
         Pitch and roll that the edges are expected to show; without, they are followed wherever
@@ -124,35 +91,29 @@ def follow_edges(
     enough : int
         Stop once there are this many tracks that may be lines.
     """
-    guided = tilt_rad is not None
-    pitch, roll = tilt_rad or (0.0, 0.0)
-    following = Following(
-        pitch,
-        roll,
-        pull=float(settings.guided_pull) if guided else 1.0,
-        reach=float(settings.guided_reach_px) if guided else 1.0,
-        threshold=float(settings.threshold),
-        max_gap=settings.gap_rows,
-        border=settings.border_rows,
-        enough=enough,
-        least_points=settings.least_points(strip.row_aspect),
-        least_score=float(settings.least_evidence / strip.row_aspect),
-    )
-    return _follow_edges(response, strip, starts, following)
+    if tilt_rad is None:
+        # Any curve, and not only verticals.
+        numbers = numbers._replace(guided_pull=1.0, guided_reach_px=1.0)
+    return _follow_edges(response, strip, starts, numbers, tilt_rad or (0.0, 0.0), enough)
 
 
 @njit(cache=True, error_model="numpy")
 def _follow_edges(
-    response: StripResponse, strip: Strip, starts: LineStarts, following: Following
+    response: StripResponse,
+    strip: Strip,
+    starts: LineStarts,
+    numbers: LineNumbers,
+    tilt: tuple[float, float],
+    enough: int,
 ) -> LineTracks:
     rise = strip.rise
     width, height = rise.shape
     # By how many columns an edge is expected to move for a rise of 1.
     columns_per_rise = np.empty(width)
     for c in range(width):
-        lean = following.pitch * strip.sine[c] - following.roll * strip.cosine[c]
+        lean = tilt[0] * strip.sine[c] - tilt[1] * strip.cosine[c]
         columns_per_rise[c] = lean * strip.columns_per_rad[c]
-    count = len(starts.row)
+    count, least_score = len(starts.row), numbers.least_evidence / strip.row_aspect
     lowest, highest = height, -1
     for v in starts.row:
         lowest, highest = min(lowest, v), max(highest, v)
@@ -167,7 +128,7 @@ def _follow_edges(
     column, score = np.empty(height), np.zeros(height, np.float32)
     tracks = n = counting = 0
     for start in range(len(start_row)):
-        if counting >= following.enough:
+        if counting >= enough:
             break
         v, c = start_row[start], start_column[start]
         sign = np.float32(1.0) if start_value[start] > 0.0 else np.float32(-1.0)
@@ -179,7 +140,7 @@ def _follow_edges(
         for direction in (-1, 1):
             # Upward from the start, then downward from the point that was found there.
             begin = v, column[v], direction
-            end = _follow(response, rise, columns_per_rise, following, sign, begin, column, score)
+            end = _follow(response, rise, columns_per_rise, numbers, sign, begin, column, score)
             top, bottom = min(top, end), max(bottom, end)
             if score[v] == 0.0:
                 break
@@ -198,7 +159,7 @@ def _follow_edges(
             polarity[tracks] = sign
             tracks += 1
             bounds[tracks] = n
-            if n - first >= following.least_points and total >= following.least_score:
+            if n - first >= numbers.least_points and total >= least_score:
                 counting += 1
     return LineTracks(
         polarity[:tracks],
@@ -225,7 +186,7 @@ def _place(column: int, part: float) -> tuple[int, float]:
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _follow(
     response: StripResponse, rise: SingleArray, columns_per_rise: FloatArray,
-    following: Following, sign: np.float32, start: tuple[int, float, int], column: FloatArray,
+    numbers: LineNumbers, sign: np.float32, start: tuple[int, float, int], column: FloatArray,
     score: SingleArray,
 ) -> int:  # fmt: skip
     """Follow an edge from a row and column on in a direction; return the last row.
@@ -234,8 +195,8 @@ def _follow(
     """
     # Numba counts references to arrays in tuples wherever they are taken out of these.
     value, known = response.value, response.known
-    pull, reach, threshold = following.pull, following.reach, following.threshold
-    border, max_gap = following.border, following.max_gap
+    pull, reach, threshold = numbers.guided_pull, numbers.guided_reach_px, numbers.threshold
+    border, max_gap = numbers.border_rows, numbers.gap_rows
     width, height = rise.shape
     v, place, direction = start
     j, part = _place(0, place)

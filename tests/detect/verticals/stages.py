@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.line_settings import LineSettings
+from detect.line_settings import LineNumbers, LineSettings
 from detect.verticals import starts
-from detect.verticals.judgement import Criteria, Judgement, fit_and_judge
+from detect.verticals.judgement import Judgement, fit_and_judge
 from detect.verticals.refinement import step_filters
 from detect.verticals.response import StripResponse, line_filter, strip_of, strip_response
 from detect.verticals.starts import LineStarts, StartBand, band_response, find_maxima, start_band
@@ -50,7 +50,8 @@ def line_tracks(
     """Edges followed from starts: along the verticals of a tilt, or in any direction."""
     response = image if isinstance(image, StripResponse) else response_to(image, table, settings)
     expected = None if tilt is None else (float(tilt.pitch_rad), float(tilt.roll_rad))
-    return follow_edges(response, strip_of(table), starts, settings, expected, enough)
+    numbers = LineNumbers.of(settings, table.row_aspect)
+    return follow_edges(response, strip_of(table), starts, numbers, expected, enough)
 
 
 def judge_tracks(
@@ -61,9 +62,9 @@ def judge_tracks(
     steps: int | None = None,
 ) -> Judgement:
     """Lines through tracks, refined in all or some steps, their fates, and the tilt."""
-    criteria = Criteria.of(settings, table.row_aspect)
-    judged = fit_and_judge(image, strip_of(table), tracks, step_filters(settings, steps), criteria)
+    numbers = LineNumbers.of(settings, table.row_aspect)
+    judged = fit_and_judge(image, strip_of(table), tracks, step_filters(settings, steps), numbers)
     if judged.tilt is None:
         return judged
-    tilt = with_error(judged.tilt, judged.verticals, judged.edge, criteria.search)
+    tilt = with_error(judged.tilt, judged.verticals, judged.edge, numbers)
     return judged._replace(tilt=tilt)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from camera import Camera
-from detect.line_settings import DEFAULT
+from detect.line_settings import DEFAULT, LineNumbers
 from detect.lines import detect_lines
-from detect.verticals.judgement import Criteria, tilt_of_chains
+from detect.verticals.judgement import tilt_of_chains
 from detect.verticals.response import strip_of
 from detect.verticals.starts import find_maxima
 from detect.verticals.tilt import TiltEstimate
@@ -32,8 +32,8 @@ def scene(camera: Camera, count: int) -> np.ndarray:
 def told_by_the_band(image: np.ndarray) -> TiltEstimate | None:
     response, band = start_response(image, TABLE, DEFAULT)
     maxima = find_maxima(response, DEFAULT.threshold)
-    criteria = Criteria.of(DEFAULT, TABLE.row_aspect)
-    return tilt_of_chains(strip_of(TABLE), maxima, band, criteria)
+    numbers = LineNumbers.of(DEFAULT, TABLE.row_aspect)
+    return tilt_of_chains(strip_of(TABLE), maxima, band, numbers)
 
 
 @pytest.mark.parametrize("tilt_deg", [(0.0, 0.0), (2.3, 0.5), (-1.5, 2.0), (3.5, -3.0)])

@@ -10,12 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter
 
-from detect.line_settings import DEFAULT
+from detect.line_settings import DEFAULT, LineNumbers
 from detect.lines import detect_lines
 from detect.verticals.judgement import share_edges
 from detect.verticals.tilt import (
     TiltEstimate,
-    TiltSearch,
     Verticals,
     agree_on_tilt,
     consensus,
@@ -170,7 +169,7 @@ def test_lines_of_one_edge_tell_as_much_as_one() -> None:
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
         lines = Verticals(normal, variance, np.full(count, 0.015), weight)
         share_edges(lines, edges_at(place, evidence))
-        tilt, _ = agree_on_tilt(lines, TiltSearch.of(DEFAULT))
+        tilt, _ = agree_on_tilt(lines, LineNumbers.of(DEFAULT))
         assert tilt.lines > 0
         assert lines.weight.sum() == pytest.approx(16.0)
         return np.array([tilt.pitch_rad, tilt.roll_rad]), tilt.covariance

@@ -7,14 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from detect.line_settings import DEFAULT
+from detect.line_settings import DEFAULT, LineNumbers
 from detect.verticals.tilt import (
     SCATTER_RAD,
     SCATTER_SHARE,
     STRAY_RAD,
     TOGETHER_RAD,
     TiltEstimate,
-    TiltSearch,
     Verticals,
     consensus,
     gather,
@@ -39,7 +38,7 @@ def stated_error(
     settings = replace(DEFAULT, tilt_prior_deg=float(np.degrees(0.035)), stray_share=share)
     lines = Verticals(normal, variance, np.ones(len(weight)), weight)
     estimate = TiltEstimate(*tilt, np.eye(2), len(weight))
-    return with_error(estimate, lines, edge, TiltSearch.of(settings)).covariance
+    return with_error(estimate, lines, edge, LineNumbers.of(settings)).covariance
 
 
 def building(
