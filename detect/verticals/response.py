@@ -123,6 +123,8 @@ class StripResponse(NamedTuple):
     owner : (S, B) int32
         One more than the number of the vertical whose moments are in each block of rows; 0 for
         none.
+    sums : (4, BLOCK) float32
+        Sums along a vertical in a block.
     """
 
     pixels: NDArray[np.uint8]
@@ -134,6 +136,7 @@ class StripResponse(NamedTuple):
     known: NDArray[np.bool_]
     moments: NDArray[np.float32]
     owner: NDArray[np.int32]
+    sums: NDArray[np.float32]
 
 
 def weights_across(sigma_px: float, spacing_px: float = 1.0) -> FloatArray:
@@ -199,6 +202,7 @@ def strip_response(image: NDArray[np.uint8], strip: Strip, window: LineFilter) -
         # Behind the filter's weights are zeros: what they are multiplied by must be finite.
         moments=np.zeros((_PLACES, 4, height), np.float32),
         owner=np.zeros((_PLACES, blocks), np.int32),
+        sums=np.empty((4, BLOCK), np.float32),
     )
 
 
@@ -249,7 +253,8 @@ def extend(response: StripResponse, c: int, block: int) -> None:
             owner[other] = c + 1
             rows = other * BLOCK, min((other + 1) * BLOCK, len(column))
             _take_moments(pixels, width, column, window.across, window.reach, rows, moments)
-    _correlate_along(moments, window, (begin, end), (top, bottom), response.value[c])
+    _sum_along(moments, window, (begin, end), (top, bottom), response.sums)
+    _respond(response.sums, window.regulariser, response.value[c, begin:end])
     response.known[c, block] = True
 
 
@@ -278,15 +283,16 @@ def _take_moments(
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"}, forceinline=True)
-def _correlate_along(
+def _sum_along(
     moments: NDArray[np.float32], window: LineFilter, rows: tuple[int, int], seen: tuple[int, int],
-    value: NDArray[np.float32],
+    sums: NDArray[np.float32],
 ) -> None:  # fmt: skip
-    """Responses in some rows from the moments in the rows round them on which it is seen."""
+    """(4, BLOCK) weighted sums of moments and of 1, over the rows on which a vertical is seen."""
+    along, share, half_length = window.along, window.along_sums, window.half_length
     means, covs, squares, inside = moments[0], moments[1], moments[2], moments[3]
-    along, sums, half_length = window.along, window.along_sums, window.half_length
     for v in range(rows[0], rows[1]):
-        response = np.float32(0.0)
+        mean = cov = square = np.float32(0.0)
+        own_share = np.float32(1.0)
         # A window that leaves the image has no response, nor has a vertical that is not seen.
         if inside[v] > 0.0:
             begin = v - half_length
@@ -294,13 +300,18 @@ def _correlate_along(
             mean, cov, square = _weighted_sums(
                 along[first - begin : after - begin], means, covs, squares, np.uint64(first)
             )
-            scale = np.float32(1.0) / (sums[after - begin] - sums[first - begin])
-            mean *= scale
-            cov *= scale
-            # Rounding can make a vanishing variance negative.
-            variance = abs(square * scale - mean * mean)
-            response = cov * abs(cov) / (variance + window.regulariser)
-        value[v] = response
+            own_share = share[after - begin] - share[first - begin]
+        i = np.uint64(v - rows[0])
+        sums[0, i], sums[1, i], sums[2, i], sums[3, i] = mean, cov, square, own_share
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"}, forceinline=True)
+def _respond(sums: NDArray[np.float32], noise: np.float32, value: NDArray[np.float32]) -> None:
+    for i in range(np.uint64(len(value))):
+        scale = np.float32(1.0) / sums[3, i]
+        mean, cov = sums[0, i] * scale, sums[1, i] * scale
+        # Rounding can make a vanishing variance negative.
+        value[i] = cov * abs(cov) / (abs(sums[2, i] * scale - mean * mean) + noise)
 
 
 # Sums in any order become vectors; inlined, their order is that of the kernel that has them.
