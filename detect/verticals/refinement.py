@@ -360,7 +360,7 @@ def _climb(
     return NewtonStep(a, b, aa, ab, bb)
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"}, forceinline=True)
 def newton_step(
     image: NDArray[np.uint8], crossings: Crossings, weights: SingleArray, half: int, sign: float
 ) -> NewtonStep:
