@@ -103,20 +103,21 @@ def fit_and_judge(
     numbers: LineNumbers,
 ) -> Judgement:  # fmt: skip
     """Fit lines to tracks, select them one by one, and estimate the tilt on which most agree."""
-    fits, evidence, fate, tilt, lines, edge = _fit_and_judge(image, strip, tracks, filters, numbers)
+    fits = fit_lines(image, strip, tracks, filters, numbers)
+    evidence, fate, accepted, lines, edge = _judge(strip, tracks, fits, numbers)
+    tilt, agrees = agree_on_tilt(lines, numbers)
+    fate[accepted[~agrees]] = NOT_VERTICAL
     return Judgement(fits, evidence, fate, tilt if tilt.lines > 0 else None, lines, edge)
 
 
+# Kernels that are launched one after the other compile faster than one in another.
+
+
 @njit(cache=True, error_model="numpy")
-def _fit_and_judge(
-    image: NDArray[np.uint8], strip: Strip, tracks: LineTracks, filters: StepFilters,
-    numbers: LineNumbers,
-) -> tuple[
-    LineFits, FloatArray, NDArray[np.int8], TiltEstimate, Verticals, NDArray[np.int64]
-]:  # fmt: skip
-    """The parts of a `Judgement`; a tilt of 0 lines where too few agree."""
-    least_score = numbers.least_evidence / strip.row_aspect
-    fits = fit_lines(image, strip, tracks, filters, numbers.least_points, least_score)
+def _judge(
+    strip: Strip, tracks: LineTracks, fits: LineFits, numbers: LineNumbers
+) -> tuple[FloatArray, NDArray[np.int8], NDArray[np.int64], Verticals, NDArray[np.int64]]:
+    """Evidence and fates of tracks by themselves; which are accepted; their planes and edges."""
     count = len(tracks.polarity)
     evidence, fate = np.empty(count), np.empty(count, np.int8)
     _judge_each(strip, tracks, fits, numbers, evidence, fate)
@@ -134,11 +135,7 @@ def _fit_and_judge(
     lines = _weigh(fits, accepted, votes, numbers)
     edge = gather(place, near, own_evidence, polarity)
     share_edges(lines, edge)
-    tilt, agrees = agree_on_tilt(lines, numbers)
-    for k in range(count):
-        if not agrees[k]:
-            fate[accepted[k]] = NOT_VERTICAL
-    return fits, evidence, fate, tilt, lines, edge
+    return evidence, fate, accepted, lines, edge
 
 
 @njit(cache=True, error_model="numpy")
@@ -262,28 +259,31 @@ def tilt_of_chains(
 ) -> TiltEstimate | None:
     """The tilt that most chains of the band's maxima agree with; None where too few do."""
     numbers = numbers._replace(
-        bend_px=_CHAIN_BEND_PX, lean_noise=1.0, largest_lean_px=_CHAIN_LEAN_PX
+        least_points=_CHAIN_LEAST,
+        least_evidence=0.0,
+        bend_px=_CHAIN_BEND_PX,
+        lean_noise=1.0,
+        largest_lean_px=_CHAIN_LEAN_PX,
     )
-    tilt = _tilt_of_chains(strip, maxima, band.row, numbers)
+    tilt, _ = agree_on_tilt(_straight_chains(strip, maxima, band.row, numbers), numbers)
     return tilt if tilt.lines > 0 else None
 
 
 @njit(cache=True, error_model="numpy")
-def _tilt_of_chains(
+def _straight_chains(
     strip: Strip, maxima: Maxima, rows: NDArray[np.int32], numbers: LineNumbers
-) -> TiltEstimate:
-    """That of straight chains, all of which count the same; of 0 lines where too few agree."""
+) -> Verticals:
+    """Straight chains, all of which count the same."""
     tracks = _tracks_of_chains(maxima, rows)
     fits = no_fits(len(tracks.polarity))
     straight, count = np.empty(len(tracks.polarity), np.int64), 0
     chart = np.empty((2, len(tracks.row)))
     for t in range(len(straight)):
-        fit_points(strip, tracks, t, _CHAIN_LEAST, 0.0, chart, fits)
+        fit_points(strip, tracks, t, numbers, chart, fits)
         if fits.scatter_px[t] <= _CHAIN_SCATTER_PX:
             straight[count] = t
             count += 1
-    votes = np.full(count, numbers.weight_limit)
-    return agree_on_tilt(_weigh(fits, straight[:count], votes, numbers), numbers)[0]
+    return _weigh(fits, straight[:count], np.full(count, numbers.weight_limit), numbers)
 
 
 @njit(cache=True, error_model="numpy")

@@ -22,7 +22,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from detect.line_settings import LineSettings
+from detect.line_settings import LineNumbers, LineSettings
 from detect.verticals.response import MIDDLE_GREY, FloatArray, SingleArray, Strip
 from detect.verticals.tracking import LineTracks
 
@@ -169,23 +169,31 @@ class Eigenline(NamedTuple):
 @njit(cache=True, error_model="numpy")
 def no_fits(count: int) -> LineFits:
     """Of some tracks none of which has a line yet."""
+    line, covariance, sharpness = np.empty((count, 2)), np.empty((count, 2, 2)), np.empty(count)
+    scatter_px, shift_px, spread = np.empty(count), np.empty(count), np.empty(count)
+    reference_rad, pixel_rad, contrast = np.empty(count), np.empty(count), np.empty(count)
+    for t in range(count):
+        scatter_px[t] = shift_px[t] = spread[t] = contrast[t] = np.nan
+        line[t, 0] = line[t, 1] = covariance[t, 0, 0] = covariance[t, 1, 1] = np.nan
+        covariance[t, 0, 1] = covariance[t, 1, 0] = np.nan
+        sharpness[t] = 1.0
     return LineFits(
-        reference_rad=np.empty(count),
-        pixel_rad=np.empty(count),
-        line=np.full((count, 2), np.nan),
-        covariance=np.full((count, 2, 2), np.nan),
-        scatter_px=np.full(count, np.nan),
-        shift_px=np.full(count, np.nan),
-        spread=np.full(count, np.nan),
-        contrast=np.full(count, np.nan),
-        sharpness=np.ones(count),
+        reference_rad,
+        pixel_rad,
+        line,
+        covariance,
+        scatter_px,
+        shift_px,
+        spread,
+        contrast,
+        sharpness,
     )
 
 
 @njit(cache=True, error_model="numpy")
 def fit_points(
-    strip: Strip, tracks: LineTracks, t: int, least_points: int, least_score: float,
-    chart: FloatArray, fits: LineFits,
+    strip: Strip, tracks: LineTracks, t: int, numbers: LineNumbers, chart: FloatArray,
+    fits: LineFits,
 ) -> Eigenline:  # fmt: skip
     """Fit a line to track t by the eigen-decomposition of its points' scatter.
 
@@ -193,8 +201,8 @@ def fit_points(
     ----------
     strip, tracks
         The table, the tracks.
-    least_points, least_score : int, float
-        Tracks of fewer points, or of a smaller sum of scores, have no line.
+    numbers : LineNumbers
+        Tracks of too few points or too little evidence have no line.
     chart : (2, N) float64
         Gets X and Z of the points.
     fits : LineFits
@@ -210,7 +218,7 @@ def fit_points(
     origin = min(max(int(middle / n + 0.5), 1), len(strip.bearing) - 2)
     pixel = 1.0 / abs(strip.columns_per_rad[origin])
     fits.reference_rad[t], fits.pixel_rad[t] = strip.bearing[origin], pixel
-    if n < least_points or total < least_score:
+    if n < numbers.least_points or total < numbers.least_evidence / strip.row_aspect:
         return Eigenline(np.nan, np.nan, np.nan, np.nan, np.nan)
     x, z = chart[0, :n], chart[1, :n]
     _place_in_chart(strip, row[begin:end], column[begin:end], strip.bearing[origin], x, z)
@@ -226,10 +234,10 @@ def fit_points(
     return line
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@njit(cache=True, error_model="numpy")
 def fit_lines(
     image: NDArray[np.uint8], strip: Strip, tracks: LineTracks, filters: StepFilters,
-    least_points: int, least_score: float,
+    numbers: LineNumbers,
 ) -> LineFits:  # fmt: skip
     """Fit lines to tracks (`fit_points`), and refine them on the grey values in some steps."""
     fits = no_fits(len(tracks.polarity))
@@ -237,7 +245,7 @@ def fit_lines(
     chart, column = np.empty((2, height)), np.empty(height)
     by_a, by_b = np.empty(height), np.empty(height)
     for t in range(len(tracks.polarity)):
-        line = fit_points(strip, tracks, t, least_points, least_score, chart, fits)
+        line = fit_points(strip, tracks, t, numbers, chart, fits)
         if len(filters.half) == 0 or np.isnan(fits.line[t, 0]):
             continue
         begin, end = tracks.bounds[t], tracks.bounds[t + 1]
