@@ -227,8 +227,12 @@ class Associate(RunFlags):
         Factor on the discs' standard deviations: a robot that sways moves them by more than the
         file says.
     tilt_sigma_deg : float
-        Standard deviation of the robot's sway, which moves all discs of a frame together: for rows
-        whose covariances leave it out and are smaller than that.
+        Standard deviation of the robot's sway, which moves all discs of a frame together.
+    kept_probability : float
+        Share of a disc's right rows that keep its ID at the map level, by their covariances as the
+        file states them; rows farther from its place in the map get -1.
+    fewest_rows : int
+        Discs of fewer such rows are taken for clutter: their rows get -1.
     noise : several floats
         Score again with noise added to the measurements (factors on their standard deviation).
     seed : int
@@ -242,7 +246,9 @@ class Associate(RunFlags):
     map_level: bool = True
     gate_probability: float = 0.999
     sigma_scale: float = 1.4
-    tilt_sigma_deg: float = 0.0
+    tilt_sigma_deg: float = 0.2
+    kept_probability: float = 0.99
+    fewest_rows: int = 3
     noise: tuple[float, ...] = ()
     seed: int = 1
     output: Annotated[MaybePath, arg(aliases=["-o"])] = None

@@ -66,7 +66,7 @@ class LocalSettings:
     method: Method = "joint"
     gate_probability: float = 0.999
     sigma_scale: float = 1.4
-    tilt_sigma_rad: float = 0.0
+    tilt_sigma_rad: float = 0.0035
     camera_height_m: float = 1.5
     forget_frames: int = 60
     forget_sigma_m: float = 0.35

@@ -6,15 +6,17 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csc_array
+from scipy.sparse import csc_array, csr_array
 from scipy.sparse.linalg import splu
+from scipy.spatial import KDTree
+from scipy.stats import chi2
 
 from slam.association.loops import (
     SHARED_BY_ONE_PLACE,
     Match,
     Stretch,
-    mutual_pairs,
     shared_landmarks,
+    sightings,
 )
 from slam.models.motion import relative_pose, rotation
 
@@ -24,6 +26,8 @@ IntArray = NDArray[np.int64]
 # Standard deviations of a step of the path and of a match of two stretches (rad, m).
 _STEP_SIGMA = (0.005, 0.01)
 _MATCH_SIGMA = (0.02, 0.05)
+# Labels farther apart than this are not compared.
+_FARTHEST_M = 0.35
 
 
 def seen_together(frames: IntArray, labels: IntArray) -> set[tuple[int, int]]:
@@ -95,7 +99,7 @@ def merge_labels(
 
 
 def in_order(labels: IntArray) -> IntArray:
-    """Number labels from 0 without gaps, in the order of their first rows.
+    """Number labels from 0 without gaps, in the order of their first rows; -1 stays.
 
     Parameters
     ----------
@@ -105,9 +109,10 @@ def in_order(labels: IntArray) -> IntArray:
     -------
     (n,) int64
     """
-    _, first, inverse = np.unique(labels, return_index=True, return_inverse=True)
+    names, first, inverse = np.unique(labels, return_index=True, return_inverse=True)
+    first[names < 0] = -1
     rank = np.empty(len(first), dtype=np.int64)
-    rank[np.argsort(first, kind="stable")] = np.arange(len(first))
+    rank[np.argsort(first, kind="stable")] = np.arange(len(first)) - np.count_nonzero(names < 0)
     return rank[inverse]
 
 
@@ -130,36 +135,42 @@ def pairs_by_votes(matches: Sequence[Match]) -> list[tuple[int, int]]:
     return sorted(votes, key=lambda pair: (-votes[pair], pair))
 
 
-def pairs_in_place(stretches: Sequence[Stretch], reach_m: float) -> list[tuple[int, int]]:
-    """Pairs of labels at the same position, in stretches known to be the same place.
+def pairs_in_place(
+    stretches: Sequence[Stretch], covariance: FloatArray, gate_probability: float
+) -> list[tuple[int, int]]:
+    """Pairs of labels that lie at the same position, in stretches known to be the same place.
 
     Parameters
     ----------
     stretches : sequence of Stretch
         By the present map and labels.
-    reach_m : float
-        How near two labels must be.
+    covariance : (M, 2, 2) float64
+        Of the labels' positions (m^2).
+    gate_probability : float
+        Share of the labels of one landmark that are compatible.
 
     Returns
     -------
     list of (int, int)
-        Nearest first.
+        The likeliest first.
     """
-    distances: dict[tuple[int, int], float] = {}
-    together = shared_landmarks(stretches)
-    for k, later in enumerate(stretches):
-        others = together[[k], :k].tocoo()
-        for earlier in (stretches[i] for i in others.col[others.data >= SHARED_BY_ONE_PLACE]):
-            offset = np.abs(earlier.xy.mean(axis=0) - later.xy.mean(axis=0))
-            if offset.max() > 40.0:
-                continue
-            first = ~np.isin(earlier.labels, later.labels)
-            second = ~np.isin(later.labels, earlier.labels)
-            for a, b in mutual_pairs(earlier.xy[first], later.xy[second], reach_m):
-                one, other = earlier.labels[first][a], later.labels[second][b]
-                gap = float(np.linalg.norm(earlier.xy[first][a] - later.xy[second][b]))
-                distances[(min(one, other), max(one, other))] = gap
-    return sorted(distances, key=lambda pair: (distances[pair], pair))
+    labels = np.unique(np.concatenate([np.zeros(0, np.int64), *(s.labels for s in stretches)]))
+    if len(labels) < 2:
+        return []
+    xy = np.empty((int(labels[-1]) + 1, 2))
+    for stretch in stretches:
+        xy[stretch.labels] = stretch.xy
+    near = KDTree(xy[labels]).query_pairs(_FARTHEST_M, output_type="ndarray")
+    first, second = labels[near].T
+    seen = csr_array(sightings(stretches), dtype=np.bool_)
+    linked = csr_array(shared_landmarks(stretches) >= SHARED_BY_ONE_PLACE)
+    one_place = np.asarray((linked @ seen[:, first]).multiply(seen[:, second]).sum(axis=0)) > 0
+    apart = xy[first] - xy[second]
+    both = covariance[first] + covariance[second]
+    squared = np.sum(apart * np.linalg.solve(both, apart[..., None])[..., 0], axis=1)
+    usable = np.flatnonzero(one_place & (squared <= chi2.ppf(gate_probability, 2)))
+    ordered = usable[np.lexsort((second[usable], first[usable], squared[usable]))]
+    return [(int(first[k]), int(second[k])) for k in ordered]
 
 
 def closed_path(path: FloatArray, matches: Sequence[Match]) -> FloatArray:

@@ -47,8 +47,6 @@ class Solution:
         Discs by label (m).
     line_xy : (L, 2) float64
         Lines by label (m); NaN where nothing is known.
-    circle_squared, line_squared : (n,) float64
-        Squared normalised residual of each row (of a row of an unknown line 0).
     cost : float
         The minimum: sum of Huber's function of the squared normalised residuals.
     """
@@ -56,8 +54,6 @@ class Solution:
     path: FloatArray
     circle_xy: FloatArray
     line_xy: FloatArray
-    circle_squared: FloatArray
-    line_squared: FloatArray
     cost: float
 
 
@@ -240,9 +236,7 @@ def solve_path(
         damping *= 0.1
         if gained <= tolerance * cost:
             break
-    line_squared = np.zeros(len(recording.lines))
-    line_squared[system.line_rows] = residuals[2] ** 2
-    return Solution(poses, discs, lines, np.sum(residuals[1] ** 2, axis=1), line_squared, cost)
+    return Solution(poses, discs, lines, cost)
 
 
 _Residuals = tuple[FloatArray, FloatArray, FloatArray, FloatArray]

@@ -174,23 +174,18 @@ def stretches_of(
     return found
 
 
-def shared_landmarks(stretches: Sequence[Stretch]) -> csr_array:
-    """How many landmarks stretches have in common.
-
-    Parameters
-    ----------
-    stretches : sequence of S Stretch
-
-    Returns
-    -------
-    (S, S) sparse int64
-        Of each two; rows and columns as in the sequence.
-    """
+def sightings(stretches: Sequence[Stretch]) -> csr_array:
+    """(S, M) sparse int64, 1 where a stretch shows a label."""
     sizes = np.array([len(s.labels) for s in stretches], dtype=np.int64)
     labels = np.concatenate([np.zeros(0, dtype=np.int64), *(s.labels for s in stretches)])
     starts = np.concatenate([[0], np.cumsum(sizes)])
     shape = (len(sizes), int(labels.max(initial=-1)) + 1)
-    seen = csr_array((np.ones(len(labels), dtype=np.int64), labels, starts), shape=shape)
+    return csr_array((np.ones(len(labels), dtype=np.int64), labels, starts), shape=shape)
+
+
+def shared_landmarks(stretches: Sequence[Stretch]) -> csr_array:
+    """(S, S) sparse int64, how many landmarks each two stretches have in common."""
+    seen = sightings(stretches)
     return csr_array(seen @ seen.T)
 
 

@@ -16,6 +16,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
 from slam.association.frame_to_frame import LocalSettings, associate_locally
 from slam.association.line_points import PointSettings, lines_by_points
@@ -30,14 +31,17 @@ from slam.association.loop_closing import (
 from slam.association.loop_path import Solution, intersect_bearings, solve_path
 from slam.association.loops import LoopSettings, Match, find_matches, stretches_of
 from slam.errors import SlamError
-from slam.models.motion import chain_steps
+from slam.models.measurement import disc_in_robot
+from slam.models.motion import chain_steps, rotation
 from slam.recording import Recording
-from storage.bounds import demand, whole
+from storage.bounds import PROBABILITY, demand, whole
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 Progress = Callable[[str], None]
 
+# Share of the labels of one landmark that are compatible by position.
+_SAME_PLACE = 0.999
 # Edges of one door frame may be 0.1 m apart.
 _LINE_REACH_M = 0.05
 # Longer than a landmark is in view or waited for by the local map.
@@ -60,6 +64,11 @@ class AssociateSettings:
         How verticals are then associated along the path that the discs give.
     most_rounds : int
         Largest number of rounds.
+    kept_probability : float
+        Share of a disc's right rows that keep its label at the end, by their covariances as stated;
+        those farther from its place in the map lose it.
+    fewest_rows : int
+        A disc of fewer such rows is taken for clutter.
     """
 
     local: LocalSettings = field(default_factory=LocalSettings)
@@ -67,9 +76,17 @@ class AssociateSettings:
     loops: LoopSettings = field(default_factory=LoopSettings)
     points: PointSettings = field(default_factory=PointSettings)
     most_rounds: int = 6
+    kept_probability: float = 0.99
+    fewest_rows: int = 3
 
     def __post_init__(self) -> None:
-        demand(self, SlamError, most_rounds=whole(1))
+        demand(
+            self,
+            SlamError,
+            most_rounds=whole(1),
+            kept_probability=PROBABILITY,
+            fewest_rows=whole(1),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +96,7 @@ class RunAssociation:
     Attributes
     ----------
     circle_labels, line_labels : (n,) int64
-        Of each row at the end.
+        Of each row at the end; -1 where a row of a disc fits none, or none that is seen often.
     local_circle_labels, local_line_labels : (n,) int64
         From frame to frame only.
     matches : tuple of Match
@@ -145,6 +162,7 @@ def associate_run(
         labels = circle_labels if by_discs else line_labels
         solution = _solved(recording, by_discs, labels, None, setting, camera_xy)
         loops = setting.loops
+        swayed = _swayed(recording, setting.local)
         for number in range(setting.most_rounds):
             xy = solution.circle_xy if by_discs else solution.line_xy
             stretches = stretches_of(rows.frame, labels, xy, len(recording), loops)
@@ -158,7 +176,10 @@ def associate_run(
             solution = _solved(recording, by_discs, labels, path, setting, camera_xy)
             xy = solution.circle_xy if by_discs else solution.line_xy
             stretches = stretches_of(rows.frame, labels, xy, len(recording), loops)
-            pairs = pairs_in_place(stretches, loops.reach_m)
+            spread = _isotropic(len(xy), loops.reach_m)
+            if by_discs:
+                spread = _spread(swayed, solution.path, labels, setting.local.sigma_scale)
+            pairs = pairs_in_place(stretches, spread, _SAME_PLACE)
             labels, in_place = merge_labels(rows.frame, labels, pairs)
             if in_place:
                 solution = _solved(recording, by_discs, labels, solution.path, setting, camera_xy)
@@ -176,7 +197,7 @@ def associate_run(
             loops = everywhere
         path = solution.path
         if by_discs:
-            circle_labels = labels
+            circle_labels = _without_clutter(recording, labels, path, setting)
             if len(line_labels):
                 report("verticals on the path of the discs")
                 line_labels, path_of_both = lines_by_points(
@@ -246,6 +267,58 @@ def _swayed(recording: Recording, setting: LocalSettings) -> Recording:
     return replace(recording, circles=replace(recording.circles, covariance=covariance))
 
 
+def _without_clutter(
+    recording: Recording, labels: IntArray, path: FloatArray, setting: AssociateSettings
+) -> IntArray:
+    """Labels of discs, -1 for rows that fit none, and for those of discs that too few rows fit."""
+    gate = chi2.ppf(setting.kept_probability, 2)
+    circles = recording.circles
+    kept = np.ones(len(labels), dtype=np.bool_)
+    none = np.zeros(0, dtype=np.int64)
+    # The second time without the rows that the first one found.
+    for _ in range(2):
+        known, numbers = np.unique(labels[kept], return_inverse=True)
+        fitting = replace(
+            circles,
+            frame=circles.frame[kept],
+            xy=circles.xy[kept],
+            covariance=circles.covariance[kept],
+        )
+        solution = solve_path(
+            _without_lines(replace(recording, circles=fitting)), numbers, none, path
+        )
+        path = solution.path
+        places = np.full((int(labels.max(initial=-1)) + 1, 2), np.nan)
+        places[known] = solution.circle_xy
+        off = disc_in_robot(path[circles.frame + 1], places[labels]) - circles.xy
+        whitened = np.linalg.solve(circles.covariance, off[..., None])[..., 0]
+        kept = np.sum(off * whitened, axis=1) <= gate
+        kept &= np.bincount(labels[kept], minlength=len(places))[labels] >= setting.fewest_rows
+    return np.where(kept, labels, -1)
+
+
+def _spread(
+    recording: Recording, path: FloatArray, labels: IntArray, sigma_scale: float
+) -> FloatArray:
+    """(M, 2, 2) how far labels of one disc may lie from each other in the map, as covariances.
+
+    The mean information of a label's rows: their errors are common (calibration, lean, one side of
+    the disc), so that many rows are hardly better than one.
+    """
+    circles = recording.circles
+    turn = rotation(path[circles.frame + 1, 2])
+    information = np.linalg.inv(sigma_scale**2 * turn @ circles.covariance @ turn.swapaxes(1, 2))
+    count = np.bincount(labels)
+    total = np.zeros((len(count), 2, 2))
+    np.add.at(total, labels, information)
+    return np.asarray(count[:, None, None] * np.linalg.inv(total))
+
+
+def _isotropic(count: int, reach_m: float) -> FloatArray:
+    """(count, 2, 2) covariances with which positions are compatible up to a distance."""
+    return np.tile(0.5 * reach_m**2 / chi2.ppf(_SAME_PLACE, 2) * np.eye(2), (count, 1, 1))
+
+
 def _merged_lines(
     recording: Recording,
     path: FloatArray,
@@ -259,7 +332,7 @@ def _merged_lines(
     for _ in range(setting.most_rounds):
         xy = intersect_bearings(recording, path, labels, camera_xy=camera_xy)
         stretches = stretches_of(recording.lines.frame, labels, xy, len(recording), setting.loops)
-        pairs = pairs_in_place(stretches, _LINE_REACH_M)
+        pairs = pairs_in_place(stretches, _isotropic(len(xy), _LINE_REACH_M), _SAME_PLACE)
         labels, merged = merge_labels(recording.lines.frame, labels, pairs)
         if merged == 0:
             break

@@ -21,6 +21,8 @@ class AssociationScore:
     ----------
     rows : int
         Rows that were scored.
+    unlabelled_rows : int
+        Of these, rows without a label: they count as landmarks seen once, and as no splits.
     true_landmarks, found_landmarks : int
         Different IDs, and different labels, among them.
     pair_precision : float
@@ -37,6 +39,7 @@ class AssociationScore:
     """
 
     rows: int
+    unlabelled_rows: int
     true_landmarks: int
     found_landmarks: int
     pair_precision: float
@@ -56,7 +59,7 @@ def score_association(labels: IntArray, ids: Sequence[tuple[int, ...]]) -> Assoc
     Parameters
     ----------
     labels : (n,) int64
-        Labels found, at least 0.
+        Labels found, at least 0; -1 for rows that were given none.
     ids : sequence of n tuples of int
         The file's IDs of each row; empty where unknown.
 
@@ -66,7 +69,10 @@ def score_association(labels: IntArray, ids: Sequence[tuple[int, ...]]) -> Assoc
     """
     known = [k for k, listed in enumerate(ids) if listed]
     names = {name: k for k, name in enumerate(sorted({i for k in known for i in ids[k]}))}
-    _, label = np.unique(np.asarray(labels, dtype=np.int64)[known], return_inverse=True)
+    given = np.asarray(labels, dtype=np.int64)[known]
+    unlabelled = given < 0
+    given = np.where(unlabelled, given.max(initial=0) + 1 + np.arange(len(given)), given)
+    _, label = np.unique(given, return_inverse=True)
     row = np.array([n for n, k in enumerate(known) for _ in ids[k]], dtype=np.int64)
     column = np.array([names[i] for k in known for i in ids[k]], dtype=np.int64)
     count = len(known)
@@ -83,16 +89,17 @@ def score_association(labels: IntArray, ids: Sequence[tuple[int, ...]]) -> Assoc
         own = sorted(names[i] for i in ids[k])
         chosen[n] = own[int(np.argmax(votes[label[n], own]))]
     cells = np.zeros((found, len(names)), dtype=np.int64)
-    np.add.at(cells, (label, chosen), 1)
+    np.add.at(cells, (label[~unlabelled], chosen[~unlabelled]), 1)
     matched = linear_sum_assignment(cells, maximize=True)
     return AssociationScore(
         rows=count,
+        unlabelled_rows=int(np.count_nonzero(unlabelled)),
         true_landmarks=len(set(chosen.tolist())),
-        found_landmarks=found,
+        found_landmarks=found - int(np.count_nonzero(unlabelled)),
         pair_precision=right / of_label if of_label else 1.0,
         pair_recall=right / of_landmark if of_landmark else 1.0,
         right_rows=float(cells[matched].sum() / count) if count else 1.0,
-        wrong_merges=int(np.sum(np.count_nonzero(cells, axis=1) - 1)),
+        wrong_merges=int(np.sum(np.maximum(np.count_nonzero(cells, axis=1) - 1, 0))),
         splits=int(np.sum(np.maximum(np.count_nonzero(cells, axis=0) - 1, 0))),
     )
 

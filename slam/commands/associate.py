@@ -11,6 +11,8 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 import slam
 from landmarks import CircleLandmark, LineLandmark, Row, read_rows, write_rows
 from slam.association.frame_to_frame import LocalSettings
@@ -40,6 +42,8 @@ def perform(options: Associate) -> int:
         options,
         SlamError,
         gate_probability=PROBABILITY,
+        kept_probability=PROBABILITY,
+        fewest_rows=whole(1),
         sigma_scale=ABOVE_0,
         tilt_sigma_deg=from_to(0.0, 45.0),
         noise=NOT_NEGATIVE,
@@ -54,6 +58,8 @@ def perform(options: Associate) -> int:
             tilt_sigma_rad=math.radians(options.tilt_sigma_deg),
         ),
         map_level=options.map_level,
+        kept_probability=options.kept_probability,
+        fewest_rows=options.fewest_rows,
     )
     sources = _sources(options, circles)
     targets = [_target(options.output, source, len(sources) > 1) for source in sources]
@@ -157,13 +163,13 @@ def score_lines(noise: float, seconds: float, scores: Scores) -> list[str]:
                 f"  {kind:7} {stage:5}  pairs: precision {s.pair_precision:.4f} recall "
                 f"{s.pair_recall:.4f}  rows right {s.right_rows:.4f}  landmarks "
                 f"{s.found_landmarks} of {s.true_landmarks}  wrong merges {s.wrong_merges}  "
-                f"splits {s.splits}"
+                f"splits {s.splits}  without label {s.unlabelled_rows}"
             )
     return lines
 
 
 def identified_rows(rows: Sequence[Row], found: RunAssociation, source: Path) -> Iterator[Row]:
-    """Rows of a file with the IDs found, counted from 1; everything else as it was.
+    """Rows of a file with the IDs found, counted from 1, -1 without; everything else as it was.
 
     Parameters
     ----------
@@ -194,7 +200,10 @@ def identified_rows(rows: Sequence[Row], found: RunAssociation, source: Path) ->
     circle, line = iter(found.circle_labels.tolist()), iter(found.line_labels.tolist())
     for row in rows:
         if isinstance(row.record, CircleLandmark):
-            yield row.with_record(replace(row.record, ids=(next(circle) + 1,)))
+            label = next(circle)
+            yield row.with_record(
+                replace(row.record, ids=(label + 1 if label >= 0 else UNKNOWN_ID,))
+            )
         elif isinstance(row.record, LineLandmark):
             yield row.with_record(replace(row.record, ids=(next(line) + 1,)))
         else:
@@ -210,6 +219,8 @@ def _counted(rows: Sequence[Row], found: RunAssociation) -> str:
     ):
         if any(isinstance(row.record, kind) for row in rows):
             parts.append(f"{labels.max() + 1} {name}")
+            if np.any(labels < 0):
+                parts[-1] += f" and {np.count_nonzero(labels < 0)} rows that show none of them"
     return ", ".join(parts) or "no landmarks"
 
 

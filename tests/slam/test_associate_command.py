@@ -27,13 +27,15 @@ def test_only_ids_change_and_scores_stand_beside(project_root: Path, tmp_path: P
     assert target.read_bytes() != source.read_bytes()
     assert _without_ids(target.read_bytes()) == _without_ids(source.read_bytes())
     discs = [d for frame in read_frames(target) for d in frame.circles]
-    assert all(len(disc.ids) == 1 and disc.ids[0] >= 1 for disc in discs)
+    ids = [disc.ids for disc in discs]
+    assert all(len(own) == 1 and (own[0] == -1 or ids.count(own) >= 3) for own in ids)
     report = json.loads((tmp_path / "found.json").read_text())
     assert [run["noise"] for run in report["runs"]] == [0.0, 1.0]
     score = report["runs"][0]["scores"]["circles"]["map"]
     assert score["rows"] == 304
     assert score["pair_precision"] == 1.0
-    assert score["pair_recall"] == 1.0
+    assert score["splits"] == 0
+    assert score["unlabelled_rows"] == sum(own == (-1,) for own in ids) <= 6
     assert report["settings"]["local"]["method"] == "joint"
 
 
@@ -86,6 +88,8 @@ def test_existing_files_and_settings_without_sense_are_refused(
         (["--gate-probability", "1.5"], "gate_probability is 1.5"),
         (["--sigma-scale", "0"], "sigma_scale is 0"),
         (["--tilt-sigma-deg", "-1"], "tilt_sigma_deg is -1"),
+        (["--kept-probability", "0"], "kept_probability is 0"),
+        (["--fewest-rows", "0"], "fewest_rows is 0"),
         (["--noise", "-1"], "noise is -1: expected 0 or more"),
     ):
         assert main(["associate", run, "-o", str(target), *setting]) == 1

@@ -45,6 +45,15 @@ def test_rows_without_id_are_left_out() -> None:
     assert (empty.rows, empty.right_rows, empty.found_landmarks) == (0, 1.0, 0)
 
 
+def test_rows_without_label_cost_recall_alone() -> None:
+    score = score_association(np.array([0, 0, -1, -1]), [(1,), (1,), (1,), (2,)])
+    assert (score.rows, score.unlabelled_rows) == (4, 2)
+    assert (score.true_landmarks, score.found_landmarks) == (2, 1)
+    assert score.pair_precision == 1.0
+    assert score.pair_recall == pytest.approx(1 / 3)
+    assert (score.right_rows, score.wrong_merges, score.splits) == (0.5, 0, 0)
+
+
 @given(st.lists(st.tuples(st.integers(0, 4), st.integers(0, 4)), max_size=14))
 def test_pairs_are_counted_as_one_by_one(rows: list[tuple[int, int]]) -> None:
     labels = np.array([label for label, _ in rows], dtype=np.int64)
