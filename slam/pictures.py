@@ -38,6 +38,8 @@ _ELLIPSE_POINTS = 40
 _CROPS_ABREAST, _CROP_PX = 8, 48.0
 # Largest number of discs that are labelled with their numbers.
 _MOST_NUMBERED = 40
+# Largest number of landmarks whose ellipses are drawn.
+_MOST_ELLIPSES = 700
 # How far beyond path and discs a vertical may be and still be drawn.
 _MARGIN_M, _MARGIN_SHARE = 10.0, 0.25
 
@@ -330,8 +332,9 @@ def _draw_panel(
         )  # fmt: skip
     axes.plot(path.poses[:, 0], path.poses[:, 1], color=_PATH, lw=0.9, label="path", zorder=3)
     if some is not None:
-        _draw_landmarks(axes, some.lines, "vertical", _LINE, "x", low, high)
-        _draw_landmarks(axes, some.discs, "disc", _DISC, "o", low, high)
+        ellipses = len(some.discs) + len(some.lines) <= _MOST_ELLIPSES
+        _draw_landmarks(axes, some.lines, ("vertical", _LINE, "x"), low, high, ellipses=ellipses)
+        _draw_landmarks(axes, some.discs, ("disc", _DISC, "o"), low, high, ellipses=ellipses)
         if 0 < len(some.discs) <= _MOST_NUMBERED:
             for number, (x, y) in zip(some.discs.ids.tolist(), some.discs.xy.tolist()):
                 axes.annotate(
@@ -348,37 +351,39 @@ def _draw_panel(
 def _draw_landmarks(
     axes: Axes,
     some: Landmarks,
-    name: str,
-    colour: str,
-    marker: str,
+    look: tuple[str, str, str],
     low: FloatArray,
     high: FloatArray,
+    *,
+    ellipses: bool,
 ) -> None:
+    name, colour, marker = look
     if len(some) == 0:
         return
     shown = _inside(some.xy, low, high)
     outside = int(np.sum(~shown))
     label = f"{name} ({len(some)}{f', {outside} of them outside' if outside else ''})"
-    # Many landmarks are close together: with small dots their ellipses remain visible.
+    # Many landmarks are close together: with small dots their ellipses remain visible, and where
+    # there are hundreds the dots alone show walls.
     size = 4.0 if len(some) <= 100 else 2.0
     axes.plot(
         some.xy[shown, 0], some.xy[shown, 1], ls="", marker=marker, ms=size, color=colour,
         mew=0.8 if marker == "x" else 0.0, label=label, zorder=5,
     )  # fmt: skip
     known = shown & np.any(some.covariance != 0.0, axis=(1, 2))
-    if known.any():
+    if known.any() and ellipses:
         outlines = ellipse_outlines(some.xy[known], some.covariance[known])
         # The fillings of hundreds of overlapping ellipses would hide everything else.
         filling, edge, width = (0.15, 1.0, 0.7) if len(some) <= 100 else (0.05, 0.55, 0.5)
-        ellipses = PolyCollection(
+        patches = PolyCollection(
             list(outlines),
             facecolors=[(*_rgb(colour), filling)],
             edgecolors=[(*_rgb(colour), edge)],
             linewidths=width,
             zorder=2,
         )
-        ellipses.set_label(f"3 {_SIGMA} of {name}")
-        axes.add_collection(ellipses, autolim=False)
+        patches.set_label(f"3 {_SIGMA} of {name}")
+        axes.add_collection(patches, autolim=False)
 
 
 def _rgb(colour: str) -> tuple[float, float, float]:

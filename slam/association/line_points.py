@@ -17,17 +17,16 @@ those verticals in the problem, and the search is repeated with narrower gates.
 
 from __future__ import annotations
 
-import heapq
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from landmarks import wrap_angle
-from slam.association.line_points_kernels import Detection, Rays, best_run, crossings, scores_of
+from slam.association.line_points_kernels import Rays, Search, crossings, take_points
 from slam.association.loop_path import intersect_bearings, solve_path
 from slam.errors import SlamError
-from slam.models.measurement import disc_in_map
+from slam.models.measurement import bearing_of_vertical, disc_in_map
 from slam.recording import Recording
 from storage.bounds import ABOVE_0, PROBABILITY, demand, whole
 
@@ -36,7 +35,6 @@ IntArray = NDArray[np.int64]
 
 # How far beyond the field of view a bearing may be.
 _WIDER_RAD = 0.005
-_FEWEST_ROWS = 3
 # Number of times that the frame-to-frame association corrects the path.
 _FIRST_ROUNDS = 2
 
@@ -195,15 +193,19 @@ def rays_of(
     Rays
     """
     lines = recording.lines
-    poses = path[lines.frame + 1]
+    row = np.lexsort((lines.bearing_rad, lines.frame))
+    frame, bearing = lines.frame[row], lines.bearing_rad[row]
+    poses = path[frame + 1]
     return Rays(
+        row=row,
         centre=disc_in_map(poses, np.broadcast_to(np.asarray(camera_xy), (len(poses), 2))),
-        angle=lines.bearing_rad + poses[:, 2],
-        sigma=np.hypot(sigma_scale * lines.sigma_rad, heading_sigma_rad),
-        frame=lines.frame,
-        start=np.searchsorted(lines.frame, np.arange(len(recording) + 1)),
-        heading=path[1:, 2].copy(),
-        widest_rad=float(np.max(np.abs(lines.bearing_rad), initial=0.0)) + _WIDER_RAD,
+        angle=bearing + poses[:, 2],
+        bearing=bearing,
+        sigma=np.hypot(sigma_scale * lines.sigma_rad[row], heading_sigma_rad),
+        frame=frame,
+        start=np.searchsorted(frame, np.arange(len(recording) + 1)),
+        heading=np.stack([np.cos(path[1:, 2]), np.sin(path[1:, 2])], axis=1),
+        widest_rad=min(float(np.max(np.abs(bearing), initial=0.0)) + _WIDER_RAD, 1.57),
     )
 
 
@@ -218,72 +220,27 @@ def find_points(rays: Rays, setting: PointSettings) -> tuple[IntArray, FloatArra
     Returns
     -------
     labels : (n,) int64
-        The point of each ray, -1 without one.
+        The point of each row, -1 without one.
     points : (k, 2) float64
         In the map (m).
     """
-    window = setting.window_frames
     points, frames = crossings(
         rays,
         np.array(setting.gaps, dtype=np.int64),
         setting.least_parallax_sigmas,
         setting.farthest_m,
     )
-    detection = Detection(setting.detected, setting.gate_sigmas)
-    scores = scores_of(points, frames, rays, window, detection)
-    free = np.ones(len(rays.angle), dtype=np.bool_)
-    rows = np.empty(len(rays.heading), dtype=np.int64)
-    labels = np.full(len(free), -1, dtype=np.int64)
-    found: list[FloatArray] = []
-    # Scores only fall as rows are assigned: a point still first when rescored is the best.
-    waiting = [(-scores[k], int(k)) for k in np.flatnonzero(scores >= setting.least_score)]
-    heapq.heapify(waiting)
-
-    def run(place: FloatArray, first: int, last: int) -> float:
-        """The score of a place by what is left; its rows are in `rows` then."""
-        return float(best_run(place, rays, free, first, last, detection, rows))
-
-    while waiting:
-        _, k = heapq.heappop(waiting)
-        first, last = max(0, int(frames[k]) - window), min(len(rows), int(frames[k]) + window)
-        point = points[k]
-        score = run(point, first, last)
-        if score < setting.least_score:
-            continue
-        if waiting and score < -waiting[0][0]:
-            heapq.heappush(waiting, (-score, k))
-            continue
-        for _ in range(3):
-            used = rows[first:last]
-            better = _meeting_point(rays, used[used >= 0], point)
-            improved = run(better, first, last)
-            if improved <= score:
-                break
-            point, score = better, improved
-        run(point, first, last)
-        used = rows[first:last][rows[first:last] >= 0]
-        if len(used) >= _FEWEST_ROWS:
-            labels[used] = len(found)
-            free[used] = False
-            found.append(point)
-    return labels, np.array(found, dtype=np.float64).reshape(-1, 2)
-
-
-def _meeting_point(rays: Rays, used: IntArray, point: FloatArray) -> FloatArray:
-    """The point that some rays pass closest to: robust least squares, from a point near it."""
-    for _ in range(4):
-        offset = point - rays.centre[used]
-        off = wrap_angle(np.arctan2(offset[:, 0], -offset[:, 1]) - rays.angle[used])
-        squared = np.sum(offset**2, axis=1)
-        jacobian = np.stack([-offset[:, 1], offset[:, 0]], axis=1) / squared[:, None]
-        whitened = off / rays.sigma[used]
-        weight = 1.0 / (rays.sigma[used] ** 2 * (1.0 + 0.25 * whitened**2))
-        weighted = jacobian * weight[:, None]
-        change = np.linalg.solve(weighted.T @ jacobian + 1e-6 * np.eye(2), weighted.T @ off)
-        if np.hypot(*change) > 1.0:  # rays nearly parallel: nothing to be had
-            break
-        point = point - change
-    return point
+    search = Search(
+        setting.detected,
+        setting.gate_sigmas,
+        setting.window_frames,
+        setting.least_score,
+        float(rays.sigma.max(initial=0.0)),
+    )
+    taken, found = take_points(points, frames, rays, search)
+    labels = np.empty(len(taken), dtype=np.int64)
+    labels[rays.row] = taken
+    return labels, found
 
 
 def _path_with_points(
@@ -314,8 +271,8 @@ def _path_with_points(
             sigma_scale=disc_sigma_scale,
         )
         path = solution.path
-        rays = rays_of(recording, path, camera_xy, 1.0, 0.0)
-        offset = solution.line_xy[np.where(used, labels, 0)] - rays.centre
-        off = wrap_angle(np.arctan2(offset[:, 0], -offset[:, 1]) - rays.angle)
+        places = solution.line_xy[np.where(used, labels, 0)]
+        bearing = bearing_of_vertical(path[recording.lines.frame + 1], places, camera_xy)
+        off = wrap_angle(bearing - recording.lines.bearing_rad)
         used &= np.abs(off) < 4.0 * sigma
     return path

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from landmarks import wrap_angle
 from slam.association.frame_to_frame import LocalSettings, associate_locally
 from slam.association.line_points import PointSettings, lines_by_points
 from slam.association.local_map import tilt_jacobian
@@ -31,7 +32,7 @@ from slam.association.loop_closing import (
 from slam.association.loop_path import Solution, intersect_bearings, solve_path
 from slam.association.loops import LoopSettings, Match, find_matches, stretches_of
 from slam.errors import SlamError
-from slam.models.measurement import disc_in_robot
+from slam.models.measurement import bearing_of_vertical, disc_in_robot
 from slam.models.motion import chain_steps, rotation
 from slam.recording import Recording
 from storage.bounds import PROBABILITY, demand, whole
@@ -141,14 +142,16 @@ def associate_run(
     """
     setting = settings or AssociateSettings()
     report = progress or (lambda _: None)
+    both = len(recording.circles) > 0 and len(recording.lines) > 0
     local = associate_locally(
         recording,
-        setting.local,
+        # Bearings say more of a frame's heading than discs, whose sway would only blur it.
+        replace(setting.local, tilt_sigma_rad=0.0) if both else setting.local,
         camera_xy=camera_xy,
         progress=lambda done: report(f"frame {done} of {len(recording)}"),
     )
     incomplete = local.incomplete
-    if len(recording.circles) and len(recording.lines):
+    if both:
         # Discs help to associate lines; lines are often confused and would only harm the discs.
         discs_alone = associate_locally(_without_lines(recording), setting.local)
         local = replace(local, circle_labels=discs_alone.circle_labels)
@@ -201,7 +204,7 @@ def associate_run(
             if len(line_labels):
                 report("verticals on the path of the discs")
                 line_labels, path_of_both = lines_by_points(
-                    _swayed(recording, setting.local),
+                    recording,
                     path,
                     labels,
                     line_labels,
@@ -326,7 +329,7 @@ def _merged_lines(
     setting: AssociateSettings,
     camera_xy: tuple[float, float],
 ) -> IntArray:
-    """Labels of lines after merging lines at the same position in the map."""
+    """Labels of lines, those at the same position in the map merged, -1 for clutter."""
     if len(labels) == 0:
         return labels
     for _ in range(setting.most_rounds):
@@ -336,4 +339,11 @@ def _merged_lines(
         labels, merged = merge_labels(recording.lines.frame, labels, pairs)
         if merged == 0:
             break
-    return labels
+    lines = recording.lines
+    xy = intersect_bearings(recording, path, labels, camera_xy=camera_xy)[labels]
+    off = bearing_of_vertical(path[lines.frame + 1], xy, camera_xy) - lines.bearing_rad
+    # Lines without a place have nothing that their rows could contradict.
+    gate = lines.sigma_rad * np.sqrt(chi2.ppf(setting.kept_probability, 1))
+    kept = ~(np.abs(wrap_angle(off)) > gate)
+    kept &= np.bincount(labels[kept], minlength=len(labels))[labels] >= setting.fewest_rows
+    return np.where(kept, labels, -1)

@@ -197,15 +197,15 @@ def identified_rows(rows: Sequence[Row], found: RunAssociation, source: Path) ->
     for count, size in zip(counts.values(), expected):
         if count not in (0, size):
             raise SlamError(f"{source}: {count} rows of a kind: expected the {size} associated")
-    circle, line = iter(found.circle_labels.tolist()), iter(found.line_labels.tolist())
+    circle, line = (
+        iter(np.where(labels >= 0, labels + 1, UNKNOWN_ID).tolist())
+        for labels in (found.circle_labels, found.line_labels)
+    )
     for row in rows:
         if isinstance(row.record, CircleLandmark):
-            label = next(circle)
-            yield row.with_record(
-                replace(row.record, ids=(label + 1 if label >= 0 else UNKNOWN_ID,))
-            )
+            yield row.with_record(replace(row.record, ids=(next(circle),)))
         elif isinstance(row.record, LineLandmark):
-            yield row.with_record(replace(row.record, ids=(next(line) + 1,)))
+            yield row.with_record(replace(row.record, ids=(next(line),)))
         else:
             yield row
 

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from slam.mapping.graph import Estimate, Graph
+from slam.models.measurement import bearing_jacobians, disc_in_robot
 from slam.recording import LineRows
 
 FloatArray = NDArray[np.float64]
@@ -16,6 +18,8 @@ IntArray = NDArray[np.int64]
 LEAST_PARALLAX_RAD = float(np.radians(5.0))
 #: Largest median distance of rays from their intersection, in standard deviations.
 MOST_MEDIAN_MISS = 10.0
+#: Lines whose place is less certain, the poses being known, are left out.
+MOST_SIGMA_M = 0.5
 # Odometry is good enough for a first triangulation over about this many metres of path.
 _LOCAL_PATH_M = 15.0
 
@@ -97,6 +101,35 @@ def place_lines(
         xy=np.array([xy for _, xy in placed], dtype=np.float64).reshape(-1, 2),
         unplaced=np.setdiff1d(np.array(every, dtype=np.int64), found),
     )
+
+
+def well_placed(graph: Graph, estimate: Estimate) -> NDArray[np.bool_]:
+    """Which lines of an estimate the bearings of its poses place.
+
+    Parameters
+    ----------
+    graph : Graph
+        With lines.
+    estimate : Estimate
+
+    Returns
+    -------
+    (K,) bool
+        False for lines whose place is less certain than `MOST_SIGMA_M`, or that lie behind the
+        camera in most of their rows.
+    """
+    line, row = graph.member_line, graph.member_row
+    pose = estimate.poses[graph.line_pose[row]]
+    to_line = disc_in_robot(pose, estimate.line_xy[line]) - graph.camera_xy
+    _, by_line = bearing_jacobians(pose, estimate.line_xy[line], graph.camera_xy)
+    by_line /= graph.bearing_sigma_rad[row][:, None]
+    information = np.zeros((len(graph.line_ids), 2, 2))
+    np.add.at(information, line, by_line[:, :, None] * by_line[:, None, :])
+    bearing = graph.bearing_rad[row]
+    ahead = to_line[:, 0] * np.sin(bearing) - to_line[:, 1] * np.cos(bearing) > 0.0
+    share = np.bincount(line, ahead, len(information)) / graph.line_row_counts
+    certain = np.linalg.eigvalsh(information)[:, 0] > MOST_SIGMA_M**-2
+    return np.asarray(certain & (share > 0.5))
 
 
 def triangulate(

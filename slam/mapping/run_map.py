@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -15,8 +16,8 @@ from slam.errors import SlamError
 from slam.mapping.chi_squared import ChiSquared, chi_squared
 from slam.mapping.connection import check_connected
 from slam.mapping.graph import Estimate, Graph, first_sight, graph_of_recording, with_lines
-from slam.mapping.graph_terms import Weighting
-from slam.mapping.initial_lines import InitialLines, place_lines
+from slam.mapping.graph_terms import Loss, Weighting
+from slam.mapping.initial_lines import InitialLines, place_lines, well_placed
 from slam.mapping.marginals import Marginals, marginals
 from slam.mapping.solve import Solution, solve
 from slam.mapping.solve_gtsam import solve_gtsam
@@ -43,7 +44,7 @@ class LeftOut:
     discs_seen_once : int
         They are in the map, but nothing checks them.
     lines_without_parallax : int
-        Lines never seen, alone in a row, under enough parallax.
+        Lines never seen, alone in a row, under enough parallax, or that do not stay placed.
     line_rows : int
         Rows of lines that show one of those.
     """
@@ -149,7 +150,7 @@ def map_run(
     graph = graph_of_recording(recording, camera)
     begin = first_sight(graph, start)
     plain = Weighting()
-    descend = _descent(solver)
+    descend = _descent(solver, wanted.loss)
     trail: list[Solution] = []
 
     def keep(solution: Solution) -> Estimate:
@@ -167,8 +168,7 @@ def map_run(
                 f"{name}: none of {len(placed.unplaced)} lines is seen, alone in a row, under "
                 "enough parallax: there is nothing to map"
             )
-        graph = with_lines(graph, recording.lines, placed.ids)
-        estimate = replace(estimate, line_xy=placed.xy)
+        graph, estimate = _with_lines(graph, recording, estimate, placed, keep)
     if only_start:
         fixed = replace(wanted, calibrate=False, tilt_sigma_rad=0.0)
         if fixed.loss != "none":
@@ -218,10 +218,33 @@ def path_of(recording: Recording, estimate: Estimate, covariance: Marginals | No
     )
 
 
-def _descent(solver: Solver) -> Callable[[Graph, Estimate, Weighting], Solution]:
+def _with_lines(
+    graph: Graph,
+    recording: Recording,
+    estimate: Estimate,
+    placed: InitialLines,
+    keep: Callable[[Solution], Estimate],
+) -> tuple[Graph, Estimate]:
+    """The problem with the lines that stay well placed while all is fitted together."""
+    ids, xy = placed.ids, placed.xy
+    robust = Weighting(loss="huber")
+    while True:
+        graph = with_lines(graph, recording.lines, ids)
+        estimate = replace(estimate, line_xy=xy)
+        if len(ids) == 0:
+            return graph, estimate
+        estimate = keep(solve(graph, estimate, robust, tolerance=_COARSE))
+        good = well_placed(graph, estimate)
+        if np.all(good):
+            return graph, estimate
+        ids, xy = ids[good], estimate.line_xy[good]
+
+
+def _descent(solver: Solver, loss: Loss) -> Callable[[Graph, Estimate, Weighting], Solution]:
     if solver == "gtsam":
         return solve_gtsam
-    return solve
+    # A robust loss converges slowly at last: reweighting is no Newton's method.
+    return partial(solve, tolerance=1e-10 if loss == "none" else 1e-7)
 
 
 def _check_usable(
@@ -257,7 +280,7 @@ def _left_out(recording: Recording, graph: Graph, placed: InitialLines) -> LeftO
         rows_without_id=int(np.sum(recording.circles.ids < 0))
         + sum(not some for some in lines.ids),
         discs_seen_once=int(np.sum(graph.disc_row_counts == 1)),
-        lines_without_parallax=len(placed.unplaced),
+        lines_without_parallax=len(placed.unplaced) + len(placed.ids) - len(graph.line_ids),
         line_rows=sum(bool(some) for some in lines.ids) - len(graph.line_pose),
     )
 

@@ -112,7 +112,14 @@ def solve(
         before = lowest
         equations = normal_equations(linearise(graph, estimate, weighting))
         while damping < _LARGEST_DAMPING:
-            trial = moved(estimate, layout, *damped_step(equations, damping))
+            try:
+                step = damped_step(equations, damping)
+            except SlamError:
+                if 10.0 * damping >= _LARGEST_DAMPING:
+                    raise
+                damping *= 10.0
+                continue
+            trial = moved(estimate, layout, *step)
             trial, trial_cost = _with_best_positions(graph, trial, weighting, layout)
             if trial_cost < before:
                 estimate, lowest = trial, trial_cost

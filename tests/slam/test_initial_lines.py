@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
+import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from slam.mapping.initial_lines import place_lines, triangulate
+from camera import Camera
+from slam.mapping.graph import Estimate, graph_of_recording, with_lines
+from slam.mapping.graph_terms import Loss, Weighting
+from slam.mapping.initial_lines import place_lines, triangulate, well_placed
+from slam.mapping.run_map import map_run
 from slam.models.measurement import bearing_of_vertical
 from slam.recording import LineRows
+from tests.slam.small_run import small_run
 
 FloatArray = NDArray[np.float64]
 CAMERA_XY = np.array([0.05, -0.1])
@@ -47,3 +55,42 @@ def test_a_line_seen_twenty_thousand_times_is_placed() -> None:
     placed = place_lines(poses, rows, CAMERA_XY)
     assert placed.ids.tolist() == [4]
     np.testing.assert_allclose(placed.xy[0], line, atol=1e-6)
+
+
+def test_lines_that_bearings_do_not_place_are_found_at_an_estimate() -> None:
+    run = small_run(3)
+    graph = replace(graph_of_recording(run.recording), camera_xy=CAMERA_XY)
+    ids = np.arange(1, len(run.line_xy) + 1)
+    graph = with_lines(graph, run.recording.lines, ids)
+    xy = run.line_xy.copy()
+    assert np.all(well_placed(graph, Estimate(run.poses, run.disc_xy, xy)))
+    middle = run.poses[:, :2].mean(axis=0)
+    xy[1] = middle + 500.0 * (xy[1] - middle)  # as good as at infinity
+    xy[2] = middle - 3.0 * (xy[2] - middle)  # on the other side of the robot
+    placed = well_placed(graph, Estimate(run.poses, run.disc_xy, xy))
+    assert np.flatnonzero(~placed).tolist() == [1, 2]
+
+
+@pytest.mark.parametrize("loss", ["none", "huber", "geman-mcclure"])
+def test_a_line_seen_from_one_place_does_not_spoil_the_map(
+    published_camera: Camera, loss: Loss
+) -> None:
+    """Its rays are parallel but for one that is another line's."""
+    run = small_run(3)
+    lines = run.recording.lines
+    count = 6
+    spoilt = replace(
+        lines,
+        frame=np.concatenate([lines.frame, np.arange(count)]),
+        bearing_rad=np.concatenate([lines.bearing_rad, 0.3 - run.poses[1 : count + 1, 2], [0.8]])[
+            : len(lines) + count
+        ],
+        sigma_rad=np.full(len(lines) + count, 0.004),
+        ids=lines.ids + ((99,),) * count,
+    )
+    spoilt.bearing_rad[-1] += 0.2
+    mapped = map_run(replace(run.recording, lines=spoilt), published_camera, Weighting(loss=loss))
+    clean = map_run(run.recording, published_camera, Weighting(loss=loss))
+    assert mapped.graph.line_ids.tolist() == clean.graph.line_ids.tolist()
+    assert mapped.left_out.lines_without_parallax == clean.left_out.lines_without_parallax + 1
+    np.testing.assert_allclose(mapped.estimate.poses, clean.estimate.poses, atol=1e-4)

@@ -136,18 +136,22 @@ def test_rows_without_a_point_keep_the_label_they_had() -> None:
 def test_frames_without_rows_and_runs_without_crossings_do_no_harm() -> None:
     none = np.zeros(0)
     start = np.zeros(6, dtype=np.int64)
-    empty = Rays(none.reshape(0, 2), none, none, start[:0], start, np.zeros(5), 0.7)
+    ahead = np.tile([1.0, 0.0], (5, 1))
+    row = start[:0]
+    empty = Rays(row, none.reshape(0, 2), none, none, none, row, start, ahead, 0.7)
     labels, points = find_points(empty, PointSettings())
     assert labels.shape == (0,)
     assert points.shape == (0, 2)
     # Rows in the first two and the last of five frames, none of them crossing another.
     rays = Rays(
+        row=np.arange(3),
         centre=np.zeros((3, 2)),
         angle=np.array([0.1, 0.1, 0.1]),
+        bearing=np.array([0.1, 0.1, 0.1]),
         sigma=np.full(3, 0.002),
         frame=np.array([0, 1, 4]),
         start=np.array([0, 1, 2, 2, 2, 3]),
-        heading=np.zeros(5),
+        heading=ahead,
         widest_rad=0.7,
     )
     labels, points = find_points(rays, PointSettings())
