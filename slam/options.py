@@ -330,19 +330,23 @@ class Export(RunFlags):
 
 @dataclass(frozen=True)
 class Import:
-    """Read a g2o graph or a TUM trajectory back into this project's files.
+    """Read other tools' and data sets' files into this project's.
 
     Example: slam import /tmp/e.g2o -o /tmp/e-again.circles
 
     Parameters
     ----------
     file : Path
-        A .g2o graph, or a .tum trajectory.
+        A .g2o graph, a .tum trajectory, RobotN_Odometry.dat or Landmark_Groundtruth.dat of the
+        UTIAS data set (MRCLAM), or aa3_dr.mat of Victoria Park.
     axes : str
-        The axes that the file is in; see `slam export`.
+        The axes that the graph or trajectory is in; see `slam export`.
+    range_sigma, bearing_sigma : float
+        Standard deviations of a data set's ranges (m) and bearings (rad).
     output : Path
         Of a graph the .circles file to write, or, with the suffix .csv, the path of its estimates;
-        of a trajectory the path.csv.
+        of a trajectory the path.csv; of a robot the .circles, or the .csv of its true path; of
+        true landmarks the map.csv.
     force : bool
         Replace an existing file.
     """
@@ -350,6 +354,8 @@ class Import:
     file: Positional[Path]
     output: Annotated[Path, arg(aliases=["-o"])]
     axes: Literal["robotics", "dataset"] = "robotics"
+    range_sigma: float = 0.1
+    bearing_sigma: float = 0.03
     force: bool = False
 
 

@@ -56,7 +56,8 @@ class LocalSettings:
     forget_frames : int
         A landmark unseen for longer is forgotten.
     forget_sigma_m : float
-        So is a disc whose position relative to the robot has become less certain than this.
+        So is a disc whose position relative to the robot has become less certain than this, beyond
+        4 m in proportion to its distance.
     most_landmarks : int
         At most this many landmarks of each kind are kept, those seen last.
     most_nodes : int

@@ -21,6 +21,8 @@ from slam.models.motion import rotation
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
+# Up to this distance discs have to be equally certain.
+_NEAR_M = 4.0
 # Lines farther away than this have no place yet (1/m).
 _LEAST_INVERSE_DISTANCE = 0.02
 
@@ -166,7 +168,8 @@ def kept(
         return local
     variance = np.diagonal(local.covariance).reshape(m, 2).sum(axis=1)
     keep = frame - local.last_frame <= forget_frames
-    keep &= local.is_line | (variance <= forget_sigma_m**2)
+    farther = np.maximum(np.linalg.norm(local.mean, axis=1) / _NEAR_M, 1.0)
+    keep &= local.is_line | (variance <= (farther * forget_sigma_m) ** 2)
     for kind in (False, True):
         some = np.flatnonzero(keep & (local.is_line == kind))
         if len(some) > most_landmarks:

@@ -20,10 +20,12 @@ from landmarks.map_file import (
 from slam.commands.run_camera import camera_of_run
 from slam.commands.run_rows import print_assumed, recording_of
 from slam.errors import SlamError
+from slam.formats import mrclam, victoria_park
 from slam.formats.axes import MEANING, Axes, covariance_from_dataset, from_dataset
 from slam.formats.g2o import write_g2o
 from slam.formats.g2o_frames import demand_readable, frames_of_graph, graph_of_frames, poses_of_run
 from slam.formats.g2o_reading import read_g2o
+from slam.formats.range_bearing import frames_of
 from slam.formats.tables import (
     identified_discs,
     identified_lines,
@@ -36,6 +38,7 @@ from slam.formats.tum import read_times, read_tum, write_tum
 from slam.options import Export, Import
 from slam.recording import demand_landmarks, landmark_file
 from storage import OutputExistsError
+from storage.bounds import ABOVE_0, demand
 
 _LANDMARKS = (".circles", ".lines", ".markers")
 _G2O_WORDS = ("VERTEX_SE2", "VERTEX_XY", "EDGE_SE2", "EDGE_SE2_XY", "FIX")
@@ -159,6 +162,8 @@ def _import(command: Import) -> int:
             f"{command.file}: is a landmark file: expected a .g2o graph or a .tum trajectory; "
             "`slam export` writes them"
         )
+    if command.file.suffix in (".dat", ".mat"):
+        return _import_data_set(command)
     if command.file.suffix == ".tum" or (
         command.file.suffix != ".g2o" and _first_word(command.file) not in _G2O_WORDS
     ):
@@ -181,6 +186,35 @@ def _import(command: Import) -> int:
     print(
         f"{command.output}: {len(frames)} steps, {len(graph.circles)} measurements of discs{note}"
     )
+    return 0
+
+
+def _import_data_set(command: Import) -> int:
+    """Of the UTIAS data set a robot's run, its true path or the landmarks; of Victoria Park all."""
+    demand(command, SlamError, range_sigma=ABOVE_0, bearing_sigma=ABOVE_0)
+    file, head = command.file, [_made_by(command.file)]
+    if file.name == mrclam.LANDMARKS:
+        landmark_map = mrclam.read_landmarks(file)
+        write_map(command.output, landmark_map, head, overwrite=command.force)
+        print(f"{command.output}: {len(landmark_map.discs)} landmarks")
+        return 0
+    if file.name.endswith(mrclam.ODOMETRY) and command.output.suffix == ".csv":
+        path = mrclam.read_truth(file)
+        write_path(command.output, path, head, overwrite=command.force)
+        print(f"{command.output}: {len(path.poses)} poses")
+        return 0
+    if file.name.endswith(mrclam.ODOMETRY):
+        run = mrclam.read_robot(file)
+    elif file.name == victoria_park.DRIVE:
+        run = victoria_park.read_drive(file)
+    else:
+        raise SlamError(
+            f"{file}: expected a RobotN{mrclam.ODOMETRY} or {mrclam.LANDMARKS} of the UTIAS data "
+            f"set, or the {victoria_park.DRIVE} of Victoria Park"
+        )
+    frames = frames_of(run, command.range_sigma, command.bearing_sigma)
+    write_frames(command.output, frames, head=head[0], overwrite=command.force)
+    print(f"{command.output}: {len(frames)} steps, {len(run.frame)} measurements")
     return 0
 
 

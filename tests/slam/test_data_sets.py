@@ -1,0 +1,215 @@
+"""Excerpts in the formats of MRCLAM and of Victoria Park, whose truth is known: read and used."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.io import savemat
+
+from landmarks import wrap_angle
+from landmarks.map_file import read_map, read_path
+from slam.cli import main
+from slam.formats.victoria_park import trees_of
+from slam.models.measurement import disc_of_range_and_bearing
+from slam.models.motion import chain_steps
+from slam.recording import read_recording
+
+FloatArray = NDArray[np.float64]
+RANGE_SIGMA, BEARING_SIGMA = 0.05, 0.01
+
+
+@pytest.fixture(scope="module")
+def utias(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Robot 1 drives three rounds among 15 landmarks, at 20 Hz, and sees what is before it."""
+    folder = tmp_path_factory.mktemp("utias")
+    rng = np.random.default_rng(1)
+    landmarks = rng.uniform([-3.5, -3.5], [3.5, 3.5], (15, 2))
+    period, count = 0.05, 2400
+    speed, turn = 0.3, 0.15
+    chord = speed * period * np.sinc(turn * period / (2 * np.pi))
+    half = 0.5 * turn * period
+    along = np.tile([chord * np.cos(half), chord * np.sin(half), 2 * half], (count, 1))
+    poses = chain_steps(along, (0.0, -2.0, 0.1))
+    time = 1248272000.0 + period * np.arange(count + 1)
+    odometry, truth, seen = [], [], []
+    for k, pose in enumerate(poses):
+        v, w = speed + 0.01 * rng.standard_normal(), turn + 0.01 * rng.standard_normal()
+        odometry.append(f"{time[k]:.3f}\t{v:.3f}\t{w:.3f}")
+        truth.append(f"{time[k]:.3f}    {pose[0]:.6f} {pose[1]:.6f} {wrap_angle(pose[2]):.6f}")
+        if k == 0 or k % 10:
+            continue
+        offset = landmarks - pose[:2]
+        reach = np.hypot(*offset.T)
+        bearing = wrap_angle(np.arctan2(offset[:, 1], offset[:, 0]) - pose[2])
+        for i in np.flatnonzero((np.abs(bearing) < 0.8) & (reach < 5.0)):
+            r = reach[i] + RANGE_SIGMA * rng.standard_normal()
+            b = bearing[i] + BEARING_SIGMA * rng.standard_normal()
+            seen.append(f"{time[k]:.3f}\t{100 + i}\t{r:.3f}\t{b:.3f}")
+        seen.append(f"{time[k]:.3f}\t14\t1.000\t0.100")  # another robot
+    barcodes = [f"{n + 1} {(5, 14, 41, 32, 23)[n]}" for n in range(5)]
+    barcodes += [f"{6 + i} {100 + i}" for i in range(15)]
+    places = [f"{6 + i} {x:.8f} {y:.8f} 0.0001 0.0002" for i, (x, y) in enumerate(landmarks)]
+    for name, rows in (
+        ("Robot1_Odometry", odometry),
+        ("Robot1_Measurement", seen),
+        ("Robot1_Groundtruth", truth),
+        ("Barcodes", barcodes),
+        ("Landmark_Groundtruth", places),
+    ):
+        head = [
+            "# UTIAS Multi-Robot Cooperative Localization and Mapping Dataset",
+            "# Time [s] ...",
+        ]
+        (folder / f"{name}.dat").write_text("\n".join([*head, *rows]) + "\n")
+    sigmas = ["--range-sigma", str(RANGE_SIGMA), "--bearing-sigma", str(BEARING_SIGMA)]
+    robot = str(folder / "Robot1_Odometry.dat")
+    assert main(["import", robot, "-o", str(folder / "run.circles"), *sigmas]) == 0
+    assert main(["import", robot, "-o", str(folder / "true.csv")]) == 0
+    places_file = str(folder / "Landmark_Groundtruth.dat")
+    assert main(["import", places_file, "-o", str(folder / "true_map.csv")]) == 0
+    return folder
+
+
+def _start(folder: Path) -> list[str]:
+    return ["--start", *map(str, read_path(folder / "true.csv").poses[0])]
+
+
+def _off(folder: Path, path: Path) -> float:
+    error = read_path(path).poses[:, :2] - read_path(folder / "true.csv").poses[:, :2]
+    return float(np.sqrt(np.mean(np.sum(error**2, axis=1))))
+
+
+def test_utias_is_mapped(utias: Path) -> None:
+    recording = read_recording(utias / "run.circles")
+    assert len(recording) == len(read_path(utias / "true.csv").poses) - 1 == 240
+    assert set(recording.circles.ids.tolist()) <= set(range(6, 21))
+    run = ["map", str(utias / "run.circles"), "-o", str(utias / "map"), *_start(utias)]
+    assert main(run) == 0
+    assert _off(utias, utias / "map" / "path.csv") < 0.05
+    found, true = read_map(utias / "map" / "map.csv").discs, read_map(utias / "true_map.csv").discs
+    places = true.xy[np.searchsorted(true.ids, found.ids)]
+    assert np.sqrt(np.mean(np.sum((found.xy - places) ** 2, axis=1))) < 0.05
+
+
+def test_utias_is_filtered_and_localised_in(utias: Path) -> None:
+    run, reference = str(utias / "run.circles"), ["--reference", str(utias / "true.csv")]
+    common = [*reference, *_start(utias)]
+    assert main(["ekf", run, *common, "-o", str(utias / "ekf")]) == 0
+    assert _off(utias, utias / "ekf" / "path.csv") < 0.05
+    own_map = ["--map", str(utias / "true_map.csv"), "-o", str(utias / "local")]
+    assert main(["localize", run, *own_map, *common]) == 0
+    assert _off(utias, utias / "local" / "path.csv") < 0.05
+
+
+def test_utias_is_associated_without_identifiers(utias: Path) -> None:
+    target = utias / "found.circles"
+    level = ["--tilt-sigma-deg", "0"]  # ranges are measured, not seen on the floor
+    assert main(["associate", str(utias / "run.circles"), "-o", str(target), *level]) == 0
+    report = json.loads((utias / "found.json").read_text())
+    score = report["runs"][0]["scores"]["circles"]["map"]
+    assert score["pair_precision"] > 0.99
+    assert score["right_rows"] > 0.9
+
+
+def test_malformed_files_are_refused(utias: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    odd = utias / "odd"
+    odd.mkdir()
+    for name in ("Measurement", "Odometry"):
+        text = (utias / f"Robot1_{name}.dat").read_text()
+        (odd / f"Robot1_{name}.dat").write_text(text + ("1.0 2.0\n" if name == "Odometry" else ""))
+    target = str(odd / "run.circles")
+    assert main(["import", str(odd / "Robot1_Odometry.dat"), "-o", target]) == 1
+    assert "Robot1_Odometry.dat:2404: 2 numbers: expected time, v, omega" in capsys.readouterr().err
+    assert main(["import", str(odd / "Robot1_Measurement.dat"), "-o", target]) == 1
+    assert "expected a RobotN_Odometry.dat" in capsys.readouterr().err
+    (odd / "aa3_dr.mat").write_text("no matrix")
+    assert main(["import", str(odd / "aa3_dr.mat"), "-o", target]) == 1
+    assert "aa3_dr.mat: cannot be read" in capsys.readouterr().err
+
+
+def scan_of(trees: FloatArray, pose: FloatArray, radius_m: float = 0.25) -> FloatArray:
+    """Ranges every half degree to trunks in front of the scanner, in cm as the files have them."""
+    angle = np.radians(0.5 * np.arange(361) - 90.0) + pose[2]
+    ray = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    scan = np.full(361, 81.91)
+    for tree in trees:
+        offset = tree - pose[:2]
+        along = ray @ offset
+        square = radius_m**2 - (offset @ offset - along**2)
+        hit = (square > 0.0) & (along > 0.0)
+        scan[hit] = np.minimum(scan[hit], along[hit] - np.sqrt(square[hit]))
+    return 100.0 * scan
+
+
+def test_victoria_park_is_mapped_from_odometry(tmp_path: Path) -> None:
+    """Two rounds of a car among trees; the scanner is ahead of the axle and to the left of it."""
+    rng = np.random.default_rng(2)
+    period, count, speed, radius = 0.2, 420, 3.0, 20.0
+    turn = speed / radius * period
+    axle = chain_steps(
+        np.tile([speed * period * np.sinc(turn / (2 * np.pi)) * f for f in (1.0, 0.0)] + [turn],
+                (count, 1))
+        @ np.array([[np.cos(turn / 2), np.sin(turn / 2), 0], [0, 1, 0], [0, 0, 1]])
+    )  # fmt: skip
+    cos, sin = np.cos(axle[:, 2]), np.sin(axle[:, 2])
+    scanner = axle.copy()
+    scanner[:, 0] += 3.78 * cos - 0.5 * sin
+    scanner[:, 1] += 3.78 * sin + 0.5 * cos
+    around = rng.uniform(0.0, 2 * np.pi, 60)
+    reach = rng.choice([13.0, 27.0], 60) + rng.uniform(-3.0, 3.0, 60)
+    trees = np.stack([reach * np.cos(around), radius + reach * np.sin(around)], axis=1)
+    steering = np.arctan(2.83 / radius)
+    encoder = speed * (1.0 - np.tan(steering) * 0.76 / 2.83)
+    noise = 1.0 + 0.01 * rng.standard_normal(count + 1)
+    time = 1000.0 * period * np.arange(count + 1)
+    savemat(
+        tmp_path / "aa3_dr.mat",
+        {
+            "time": time[:, None],
+            "speed": (encoder * noise)[:, None],
+            "steering": steering + 0.002 * rng.standard_normal((count + 1, 1)),
+        },
+    )
+    scans = np.array([scan_of(trees, pose) for pose in scanner])
+    savemat(tmp_path / "aa3_lsr2.mat", {"TLsr": time[:, None], "LASER": np.round(scans)})
+    run = str(tmp_path / "run.circles")
+    assert main(["import", str(tmp_path / "aa3_dr.mat"), "-o", run]) == 0
+    recording = read_recording(run)
+    assert len(recording) == count + 1
+    assert 0.2 * len(recording) < len(recording.circles)
+    found = str(tmp_path / "found.circles")
+    local = ["--tilt-sigma-deg", "0", "--no-map-level"]
+    assert main(["associate", run, "-o", found, *local]) == 0
+    assert main(["map", found, "-o", str(tmp_path / "map")]) == 0
+    # Both in the axes of the data set's robot at the first scan: X left, Y backward.
+    path = read_path(tmp_path / "map" / "path.csv").poses[1:]
+    true = np.stack([scanner[:, 1] - scanner[0, 1], scanner[0, 0] - scanner[:, 0]], axis=1)
+    off = path[:, :2] - path[0, :2] - true
+    assert np.sqrt(np.mean(np.sum(off**2, axis=1))) < 0.5
+
+
+def test_trunks_are_found_where_nothing_hides_them() -> None:
+    trees = np.array([[8.0, 3.0], [12.0, -2.0], [30.0, 0.5]])
+    found = trees_of(scan_of(trees, np.zeros(3)) / 100.0)
+    bearing = np.arctan2(trees[:, 1], trees[:, 0])
+    order = np.argsort(bearing)
+    assert found[:, 1] == pytest.approx(bearing[order], abs=np.radians(0.3))
+    assert found[:, 0] == pytest.approx(np.hypot(*trees[order].T), abs=0.15)
+    wall = np.full(361, 10.0)
+    assert trees_of(wall).shape == (0, 2)
+
+
+def test_covariances_of_range_and_bearing_are_right() -> None:
+    rng = np.random.default_rng(3)
+    count = 20_000
+    reach, bearing = (
+        4.0 + 0.05 * rng.standard_normal(count),
+        0.6 + 0.01 * rng.standard_normal(count),
+    )
+    xy, _ = disc_of_range_and_bearing(reach, bearing, 0.05, 0.01)
+    _, covariance = disc_of_range_and_bearing([4.0], [0.6], 0.05, 0.01)
+    assert np.cov(xy.T) == pytest.approx(covariance[0], rel=0.05, abs=5e-5)
