@@ -90,33 +90,6 @@ def disc_in_map(pose: ArrayLike, seen_xy: ArrayLike) -> FloatArray:
     )
 
 
-def disc_in_map_jacobians(pose: ArrayLike, seen_xy: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Jacobians of `disc_in_map` by the pose and by the measurement.
-
-    Parameters
-    ----------
-    pose, seen_xy : array_like
-        As for `disc_in_map`.
-
-    Returns
-    -------
-    by_pose : (..., 2, 3) float64
-    by_seen : (..., 2, 2) float64
-    """
-    robot = np.asarray(pose, dtype=np.float64)
-    seen = np.asarray(seen_xy, dtype=np.float64)
-    cos, sin = np.cos(robot[..., 2]), np.sin(robot[..., 2])
-    shape = np.broadcast_shapes(robot.shape[:-1], seen.shape[:-1])
-    by_seen = np.zeros((*shape, 2, 2))
-    by_seen[..., 0, 0] = by_seen[..., 1, 1] = cos
-    by_seen[..., 0, 1], by_seen[..., 1, 0] = -sin, sin
-    by_pose = np.zeros((*shape, 2, 3))
-    by_pose[..., 0, 0] = by_pose[..., 1, 1] = 1.0
-    by_pose[..., 0, 2] = -sin * seen[..., 0] - cos * seen[..., 1]
-    by_pose[..., 1, 2] = cos * seen[..., 0] - sin * seen[..., 1]
-    return by_pose, by_seen
-
-
 def bearing_of_vertical(pose: ArrayLike, line_xy: ArrayLike, camera_xy: ArrayLike) -> FloatArray:
     """Measurement model of a vertical line: the bearing under which the camera sees it.
 

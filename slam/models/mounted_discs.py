@@ -78,17 +78,6 @@ class Geometry:
     tilt: FloatArray
 
 
-def nominal_geometry(camera: Camera, poses: FloatArray, disc_xy: FloatArray) -> Geometry:
-    """The geometry with the camera mounted as calibrated and the robot upright."""
-    return Geometry(
-        poses=poses,
-        disc_xy=disc_xy,
-        rotation=np.array(camera.rotation),
-        centre=np.array(camera.centre),
-        tilt=np.zeros((len(poses), 2)),
-    )
-
-
 @dataclass(frozen=True, eq=False)
 class PixelJacobians:
     """Derivatives of n pixels by what they depend on.

@@ -16,7 +16,6 @@ from slam.filters.innovation_kernels import MeasuredDiscs, MeasuredLines, frame_
 from slam.filters.joint_covariance import JointCovariance
 from slam.models.measurement import (
     disc_in_map,
-    disc_in_map_jacobians,
     disc_in_robot,
     disc_jacobians,
 )
@@ -91,7 +90,9 @@ def dense_filter(recording: Recording) -> tuple[FloatArray, FloatArray, list[int
         for i in here:
             if i in old:
                 continue
-            by_pose, by_seen = disc_in_map_jacobians(state[:3], circles.xy[i])
+            measured_by = disc_jacobians(state[:3], disc_in_map(state[:3], circles.xy[i]))
+            by_seen = np.linalg.inv(measured_by[1])
+            by_pose = -by_seen @ measured_by[0]
             G = np.zeros((2, len(state)))
             G[:, :3] = by_pose
             own = G @ covariance @ G.T + by_seen @ circles.covariance[i] @ by_seen.T

@@ -8,10 +8,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from camera import Camera
 from slam.models.mounted_discs import (
     Geometry,
     PixelJacobians,
-    nominal_geometry,
     predict_pixels,
     rotation_exp,
     skew,
@@ -29,6 +29,17 @@ __all__ = [
 ]
 
 FloatArray = NDArray[np.float64]
+
+
+def nominal_geometry(camera: Camera, poses: FloatArray, disc_xy: FloatArray) -> Geometry:
+    """The geometry with the camera mounted as calibrated and the robot upright."""
+    return Geometry(
+        poses=poses,
+        disc_xy=disc_xy,
+        rotation=np.array(camera.rotation),
+        centre=np.array(camera.centre),
+        tilt=np.zeros((len(poses), 2)),
+    )
 
 
 def odometry_residuals(
