@@ -56,6 +56,8 @@ _BY_FIT = 0.5
 _WHOLE_RIM = 0.9
 #: A rim whose step varies by less than this over the directions, relative to its mean, is even.
 _EVEN = 0.18
+#: A fit that explains less of the variance than this is of a disc that something hides.
+_LITTLE = 0.7
 #: A fit that explains less of the variance than this may place the disc worse than half of its rim.
 _WELL_EXPLAINED, _HALF_RIM = 0.97, 0.5
 
@@ -310,10 +312,10 @@ def _with_rim(scene: Scene, quality: float, log_odds: float, result: Any) -> flo
     ):
         surer = rim.cov_xx + rim.cov_yy < result.cov_xx + result.cov_yy
         partly = result.explained < _WELL_EXPLAINED and rim.agreeing >= _HALF_RIM
-        if partly and surer and _places_well(rim):
+        if partly and surer and _places_well(rim, result.explained):
             _place_by_rim(result, rim)
         return by_fit
-    if _places_well(rim):
+    if _places_well(rim, result.explained):
         _place_by_rim(result, rim)
     return by_rim
 
@@ -331,12 +333,14 @@ def _radius_px(scene: Scene, x: float, y: float) -> float:
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _places_well(rim: Rim) -> bool:
+def _places_well(rim: Rim, explained: float) -> bool:
     """Whether a rim is hidden in part, and steps by as much all round where it is not.
 
-    Where movement blurs it, it steps less on two sides, and is found beside its place.
+    Where movement blurs it, it steps less on two sides, and is found beside its place; then the fit
+    explains most, though.
     """
-    return rim.agreeing < _WHOLE_RIM and rim.unevenness < _EVEN
+    even = rim.unevenness < _EVEN or explained < _LITTLE
+    return even and rim.agreeing < _WHOLE_RIM
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

@@ -120,7 +120,7 @@ def test_a_disc_behind_a_door_is_found_where_it_is(
         off = np.linalg.norm(
             found_in(published_camera, table, floor, seed).floor_xy - place, axis=1
         )
-        assert off.min(initial=1.0) < 0.015, place
+        assert off.min(initial=1.0) < 0.025, place
 
 
 def test_covariances_of_the_rim_fit_its_errors(published_camera: Camera) -> None:
