@@ -23,12 +23,12 @@ from camera.distortion import inverse_table
 from camera.kernels import camera_numbers, lens_numbers
 from detect.discs.candidates import alone_published, local_maxima
 from detect.discs.fit import blur_ratio_of, fit_settings
-from detect.discs.hough import hough_candidates
+from detect.discs.hough import HoughCandidates, hough_candidates
 from detect.discs.positions import published_positions as pixel_positions
 from detect.discs.positions import refined_covariances
 from detect.discs.quality import Limits, centres_of, least_part_quality
 from detect.discs.quality import quality_of_centres as quality_of_centres
-from detect.discs.rim_network import RimNetwork, rim_network
+from detect.discs.rim_network import Networks, trained_networks
 from detect.discs.search import DiscSearch, Scene, search_discs
 from detect.discs.second_look import SecondLooks, Sought, second_looks
 from detect.errors import FrameError
@@ -48,7 +48,7 @@ _SIGNS: dict[Polarity, int] = {"any": 0, "light": 1, "dark": -1}
 #: Rows of an image from which its noise is estimated.
 _NOISE_ROWS = 16
 #: Least gradient of an edge that votes, and least step of a rim, grey levels (per pixel).
-_EDGE, _LEAST_STEP = 4.0, 8.0
+_EDGE, _LEAST_STEP = 5.5, 8.0
 #: Of the least quality, part of the directions of what is fitted must have this share.
 _PART_QUALITY = 0.8
 #: Discs of so little more than the least evidence are for the second look, where there is one.
@@ -129,23 +129,22 @@ def detect_circles(
     )  # fmt: skip
     found = search_discs(scene, centres, weakest)
     pixels, found_quality = centres.pixels[found.centre], centres.quality[found.centre]
-    floor_xy, evidence = found.floor_xy, found.evidence
-    covariance = refined_covariance(camera, floor_xy, found.covariance, settings)
+    floor_xy, fitted, evidence = found.floor_xy, found.covariance, found.evidence
     if _looks_twice(settings):
         more = second_looks_at(image, camera, table, settings, floor_xy, noise)
         is_disc = more.log_odds >= 0.0
-        more_xy = more.floor_xy[is_disc]
-        last = [camera.width - 1, camera.height - 1]
-        more_pixels = np.clip(np.rint(camera.project_floor(more_xy)), 0, last).astype(np.int64)
-        pixels = np.concatenate([pixels, more_pixels])
-        order = np.argsort(pixels[:, 1] * image.shape[1] + pixels[:, 0], kind="stable")
-        pixels = pixels[order]
-        found_quality = np.concatenate([found_quality, more.quality[is_disc]])[order]
-        floor_xy = np.concatenate([floor_xy, more_xy])[order]
-        more_covariance = refined_covariance(camera, more_xy, more.covariance[is_disc], settings)
-        covariance = np.concatenate([covariance, more_covariance])[order]
-        more_evidence = settings.evidence + more.log_odds[is_disc]
-        evidence = np.concatenate([evidence, more_evidence])[order]
+        if is_disc.any():
+            more_xy = more.floor_xy[is_disc]
+            last = [camera.width - 1, camera.height - 1]
+            more_pixels = np.clip(np.rint(camera.project_floor(more_xy)), 0, last).astype(np.int64)
+            pixels = np.concatenate([pixels, more_pixels])
+            order = np.argsort(pixels[:, 1] * image.shape[1] + pixels[:, 0], kind="stable")
+            pixels = pixels[order]
+            found_quality = np.concatenate([found_quality, more.quality[is_disc]])[order]
+            floor_xy = np.concatenate([floor_xy, more_xy])[order]
+            fitted = np.concatenate([fitted, more.covariance[is_disc]])[order]
+            evidence = np.concatenate([evidence, settings.evidence + more.log_odds[is_disc]])[order]
+    covariance = refined_covariance(camera, floor_xy, fitted, settings)
     if not settings.refine:
         floor_xy, covariance = published_positions(camera, pixels)
     return CircleDetections(
@@ -162,6 +161,19 @@ def _looks_twice(settings: CircleSettings) -> bool:
     return settings.polarity != "any" and settings.verify and settings.refine
 
 
+def candidates_at(
+    image: NDArray[np.uint8],
+    camera: Camera,
+    table: DiscTable,
+    settings: CircleSettings,
+    noise: float,
+) -> HoughCandidates:
+    """Candidates of the second look, as parameters of `second_looks_at`."""
+    edge = max(_EDGE, 0.7 * settings.noise_floor * max(noise, _LEAST_NOISE))
+    sign = float(_SIGNS[settings.polarity])
+    return hough_candidates(image, camera, table, settings.radius_m, sign, edge)
+
+
 def second_looks_at(
     image: NDArray[np.uint8],
     camera: Camera,
@@ -169,7 +181,7 @@ def second_looks_at(
     settings: CircleSettings,
     found_xy: FloatArray,
     noise: float,
-    network: RimNetwork | None = None,
+    networks: Networks | None = None,
 ) -> SecondLooks:
     """Look a second time where no disc was found (see `detect.discs.second_look`).
 
@@ -181,17 +193,18 @@ def second_looks_at(
         Discs found already, metres.
     noise : float
         Of the image, grey levels.
-    network : RimNetwork, optional
-        Another than the trained one.
+    networks : Networks, optional
+        Others than the trained ones.
     """
-    weakest = settings.noise_floor * max(noise, _LEAST_NOISE)
-    sign = float(_SIGNS[settings.polarity])
-    edge = max(_EDGE, 0.5 * weakest)
-    candidates = hough_candidates(image, camera, table, settings.radius_m, sign, edge)
+    sign, weakest = (
+        float(_SIGNS[settings.polarity]),
+        settings.noise_floor * max(noise, _LEAST_NOISE),
+    )
     sought = Sought(settings.radius_m, settings.separation_m, sign, max(weakest, _LEAST_STEP))
     return second_looks(
-        image, candidates, np.ascontiguousarray(found_xy), sought,
-        _kernel_camera(camera).numbers, network or rim_network(),
+        image, candidates_at(image, camera, table, settings, noise),
+        np.ascontiguousarray(found_xy), sought, _kernel_camera(camera).numbers,
+        networks or trained_networks(),
     )  # fmt: skip
 
 

@@ -1,16 +1,16 @@
 """Candidates by the edges of the image: a Hough transform for discs of known size on the floor.
 
 At the rim of a light disc the gradient of the grey value, taken on the floor, points to the centre,
-one radius away. With A the derivative of the floor position X by the pixel and g the gradient in
-the image, the centre is
+one radius away. With A the derivative of the floor position X by the pixel, B = |det A| A^-T, and g
+the gradient in the image, the centre is
 
-    X + r n,  n = m / norm(m),  m = A^-T g,
+    X + r n,  n = B g / norm(B g),
 
 and X - r n for a dark disc. Every pixel with a strong gradient votes for one centre, by the share
-of the rim that it sees; so whatever hides or lights a part of a disc takes its own share of the
-votes and no more. Votes are counted in cells of about a quarter of the radius, and at least a
-pixel, that lie on rings about the camera; a score is that of three by three cells, relative to
-the mean of its ring, where texture and distance make all scores higher.
+of the rim that it sees, norm(B g) / norm(g) of 2 pi r; so whatever hides or lights a part of a disc
+takes its own share of the votes and no more. Votes are counted in cells of a quarter of the radius
+across, and of at least a pixel ahead. A score is that of three by three cells, relative to the mean
+of all cells as far ahead, where texture and distance make all scores higher.
 
 Source: C. Kimme, D. Ballard and J. Sklansky, Finding Circles by an Array of Accumulators,
 CACM 18 (1975).
@@ -22,7 +22,6 @@ import math
 from functools import lru_cache
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -33,54 +32,59 @@ from lut import DiscTable
 
 FloatArray = NDArray[np.float64]
 
-#: Width of a cell, radii, and at least, pixels.
+#: Width of a cell, radii, and at least ahead, pixels.
 _CELL_RADII, _CELL_PX = 0.25, 0.8
-#: Cells of the raster that says in which cell a floor position lies, for each radius.
-_RASTER_PER_RADIUS = 5.0
-#: Added to the mean votes of a ring: where it is empty, few votes are no candidate.
-_BACKGROUND = 0.3
-#: Least score of a candidate, and how many an image may have.
-_LEAST_SCORE, _MOST = 1.5, 100
+#: Steps in which it is looked up how far ahead a cell is, for each radius.
+_STEPS_PER_RADIUS = 16.0
+#: Where every disc is this wide (pixels), columns are added in pairs; where it is this high, every
+#: second row votes, and so on.
+_WIDE_PX, _HIGH_PX = 9.0, 6.0
+#: Added to the mean votes of the cells as far ahead: where these are empty, few votes are none.
+_BACKGROUND = 0.45
+#: Least score of a candidate, and how many an image may have; how many of them may be neighbours.
+_LEAST_SCORE, _MOST, _MOST_PEAKS = 1.65, 60, 1000
 #: Sobel's kernel multiplies a step per pixel by this.
 _SOBEL_GAIN = 8.0
 
 
-class Cells(NamedTuple):
-    """The cells in which votes are counted; a cell without votes is before and behind each ring.
+class Grid(NamedTuple):
+    """Which pixels vote, and the cells in which their votes are counted.
 
     Attributes
     ----------
-    raster : (N, M) int32
-        Cell of each place of a regular raster on the floor; 0 for none.
-    origin : (2,) float64
-        Floor position of the raster's corner, metres.
-    per_metre : float
-        Raster places.
-    above, below : (K,) int64
-        The cell in the next and in the previous ring that lies in the same direction.
-    ring : (R,) int64
-        First cell of each ring.
-    floor_xy : (K, 2) float64
-        Middle of each cell, metres.
-    first_row : int
-        Of the image, that sees floor.
+    paired : bool
+        Columns of the image are added in pairs.
+    image_row : (R,) int64
+        Rows of the image that vote.
+    pixel : (R, W, 6) float32
+        Of each pixel (or pair) its place, cells across and steps ahead, and B / (2 pi r) by rows;
+        all 0 where no floor is seen.
+    row_of_step : (S,) int64
+        Row of cells at each step ahead.
+    ahead : (M,) float64
+        Middle of each row of cells, metres.
+    first, last : (M,) int64
+        Columns of cells between which each row is in view.
+    columns : int
+    cell, step, left : float
+        Width of cells, of steps ahead, and where column 0 begins, metres.
+    foot, turn : (2,), (2, 2) float64
+        Foot of the camera, metres, and the directions across and ahead.
     """
 
-    raster: NDArray[np.int32]
-    origin: FloatArray
-    per_metre: float
-    above: NDArray[np.int64]
-    below: NDArray[np.int64]
-    ring: NDArray[np.int64]
-    floor_xy: FloatArray
-    first_row: int
-
-
-class Edges(NamedTuple):
-    """Gradient of the grey value along u and v, in eighths of a grey level per pixel."""
-
-    along_u: NDArray[np.int16]
-    along_v: NDArray[np.int16]
+    paired: bool
+    image_row: NDArray[np.int64]
+    pixel: NDArray[np.float32]
+    row_of_step: NDArray[np.int64]
+    ahead: FloatArray
+    first: NDArray[np.int64]
+    last: NDArray[np.int64]
+    columns: int
+    cell: float
+    step: float
+    left: float
+    foot: FloatArray
+    turn: FloatArray
 
 
 class HoughCandidates(NamedTuple):
@@ -120,169 +124,190 @@ def hough_candidates(
     least_step : float
         Least gradient of an edge, grey levels per pixel.
     """
-    if not table.usable.any():
+    grid = grid_of(camera, table, radius)
+    if grid is None:
         return HoughCandidates(np.empty((0, 2)), np.empty(0))
-    cells = _cells(camera, table, radius)
-    edges = edges_of(image)
-    votes = count_votes(
-        edges.along_u, edges.along_v, table.floor_xy, sign * radius, _SOBEL_GAIN * least_step,
-        cells.raster, cells.origin, cells.per_metre, (cells.first_row, len(cells.above)),
-    )  # fmt: skip
-    score = _scores(votes, cells)
-    # None of the neighbours on the ring is better.
-    best = score >= _LEAST_SCORE
-    best[1:-1] &= (score[1:-1] >= score[:-2]) & (score[1:-1] > score[2:])
-    index = np.flatnonzero(best)
-    index = index[np.argsort(-score[index], kind="stable")]
-    index = index[suppress_neighbours(cells.floor_xy[index], score[index], radius)][:_MOST]
-    return HoughCandidates(cells.floor_xy[index], score[index])
-
-
-def edges_of(image: NDArray[np.uint8]) -> Edges:
-    """The gradient of an image, smoothed over three pixels."""
-    smooth = cv2.GaussianBlur(image, (3, 3), 0)
-    return Edges(
-        np.asarray(cv2.Sobel(smooth, cv2.CV_16S, 1, 0), np.int16),
-        np.asarray(cv2.Sobel(smooth, cv2.CV_16S, 0, 1), np.int16),
-    )
+    place, score = _peaks(count_votes(image, grid, sign * radius, least_step), grid)
+    alone = suppress_neighbours(place, score, radius)
+    place, score = place[alone], score[alone]
+    best = np.argsort(-score, kind="stable")[:_MOST]
+    return HoughCandidates(place[best] @ grid.turn + grid.foot, score[best])
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def count_votes(
-    along_u: NDArray[np.int16],
-    along_v: NDArray[np.int16],
-    floor_xy: NDArray[np.float32],
-    radius: float,
-    least: float,
-    raster: NDArray[np.int32],
-    origin: FloatArray,
-    per_metre: float,
-    size: tuple[int, int],
+    image: NDArray[np.uint8], grid: Grid, radius: float, least_step: float
 ) -> NDArray[np.float32]:
-    """Votes for each cell: shares of a rim.
+    """Votes for each cell, (M, columns) float32: shares of a rim.
 
     Parameters
     ----------
-    along_u, along_v
-        See `Edges`.
-    floor_xy : (H, W, 2) float32
-        Floor position of each pixel, metres; NaN where there is none.
+    image : (H, W) uint8
+    grid : Grid
     radius : float
         Metres, negative for dark discs.
-    least : float
-        Least length of a gradient.
-    raster, origin, per_metre
-        See `Cells`.
-    size : (int, int)
-        First row of the image that sees floor, and number of cells.
+    least_step : float
+        Least gradient of an edge, grey levels per pixel.
     """
-    first_row, cells = size
-    height, width = along_u.shape
-    votes = np.zeros(cells, np.float32)
-    rows, columns = raster.shape
-    x0, y0 = origin[0], origin[1]
-    least_squared = np.int32(math.ceil(least * least))
-    whole_rim = 2.0 * math.pi * abs(radius)
-    for v in range(max(first_row, 1), height - 1):
-        for u in range(1, width - 1):
-            gu, gv = np.int32(along_u[v, u]), np.int32(along_v[v, u])
-            if gu * gu + gv * gv < least_squared:
+    votes = np.zeros((len(grid.ahead), grid.columns), np.float32)
+    width = grid.pixel.shape[1]
+    across, ahead = np.float32(radius / grid.cell), np.float32(radius / grid.step)
+    least = np.float32((_SOBEL_GAIN * (1.0 + grid.paired) * least_step) ** 2)
+    lines = np.empty((3, width), np.int16)
+    along_u = np.empty(width, np.float32)
+    along_v = np.empty(width, np.float32)
+    square = np.empty(width, np.float32)
+    for k in range(len(grid.image_row)):
+        for i in range(3):
+            row, line = image[grid.image_row[k] + i - 1], lines[i]
+            if grid.paired:
+                for j in range(width):
+                    line[j] = np.int16(row[2 * j]) + np.int16(row[2 * j + 1])
+            else:
+                for j in range(width):
+                    line[j] = row[j]
+        upper, same, lower = lines[0], lines[1], lines[2]
+        for j in range(1, width - 1):
+            gu = (upper[j + 1] - upper[j - 1]) + 2 * (same[j + 1] - same[j - 1])
+            gv = (lower[j - 1] - upper[j - 1]) + 2 * (lower[j] - upper[j])
+            along_u[j] = np.int16(gu + (lower[j + 1] - lower[j - 1]))
+            along_v[j] = np.int16(gv + (lower[j + 1] - upper[j + 1]))
+            square[j] = along_u[j] * along_u[j] + along_v[j] * along_v[j]
+        for j in range(1, width - 1):
+            if square[j] < least:
                 continue
-            xu = 0.5 * (floor_xy[v, u + 1, 0] - floor_xy[v, u - 1, 0])
-            yu = 0.5 * (floor_xy[v, u + 1, 1] - floor_xy[v, u - 1, 1])
-            xv = 0.5 * (floor_xy[v + 1, u, 0] - floor_xy[v - 1, u, 0])
-            yv = 0.5 * (floor_xy[v + 1, u, 1] - floor_xy[v - 1, u, 1])
-            area = xu * yv - xv * yu
-            if not abs(area) > 0.0:
+            pixel = grid.pixel[k, j]
+            x = pixel[2] * along_u[j] + pixel[3] * along_v[j]
+            y = pixel[4] * along_u[j] + pixel[5] * along_v[j]
+            length = math.sqrt(x * x + y * y)
+            if not length > 0.0:
                 continue
-            nx = (yv * gu - yu * gv) / area
-            ny = (xu * gv - xv * gu) / area
-            length = math.sqrt(nx * nx + ny * ny)
-            nx /= length
-            ny /= length
-            j = int((floor_xy[v, u, 0] + radius * nx - x0) * per_metre)
-            i = int((floor_xy[v, u, 1] + radius * ny - y0) * per_metre)
-            if 0 <= i < rows and 0 <= j < columns:
-                # Of the pixel, the extent along the rim is its area by that across it.
-                across = math.hypot(xu * nx + yu * ny, xv * nx + yv * ny)
-                votes[raster[i, j]] += np.float32(abs(area) / (across * whole_rim))
+            column = int(pixel[0] + across * x / length)
+            step = int(pixel[1] + ahead * y / length)
+            if 0 <= column < grid.columns and 0 <= step < len(grid.row_of_step):
+                votes[grid.row_of_step[step], column] += length / math.sqrt(square[j])
     return votes
 
 
-def _scores(votes: NDArray[np.float32], cells: Cells) -> FloatArray:
-    """Votes of three by three cells, relative to the mean of the ring."""
-    votes[0] = 0.0
-    row = votes.copy()
-    row[1:] += votes[:-1]
-    row[:-1] += votes[1:]
-    around = row + row[cells.above] + row[cells.below]
-    around[0] = 0.0
-    sizes = np.diff(np.append(cells.ring, len(votes)))
-    mean = np.add.reduceat(around, cells.ring) / sizes
-    return np.asarray(around / np.repeat(_BACKGROUND + mean, sizes), np.float64)
+@njit(cache=True, error_model="numpy", nogil=True, fastmath={"reassoc", "nsz"})
+def _peaks(votes: NDArray[np.float32], grid: Grid) -> tuple[FloatArray, FloatArray]:
+    """Places (across, ahead) and scores of cells that no neighbour exceeds."""
+    rows, columns = votes.shape
+    score = np.zeros((rows, columns), np.float32)
+    column = np.empty(columns, np.float32)
+    for i in range(1, rows - 1):
+        # One cell more to either side; sliced, so that several are added at a time.
+        near = votes[:, grid.first[i] - 1 : grid.last[i] + 1]
+        before, same, after = near[i - 1], near[i], near[i + 1]
+        around = np.float32(0.0)
+        for j in range(len(same)):
+            column[j] = before[j] + same[j] + after[j]
+            around += column[j]
+        scale = np.float32(1.0) / np.float32(_BACKGROUND + 3.0 * around / len(same))
+        row = score[i, grid.first[i] : grid.last[i]]
+        for j in range(len(row)):
+            row[j] = scale * (column[j] + column[j + 1] + column[j + 2])
+    place, height = np.empty((_MOST_PEAKS, 2)), np.empty(_MOST_PEAKS)
+    n = 0
+    for i in range(1, rows - 1):
+        for j in range(grid.first[i], grid.last[i]):
+            value = score[i, j]
+            if value < _LEAST_SCORE or n == _MOST_PEAKS:
+                continue
+            # Of equal cells the last one.
+            before, same, after = score[i - 1], score[i], score[i + 1]
+            highest = max(same[j - 1], before[j - 1], before[j], before[j + 1])
+            if highest > value or max(same[j + 1], after[j - 1], after[j], after[j + 1]) >= value:
+                continue
+            x = y = total = 0.0
+            for a in range(i - 1, i + 2):
+                for b in range(j - 1, j + 2):
+                    total += votes[a, b]
+                    x += votes[a, b] * (b + 0.5)
+                    y += votes[a, b] * grid.ahead[a]
+            place[n, 0], place[n, 1] = grid.left + grid.cell * x / total, y / total
+            height[n] = value
+            n += 1
+    return place[:n], height[:n]
 
 
 @lru_cache(maxsize=4)
-def _cells(camera: Camera, table: DiscTable, radius: float) -> Cells:
-    """Rings about the camera's foot, from the nearest to the farthest centre of the table."""
-    foot, height = camera.centre[:2], float(camera.centre[2])
-    floor = table.floor_xy.astype(np.float64)
-    offset = floor - foot
-    distance = np.hypot(offset[..., 0], offset[..., 1])
-    usable = table.usable & np.isfinite(distance)
-    # Directions count from the middle of what is seen: where they wrap nothing is seen.
-    ahead = offset[usable].mean(axis=0)
-    ahead /= max(float(np.hypot(*ahead)), 1e-9)
-    aside = np.array([-ahead[1], ahead[0]])
-    bearing = np.arctan2(offset @ aside, offset @ ahead)
-    edges = _ring_edges(distance, usable, radius)
-    middle = 0.5 * (edges[1:] + edges[:-1])
-    pixel = _CELL_PX * np.hypot(middle, height) / camera.scale_x
-    width = np.maximum(_CELL_RADII * radius, pixel) / middle
-    first, last = bearing[usable].min() - 0.1, bearing[usable].max() + 0.1
-    # One cell more at either end of a ring, which stays empty.
-    size = np.ceil((last - first) / width).astype(np.int64) + 2
-    ring = np.cumsum(np.append(0, size))
-    of_ring = np.repeat(np.arange(len(middle)), size)
-    turn = (np.arange(ring[-1]) - ring[of_ring] - 0.5) * width[of_ring]
+def grid_of(camera: Camera, table: DiscTable, radius: float) -> Grid | None:
+    """From the nearest to the farthest centre of the table; None where it has none.
 
-    def cell_of(other: NDArray[np.int64], along: FloatArray) -> NDArray[np.int64]:
-        inside = (other >= 0) & (other < len(middle))
-        other = np.clip(other, 0, len(middle) - 1)
-        number = np.floor(along / width[other]).astype(np.int64) + 1
-        inside &= (number >= 1) & (number < size[other] - 1)
-        return np.where(inside, ring[other] + number, 0)
-
-    low = floor[usable].min(axis=0) - 2.0 * radius
-    high = floor[usable].max(axis=0) + 2.0 * radius
-    per_metre = _RASTER_PER_RADIUS / radius
-    places = [np.arange(math.ceil((b - a) * per_metre)) + 0.5 for a, b in zip(low, high)]
-    grid = np.meshgrid(low[0] + places[0] / per_metre, low[1] + places[1] / per_metre)
-    place = np.stack(grid, axis=-1) - foot
-    far = np.hypot(place[..., 0], place[..., 1])
-    along = np.arctan2(place @ aside, place @ ahead) - first
-    angle = (turn + first)[:, None]
-    return Cells(
-        raster=cell_of(np.searchsorted(edges, far, side="right") - 1, along).astype(np.int32),
-        origin=low,
-        per_metre=per_metre,
-        above=cell_of(of_ring + 1, turn),
-        below=cell_of(of_ring - 1, turn),
-        ring=ring[:-1],
-        floor_xy=foot + middle[of_ring, None] * (np.cos(angle) * ahead + np.sin(angle) * aside),
-        first_row=int(np.flatnonzero(np.isfinite(distance).any(axis=1))[0]),
+    Parameters
+    ----------
+    camera : Camera
+    table : DiscTable
+    radius : float
+        Metres.
+    """
+    foot = np.array(camera.centre[:2])
+    offset = table.floor_xy.astype(np.float64) - foot
+    usable = table.usable & np.isfinite(offset).all(axis=-1)
+    if min(usable.shape) < 3 or not usable.any():
+        return None
+    direction = offset[usable].mean(axis=0)
+    direction /= max(float(np.hypot(*direction)), 1e-9)
+    turn = np.array([[-direction[1], direction[0]], direction])
+    place = offset @ turn.T
+    per_row = np.linalg.norm(np.gradient(place, axis=0), axis=-1)
+    per_column = np.linalg.norm(np.gradient(place, axis=1), axis=-1)
+    across, ahead = np.moveaxis(place[usable], -1, 0)
+    edges = _edges_ahead(ahead, per_row[usable], radius)
+    cell, step = _CELL_RADII * radius, radius / _STEPS_PER_RADIUS
+    left = float(across.min()) - 3.0 * cell
+    paired = bool(2.0 * radius >= _WIDE_PX * np.nanmax(per_column[usable]))
+    if paired:
+        pairs = place.shape[1] // 2
+        place = 0.5 * (place[:, : 2 * pairs : 2] + place[:, 1 : 2 * pairs : 2])
+    along_u, along_v = np.gradient(place, axis=1), np.gradient(place, axis=0)
+    sign = np.sign(along_u[..., 0] * along_v[..., 1] - along_v[..., 0] * along_u[..., 1])
+    matrix = [along_v[..., 1], -along_u[..., 1], -along_v[..., 0], along_u[..., 0]]
+    pixel = np.stack(
+        [(place[..., 0] - left) / cell, (place[..., 1] - edges[0]) / step]
+        + [sign * entry / (2.0 * np.pi * radius) for entry in matrix],
+        axis=-1,
+    )
+    inside = np.isfinite(pixel).all(axis=-1) & (place[..., 1] < edges[-1] + radius)
+    pixel = np.where(inside[..., None], pixel, 0.0).astype(np.float32)
+    image_row = []
+    v = 1
+    while v < len(pixel) - 1:
+        every = 1
+        if inside[v].any():
+            every = max(int(2.0 * radius / (_HIGH_PX * np.nanmedian(per_row[v]))), 1)
+            image_row.append(v)
+            pixel[v, :, 2:] *= every
+        v += every
+    row = np.searchsorted(edges, ahead, side="right") - 1
+    first, last = np.full(len(edges) - 1, np.inf), np.zeros(len(edges) - 1)
+    np.minimum.at(first, row, np.floor((across - left) / cell))
+    np.maximum.at(last, row, np.floor((across - left) / cell) + 1.0)
+    known = np.flatnonzero(last)
+    at = np.arange(math.floor((edges[-1] - edges[0]) / step)) + 0.5
+    return Grid(
+        paired=paired,
+        image_row=np.array(image_row),
+        pixel=pixel[image_row],
+        row_of_step=np.searchsorted(edges, edges[0] + step * at, side="right") - 1,
+        ahead=0.5 * (edges[1:] + edges[:-1]),
+        first=np.interp(np.arange(len(first)), known, first[known]).astype(np.int64),
+        last=np.interp(np.arange(len(last)), known, last[known]).astype(np.int64),
+        columns=int(last.max()) + 3,
+        cell=cell,
+        step=step,
+        left=left,
+        foot=foot,
+        turn=turn,
     )
 
 
-def _ring_edges(distance: FloatArray, usable: NDArray[np.bool_], radius: float) -> FloatArray:
-    """Distances between rings: a cell of the floor apart, and at least a pixel."""
-    step = np.abs(np.gradient(distance, axis=0))
-    known = usable & np.isfinite(step)
-    order = np.argsort(distance[known])
-    every = max(len(order) // 512, 1)
-    at, length = distance[known][order][::every], step[known][order][::every]
-    edges = [max(float(at[0]) - radius, radius)]
-    while edges[-1] < at[-1] + radius:
-        pixel = float(np.interp(edges[-1], at, length))
+def _edges_ahead(ahead: FloatArray, per_row: FloatArray, radius: float) -> FloatArray:
+    """Distances between rows of cells: a cell of the floor apart, and at least a pixel."""
+    order = np.argsort(ahead)[:: max(len(ahead) // 512, 1)]
+    edges = [float(ahead.min()) - radius]
+    while edges[-1] < ahead.max() + radius:
+        pixel = float(np.interp(edges[-1], ahead[order], per_row[order]))
         edges.append(edges[-1] + max(_CELL_RADII * radius, _CELL_PX * pixel))
     return np.array(edges)

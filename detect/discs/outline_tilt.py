@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from camera import Camera
 from camera.kernels import camera_numbers
-from detect.discs.rim import DIRECTIONS, median, profiles, rim_points
+from detect.discs.rim import COS, DIRECTIONS, SIN, median, profiles, rim_points
 from detect.positive_definite import invert_positive
 from detect.verticals.tilt import level_matrix
 
@@ -41,8 +41,6 @@ POINT_SIGMA_PX, TOGETHER = 0.25, 4.0
 #: What tilts of single discs, and of the floor under all of a frame's, deviate from the robot's.
 DISC_SIGMA_RAD, FLOOR_SIGMA_RAD = math.radians(0.45), math.radians(0.3)
 
-_ANGLES = 2.0 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
-_COS, _SIN = np.cos(_ANGLES), np.sin(_ANGLES)
 _STEP_RAD = 1e-4
 _ITERATIONS = 7
 #: Degrees of freedom of Student's density of discs' tilts.
@@ -240,8 +238,8 @@ def _tilts_of_discs(
         if np.count_nonzero(~np.isnan(distance)) < LEAST_DIRECTIONS:
             continue
         for m in range(DIRECTIONS):
-            point_xy[m, 0] = radius * distance[m] * _COS[m]
-            point_xy[m, 1] = radius * distance[m] * _SIN[m]
+            point_xy[m, 0] = radius * distance[m] * COS[m]
+            point_xy[m, 1] = radius * distance[m] * SIN[m]
         # What a higher camera sees is larger than the calibrated floor has it.
         found, tilt, covariance = fit_outline(
             point_xy, scale / radius, centre, x, y, radius / height_ratio

@@ -64,7 +64,7 @@ _CERTAINLY_BEST = 0.9
 
 _1 = np.uint64(1)
 _ANGLES = 2.0 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
-_COS, _SIN = np.cos(_ANGLES), np.sin(_ANGLES)
+COS, SIN = np.cos(_ANGLES), np.sin(_ANGLES)
 #: Weights of a parabola's beginning, middle and end at the steps.
 _SHARES = np.linspace(NEAREST, FARTHEST, STEPS) / FARTHEST
 _BEGIN, _MIDDLE, _END = (
@@ -129,7 +129,7 @@ def profiles(
     right, bottom = image.shape[1] - 1.0, image.shape[0] - 1.0
     for k in range(DIRECTIONS):
         # The image of a direction is a parabola to well below a tenth of a pixel.
-        dx, dy = radius * _COS[k], radius * _SIN[k]
+        dx, dy = radius * COS[k], radius * SIN[k]
         u1, v1 = project_floor_point(camera_numbers, x + half * dx, y + half * dy)
         u2, v2 = project_floor_point(camera_numbers, x + FARTHEST * dx, y + FARTHEST * dy)
         scale[k] = math.hypot(u1 - u0, v1 - v0) / half
@@ -378,7 +378,7 @@ def follow_rim(
         log_px += math.log(scale[k]) / DIRECTIONS
         tolerance[k] = TOLERANCE_RADII + TOLERANCE_PX / scale[k]
         if distance[k] == distance[k]:
-            at_x[k], at_y[k] = distance[k] * _COS[k], distance[k] * _SIN[k]
+            at_x[k], at_y[k] = distance[k] * COS[k], distance[k] * SIN[k]
             weight[k] = (scale[k] / POINT_SIGMA_PX) ** 2
     chosen = np.zeros(DIRECTIONS)
     best, best_count = best_circle(at_x, at_y, weight, tolerance, chosen)
@@ -395,8 +395,8 @@ def follow_rim(
     for k in range(DIRECTIONS):
         u, v = project_floor_point(
             camera_numbers,
-            x + radius * (best.x + best.radius * _COS[k]),
-            y + radius * (best.y + best.radius * _SIN[k]),
+            x + radius * (best.x + best.radius * COS[k]),
+            y + radius * (best.y + best.radius * SIN[k]),
         )
         inside = 0.0 <= u <= width - 1.0 and 0.0 <= v <= height - 1.0
         visible += inside

@@ -20,23 +20,32 @@ from numpy.typing import NDArray
 from camera.kernels import project_floor_point
 from detect.discs.candidates import suppress_neighbours
 from detect.discs.hough import HoughCandidates
-from detect.discs.rim import DIRECTIONS, FARTHEST, NEAREST, STEPS, Rim, follow_rim, median, profiles
-from detect.discs.rim_network import (
-    RimNetwork,
-    network_inputs,
-    network_log_odds,
-    worth_the_network,
+from detect.discs.rim import (
+    COS,
+    DIRECTIONS,
+    FARTHEST,
+    NEAREST,
+    SIN,
+    STEPS,
+    Rim,
+    follow_rim,
+    median,
+    profiles,
 )
+from detect.discs.rim_network import Networks, network_inputs, network_log_odds
 
 FloatArray = NDArray[np.float64]
 
 #: Where grey values count as of the disc and of the floor, nominal radii.
 _INSIDE, _OUTSIDE = (0.4, 0.75), (1.25, 1.6)
-_INNER, _OUTER = 0.6, 1.4
-#: Least share of the directions in which the disc differs from the floor, and of the rim.
-_LEAST_STEPS, _LEAST_RIM = 0.35, 0.35
-_ANGLES = 2.0 * np.pi * np.arange(16) / 16
-_COS, _SIN = np.cos(_ANGLES), np.sin(_ANGLES)
+#: Directions of a glance (a part of the rim's), where its samples are, and which are inside and
+#: outside; the least share of directions in which the disc differs from the floor.
+GLANCED = DIRECTIONS // 2
+GLANCED_AT = np.linspace(0.3, 1.7, 8)
+_INNER, _OUTER = slice(1, 3), slice(5, 7)
+_LEAST_STEPS = 0.35
+#: Least share of the rim that is on a circle.
+_LEAST_RIM = 0.35
 #: Nearer to a disc already found than this share of the separation nothing is looked for.
 _WITHIN = 0.75
 #: A rim followed from its own middle may lose this share and is still the better one.
@@ -91,7 +100,7 @@ def second_looks(
     found_xy: FloatArray,
     sought: Sought,
     camera_numbers: FloatArray,
-    network: RimNetwork,
+    networks: Networks,
 ) -> SecondLooks:
     """Look a second time at candidates that are not at discs already found.
 
@@ -104,9 +113,9 @@ def second_looks(
     sought : Sought
     camera_numbers : (K,) float64
         `camera.kernels.camera_numbers`.
-    network : RimNetwork
+    networks : Networks
     """
-    looks = _look_at_all(image, candidates, found_xy, sought, camera_numbers, network)
+    looks = _look_at_all(image, candidates, found_xy, sought, camera_numbers, networks)
     best = suppress_neighbours(looks.floor_xy, looks.log_odds, sought.separation)
     return SecondLooks(*(values[best] for values in looks))
 
@@ -118,7 +127,7 @@ def _look_at_all(
     found_xy: FloatArray,
     sought: Sought,
     camera_numbers: FloatArray,
-    network: RimNetwork,
+    networks: Networks,
 ) -> SecondLooks:
     n = len(candidates.score)
     features = np.empty((n, len(FEATURES)))
@@ -131,14 +140,15 @@ def _look_at_all(
         x, y = candidates.floor_xy[i, 0], candidates.floor_xy[i, 1]
         if _near_any(found_xy, x, y, _WITHIN * sought.separation):
             continue
-        contrast = _contrast(image, camera_numbers, candidates.floor_xy[i], sought)
+        grey, scale = glance(image, camera_numbers, x, y, sought.radius)
+        contrast = _contrast(grey, sought)
         if contrast == 0.0:
+            continue
+        inputs, scales = network_inputs(grey, scale, sought.sign)
+        if network_log_odds(inputs, scales, candidates.score[i : i + 1], networks.glance) < 0.0:
             continue
         rim = follow_rim(image, camera_numbers, x, y, sought.radius, sought.sign * contrast)
         if rim.agreeing < _LEAST_RIM:
-            continue
-        _note_rim(rim, sought.radius, candidates.score[i], features[count])
-        if not worth_the_network(features[count], network):
             continue
         again = follow_rim(image, camera_numbers, rim.x, rim.y, sought.radius, rim.step)
         if again.agreeing >= rim.agreeing - _RIM_SLACK:
@@ -149,8 +159,8 @@ def _look_at_all(
             continue
         _note_rim(rim, sought.radius, candidates.score[i], features[count])
         grey, scale = profiles(image, camera_numbers, rim.x, rim.y, sought.radius)
-        inputs, scales = network_inputs(grey, scale, sought.sign)
-        log_odds[count] = network_log_odds(inputs, scales, features[count], network) - _TAKEN
+        inputs, scales = network_inputs(pairs_of_steps(grey), scale, sought.sign)
+        log_odds[count] = network_log_odds(inputs, scales, features[count], networks.look) - _TAKEN
         quality[count] = _quality(grey)
         place[count, 0], place[count, 1] = rim.x, rim.y
         covariance[count, 0, 0], covariance[count, 1, 1] = rim.cov_xx, rim.cov_yy
@@ -182,28 +192,49 @@ def _between(grey: FloatArray, bounds: tuple[float, float]) -> FloatArray:
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _contrast(
-    image: NDArray[np.uint8], numbers: FloatArray, at: FloatArray, sought: Sought
-) -> float:
-    """Median step over those directions that step enough; 0 where these are too few."""
-    u0, v0 = project_floor_point(numbers, at[0], at[1])
-    ux, vx = project_floor_point(numbers, at[0] + sought.radius, at[1])
-    uy, vy = project_floor_point(numbers, at[0], at[1] + sought.radius)
+def glance(
+    image: NDArray[np.uint8], camera_numbers: FloatArray, x: float, y: float, radius: float
+) -> tuple[FloatArray, FloatArray]:
+    """The nearest grey values along some directions, without perspective within the disc.
+
+    Parameters and results are as of `detect.discs.rim.profiles`, with fewer directions and steps.
+    """
+    grey, scale = np.empty((GLANCED, len(GLANCED_AT))), np.empty(GLANCED)
+    u0, v0 = project_floor_point(camera_numbers, x, y)
+    ux, vx = project_floor_point(camera_numbers, x + radius, y)
+    uy, vy = project_floor_point(camera_numbers, x, y + radius)
     height, width = image.shape
-    steps = np.empty(len(_COS))
+    for k in range(GLANCED):
+        cos, sin = COS[k * (DIRECTIONS // GLANCED)], SIN[k * (DIRECTIONS // GLANCED)]
+        du, dv = cos * (ux - u0) + sin * (uy - u0), cos * (vx - v0) + sin * (vy - v0)
+        scale[k] = math.sqrt(du * du + dv * dv)
+        for m in range(len(GLANCED_AT)):
+            u, v = (
+                math.floor(u0 + GLANCED_AT[m] * du + 0.5),
+                math.floor(v0 + GLANCED_AT[m] * dv + 0.5),
+            )
+            inside = 0 <= u < width and 0 <= v < height
+            grey[k, m] = image[v, u] if inside else math.nan
+    return grey, scale
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def pairs_of_steps(grey: FloatArray) -> FloatArray:
+    """Profiles as the network sees them: means of two steps each."""
+    return 0.5 * (grey[:, ::2] + grey[:, 1::2])
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _contrast(grey: FloatArray, sought: Sought) -> float:
+    """Median step over those directions that step enough; 0 where these are too few."""
+    steps = np.empty(GLANCED)
     count = 0
-    for k in range(len(_COS)):
-        du = _COS[k] * (ux - u0) + _SIN[k] * (uy - u0)
-        dv = _COS[k] * (vx - v0) + _SIN[k] * (vy - v0)
-        u1, v1 = math.floor(u0 + _INNER * du + 0.5), math.floor(v0 + _INNER * dv + 0.5)
-        u2, v2 = math.floor(u0 + _OUTER * du + 0.5), math.floor(v0 + _OUTER * dv + 0.5)
-        if min(u1, u2, v1, v2) < 0 or max(u1, u2) >= width or max(v1, v2) >= height:
-            continue
-        step = sought.sign * (float(image[v1, u1]) - float(image[v2, u2]))
+    for k in range(GLANCED):
+        step = sought.sign * (np.mean(grey[k, _INNER]) - np.mean(grey[k, _OUTER]))
         if step > sought.least_step:
             steps[count] = step
             count += 1
-    return median(steps[:count]) if count >= _LEAST_STEPS * len(_COS) else 0.0
+    return median(steps[:count]) if count >= _LEAST_STEPS * GLANCED else 0.0
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

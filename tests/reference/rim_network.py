@@ -13,8 +13,8 @@ FloatArray = NDArray[np.floating]
 def inputs_of(
     grey: FloatArray, pixels_per_radius: FloatArray, sign: float
 ) -> tuple[FloatArray, FloatArray]:
-    """See `detect.discs.rim_network.network_inputs`."""
-    values = sign * (grey[:, ::2] + grey[:, 1::2]) / 2.0
+    """See `detect.discs.rim_network.network_inputs`; the inputs as (K, I)."""
+    values = sign * grey
     outside = np.isnan(values)
     off = values - np.nanmean(values)
     deviation = np.sqrt(np.nanmean(off**2) + 9.0)

@@ -8,7 +8,7 @@ import sys
 import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import tyro
@@ -25,7 +25,7 @@ from tools.evaluation.markers_command import Markers, MarkersCommand
 from tools.evaluation.markers_command import perform as evaluate_markers
 from tools.evaluation.published_lines import print_printed_lines
 from tools.evaluation.real_run import measure_run, table_of
-from tools.evaluation.rim_network_training import cross_validation, train
+from tools.evaluation.rim_network_training import cross_validation, train_all
 from tools.evaluation.second_look_data import gather
 from tools.evaluation.tilt_of_discs import compare_tilts, report_of
 
@@ -323,15 +323,17 @@ def _carry_out(
 
 
 def _train_rim_network(command: TrainRimNetwork) -> int:
-    looks = gather(command.data, command.every, command.scenes, command.seed)
-    print(f"{len(looks.is_disc)} looks, {looks.is_disc.sum()} at discs")
-    for line in cross_validation(looks, command.seed):
+    glances, looks = gather(command.data, command.every, command.scenes, command.seed)
+    for kind, of in (("glances", glances), ("looks", looks)):
+        print(f"{len(of.is_disc)} {kind}, {of.is_disc.sum()} at discs")
+    for line in cross_validation(glances, looks, command.seed):
         print(line)
-    network = train(looks, np.ones(len(looks.is_disc), np.bool_), command.seed)
+    networks = train_all(glances, looks, command.seed)
     command.output.parent.mkdir(parents=True, exist_ok=True)
+    weights: dict[str, Any] = networks.by_name()
     with write_whole(command.output, overwrite=command.force) as stream:
-        np.savez(stream, **network._asdict())
-    print(f"{command.output}: {sum(array.size for array in network)} weights")
+        np.savez(stream, **weights)
+    print(f"{command.output}: {sum(array.size for array in weights.values())} weights")
     return 0
 
 

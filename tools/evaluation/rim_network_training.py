@@ -12,18 +12,15 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize
-from scipy.special import expit
 
-from detect.discs.rim_network import DISTANCES, INPUTS, SCALES, RimNetwork
+from detect.discs.rim_network import OTHERS, SCALES, Networks, RimNetwork
 from tools.evaluation.second_look_data import Looks
 
 FloatArray = NDArray[np.floating]
 
-CHANNELS, UNITS, MEMBERS = 12, 16, 4
-_EPOCHS, _BATCH = 60, 256
-#: Share of the discs that the features of the rim alone may lose.
-_QUICKLY_LOST = 0.01
+_BATCH = 256
+#: Share of the discs that a glance may lose.
+_LOST_AT_A_GLANCE = 0.01
 _LONGEST_STEP, _RISING, _DECAY = 6e-3, 0.3, 0.02
 _MOMENTUM, _SQUARES = 0.9, 0.99
 #: A look is never taken for certain.
@@ -32,12 +29,24 @@ _SMOOTHING = 0.01
 _GAIN, _NOISE = 0.3, 4.0
 
 
+class Shape(NamedTuple):
+    """How large networks are, how many are averaged, and how often each sees every look."""
+
+    channels: int
+    units: int
+    members: int
+    epochs: int
+
+
+SHAPES = {"glance": Shape(12, 8, 1, 40), "look": Shape(12, 16, 4, 60)}
+
+
 class Batch(NamedTuple):
     """What the network sees of N looks.
 
     Attributes
     ----------
-    inputs : (N, DIRECTIONS, INPUTS) float32
+    inputs : (N, K, I) float32
     scales : (N, SCALES) float32
     features : (N, F) float32
     """
@@ -49,11 +58,10 @@ class Batch(NamedTuple):
 
 def batch_of(grey: FloatArray, pixels_per_radius: FloatArray, features: FloatArray) -> Batch:
     """`detect.discs.rim_network.network_inputs` of N looks at light discs."""
-    values = grey.reshape(*grey.shape[:-1], DISTANCES, 2).mean(axis=-1)
-    outside = np.isnan(values)
+    outside = np.isnan(grey)
     count = np.maximum((~outside).sum(axis=(1, 2), keepdims=True), 1)
-    mean = np.where(outside, 0.0, values).sum(axis=(1, 2), keepdims=True) / count
-    off = np.where(outside, 0.0, values - mean)
+    mean = np.where(outside, 0.0, grey).sum(axis=(1, 2), keepdims=True) / count
+    off = np.where(outside, 0.0, grey - mean)
     deviation = np.sqrt((off**2).sum(axis=(1, 2), keepdims=True) / count + 9.0)
     size = np.log(pixels_per_radius) - 1.5
     inputs = np.concatenate(
@@ -63,20 +71,27 @@ def batch_of(grey: FloatArray, pixels_per_radius: FloatArray, features: FloatArr
     return Batch(inputs.astype(np.float32), scales.astype(np.float32), features)
 
 
+def _first_weights(
+    inputs: int, features: int, shape: Shape, rng: np.random.Generator
+) -> list[FloatArray]:
+    channels, units = shape.channels, shape.units
+    sizes = [
+        (3 * inputs, channels), (3 * channels, channels), (3 * channels + SCALES, units),
+        (units + features, 1),
+    ]  # fmt: skip
+    weights: list[FloatArray] = []
+    for n, m in sizes:
+        first = np.sqrt(2.0 / n) * rng.normal(size=(n, m))
+        weights += [first.astype(np.float32), np.zeros(m, np.float32)]
+    weights[-2] *= 0.3
+    return weights
+
+
 class _Member:
     """One network: its weights, in the order of `RimNetwork`, and the values of a pass."""
 
-    def __init__(self, features: int, rng: np.random.Generator) -> None:
-        def layer(inputs: int, outputs: int) -> FloatArray:
-            deviations = rng.normal(size=(inputs, outputs)) * np.sqrt(2.0 / inputs)
-            return np.asarray(deviations, np.float32)
-
-        self.weights = [
-            layer(3 * INPUTS, CHANNELS), np.zeros(CHANNELS, np.float32),
-            layer(3 * CHANNELS, CHANNELS), np.zeros(CHANNELS, np.float32),
-            layer(3 * CHANNELS + SCALES, UNITS), np.zeros(UNITS, np.float32),
-            0.3 * layer(UNITS + features, 1), np.zeros(1, np.float32),
-        ]  # fmt: skip
+    def __init__(self, weights: list[FloatArray]) -> None:
+        self.weights = weights
 
     def log_odds(self, batch: Batch) -> FloatArray:
         w_around, b_around, w_again, b_again, w_dense, b_dense, w_out, b_out = self.weights
@@ -95,20 +110,20 @@ class _Member:
         """Of a cost with these derivatives by the log-odds of the latest pass."""
         _, _, w_again, _, w_dense, _, w_out, _ = self.weights
         d_out = d_odds[:, None]
-        d_dense = (d_out @ w_out.T)[:, :UNITS] * (self._dense > 0.0)
-        mean, most, least = np.split((d_dense @ w_dense.T)[:, : 3 * CHANNELS], 3, axis=-1)
-        directions = self._again.shape[1]
+        d_dense = (d_out @ w_out.T)[:, : w_dense.shape[1]] * (self._dense > 0.0)
+        mean, most, least = np.split((d_dense @ w_dense.T)[:, :-SCALES], 3, axis=-1)
+        directions, channels = self._again.shape[1:]
         d_again = np.repeat((mean / directions)[:, None], directions, axis=1)
-        look, channel = np.ogrid[: len(d_odds), :CHANNELS]
+        look, channel = np.ogrid[: len(d_odds), :channels]
         d_again[look, self._most, channel] += most
         d_again[look, self._least, channel] += least
-        d_again = (d_again * (self._again > 0.0)).reshape(-1, CHANNELS)
+        d_again = (d_again * (self._again > 0.0)).reshape(-1, channels)
         before, same, after = np.split((d_again @ w_again.T).reshape(self._around_seen.shape), 3, 2)
         d_around = np.roll(before, -1, axis=1) + same + np.roll(after, 1, axis=1)
-        d_around = (d_around * (self._around > 0.0)).reshape(-1, CHANNELS)
+        d_around = (d_around * (self._around > 0.0)).reshape(-1, channels)
         return [
-            self._seen.reshape(-1, 3 * INPUTS).T @ d_around, d_around.sum(axis=0),
-            self._around_seen.reshape(-1, 3 * CHANNELS).T @ d_again, d_again.sum(axis=0),
+            self._seen.reshape(len(d_around), -1).T @ d_around, d_around.sum(axis=0),
+            self._around_seen.reshape(len(d_again), -1).T @ d_again, d_again.sum(axis=0),
             self._pooled.T @ d_dense, d_dense.sum(axis=0),
             self._all.T @ d_out, d_out.sum(axis=0),
         ]  # fmt: skip
@@ -131,15 +146,16 @@ def _varied(looks: Looks, chosen: NDArray[np.int64], rng: np.random.Generator) -
     return batch_of(lit.astype(np.float32), scale, looks.features[chosen].astype(np.float32))
 
 
-def _train_member(looks: Looks, used: NDArray[np.int64], seed: int) -> _Member:
+def _train_member(looks: Looks, used: NDArray[np.int64], shape: Shape, seed: int) -> _Member:
     rng = np.random.default_rng(seed)
-    member = _Member(looks.features.shape[1], rng)
+    inputs, features = looks.grey.shape[-1] + OTHERS, looks.features.shape[1]
+    member = _Member(_first_weights(inputs, features, shape, rng))
     target = looks.is_disc * (1.0 - 2.0 * _SMOOTHING) + _SMOOTHING
     weight = looks.weight / looks.weight[used].mean()
     first = [np.zeros_like(w) for w in member.weights]
     second = [np.zeros_like(w) for w in member.weights]
-    steps = _EPOCHS * -(-len(used) // _BATCH)
-    orders = (rng.permutation(used) for _ in range(_EPOCHS))
+    steps = shape.epochs * -(-len(used) // _BATCH)
+    orders = (rng.permutation(used) for _ in range(shape.epochs))
     batches = (order[k : k + _BATCH] for order in orders for k in range(0, len(order), _BATCH))
     for t, chosen in enumerate(batches, 1):
         odds = member.log_odds(_varied(looks, chosen, rng))
@@ -160,44 +176,14 @@ def _train_member(looks: Looks, used: NDArray[np.int64], seed: int) -> _Member:
     return member
 
 
-def quick_weights(looks: Looks, used: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """`RimNetwork.quick`: a logistic regression that keeps all but a few of the discs."""
-    chosen = looks.features[used]
-    mean, deviation = chosen.mean(axis=0), chosen.std(axis=0) + 1e-6
-    scaled = (chosen - mean) / deviation
-    design = np.concatenate([scaled, scaled**2, np.ones((len(chosen), 1))], axis=1)
-    target, weight = looks.is_disc[used], looks.weight[used]
-
-    def cost(weights: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
-        odds = design @ weights
-        value = weight @ (np.logaddexp(0.0, odds) - target * odds) + 0.5 * weights @ weights
-        return float(value), design.T @ (weight * (expit(odds) - target)) + weights
-
-    linear, square, _ = np.split(
-        minimize(cost, np.zeros(design.shape[1]), jac=True).x, [len(mean), 2 * len(mean)]
-    )
-    # The same in the features as they are.
-    square = square / deviation**2
-    linear = linear / deviation - 2.0 * square * mean
-    odds = chosen @ linear + chosen**2 @ square
-    limit = np.quantile(odds[target], _QUICKLY_LOST)
-    return np.concatenate([linear, square, [-limit]])
-
-
-def worth_the_network(looks: Looks, quick: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """`detect.discs.rim_network.worth_the_network` of all looks."""
-    n = looks.features.shape[1]
-    odds = looks.features @ quick[:n] + looks.features**2 @ quick[n : 2 * n] + quick[-1]
-    return np.asarray(odds >= 0.0)
-
-
-def train(looks: Looks, used: NDArray[np.bool_], seed: int) -> RimNetwork:
+def train(looks: Looks, used: NDArray[np.bool_], shape: Shape, seed: int) -> RimNetwork:
     """Train networks on some of the looks.
 
     Parameters
     ----------
     looks : Looks
     used : (N,) bool
+    shape : Shape
     seed : int
         Of the first network; each has its own.
 
@@ -206,55 +192,74 @@ def train(looks: Looks, used: NDArray[np.bool_], seed: int) -> RimNetwork:
     RimNetwork
         Its features are those of the looks as they are.
     """
-    quick = quick_weights(looks, used)
-    used = used & worth_the_network(looks, quick)
     index = np.flatnonzero(used)
     mean, deviation = looks.features[used].mean(axis=0), looks.features[used].std(axis=0) + 1e-6
     alike = looks._replace(features=(looks.features - mean) / deviation)
-    members = [_train_member(alike, index, seed + k).weights for k in range(MEMBERS)]
+    members = [_train_member(alike, index, shape, seed + k).weights for k in range(shape.members)]
     around, around_bias, again, again_bias, dense, dense_bias, out, out_bias = (
         np.stack(layer) for layer in zip(*members, strict=True)
     )
-    by_unit, by_feature = out[:, :UNITS, 0], out[:, UNITS:, 0] / deviation
+    by_unit, by_feature = out[:, : shape.units, 0], out[:, shape.units :, 0] / deviation
     return RimNetwork(
-        around.reshape(MEMBERS, 3, INPUTS, CHANNELS), around_bias,
-        again.reshape(MEMBERS, 3, CHANNELS, CHANNELS), again_bias, dense, dense_bias,
+        around.reshape(shape.members, 3, -1, shape.channels), around_bias,
+        again.reshape(shape.members, 3, -1, shape.channels), again_bias, dense, dense_bias,
         np.c_[by_unit, by_feature].astype(np.float32),
         (out_bias[:, 0] - by_feature @ mean).astype(np.float32),
-        quick,
     )  # fmt: skip
 
 
-def log_odds(network: RimNetwork, batch: Batch) -> NDArray[np.float64]:
-    """(N,) log-odds of looks by a network: `detect.discs.rim_network.network_log_odds` in NumPy."""
+def train_glance(glances: Looks, used: NDArray[np.bool_], seed: int) -> RimNetwork:
+    """As `train`, for a network above 0 for all but a few of the discs."""
+    network = train(glances, used, SHAPES["glance"], seed)
+    discs = log_odds(network, glances, used & glances.is_disc)
+    least = np.quantile(discs, _LOST_AT_A_GLANCE).astype(np.float32)
+    return network._replace(out_bias=network.out_bias - least)
+
+
+def train_all(glances: Looks, looks: Looks, seed: int) -> Networks:
+    """The networks of the detector, by all glances and looks."""
+    return Networks(
+        train_glance(glances, np.ones(len(glances.is_disc), np.bool_), seed),
+        train(looks, np.ones(len(looks.is_disc), np.bool_), SHAPES["look"], seed),
+    )
+
+
+def log_odds(network: RimNetwork, looks: Looks, chosen: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Log-odds of some looks: `detect.discs.rim_network.network_log_odds` in NumPy."""
+    batch = batch_of(
+        looks.grey[chosen, 0], looks.pixels_per_radius[chosen, 0], looks.features[chosen]
+    )
     members = []
-    for layers in zip(*network[:-1], strict=True):
-        w = RimNetwork._make([*layers, network.quick])
-        member = _Member(0, np.random.default_rng(0))
-        member.weights = [
+    for layers in zip(*network, strict=True):
+        w = RimNetwork(*layers)
+        weights = [
             w.around.reshape(-1, w.around.shape[-1]), w.around_bias,
             w.again.reshape(-1, w.again.shape[-1]), w.again_bias,
             w.dense, w.dense_bias, w.out[:, None], np.atleast_1d(w.out_bias),
         ]  # fmt: skip
-        members.append(member.log_odds(batch))
+        members.append(_Member(weights).log_odds(batch))
     return np.asarray(np.mean(members, axis=0), np.float64)
 
 
-def cross_validation(looks: Looks, seed: int) -> Iterable[str]:
+def cross_validation(glances: Looks, looks: Looks, seed: int) -> Iterable[str]:
     """What networks find in each building that was left out of training them, line by line."""
-    buildings = np.array([source.split()[0] for source in looks.source])
+    buildings, glanced = (
+        np.array([source.split()[0] for source in of.source]) for of in (looks, glances)
+    )
     for left_out in np.unique(buildings[looks.source == buildings]):
-        own = looks.source == left_out
+        own, seen = looks.source == left_out, glances.source == left_out
         if not looks.is_disc[own].any():
             continue
-        network = train(looks, buildings != left_out, seed)
-        batch = batch_of(looks.grey[own, 0], looks.pixels_per_radius[own, 0], looks.features[own])
-        odds = np.where(
-            worth_the_network(looks, network.quick)[own], log_odds(network, batch), -np.inf
-        )
+        network = train_glance(glances, glanced != left_out, seed)
+        odds = log_odds(network, glances, seen)
+        passed = [(odds[glances.is_disc[seen] == disc] >= 0.0).mean() for disc in (True, False)]
+        odds = log_odds(train(looks, buildings != left_out, SHAPES["look"], seed), looks, own)
         discs, others = odds[looks.is_disc[own]], odds[~looks.is_disc[own]]
         text = ", ".join(
             f">= {t:g}: {(discs >= t).sum()}/{len(discs)} discs, {(others >= t).sum()} others"
             for t in np.arange(-1.0, 2.01, 0.5)
         )
-        yield f"left out {left_out}: {text}"
+        yield (
+            f"left out {left_out}: glances keep {passed[0]:.3f} of discs, {passed[1]:.3f} else;"
+            f" {text}"
+        )

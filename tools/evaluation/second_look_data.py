@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 from camera import Camera, read_camera
 from camera.calibration.floor import with_pose
 from camera.kernels import camera_numbers
-from detect.circles import detect_circles, disc_shape, second_looks_at
+from detect.circles import candidates_at, detect_circles, disc_shape, second_looks_at
 from detect.discs.rim import DIRECTIONS, STEPS, profiles
-from detect.discs.rim_network import INPUTS, SCALES, RimNetwork
-from detect.discs.second_look import FEATURES
+from detect.discs.rim_network import OTHERS, SCALES, Networks, RimNetwork
+from detect.discs.second_look import FEATURES, GLANCED_AT, glance, pairs_of_steps
 from detect.noise import estimate_noise
 from detect.settings import CircleSettings
 from lut import DiscTable, cached_disc_table
@@ -53,34 +53,32 @@ _SCENE_WEIGHT, _SCENES_PER_STAGE, _SHARES = 0.4, 50, (0.1, 0.5)
 _VIEWS, _OFF_PLACE, _OFF_SIZE = 5, 0.007, 0.06
 
 
-def _network_by_rim() -> RimNetwork:
-    """Prefers, of the looks at one place, the one with most of a rim."""
-    shapes = (1, 3, INPUTS, 1), (1, 1), (1, 3, 1, 1), (1, 1), (1, 3 + SCALES, 1), (1, 1)
-    out = np.zeros((1, 1 + len(FEATURES)), np.float32)
-    out[0, 1 + FEATURES.index("rim")] = 1.0
-    return RimNetwork._make(
-        [
-            *(np.zeros(shape, np.float32) for shape in shapes),
-            out,
-            np.zeros(1, np.float32),
-            np.zeros(2 * len(FEATURES) + 1),
-        ]
-    )
+def _network_by(features: int, decisive: int, inputs: int) -> RimNetwork:
+    """Goes by one feature alone."""
+    shapes = (1, 3, inputs, 1), (1, 1), (1, 3, 1, 1), (1, 1), (1, 3 + SCALES, 1), (1, 1)
+    out = np.zeros((1, 1 + features), np.float32)
+    out[0, 1 + decisive] = 1.0
+    weights = [np.zeros(shape, np.float32) for shape in shapes]
+    return RimNetwork._make([*weights, out, np.zeros(1, np.float32)])
 
 
+#: Glances pass; of the looks at one place, the one with most of a rim is the best.
+_BY_RIM = Networks(
+    _network_by(1, 0, len(GLANCED_AT) + OTHERS),
+    _network_by(len(FEATURES), FEATURES.index("rim"), STEPS // 2 + OTHERS),
+)
 _NOWHERE, _NO_PLACES = np.zeros((0, 4)), np.zeros((0, 2))
 
 
 class Looks(NamedTuple):
-    """Second looks of known truth.
+    """Glances at candidates or second looks, of known truth.
 
     Attributes
     ----------
     features : (N, F) float64
-        Of the rims.
-    grey : (N, V, DIRECTIONS, STEPS) float32
-    pixels_per_radius : (N, V, DIRECTIONS) float32
-        Profiles of the rims (`detect.discs.rim.profiles`), seen from V places nearby.
+    grey : (N, V, K, M) float32
+    pixels_per_radius : (N, V, K) float32
+        What the network sees, from V places nearby.
     is_disc : (N,) bool
     weight : (N,) float64
     source : (N,) str
@@ -94,13 +92,14 @@ class Looks(NamedTuple):
     source: NDArray[np.str_]
 
 
-_BY_RIM = _network_by_rim()
+_Row = tuple[FloatArray, FloatArray, FloatArray, bool, float, str]
 
 
 class _Gathering:
     def __init__(self, rng: np.random.Generator) -> None:
         self._rng = rng
-        self.rows: list[tuple[FloatArray, FloatArray, FloatArray, bool, float, str]] = []
+        self.glances: list[_Row] = []
+        self.looks: list[_Row] = []
 
     def add(
         self,
@@ -119,38 +118,47 @@ class _Gathering:
         camera, table = view
         noise = estimate_noise(image, 32)
         found = detect_circles(image, camera, table, _FIRST)
-        looks = second_looks_at(image, camera, table, _SETTINGS, _NO_PLACES, noise, _BY_RIM)
-        pixels = camera.project_floor(looks.floor_xy)
-        for features, place, uv in zip(looks.features, looks.floor_xy, pixels, strict=True):
-            if not np.isfinite(features).all():
-                continue
+        numbers = camera_numbers(camera)
+
+        def judged(place: FloatArray) -> tuple[bool, float, str]:
+            uv = camera.project_floor(place[None])[0]
             near, far = _nearest(uv, discs), _nearest(uv, unsure)
             is_disc, is_other = near < 0.6, far < 0.6 if only else min(near, far) > 1.5
             counts = weight[0] if is_disc else weight[1]
             if is_disc and (np.hypot(*(found.floor_xy - place).T) < _RADIUS).any():
                 counts *= _FOUND_WEIGHT
-            if (is_disc or is_other) and counts > 0.0:
-                views = self._views(image, camera, place)
-                self.rows.append((features, *views, is_disc, counts, source))
+            return is_disc, counts if is_disc or is_other else 0.0, source
+
+        candidates = candidates_at(image, camera, table, _SETTINGS, noise)
+        for place, score in zip(candidates.floor_xy, candidates.score, strict=True):
+            grey, scale = glance(image, numbers, place[0], place[1], _RADIUS)
+            self.glances.append((np.array([score]), grey[None], scale[None], *judged(place)))
+        looks = second_looks_at(image, camera, table, _SETTINGS, _NO_PLACES, noise, _BY_RIM)
+        for features, place in zip(looks.features, looks.floor_xy, strict=True):
+            if np.isfinite(features).all():
+                self.looks.append((features, *self._views(image, camera, place), *judged(place)))
 
     def _views(
         self, image: NDArray[np.uint8], camera: Camera, place: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        grey, scale = np.empty((_VIEWS, DIRECTIONS, STEPS)), np.empty((_VIEWS, DIRECTIONS))
+        grey, scale = np.empty((_VIEWS, DIRECTIONS, STEPS // 2)), np.empty((_VIEWS, DIRECTIONS))
         off = self._rng.normal(size=(_VIEWS, 3)) * [_OFF_PLACE, _OFF_PLACE, _OFF_SIZE]
         off[0] = 0.0
         numbers = camera_numbers(camera)
         for k, (dx, dy, size) in enumerate(off):
             radius = _RADIUS * (1.0 + size)
-            grey[k], scale[k] = profiles(image, numbers, place[0] + dx, place[1] + dy, radius)
+            steps, scale[k] = profiles(image, numbers, place[0] + dx, place[1] + dy, radius)
+            grey[k] = pairs_of_steps(steps)
         return grey, scale
 
-    def looks(self) -> Looks:
-        features, grey, scale, is_disc, weight, source = zip(*self.rows, strict=True)
-        return Looks(
-            np.array(features), np.array(grey, np.float32), np.array(scale, np.float32),
-            np.array(is_disc), np.array(weight), np.array(source),
-        )  # fmt: skip
+
+def _looks_of(rows: list[_Row]) -> Looks:
+    rows = [row for row in rows if row[4] > 0.0]
+    features, grey, scale, is_disc, weight, source = zip(*rows, strict=True)
+    return Looks(
+        np.array(features), np.array(grey, np.float32), np.array(scale, np.float32),
+        np.array(is_disc), np.array(weight), np.array(source),
+    )  # fmt: skip
 
 
 def _nearest(uv: FloatArray, places: FloatArray) -> float:
@@ -174,8 +182,8 @@ def _images(camera: Camera, places: FloatArray, slack_px: float) -> FloatArray:
     return np.array(rows).reshape(-1, 4)
 
 
-def gather(data: Path, every: int, scenes: int, seed: int) -> Looks:
-    """Look at all sources of a folder of data (see `docs/measured.md`); every n-th real frame."""
+def gather(data: Path, every: int, scenes: int, seed: int) -> tuple[Looks, Looks]:
+    """Glances and looks at all sources of a folder of data; of the real frames, every n-th."""
     rng = np.random.default_rng(seed)
     gathering = _Gathering(rng)
     _add_scenes(gathering, read_camera(data / "dlr" / "e" / "e.cam"), scenes, rng)
@@ -212,7 +220,7 @@ def gather(data: Path, every: int, scenes: int, seed: int) -> Looks:
         gathering.add(image, view, clear, mapped, (_REAL_WEIGHT, _REAL_WEIGHT), "real")
         if number % (3 * every) == 0:
             _add_disturbed(gathering, image, view, rng, "real disturbed")
-    return gathering.looks()
+    return _looks_of(gathering.glances), _looks_of(gathering.looks)
 
 
 def _add_scenes(
