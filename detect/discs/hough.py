@@ -41,8 +41,10 @@ _STEPS_PER_RADIUS = 16.0
 _WIDE_PX, _HIGH_PX = 9.0, 6.0
 #: Added to the mean votes of the cells as far ahead: where these are empty, few votes are none.
 _BACKGROUND = 0.45
-#: Least score of a candidate, and how many an image may have; how many of them may be neighbours.
+#: Least score of a candidate, and how many an image may have, at most, and before suppression.
 _LEAST_SCORE, _MOST, _MOST_PEAKS = 1.65, 60, 1000
+#: Nearer to a better candidate than this is none, radii: what touches a disc may be one, too.
+_APART = 0.6
 #: Sobel's kernel multiplies a step per pixel by this.
 _SOBEL_GAIN = 8.0
 
@@ -128,7 +130,7 @@ def hough_candidates(
     if grid is None:
         return HoughCandidates(np.empty((0, 2)), np.empty(0))
     place, score = _peaks(count_votes(image, grid, sign * radius, least_step), grid)
-    alone = suppress_neighbours(place, score, radius)
+    alone = suppress_neighbours(place, score, _APART * radius)
     place, score = place[alone], score[alone]
     best = np.argsort(-score, kind="stable")[:_MOST]
     return HoughCandidates(place[best] @ grid.turn + grid.foot, score[best])
@@ -253,8 +255,10 @@ def grid_of(camera: Camera, table: DiscTable, radius: float) -> Grid | None:
     place = offset @ turn.T
     per_row = np.linalg.norm(np.gradient(place, axis=0), axis=-1)
     per_column = np.linalg.norm(np.gradient(place, axis=1), axis=-1)
-    across, ahead = np.moveaxis(place[usable], -1, 0)
-    edges = _edges_ahead(ahead, per_row[usable], radius)
+    edges = _edges_ahead(place[usable, 1], per_row[usable], radius)
+    # Up to the image's border, nearer than the centres of the table are.
+    seen = (place[..., 1] >= edges[0]) & (place[..., 1] < edges[-1])
+    across, ahead = np.moveaxis(place[seen], -1, 0)
     cell, step = _CELL_RADII * radius, radius / _STEPS_PER_RADIUS
     left = float(across.min()) - 3.0 * cell
     paired = bool(2.0 * radius >= _WIDE_PX * np.nanmax(per_column[usable]))

@@ -34,8 +34,9 @@ NEAREST, FARTHEST = 0.35, 1.65
 LEAST_STEP = 0.35
 #: A point is on the circle within this share of the radius, and this many pixels.
 TOLERANCE_RADII, TOLERANCE_PX = 0.04, 0.4
-#: Of the radius about the nominal one, relative: the calibrated height may be off by some percent.
-RADIUS_SIGMA = 0.06
+#: Of the radius about the nominal one, relative, to find the circle (the calibrated height may be off
+#: by some percent), and to place it: of a short arc, place and radius trade off.
+RADIUS_SIGMA, PLACING_SIGMA = 0.06, 0.03
 #: Standard deviation of a point of the rim along its direction, pixels.
 POINT_SIGMA_PX = 0.25
 #: Fewer points than this make no circle.
@@ -213,11 +214,15 @@ class Circle(NamedTuple):
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def fit_circle(
-    x: NDArray[np.float64], y: NDArray[np.float64], weight: NDArray[np.float64], circle: Circle
+    x: NDArray[np.float64],
+    y: NDArray[np.float64],
+    weight: NDArray[np.float64],
+    circle: Circle,
+    radius_sigma: float,
 ) -> Circle:
     """One Gauss-Newton step of centre and radius to weighed points, from a circle near to them.
 
-    Points that are not to be fitted have the weight 0.
+    Points that are not to be fitted have the weight 0; the radius is 1 within `radius_sigma`.
     """
     s_x = s_y = s_w = s_xx = s_xy = s_yy = 0.0
     r_x = r_y = r_w = 0.0
@@ -239,7 +244,7 @@ def fit_circle(
         r_w += off
         r_x += off * dx
         r_y += off * dy
-    prior = 1.0 / RADIUS_SIGMA**2
+    prior = 1.0 / radius_sigma**2
     s_w += prior
     r_w += prior * (1.0 - circle.radius)
     s_xx += 1e-9
@@ -325,7 +330,7 @@ def best_circle(
             if count < LEAST_POINTS:
                 break
             before = circle
-            circle = fit_circle(x, y, chosen, before)
+            circle = fit_circle(x, y, chosen, before, RADIUS_SIGMA)
             count, changed = _choose(x, y, weight, tolerance, circle, 1.6 if i < 2 else 1.0, chosen)
             moved = max(abs(circle.x - before.x), abs(circle.y - before.y))
             if i > 2 and not changed and moved < _ARRIVED:
@@ -415,12 +420,13 @@ def follow_rim(
         hidden = chosen[k] == 0.0 and chosen[following] == 0.0 and not outside[k]
         runs += 1 if hidden and chosen[last] > 0.0 else 0
     scatter = math.sqrt(squares / best_count)
+    radius_found = radius * best.radius
     best, (by_xx, by_xy, by_yy) = _placed(at_x, at_y, chosen, best)
     area, share = radius * radius, _INDEPENDENT_SHARE
     return Rim(
         best_count / DIRECTIONS, visible / DIRECTIONS, runs, scatter,
         math.sqrt(mean_2) / max(abs(mean), 1e-9), mean,
-        x + radius * best.x, y + radius * best.y, radius * best.radius,
+        x + radius * best.x, y + radius * best.y, radius_found,
         area * (share * best.cov_xx + by_xx), area * (share * best.cov_xy + by_xy),
         area * (share * best.cov_yy + by_yy), radius_px,
     )  # fmt: skip
@@ -445,7 +451,7 @@ def _placed(
             trusted[k] = chosen[k]
     off = np.empty(DIRECTIONS)
     for _ in range(_PLACING_STEPS):
-        circle = fit_circle(x, y, trusted, circle)
+        circle = fit_circle(x, y, trusted, circle, PLACING_SIGMA)
         n = 0
         for k in range(DIRECTIONS):
             if trusted[k] > 0.0:
@@ -483,7 +489,8 @@ def _by_jackknife(
             left += some[k] > 0.0
         if left_out == 0 or left == 0:
             continue
-        other = fit_circle(x, y, some, fit_circle(x, y, some, circle))
+        other = fit_circle(x, y, some, circle, PLACING_SIGMA)
+        other = fit_circle(x, y, some, other, PLACING_SIGMA)
         others[n, 0], others[n, 1] = other.x, other.y
         mean_x, mean_y, n = mean_x + other.x, mean_y + other.y, n + 1
     if n < 2:

@@ -97,7 +97,7 @@ def test_a_step_to_the_circle_is_that_of_the_normal_equations() -> None:
         right = slope.T @ (weight * (length - before.radius))
         normal[2, 2] += 1.0 / RADIUS_SIGMA**2
         right[2] += (1.0 - before.radius) / RADIUS_SIGMA**2
-        after = fit_circle(x, y, weight, before)
+        after = fit_circle(x, y, weight, before, RADIUS_SIGMA)
         np.testing.assert_allclose(
             np.subtract(after[:3], before[:3]), np.linalg.solve(normal, right), rtol=1e-6, atol=1e-9
         )
