@@ -52,7 +52,7 @@ _EDGE, _LEAST_STEP = 5.5, 8.0
 #: Of the least quality, part of the directions of what is fitted must have this share.
 _PART_QUALITY = 0.8
 #: Discs of so little more than the least evidence are for the second look, where there is one.
-_DOUBTFUL = 0.5
+_DOUBTFUL = 1.0
 
 
 @dataclass(frozen=True)

@@ -53,7 +53,7 @@ _RIM_SLACK = 0.07
 #: Radius of a rim that fits best, relative to the nominal one.
 _RIM_RADIUS = 0.98
 #: Log-odds by the network that make a disc.
-_TAKEN = 1.3
+_TAKEN = 0.8
 #: Features of the rim, in the order of the network's weights.
 FEATURES = ("rim", "runs", "scatter", "radius", "radius_2", "size", "score")
 
