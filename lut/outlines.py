@@ -106,7 +106,7 @@ class CentreGroups(NamedTuple):
     samples: NDArray[np.uint32]
     """(G, GROUP_SAMPLES, 2) the pixels of these samples of the inner and of the outer outline for
     the first centre, each `GROUP_COLUMNS` or more before the end of the image; 0 for a centre that
-    has not so many."""
+    sees fewer."""
 
 
 @dataclass(frozen=True, eq=False)

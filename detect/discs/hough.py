@@ -1,8 +1,8 @@
 """Candidates by the edges of the image: a Hough transform for discs of known size on the floor.
 
 At the rim of a light disc the gradient of the grey value, taken on the floor, points to the centre,
-one radius away. With A the derivative of the floor position X by the pixel, B = |det A| A^-T, and g
-the gradient in the image, the centre is
+one radius away. With A the derivative of the floor position X by the pixel, B = abs(det A) A^-T,
+and g the gradient in the image, the centre is
 
     X + r n,  n = B g / norm(B g),
 
