@@ -11,7 +11,7 @@ in the floor plane and refines the position.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -32,9 +32,10 @@ from detect.discs.rim_network import Networks, trained_networks
 from detect.discs.search import DiscSearch, Scene, search_discs
 from detect.discs.second_look import SecondLooks, Sought, second_looks
 from detect.errors import FrameError
+from detect.margins import blank_margins
 from detect.noise import estimate_noise
 from detect.settings import CircleSettings, Polarity
-from lut import DiscShape, DiscTable
+from lut import DiscShape, DiscTable, cached_disc_table
 
 FloatArray = NDArray[np.float64]
 
@@ -118,6 +119,29 @@ def detect_circles(
         )
     if not (settings.verify or settings.refine):
         return _without_fit(image, camera, table, settings)
+    left, right = blank_margins(image)
+    if not (left or right):
+        return _with_fit(image, camera, table, settings)
+    camera, table = _between_margins(camera, left, right, disc_shape(settings))
+    image = np.ascontiguousarray(image[:, left : left + camera.width])
+    found = _with_fit(image, camera, table, settings)
+    return replace(found, pixels=found.pixels + np.array([left, 0]))
+
+
+@lru_cache(maxsize=8)
+def _between_margins(
+    camera: Camera, left: int, right: int, shape: DiscShape
+) -> tuple[Camera, DiscTable]:
+    """The camera that sees an image without its margins, and its table."""
+    width, offset_x = camera.width - left - right, camera.offset_x - left
+    camera = replace(camera, width=width, offset_x=offset_x)
+    return camera, cached_disc_table(camera, shape)
+
+
+def _with_fit(
+    image: NDArray[np.uint8], camera: Camera, table: DiscTable, settings: CircleSettings
+) -> CircleDetections:
+    """The default detector: discs that are fitted from the best centres."""
     noise = estimate_noise(image, _NOISE_ROWS)
     weakest = settings.noise_floor * max(noise, _LEAST_NOISE)
     least, sign = settings.threshold, _SIGNS[settings.polarity]
