@@ -1,6 +1,6 @@
 """The disc detector: one image in, discs on the floor out.
 
-The way of one image, top to bottom, is `detect_circles`. The published detector (DLR Spatial
+The way of one image begins at `detect_circles`. The published detector (DLR Spatial
 Cognition data set report, circle detection) needs no more than the quality of each centre: it
 accepts those of a good quality and contrast, keeps the best within a disc's width, and reports the
 pixel with a covariance of one pixel and some centimetres. The default goes on from the maxima of
@@ -50,7 +50,7 @@ _SIGNS: dict[Polarity, int] = {"any": 0, "light": 1, "dark": -1}
 _NOISE_ROWS = 16
 #: Least gradient of an edge that votes, and least step of a rim, grey levels (per pixel).
 _EDGE, _LEAST_STEP = 5.5, 8.0
-#: Of the least quality, part of the directions of what is fitted must have this share.
+#: Of the least quality, the samples that a group of centres shares must have this share.
 _PART_QUALITY = 0.8
 #: Discs of so little more than the least evidence are for the second look, where there is one.
 _DOUBTFUL = 1.0
@@ -220,10 +220,8 @@ def second_looks_at(
     networks : Networks, optional
         Others than the trained ones.
     """
-    sign, weakest = (
-        float(_SIGNS[settings.polarity]),
-        settings.noise_floor * max(noise, _LEAST_NOISE),
-    )
+    sign = float(_SIGNS[settings.polarity])
+    weakest = settings.noise_floor * max(noise, _LEAST_NOISE)
     sought = Sought(settings.radius_m, settings.separation_m, sign, max(weakest, _LEAST_STEP))
     return second_looks(
         image, candidates_at(image, camera, table, settings, noise),
